@@ -1,0 +1,24 @@
+"""jaxsky: a JAX-differentiable model of the polarized microwave sky."""
+
+from jaxsky.bandpass import Bandpass
+from jaxsky.components import AME, CMB, Component, Dust, Synchrotron
+from jaxsky.parameters import get_parameters, parameter_names, set_parameters
+from jaxsky.sky import Sky, observe, observe_band, observe_components
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "AME",
+    "CMB",
+    "Bandpass",
+    "Component",
+    "Dust",
+    "Sky",
+    "Synchrotron",
+    "get_parameters",
+    "observe",
+    "observe_band",
+    "observe_components",
+    "parameter_names",
+    "set_parameters",
+]

@@ -1,0 +1,157 @@
+"""Bandpasses: weights over frequency, their conventions, and the average of a spectrum."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxsky.checks import as_array, check_finite, check_positive, is_concrete
+from jaxsky.sed import cmb_derivative
+from jaxsky.units import band_conversion
+
+__all__ = ["CONVENTIONS", "Bandpass", "average"]
+
+#: convention -> factor that turns its weights into weights on antenna temperature
+CONVENTIONS: dict[str, Callable[[Array], Array]] = {
+    "RJ": jnp.ones_like,
+    "power": lambda nu: (nu / nu[0]) ** 2,
+    "CMB": lambda nu: 1 / cmb_derivative(nu),
+}
+
+
+class Bandpass(eqx.Module):
+    """The response of a detector to the frequencies of a band.
+
+    A band observes the weighted mean of the antenna temperature, int W S dnu / int W dnu (the
+    paper's eq. 8, by the trapezoid rule). Tables of W come in three conventions: the response
+    to unit antenna temperature ("RJ": the paper, Planck LFI), to unit power, Jy/sr ("power":
+    WMAP, Planck HFI, PySM) or to unit thermodynamic temperature ("CMB"). They differ by a
+    factor of frequency that is applied here, so all else is the same for the three.
+
+    Parameters
+    ----------
+    nu : frequencies [GHz], shape (sample,), strictly increasing; one sample is a delta function
+    weights : response, shape (sample,), any normalisation
+    convention : "RJ", "power" or "CMB"
+
+    Raises
+    ------
+    TypeError
+        If an argument carries a unit or is not numeric.
+    ValueError
+        For a wrong shape or convention, frequencies that do not increase, or a zero integral.
+
+    Examples
+    --------
+    >>> band = Bandpass([28.0, 30.0, 32.0], [1.0, 2.0, 1.0])
+    >>> float(band.center)
+    30.0
+    """
+
+    nu: Float[Array, " sample"]
+    weights: Float[Array, " sample"]
+    convention: str = eqx.field(static=True)
+
+    def __init__(self, nu: ArrayLike, weights: ArrayLike, convention: str = "RJ") -> None:
+        self.nu = as_array("nu", nu)
+        self.weights = as_array("weights", weights)
+        self.convention = convention
+        if convention not in CONVENTIONS:
+            known = ", ".join(CONVENTIONS)
+            raise ValueError(f"Argument `convention` must be one of {known}, not {convention!r}.")
+        if self.nu.ndim != 1 or self.nu.shape != self.weights.shape or not self.nu.size:
+            raise ValueError(
+                "Arguments `nu` and `weights` must have one shape (sample,), "
+                f"but have shapes {self.nu.shape} and {self.weights.shape}."
+            )
+        check_positive("nu", self.nu)
+        check_finite("weights", self.weights)
+        if is_concrete(self.nu) and not bool(jnp.all(jnp.diff(self.nu) > 0)):
+            raise ValueError("Argument `nu` must increase strictly from sample to sample.")
+        if is_concrete(self._integrand) and not float(self._integrand.sum()) > 0:
+            raise ValueError("Argument `weights` has an integral over `nu` that is not positive.")
+
+    @classmethod
+    def delta(cls, nu: ArrayLike) -> "Bandpass":
+        """A monochromatic band at nu [GHz]."""
+        nu = jnp.atleast_1d(as_array("nu", nu))
+        return cls(nu, jnp.ones_like(nu))
+
+    @classmethod
+    def top_hat(
+        cls, center: ArrayLike, width: ArrayLike, convention: str = "RJ", samples: int = 51
+    ) -> "Bandpass":
+        """A band of constant weight over center +- width/2 [GHz], differentiable in both."""
+        center, width = as_array("center", center), as_array("width", width)
+        check_positive("width", width)
+        nu = center + width * jnp.linspace(-0.5, 0.5, samples)
+        return cls(nu, jnp.ones_like(nu), convention)
+
+    @property
+    def _integrand(self) -> Float[Array, " sample"]:
+        weights = self.weights * CONVENTIONS[self.convention](self.nu)
+        if self.nu.size == 1:
+            return weights
+        steps = jnp.diff(self.nu)
+        ends = jnp.zeros(1, steps.dtype)
+        return weights * (jnp.concatenate([ends, steps]) + jnp.concatenate([steps, ends])) / 2
+
+    @property
+    def quadrature(self) -> Float[Array, " sample"]:
+        """Weights w_k with sum 1, such that the band reads sum_k w_k T(nu_k) in K_RJ."""
+        return self._integrand / self._integrand.sum()
+
+    @property
+    def center(self) -> Float[Array, ""]:
+        """Mean frequency, weighted as antenna temperature is [GHz]."""
+        return jnp.sum(self.quadrature * self.nu)
+
+    def shifted(self, delta: ArrayLike) -> "Bandpass":
+        """The band moved by delta [GHz]; renormalised, since all averages are."""
+        return Bandpass(self.nu + delta, self.weights, self.convention)
+
+    def stretched(self, factor: ArrayLike) -> "Bandpass":
+        """The band widened by a factor about its center; renormalised, since all averages are."""
+        nu = self.center + factor * (self.nu - self.center)
+        return Bandpass(nu, self.weights, self.convention)
+
+    def conversion(
+        self, source: str, target: str, nu_ref: ArrayLike | None = None
+    ) -> Float[Array, ""]:
+        """Factor between brightness units in this band; see `jaxsky.units.band_conversion`.
+
+        Parameters
+        ----------
+        source, target : names of units
+        nu_ref : frequency at which MJy/sr is quoted [GHz], default the band's center
+        """
+        nu_ref = self.center if nu_ref is None else nu_ref
+        return band_conversion(source, target, self.nu, self.quadrature, nu_ref)
+
+
+def average(sed: Callable[[Array], Array], band: Bandpass) -> Float[Array, "..."]:
+    """Band average sum_k w_k S(nu_k) of a spectrum: the direct sum, and the reference.
+
+    Parameters
+    ----------
+    sed : function of one frequency [GHz] that returns a number or a map
+    band : the band
+
+    Returns
+    -------
+    Array of the shape that `sed` returns. Maps are summed one sample at a time, so that memory
+    does not grow with the number of samples, and gradients recompute rather than store them.
+    """
+    shape = jax.eval_shape(sed, band.nu[0]).shape
+    if shape == ():
+        return jnp.dot(band.quadrature, jax.vmap(sed)(band.nu))
+
+    @jax.checkpoint
+    def add(total, sample):
+        nu, weight = sample
+        return total + weight * sed(nu), None
+
+    first = band.quadrature[0] * sed(band.nu[0])
+    return jax.lax.scan(add, first, (band.nu[1:], band.quadrature[1:]))[0]

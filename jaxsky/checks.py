@@ -1,0 +1,54 @@
+"""Checks of arguments, at construction and at the border: one sentence an error."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+__all__ = ["as_array", "check_finite", "check_positive", "is_concrete"]
+
+
+def is_concrete(x: object) -> bool:
+    """True if the values of `x` can be looked at now (it is not being traced)."""
+    return not isinstance(x, jax.core.Tracer)
+
+
+def as_array(name: str, value: object) -> Array:
+    """`value` as a floating-point JAX array in native byte order.
+
+    Raises
+    ------
+    TypeError
+        If it carries a unit (JAX would drop it silently) or is not numeric.
+    """
+    if hasattr(value, "unit"):
+        raise TypeError(
+            f"Argument `{name}` carries the unit {value.unit}; jaxsky takes bare arrays. "
+            "Convert it first, for example with jaxsky.io.from_quantity."
+        )
+    if isinstance(value, np.ndarray) and not value.dtype.isnative:
+        value = value.astype(value.dtype.newbyteorder("="))
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError):
+        raise TypeError(
+            f"Argument `{name}` must be a number or a numeric array, but is {type(value).__name__}."
+        ) from None
+    if jnp.iscomplexobj(array):
+        raise TypeError(f"Argument `{name}` must be real, but is complex.")
+    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
+
+
+def check_finite(name: str, value: Array) -> None:
+    """Raise ValueError if a concrete array has NaN or infinite values; says how many."""
+    if is_concrete(value) and (bad := int(jnp.sum(~jnp.isfinite(value)))):
+        raise ValueError(f"Argument `{name}` has {bad} of {value.size} values that are not finite.")
+
+
+def check_positive(name: str, value: Array) -> None:
+    """Raise ValueError if a concrete array has values that are not finite and positive."""
+    check_finite(name, value)
+    if is_concrete(value) and not bool(jnp.all(value > 0)):
+        raise ValueError(
+            f"Argument `{name}` must be positive, but its smallest value is {float(value.min()):g}."
+        )

@@ -1,0 +1,108 @@
+"""Brightness units: K_RJ, K_CMB and MJy/sr, at a frequency and over a band.
+
+Units are named by strings such as "uK_CMB", "mK_RJ", "MJy/sr". The factors are pure functions of
+arrays; the names are static. Inside the package everything is uK_RJ.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxsky.constants import MJYSR_PER_K_RJ_AT_1GHZ
+from jaxsky.sed import cmb_derivative
+
+__all__ = ["band_conversion", "conversion", "parse_unit"]
+
+_PREFIXES = {"": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9}
+#: name -> (size in the unit of its kind, kind)
+UNITS: dict[str, tuple[float, str]] = {
+    f"{prefix}{kind}": (size, kind)
+    for kind in ("K_RJ", "K_CMB")
+    for prefix, size in _PREFIXES.items()
+} | {"MJy/sr": (1.0, "MJy/sr"), "kJy/sr": (1e-3, "MJy/sr"), "Jy/sr": (1e-6, "MJy/sr")}
+
+
+def parse_unit(unit: str) -> tuple[float, str]:
+    """Size and kind ("K_RJ", "K_CMB" or "MJy/sr") of a unit's name.
+
+    Raises
+    ------
+    ValueError
+        If the name is unknown.
+
+    Examples
+    --------
+    >>> parse_unit("uK_CMB")
+    (1e-06, 'K_CMB')
+    """
+    try:
+        return UNITS[unit]
+    except KeyError:
+        raise ValueError(f"Unknown unit {unit!r}; known units are {', '.join(UNITS)}.") from None
+
+
+def _ratio(source: str, target: str, K_RJ_per: dict[str, ArrayLike]) -> Array:
+    (source_size, source_kind), (target_size, target_kind) = parse_unit(source), parse_unit(target)
+    scale = source_size / target_size
+    if source_kind == target_kind:
+        return jnp.asarray(scale)
+    return scale * K_RJ_per[source_kind] / K_RJ_per[target_kind]
+
+
+def conversion(source: str, target: str, nu: ArrayLike) -> Float[Array, "..."]:
+    """Factor from one brightness unit to another at a frequency.
+
+    Parameters
+    ----------
+    source, target : names of units
+    nu : frequency [GHz], any shape
+
+    Raises
+    ------
+    ValueError
+        If a unit is unknown.
+
+    Examples
+    --------
+    >>> round(float(conversion("uK_CMB", "uK_RJ", 100.0)), 4)
+    0.777
+    """
+    nu = jnp.asarray(nu)
+    return _ratio(
+        source,
+        target,
+        {
+            "K_RJ": jnp.ones_like(nu),
+            "K_CMB": cmb_derivative(nu),
+            "MJy/sr": 1 / (MJYSR_PER_K_RJ_AT_1GHZ * nu**2),
+        },
+    )
+
+
+def band_conversion(
+    source: str,
+    target: str,
+    nu: Float[Array, " sample"],
+    weights: Float[Array, " sample"],
+    nu_ref: ArrayLike,
+) -> Float[Array, ""]:
+    """Factor from one brightness unit to another over a band.
+
+    A band reports the weighted mean of the antenna temperature, so 1 K_CMB reads sum w g(nu)
+    K_RJ, g being `cmb_derivative`. A value in MJy/sr is that at `nu_ref` of a spectrum
+    I ~ 1/nu (the IRAS convention, which Planck HFI follows: Planck 2013 results IX).
+
+    Parameters
+    ----------
+    source, target : names of units
+    nu : frequencies [GHz]
+    weights : weights on antenna temperature, summing to 1 (`Bandpass.quadrature`)
+    nu_ref : frequency at which a brightness in MJy/sr is quoted [GHz]
+
+    Raises
+    ------
+    ValueError
+        If a unit is unknown.
+    """
+    iras = jnp.sum(weights * (nu_ref / nu) / (MJYSR_PER_K_RJ_AT_1GHZ * nu**2))
+    K_CMB = jnp.sum(weights * cmb_derivative(nu))
+    return _ratio(source, target, {"K_RJ": 1.0, "K_CMB": K_CMB, "MJy/sr": iras})

@@ -1,0 +1,1 @@
+"""Fitting tools for jaxsky skies ("fits" as in model fits, not FITS files)."""

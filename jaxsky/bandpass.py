@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.checks import as_array, check_finite, check_positive, is_concrete
 from jaxsky.sed import cmb_derivative
+from jaxsky.types import Numeric
 from jaxsky.units import band_conversion
 
 __all__ = ["CONVENTIONS", "Bandpass", "average"]
@@ -46,7 +47,7 @@ class Bandpass(eqx.Module):
     Examples
     --------
     >>> band = Bandpass([28.0, 30.0, 32.0], [1.0, 2.0, 1.0])
-    >>> float(band.center)
+    >>> round(float(band.center), 6)
     30.0
     """
 
@@ -118,7 +119,7 @@ class Bandpass(eqx.Module):
         return Bandpass(nu, self.weights, self.convention)
 
     def conversion(
-        self, source: str, target: str, nu_ref: ArrayLike | None = None
+        self, source: str, target: str, nu_ref: Numeric | None = None
     ) -> Float[Array, ""]:
         """Factor between brightness units in this band; see `jaxsky.units.band_conversion`.
 

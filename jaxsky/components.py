@@ -5,8 +5,6 @@ law is written once, for a frequency, in `sed`, and everything else (band averag
 parameter names) follows from the fields.
 """
 
-from typing import TypeAlias
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -14,10 +12,9 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxsky import sed
 from jaxsky.checks import as_array, check_finite, check_positive
 from jaxsky.constants import T_CMB
+from jaxsky.types import Parameter
 
 __all__ = ["AME", "CMB", "Component", "Dust", "Synchrotron"]
-
-Parameter: TypeAlias = Float[Array, ""] | Float[Array, " pix"]
 
 
 class Component(eqx.Module):

@@ -7,7 +7,8 @@ of nodes is read off the decay of the Chebyshev coefficients over the range of t
 """
 
 import itertools
-from typing import TypeAlias
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -34,11 +35,11 @@ TRACED_NODES = 16
 MAX_DIMENSIONS = 2
 
 
-def _is_map(leaf: object) -> bool:
+def _is_map(leaf: Any) -> bool:
     return eqx.is_array(leaf) and leaf.ndim == 1
 
 
-def _split(component: Component) -> tuple[list[Array], "jax.tree_util.Partial"]:
+def _split(component: Component) -> tuple[list[Array], Callable[..., Component]]:
     """The parameters that are maps, and a function from numbers in their place to a component."""
     leaves, structure = jax.tree.flatten(component)
     where = [i for i, leaf in enumerate(leaves) if _is_map(leaf)]
@@ -72,13 +73,11 @@ def _tails(component: Component, bands: tuple[Bandpass, ...]) -> Float[Array, "m
     for axis in range(len(maps)):
         lines = []
         for corner in itertools.product((-1.0, 0.0, 1.0), repeat=len(maps) - 1):
-            unit = list(corner[:axis]) + [grid] + list(corner[axis:])
+            unit: list[Any] = [*corner[:axis], grid, *corner[axis:]]
             values = [mid + half * u for (mid, half), u in zip(ranges, unit, strict=True)]
             values = [jnp.broadcast_to(v, (MAX_NODES,)) for v in values]
             for band in bands:
-                line = jax.vmap(
-                    lambda *v, band=band: average(rebuild(v).sed, band)
-                )(*values)
+                line = jax.vmap(lambda *v, band=band: average(rebuild(v).sed, band))(*values)
                 coefs = jnp.abs(chebyshev.coefficients(line))
                 tail = jnp.cumsum(coefs[::-1])[::-1]
                 lines.append(tail / jnp.abs(line).min())

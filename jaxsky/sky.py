@@ -65,7 +65,8 @@ class Sky(eqx.Module):
     @property
     def shape(self) -> tuple[int, int]:
         """(stokes, pix) of the maps."""
-        return next(iter(self.components.values())).amplitude.shape
+        stokes, npix = next(iter(self.components.values())).amplitude.shape
+        return stokes, npix
 
 
 def _plan(sky: Sky, bands: tuple[Bandpass, ...], tolerance: float) -> tuple[Nodes, ...]:
@@ -107,7 +108,9 @@ def _observe(sky, bands, plan):
         _emission(component, bands, nodes)
         for component, nodes in zip(sky.components.values(), plan, strict=True)
     ]
-    return _stack([[sum(rows) for rows in zip(*e, strict=True)] for e in zip(*emissions, strict=True)])
+    return _stack(
+        [[sum(rows) for rows in zip(*e, strict=True)] for e in zip(*emissions, strict=True)]
+    )
 
 
 def observe(
@@ -137,7 +140,9 @@ def observe(
     return _observe(sky, bands, _plan(sky, bands, tolerance))
 
 
-def observe_band(sky: Sky, band: Bandpass, *, tolerance: float = 1e-10) -> Float[Array, "stokes pix"]:
+def observe_band(
+    sky: Sky, band: Bandpass, *, tolerance: float = 1e-10
+) -> Float[Array, "stokes pix"]:
     """The sky seen through one band [uK_RJ]; see `observe`."""
     return observe(sky, [band], tolerance=tolerance)[0]
 

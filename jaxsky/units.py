@@ -5,10 +5,11 @@ arrays; the names are static. Inside the package everything is uK_RJ.
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from jaxsky.constants import MJYSR_PER_K_RJ_AT_1GHZ
 from jaxsky.sed import cmb_derivative
+from jaxsky.types import Numeric
 
 __all__ = ["band_conversion", "conversion", "parse_unit"]
 
@@ -40,15 +41,15 @@ def parse_unit(unit: str) -> tuple[float, str]:
         raise ValueError(f"Unknown unit {unit!r}; known units are {', '.join(UNITS)}.") from None
 
 
-def _ratio(source: str, target: str, K_RJ_per: dict[str, ArrayLike]) -> Array:
+def _ratio(source: str, target: str, K_RJ_per: dict[str, Numeric]) -> Array:
     (source_size, source_kind), (target_size, target_kind) = parse_unit(source), parse_unit(target)
     scale = source_size / target_size
     if source_kind == target_kind:
         return jnp.asarray(scale)
-    return scale * K_RJ_per[source_kind] / K_RJ_per[target_kind]
+    return jnp.asarray(scale * K_RJ_per[source_kind] / K_RJ_per[target_kind])
 
 
-def conversion(source: str, target: str, nu: ArrayLike) -> Float[Array, "..."]:
+def conversion(source: str, target: str, nu: Numeric) -> Float[Array, "..."]:
     """Factor from one brightness unit to another at a frequency.
 
     Parameters
@@ -64,7 +65,7 @@ def conversion(source: str, target: str, nu: ArrayLike) -> Float[Array, "..."]:
     Examples
     --------
     >>> round(float(conversion("uK_CMB", "uK_RJ", 100.0)), 4)
-    0.777
+    0.7772
     """
     nu = jnp.asarray(nu)
     return _ratio(
@@ -83,7 +84,7 @@ def band_conversion(
     target: str,
     nu: Float[Array, " sample"],
     weights: Float[Array, " sample"],
-    nu_ref: ArrayLike,
+    nu_ref: Numeric,
 ) -> Float[Array, ""]:
     """Factor from one brightness unit to another over a band.
 

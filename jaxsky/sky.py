@@ -12,7 +12,7 @@ from jaxsky.bandpass import Bandpass
 from jaxsky.components import Component
 from jaxsky.interpolation import Nodes, band_sed, choose_nodes
 
-__all__ = ["Sky", "observe", "observe_band", "observe_components"]
+__all__ = ["Sky", "interpolation_nodes", "observe", "observe_band", "observe_components"]
 
 
 class Sky(eqx.Module):
@@ -69,8 +69,11 @@ class Sky(eqx.Module):
         return stokes, npix
 
 
-def _plan(sky: Sky, bands: tuple[Bandpass, ...], tolerance: float) -> tuple[Nodes, ...]:
-    return tuple(choose_nodes(c, bands, tolerance) for c in sky.components.values())
+def interpolation_nodes(
+    sky: Sky, bands: Sequence[Bandpass], tolerance: float
+) -> tuple[Nodes, ...]:
+    """Node counts for each component, as `observe` chooses them and takes them."""
+    return tuple(choose_nodes(c, tuple(bands), tolerance) for c in sky.components.values())
 
 
 def _check_bands(bands: object) -> tuple[Bandpass, ...]:
@@ -114,7 +117,7 @@ def _observe(sky, bands, plan):
 
 
 def observe(
-    sky: Sky, bands: Sequence[Bandpass], *, tolerance: float = 1e-10
+    sky: Sky, bands: Sequence[Bandpass], *, tolerance: float = 1e-10, nodes: tuple[Nodes, ...] | None = None
 ) -> Float[Array, "band stokes pix"]:
     """The sky seen through a list of bands, the paper's eq. 8.
 
@@ -123,8 +126,9 @@ def observe(
     sky : the sky
     bands : list of bands
     tolerance : relative error of the band-averaged laws where parameters are maps; 0 sums
-        directly over the bands in every pixel. Inside jit or grad over the maps themselves,
-        where their range is not known, a fixed number of nodes is used
+        directly over the bands in every pixel
+    nodes : from `interpolation_nodes`, instead of a tolerance. Inside jit, where the range of
+        the maps is not known, a fixed number is used unless given here
         (`jaxsky.interpolation.TRACED_NODES`).
 
     Returns
@@ -137,7 +141,7 @@ def observe(
         If `bands` is not a list of at least one Bandpass.
     """
     bands = _check_bands(bands)
-    return _observe(sky, bands, _plan(sky, bands, tolerance))
+    return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance))
 
 
 def observe_band(
@@ -148,8 +152,8 @@ def observe_band(
 
 
 def observe_components(
-    sky: Sky, bands: Sequence[Bandpass], *, tolerance: float = 1e-10
+    sky: Sky, bands: Sequence[Bandpass], *, tolerance: float = 1e-10, nodes: tuple[Nodes, ...] | None = None
 ) -> dict[str, Float[Array, "band stokes pix"]]:
     """Each component by itself, as `observe` sees it [uK_RJ]."""
     bands = _check_bands(bands)
-    return _observe_components(sky, bands, _plan(sky, bands, tolerance))
+    return _observe_components(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance))

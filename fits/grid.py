@@ -1,0 +1,161 @@
+"""The posterior of one or two parameters on a grid."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from fits.likelihood import Likelihood, chi2
+from fits.priors import Prior, bounds, log_prior
+from fits.results import FitResult
+
+__all__ = ["grid_fit"]
+
+#: The grid is narrowed to where the posterior exceeds exp(-NARROW/2) of its maximum (6 sigma).
+NARROW = 36.0
+#: Probability of one standard deviation to either side.
+ONE_SIGMA = 0.6826894921370859
+
+
+@jax.jit
+def _log_posterior(like, axes, priors):
+    """-(chi^2)/2 + log prior on the product of the axes, and chi^2.
+
+    One vmap an axis, so that what depends on one parameter is computed along its axis only.
+    """
+    names = list(axes)
+
+    def point(*values):
+        params = dict(zip(names, values, strict=True))
+        value = chi2(like, params)
+        return -value / 2 + log_prior(params, priors), value
+
+    mapped = point
+    for i in reversed(range(len(names))):
+        mapped = jax.vmap(mapped, in_axes=tuple(0 if j == i else None for j in range(len(names))))
+    return mapped(*axes.values())
+
+
+def _weights(axis: np.ndarray) -> np.ndarray:
+    """Trapezoid weights of an even axis."""
+    weights = np.full(len(axis), axis[1] - axis[0])
+    weights[[0, -1]] /= 2
+    return weights
+
+
+def _marginal(density: np.ndarray, axes: list[np.ndarray], i: int) -> np.ndarray:
+    for j in reversed(range(len(axes))):
+        if j != i:
+            density = np.tensordot(density, _weights(axes[j]), axes=(j, 0))
+    return density / np.sum(density * _weights(axes[i]))
+
+
+def _quantiles(axis: np.ndarray, density: np.ndarray, levels: list[float]) -> list[float]:
+    steps = np.diff(axis) * (density[1:] + density[:-1]) / 2
+    cumulative = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum()
+    return [float(q) for q in np.interp(levels, cumulative, axis)]
+
+
+def _narrow(axis: np.ndarray, profile: np.ndarray) -> tuple[float, float]:
+    """Range of an axis in which the profile matters, one step wider on either side."""
+    inside = np.flatnonzero(profile > -NARROW / 2)
+    return float(axis[max(inside[0] - 1, 0)]), float(axis[min(inside[-1] + 1, len(axis) - 1)])
+
+
+def grid_fit(
+    like: Likelihood,
+    start: Mapping[str, ArrayLike],
+    priors: Mapping[str, Prior],
+    *,
+    points: int = 200,
+) -> FitResult:
+    """The posterior on a grid over the ranges of the uniform priors: the paper's test.
+
+    The grid first spans the priors, then is narrowed, again with all its points, to where the
+    posterior is not negligible, until that no longer changes it much.
+
+    Parameters
+    ----------
+    like : from `fits.likelihood`
+    start : the free parameters by name (the values do not matter); one or two
+    priors : a uniform prior for each of them
+    points : points an axis
+
+    Returns
+    -------
+    Result with the values at the highest point, intervals and covariance by integration over
+    the grid. `details` holds "axes" by name, "log_posterior" relative to its maximum, with
+    axes in the order of `free`, and "marginals" by name.
+
+    Raises
+    ------
+    KeyError, ValueError
+        For unknown parameters, more than two of them, or one without a uniform prior.
+    """
+    free = tuple(sorted(like.check(start)))
+    if len(free) > 2:
+        raise ValueError(
+            f"A grid takes one or two free parameters, not {len(free)} ({', '.join(free)}); "
+            "use the gradient fit or MCMC."
+        )
+    ranges = {name: bounds(name, priors) for name in free}
+    for name, (low, high) in ranges.items():
+        if not np.isfinite([low, high]).all():
+            raise ValueError(f"A grid needs a uniform prior for {name!r}, to know its range.")
+    for _ in range(6):
+        axes = {name: np.linspace(low, high, points) for name, (low, high) in ranges.items()}
+        log_posterior, chi2s = (np.asarray(a) for a in _log_posterior(like, axes, dict(priors)))
+        log_posterior = log_posterior - log_posterior.max()
+        values = list(axes.values())
+        narrowed = {}
+        for i, name in enumerate(free):
+            others = tuple(j for j in range(len(free)) if j != i)
+            narrowed[name] = _narrow(values[i], log_posterior.max(axis=others))
+        shrunk = [
+            (narrowed[n][1] - narrowed[n][0]) / (ranges[n][1] - ranges[n][0]) for n in free
+        ]
+        if min(shrunk) > 0.8:
+            break
+        ranges = narrowed
+    return _summary(like, free, axes, log_posterior, chi2s)
+
+
+def _summary(
+    like: Likelihood,
+    free: tuple[str, ...],
+    axes: dict[str, np.ndarray],
+    log_posterior: np.ndarray,
+    chi2s: np.ndarray,
+) -> FitResult:
+    values = list(axes.values())
+    density = np.exp(log_posterior)
+    marginals = {name: _marginal(density, values, i) for i, name in enumerate(free)}
+    tail = (1 - ONE_SIGMA) / 2
+    intervals = {}
+    for name, axis in axes.items():
+        low, high = _quantiles(axis, marginals[name], [tail, 1 - tail])
+        intervals[name] = (low, high)
+    mesh = np.stack([m.ravel() for m in np.meshgrid(*values, indexing="ij")])
+    best = int(np.argmax(log_posterior))
+    weights = density.ravel()
+    for axis_weights in np.meshgrid(*[_weights(a) for a in values], indexing="ij"):
+        weights = weights * axis_weights.ravel()
+    details: dict[str, Any] = {
+        "axes": axes,
+        "log_posterior": log_posterior,
+        "marginals": marginals,
+    }
+    return FitResult(
+        method="grid",
+        free=free,
+        best_fit={name: float(mesh[i, best]) for i, name in enumerate(free)},
+        interval_68=intervals,
+        covariance=np.atleast_2d(np.cov(mesh, aweights=weights / weights.sum(), ddof=0)),
+        chi2=float(chi2s.ravel()[best]),
+        converged=True,
+        message="integrated",
+        details=details,
+    )

@@ -1,0 +1,314 @@
+"""Likelihoods of the parameters of a sky, given maps in bands.
+
+All are a sum of squares of `residuals(params)`, a jitted and differentiable function of a plain
+dict of parameters, so the grid, the optimiser and the sampler share one definition:
+
+* "diagonal", the paper's: sum over pixels of (data - model)^2 / sigma^2.
+* "exact": the data reduced to their inner products with the templates, y = T^T W d, with the
+  exact covariance of y (`fits.covariance`). Smoothed noise is correlated between pixels and the
+  CMB between bands; the diagonal form ignores both and so misstates its errors, while y is
+  linear in the data, hence Gaussian with a covariance that can be computed.
+
+Both exist on inner products formed once (`TemplateLikelihood`) and, for spectral parameters that
+vary from pixel to pixel, pixel by pixel (`PixelLikelihood`), and agree where both apply.
+
+Names of parameters are those of the sky ("dust.beta_dust"), "calibration.<band>", a factor on
+the model in a band, and "offset.<band>.<stokes>", a constant added to it [uK_RJ].
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from fits.compress import gram, square_root
+from jaxsky import Bandpass, Sky, observe_components, parameter_names, set_parameters
+from jaxsky.checks import as_array
+from jaxsky.interpolation import Nodes
+from jaxsky.parameters import OFFSET, unknown_parameter
+from jaxsky.sky import interpolation_nodes
+
+__all__ = ["Likelihood", "PixelLikelihood", "TemplateLikelihood", "chi2", "likelihood"]
+
+#: Covariance of the inner products <rows, data>: (band, row, stokes, pix) -> square matrix over
+#: (band, row) flattened. `fits.covariance.Fluctuations.covariance` is one.
+CovarianceOf = Callable[[Float[Array, "band row stokes pix"]], Float[Array, "row row"]]
+
+
+class Bands(eqx.Module):
+    """Named bands with their instrumental parameters."""
+
+    bandpasses: tuple[Bandpass, ...]
+    names: tuple[str, ...] = eqx.field(static=True)
+    stokes: str = eqx.field(static=True)
+
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the calibration factors and offsets."""
+        calibrations = [f"calibration.{band}" for band in self.names]
+        return (*calibrations, *(f"offset.{b}.{s}" for b in self.names for s in self.stokes))
+
+    def calibration(self, params: Mapping[str, Array]) -> Float[Array, " band"]:
+        """Calibration factors, 1 unless given."""
+        return jnp.stack([jnp.asarray(params.get(f"calibration.{b}", 1.0)) for b in self.names])
+
+    def offset(self, params: Mapping[str, Array]) -> Float[Array, "band stokes"]:
+        """Offsets [uK_RJ], 0 unless given."""
+        rows = [params.get(f"offset.{b}.{s}", 0.0) for b in self.names for s in self.stokes]
+        return jnp.stack([jnp.asarray(r) for r in rows]).reshape(len(self.names), -1)
+
+    def sky_parameters(self, params: Mapping[str, Array]) -> dict[str, Array]:
+        """The parameters that are not those of the bands."""
+        own = self.parameter_names()
+        return {name: value for name, value in params.items() if name not in own}
+
+
+class Likelihood(eqx.Module):
+    """Base class: -2 log L is the sum of squares of `residuals(params)`, up to a constant."""
+
+    sky: Sky
+    bands: Bands
+
+    def residuals(self, params: Mapping[str, ArrayLike]) -> Float[Array, " row"]:
+        """Residuals at values of any of the parameters by name; the others keep theirs."""
+        raise TypeError(f"{type(self).__name__} must define `residuals`.")
+
+    def check(self, params: Mapping[str, ArrayLike]) -> dict[str, Array]:
+        """The parameters as numbers.
+
+        Raises
+        ------
+        KeyError
+            If a name is unknown; the message lists the known ones.
+        ValueError
+            If a value is not a number, or there is none.
+        """
+        known = (*parameter_names(self.sky), *self.bands.parameter_names())
+        if not params:
+            raise ValueError("Argument `start` must name at least one free parameter.")
+        for name, value in params.items():
+            if name.removesuffix(OFFSET) not in known or name.endswith(".amplitude"):
+                raise unknown_parameter(name, [k for k in known if not k.endswith(".amplitude")])
+            if jnp.shape(value) != ():
+                raise ValueError(f"Free parameter {name!r} must be a number, not a map.")
+        return {name: as_array(name, value) for name, value in params.items()}
+
+
+@jax.jit
+def chi2(like: Likelihood, params: Mapping[str, ArrayLike]) -> Float[Array, ""]:
+    """Sum of squares of the residuals: chi^2, or -2 log L up to a constant."""
+    return jnp.sum(like.residuals(params) ** 2)
+
+
+class TemplateLikelihood(Likelihood):
+    """Likelihood on inner products; for spectral parameters that are constant over the region.
+
+    `sky` has unit amplitudes on a single pixel: what a component shows in a band is then the
+    coefficient of its template. `matrix` turns (1, -coefficients, -offset) of all bands and
+    Stokes parameters into residuals.
+    """
+
+    matrix: Float[Array, "row vector"]
+
+    def residuals(self, params):
+        sky = set_parameters(self.sky, self.bands.sky_parameters(params))
+        seen = observe_components(sky, self.bands.bandpasses)
+        coefficients = jnp.stack([maps[..., 0] for maps in seen.values()], axis=-1)
+        coefficients = coefficients * self.bands.calibration(params)[:, None, None]
+        offset = self.bands.offset(params)[..., None]
+        vector = jnp.concatenate([jnp.ones_like(offset), -coefficients, -offset], axis=-1)
+        return self.matrix @ vector.ravel()
+
+
+class PixelLikelihood(Likelihood):
+    """Likelihood pixel by pixel; for spectral parameters that are maps."""
+
+    data: Float[Array, "band stokes pix"]
+    root_weights: Float[Array, "band stokes pix"]
+    nodes: tuple[Nodes, ...] = eqx.field(static=True)
+    #: rows of inner products and their whitening, for the exact form; None for the diagonal one
+    rows: Float[Array, "band row stokes pix"] | None
+    whitening: Float[Array, "row row"] | None
+
+    def residuals(self, params):
+        sky = set_parameters(self.sky, self.bands.sky_parameters(params))
+        seen = observe_components(sky, self.bands.bandpasses, nodes=self.nodes)
+        model = sum(seen.values()) * self.bands.calibration(params)[:, None, None]
+        model = model + self.bands.offset(params)[..., None]
+        if self.rows is None:
+            return ((self.data - model) * self.root_weights).ravel()
+        products = jnp.einsum("brsp,bsp->br", self.rows, self.data - model)
+        return self.whitening @ products.ravel()
+
+
+def _unit_sky(sky: Sky) -> Sky:
+    """The sky with amplitudes of one on a single pixel, for its coefficients."""
+    ones = jnp.ones((sky.shape[0], 1), next(iter(sky.components.values())).amplitude.dtype)
+    names = list(sky)
+    return eqx.tree_at(lambda s: [s[n].amplitude for n in names], sky, [ones] * len(names))
+
+
+def is_uniform(sky: Sky) -> bool:
+    """True if no spectral parameter is a map."""
+    return all(leaf.ndim != 1 for leaf in jax.tree.leaves(sky))
+
+
+def named_bands(bands: Mapping[str, Bandpass] | Sequence[Bandpass]) -> dict[str, Bandpass]:
+    """Bands with names; those of a list are called "0", "1", ..."""
+    if isinstance(bands, Mapping):
+        return dict(bands)
+    return {str(i): band for i, band in enumerate(bands)}
+
+
+def _check_maps(sky: Sky, bands: Mapping[str, Any], data: Array, sigma: Array) -> None:
+    shape = (len(bands), *sky.shape)
+    if data.shape != shape:
+        raise ValueError(
+            f"Argument `data` must have shape (band, stokes, pix) = {shape}, "
+            f"but has shape {data.shape}."
+        )
+    try:
+        broadcasts = jnp.broadcast_shapes(sigma.shape, shape) == shape
+    except ValueError:
+        broadcasts = False
+    if not broadcasts:
+        raise ValueError(
+            f"Argument `sigma` must broadcast to (band, stokes, pix) = {shape}, "
+            f"but has shape {sigma.shape}."
+        )
+    if bad := int(jnp.sum(~(sigma > 0))):
+        raise ValueError(f"Argument `sigma` has {bad} of {sigma.size} values that are not > 0.")
+    used = jnp.isfinite(jnp.broadcast_to(sigma, shape))
+    if bad := int(jnp.sum(used & ~jnp.isfinite(data))):
+        raise ValueError(
+            f"Argument `data` has {bad} values that are not finite in pixels that are used; "
+            "mask them with an infinite `sigma`."
+        )
+    if not bool(used.any()):
+        raise ValueError("No pixel is left: the mask, or an infinite `sigma`, covers the map.")
+
+
+def likelihood(
+    sky: Sky,
+    bands: Mapping[str, Bandpass] | Sequence[Bandpass],
+    data: ArrayLike,
+    sigma: ArrayLike,
+    start: Mapping[str, ArrayLike],
+    *,
+    stokes: str | None = None,
+    covariance_of: CovarianceOf | None = None,
+    pixelwise: bool = False,
+) -> Likelihood:
+    """The likelihood of maps as a function of the parameters named in `start`.
+
+    Parameters
+    ----------
+    sky : templates and spectral laws at the resolution of the data, amplitudes in uK_RJ
+    bands : the bands by name, or as a list
+    data : observed maps [uK_RJ], shape (band, stokes, pix)
+    sigma : standard deviation of the data [uK_RJ], broadcasting to their shape; infinite where
+        a pixel is masked
+    start : free parameters by name, at which the sky is otherwise expanded; a free parameter
+        that is a map in `sky` is replaced by a constant, one with ".offset" behind its name is
+        shifted
+    stokes : which rows to use, e.g. "Q"; default all, "QU" or "IQU" by their number
+    covariance_of : covariance of inner products with the data, for the exact likelihood;
+        None for the paper's diagonal one
+    pixelwise : evaluate pixel by pixel even where inner products would do
+
+    Returns
+    -------
+    A likelihood; `chi2(like, params)` and `like.residuals(params)` are its values.
+
+    Raises
+    ------
+    RuntimeError
+        If JAX is not in double precision.
+    KeyError
+        For unknown parameters.
+    ValueError
+        For shapes that do not match, sigma that is not positive, data that are not finite, no
+        pixel left, unknown Stokes parameters, or templates that cannot be told apart.
+    """
+    if not jax.config.jax_enable_x64:
+        raise RuntimeError(
+            "fits needs double precision; call jax.config.update('jax_enable_x64', True) first."
+        )
+    bands = named_bands(bands)
+    data, sigma = as_array("data", data), as_array("sigma", sigma)
+    _check_maps(sky, bands, data, sigma)
+    labels = "QU" if len(data[0]) == 2 else "IQU"
+    stokes = labels if stokes is None else stokes
+    if not stokes or set(stokes) - set(labels):
+        raise ValueError(f"Argument `stokes` must be among {labels!r}, not {stokes!r}.")
+    keep = jnp.array([labels.index(s) for s in stokes])
+    own = Bands(tuple(bands.values()), tuple(bands), labels)
+    params = Likelihood(sky, own).check(start)
+    sky_params = own.sky_parameters(params)
+    shifts = {name: value for name, value in sky_params.items() if name.endswith(OFFSET)}
+    sky = set_parameters(sky, {n: v for n, v in sky_params.items() if n not in shifts})
+    weights = jnp.broadcast_to(1 / sigma**2, data.shape)
+    if not is_uniform(sky) or pixelwise:
+        at_start = set_parameters(sky, shifts)
+        return _pixel_likelihood(at_start, sky, own, data, weights, keep, covariance_of)
+
+    templates = jnp.stack([c.amplitude for c in sky.components.values()])
+    products = gram(data, templates, weights)[:, keep]
+    size = products.shape[-1]
+    if covariance_of is None:
+        blocks = square_root(products).reshape(-1, size, size)
+        matrix = jax.scipy.linalg.block_diag(*blocks)
+    else:
+        rows = weights[:, None, :, :] * jnp.where(weights[:, None] > 0, templates, 0)
+        whitening = _whitening(covariance_of(_one_stokes_each(rows, keep)))
+        blocks = products[:, :, 1:-1].reshape(-1, size - 2, size)
+        matrix = whitening @ jax.scipy.linalg.block_diag(*blocks)
+    full = jnp.zeros((len(matrix), len(bands), len(labels), size))
+    matrix = full.at[:, :, keep].set(matrix.reshape(len(matrix), len(bands), len(keep), size))
+    return TemplateLikelihood(_unit_sky(sky), own, matrix.reshape(len(matrix), -1))
+
+
+def _one_stokes_each(rows: Array, keep: Array) -> Float[Array, "band row stokes pix"]:
+    """Rows (band, template, stokes, pix) split so that each holds one Stokes parameter."""
+    bands, templates, stokes, npix = rows.shape
+    split = jnp.eye(stokes)[keep][None, :, None, :, None] * rows[:, None]
+    return split.reshape(bands, len(keep) * templates, stokes, npix)
+
+
+def _whitening(covariance: Float[Array, "row row"]) -> Float[Array, "row row"]:
+    """W with W^T W the inverse of a covariance.
+
+    Raises
+    ------
+    ValueError
+        If the covariance is not positive definite: two templates are the same up to a factor.
+    """
+    scale = jnp.sqrt(jnp.diagonal(covariance))
+    correlation = covariance / scale[:, None] / scale[None, :]
+    if not bool(jnp.all(scale > 0)) or float(jnp.linalg.eigvalsh(correlation)[0]) < 1e-12:
+        raise ValueError(
+            "The templates cannot be told apart in this region: the covariance of their "
+            "amplitudes is not positive definite."
+        )
+    inverse = jax.scipy.linalg.solve_triangular(
+        jnp.linalg.cholesky(correlation), jnp.eye(len(scale)), lower=True
+    )
+    return inverse / scale[None, :]
+
+
+def _pixel_likelihood(at_start, sky, bands, data, weights, keep, covariance_of):
+    weights = jnp.zeros_like(weights).at[:, keep].set(weights[:, keep])
+    data = jnp.where(weights > 0, data, 0)
+    # Two spare nodes: a shift of a map moves its range, hardly its width.
+    plan = interpolation_nodes(at_start, bands.bandpasses, 1e-10)
+    nodes = tuple(n and tuple(min(k + 2, 33) for k in n) for n in plan)
+    rows = whitening = None
+    if covariance_of is not None:
+        seen = observe_components(at_start, bands.bandpasses, nodes=nodes)
+        rows = weights[:, None] * jnp.stack(list(seen.values()), axis=1)
+        rows = _one_stokes_each(rows, keep)
+        whitening = _whitening(covariance_of(rows))
+    return PixelLikelihood(sky, bands, data, jnp.sqrt(weights), nodes, rows, whitening)

@@ -1,0 +1,128 @@
+"""Priors on parameters, and the map from unbounded numbers to their range."""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+__all__ = ["Gaussian", "Prior", "Uniform", "bounds", "from_unbounded", "log_prior", "to_unbounded"]
+
+
+class Prior(eqx.Module):
+    """Base class: a log-density up to a constant, and its share of a sum of squares."""
+
+    def log_density(self, value: Array) -> Array:
+        """Log-density up to a constant; -inf outside the range."""
+        raise TypeError(f"{type(self).__name__} must define `log_density`.")
+
+
+class Uniform(Prior):
+    """Constant density in low <= value <= high.
+
+    Raises
+    ------
+    ValueError
+        If low is not below high.
+
+    Examples
+    --------
+    >>> float(Uniform(1.0, 2.0).log_density(1.5))
+    0.0
+    """
+
+    low: float = eqx.field(static=True)
+    high: float = eqx.field(static=True)
+
+    def __init__(self, low: float, high: float) -> None:
+        self.low, self.high = float(low), float(high)
+        if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
+            raise ValueError(f"A uniform prior needs finite low < high, not {low} and {high}.")
+
+    def log_density(self, value):
+        return jnp.where((value >= self.low) & (value <= self.high), 0.0, -jnp.inf)
+
+
+class Gaussian(Prior):
+    """Gaussian density with a mean and a standard deviation.
+
+    Raises
+    ------
+    ValueError
+        If sigma is not positive.
+
+    Examples
+    --------
+    >>> float(Gaussian(1.0, 0.5).log_density(2.0))
+    -2.0
+    """
+
+    mean: float = eqx.field(static=True)
+    sigma: float = eqx.field(static=True)
+
+    def __init__(self, mean: float, sigma: float) -> None:
+        self.mean, self.sigma = float(mean), float(sigma)
+        if not (np.isfinite([self.mean, self.sigma]).all() and self.sigma > 0):
+            raise ValueError(f"A Gaussian prior needs a positive sigma, not {sigma}.")
+
+    def log_density(self, value):
+        return -0.5 * ((value - self.mean) / self.sigma) ** 2
+
+
+def log_prior(params: Mapping[str, ArrayLike], priors: Mapping[str, Prior]) -> Float[Array, ""]:
+    """Sum of the log-densities of the parameters that have a prior."""
+    return sum((p.log_density(params[name]) for name, p in priors.items()), jnp.zeros(()))
+
+
+def prior_residuals(
+    params: Mapping[str, ArrayLike], priors: Mapping[str, Prior]
+) -> Float[Array, " gaussian"]:
+    """(value - mean)/sigma of the Gaussian priors: their sum of squares is -2 log_prior."""
+    rows = [
+        (params[name] - p.mean) / p.sigma for name, p in priors.items() if isinstance(p, Gaussian)
+    ]
+    return jnp.stack(rows) if rows else jnp.zeros(0)
+
+
+def bounds(name: str, priors: Mapping[str, Prior]) -> tuple[float, float]:
+    """Range of a parameter; infinite without a uniform prior."""
+    prior = priors.get(name)
+    return (prior.low, prior.high) if isinstance(prior, Uniform) else (-np.inf, np.inf)
+
+
+def from_unbounded(
+    params: Mapping[str, ArrayLike], priors: Mapping[str, Prior]
+) -> dict[str, ArrayLike]:
+    """Parameters within their uniform priors from unbounded ones, low + (high-low)(1+sin u)/2.
+
+    As in MINUIT: smooth, and flat at the edge, so that an optimum at the edge is a minimum in u.
+    """
+    result = dict(params)
+    for name, p in priors.items():
+        if isinstance(p, Uniform) and name in result:
+            result[name] = p.low + (p.high - p.low) * (1 + jnp.sin(result[name])) / 2
+    return result
+
+
+def to_unbounded(
+    params: Mapping[str, ArrayLike], priors: Mapping[str, Prior]
+) -> dict[str, ArrayLike]:
+    """The inverse of `from_unbounded`.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not inside its uniform prior.
+    """
+    result = dict(params)
+    for name, p in priors.items():
+        if isinstance(p, Uniform) and name in result:
+            if not p.low < float(result[name]) < p.high:
+                raise ValueError(
+                    f"Start value {float(result[name]):g} of {name!r} is not inside its uniform "
+                    f"prior {p.low:g} ... {p.high:g}."
+                )
+            unit = 2 * (jnp.asarray(result[name]) - p.low) / (p.high - p.low) - 1
+            result[name] = jnp.arcsin(unit)
+    return result

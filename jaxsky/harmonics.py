@@ -20,11 +20,14 @@ from jaxbind.contrib.jaxducc0 import get_healpix_sht
 from jaxtyping import Array, ArrayLike, Float
 
 __all__ = [
+    "adjoint_synthesis",
     "alm_ell",
     "alm_from_healpy",
     "alm_to_healpy",
     "analysis",
     "gaussian_beam",
+    "average_pixels",
+    "children",
     "resample",
     "synthesis",
 ]
@@ -83,9 +86,9 @@ def _ring_weights(nside: int) -> np.ndarray:
 
 
 def _blocks(stokes: int) -> list[tuple[slice, int]]:
-    """Rows of (I,) Q, U maps that are transformed together, with their spin."""
-    polarized = (slice(stokes - 2, stokes), 2)
-    return [polarized] if stokes == 2 else [(slice(0, 1), 0), polarized]
+    """Rows of I, of Q, U or of I, Q, U maps that are transformed together, with their spin."""
+    scalar, polarized = (slice(0, 1), 0), (slice(stokes - 2, stokes), 2)
+    return {1: [scalar], 2: [polarized], 3: [scalar, polarized]}[stokes]
 
 
 @cache
@@ -95,11 +98,11 @@ def _transform(nside: int, lmax: int, spin: int):
 
 @partial(jax.jit, static_argnames="nside")
 def synthesis(alm: Float[Array, "stokes alm"], nside: int) -> Float[Array, "stokes pix"]:
-    """Maps Q, U or I, Q, U from packed coefficients E, B or I, E, B.
+    """Maps I, or Q, U, or I, Q, U from packed coefficients I, or E, B, or I, E, B.
 
     Parameters
     ----------
-    alm : packed coefficients, shape (2 or 3, (lmax+1)^2)
+    alm : packed coefficients, shape (stokes, (lmax+1)^2)
     nside : resolution of the maps; lmax may exceed 3 nside - 1, the maps are then samples
     """
     lmax = int(np.sqrt(alm.shape[-1])) - 1
@@ -108,31 +111,33 @@ def synthesis(alm: Float[Array, "stokes alm"], nside: int) -> Float[Array, "stok
     )
 
 
+@partial(jax.jit, static_argnames="lmax")
+def adjoint_synthesis(maps: Float[Array, "stokes pix"], lmax: int) -> Float[Array, "stokes alm"]:
+    """Transpose of `synthesis`: inner products of maps with the spherical harmonics."""
+    nside = healpy.npix2nside(maps.shape[-1])
+    empty = jax.ShapeDtypeStruct((len(maps), (lmax + 1) ** 2), maps.dtype)
+    return jax.linear_transpose(partial(synthesis, nside=nside), empty)(maps)[0]
+
+
 @partial(jax.jit, static_argnames=("lmax", "iterations"))
 def analysis(
     maps: Float[Array, "stokes pix"], lmax: int, iterations: int = ITERATIONS
 ) -> Float[Array, "stokes alm"]:
-    """Packed coefficients E, B or I, E, B of maps Q, U or I, Q, U.
+    """Packed coefficients of maps I, or Q, U, or I, Q, U: the inverse of `synthesis`.
 
     Ring-weighted quadrature, refined by Jacobi steps on the residual map.
 
     Parameters
     ----------
-    maps : shape (2 or 3, pix), RING
+    maps : shape (stokes, pix), RING; one row is I, two are Q, U, three are I, Q, U
     lmax : largest multipole, at most 3 nside - 1
     iterations : Jacobi steps
     """
     nside = healpy.npix2nside(maps.shape[-1])
     weights = jnp.asarray(_ring_weights(nside), maps.dtype)
-    empty = jax.ShapeDtypeStruct((len(maps), (lmax + 1) ** 2), maps.dtype)
-    adjoint = jax.linear_transpose(partial(synthesis, nside=nside), empty)
-
-    def quadrature(m):
-        return adjoint(weights * m)[0]
-
-    alm = quadrature(maps)
+    alm = adjoint_synthesis(weights * maps, lmax)
     for _ in range(iterations):
-        alm = alm + quadrature(maps - synthesis(alm, nside))
+        alm = alm + adjoint_synthesis(weights * (maps - synthesis(alm, nside)), lmax)
     return alm
 
 
@@ -147,9 +152,28 @@ def resample(
 
     Parameters
     ----------
-    maps : shape (2 or 3, pix), RING
+    maps : shape (stokes, pix), RING; one row is I, two are Q, U, three are I, Q, U
     window : factor for each multipole 0 ... lmax; lmax at most 3 nside - 1 of the input
     nside : resolution of the result
     """
     lmax = len(window) - 1
     return synthesis(analysis(maps, lmax) * window[alm_ell(lmax)], nside)
+
+
+@cache
+def _children(nside_in: int, nside_out: int) -> np.ndarray:
+    """RING indices at nside_in of the pixels inside each pixel at nside_out, (pix_out, child)."""
+    parents = healpy.ring2nest(nside_out, np.arange(healpy.nside2npix(nside_out)))
+    ratio = (nside_in // nside_out) ** 2
+    return healpy.nest2ring(nside_in, parents[:, None] * ratio + np.arange(ratio))
+
+
+def children(maps: Float[Array, "... pix"], nside: int) -> Float[Array, "... parent child"]:
+    """Pixels of maps, grouped by the pixel of a lower resolution that they lie in (RING)."""
+    nside_in = healpy.npix2nside(maps.shape[-1])
+    return maps[..., _children(nside_in, nside)]
+
+
+def average_pixels(maps: Float[Array, "... pix"], nside: int) -> Float[Array, "... pix"]:
+    """Maps at a lower resolution as means over pixels, like healpy's ud_grade (RING)."""
+    return children(maps, nside).mean(axis=-1)

@@ -1,0 +1,66 @@
+"""What maps hold besides the model: noise and CMB, and the covariance of what is made of them.
+
+At a common resolution the noise of a band is a linear operator applied to white noise, and the
+CMB is synthesised from independent coefficients, one set for all bands. The inner products of
+rows with the data therefore have a covariance that follows exactly from a few transposed
+transforms of the rows; no simulation, no matrix over pixels.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from fits.preparation import Preparation
+from jaxsky.harmonics import adjoint_synthesis, alm_ell
+
+__all__ = ["Fluctuations"]
+
+
+class Fluctuations(eqx.Module):
+    """Noise and CMB of Q, U maps in several bands.
+
+    Parameters
+    ----------
+    preparations : operator with which each band was brought to the common resolution
+    noise : for each band, covariance of Q and U in each pixel before that [uK_RJ^2]
+    cmb_spectra : C_l of EE and BB times the window of the prepared maps squared [uK_CMB^2],
+        shape (2, ell); None without CMB
+    cmb_factors : uK_RJ per uK_CMB in each band, shape (band,)
+    """
+
+    preparations: tuple[Preparation, ...]
+    noise: tuple[Float[Array, "stokes stokes pix"], ...]
+    cmb_spectra: Float[Array, "stokes ell"] | None
+    cmb_factors: Float[Array, " band"]
+
+    def covariance(
+        self, rows: Float[Array, "band row stokes pix"]
+    ) -> Float[Array, "bandrow bandrow"]:
+        """Covariance of the inner products of rows with the fluctuations of each band."""
+        bands, count = rows.shape[:2]
+        total = jnp.zeros((bands, count, bands, count))
+        for b, (preparation, noise) in enumerate(zip(self.preparations, self.noise, strict=True)):
+            before = jnp.stack([preparation.transpose(row) for row in rows[b]])
+            block = jnp.einsum("isp,stp,jtp->ij", before, noise, before)
+            total = total.at[b, :, b, :].add(block)
+        total = total.reshape(bands * count, bands * count)
+        if self.cmb_spectra is None:
+            return total
+        lmax = self.cmb_spectra.shape[-1] - 1
+        root = jnp.sqrt(self.cmb_spectra)[:, alm_ell(lmax)]
+        modes = jnp.stack(
+            [
+                factor * (root * adjoint_synthesis(row, lmax)).ravel()
+                for factor, band in zip(self.cmb_factors, rows, strict=True)
+                for row in band
+            ]
+        )
+        return total + modes @ modes.T
+
+    def sigma(self) -> Float[Array, "band stokes pix"]:
+        """Standard deviation of the noise in each pixel of the prepared maps [uK_RJ]."""
+        variances = [
+            preparation.variance(jnp.diagonal(noise, axis1=0, axis2=1).T)
+            for preparation, noise in zip(self.preparations, self.noise, strict=True)
+        ]
+        return jnp.sqrt(jnp.stack(variances))

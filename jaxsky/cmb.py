@@ -1,0 +1,79 @@
+"""The CMB: power spectra from CAMB, and realisations of them."""
+
+from functools import cache
+
+import camb
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsky.harmonics import alm_ell
+
+__all__ = ["PLANCK_2018", "camb_spectra", "realisation"]
+
+#: Planck 2018 results VI, TT,TE,EE+lowE+lensing; arguments of `camb.set_params`.
+PLANCK_2018 = {
+    "H0": 67.36,
+    "ombh2": 0.02237,
+    "omch2": 0.1200,
+    "mnu": 0.06,
+    "omk": 0.0,
+    "tau": 0.0544,
+    "As": 2.1e-9,
+    "ns": 0.9649,
+}
+
+
+@cache
+def camb_spectra(lmax: int, r: float = 0.0, **cosmology: float) -> Float[np.ndarray, "4 ell"]:
+    """Lensed spectra C_l of TT, EE, BB, TE with tensors [uK_CMB^2], l = 0 ... lmax.
+
+    Parameters
+    ----------
+    lmax : largest multipole
+    r : tensor-to-scalar ratio
+    **cosmology : of `camb.set_params`, instead of `PLANCK_2018`
+
+    Raises
+    ------
+    ValueError
+        If r is negative.
+    """
+    if r < 0:
+        raise ValueError(f"Argument `r` must not be negative, but is {r}.")
+    # The lensing of l = lmax needs higher multipoles, and CAMB some for its interpolation.
+    params = camb.set_params(
+        **(cosmology or PLANCK_2018), r=r, WantTensors=r > 0, lmax=max(lmax + 500, 1000)
+    )
+    results = camb.get_results(params)
+    return np.asarray(results.get_total_cls(lmax, CMB_unit="muK", raw_cl=True)).T
+
+
+def realisation(
+    key: Array, spectra: Float[Array, "4 ell"], stokes: str = "QU"
+) -> Float[Array, "stokes alm"]:
+    """Packed coefficients (E, B or I, E, B) of a Gaussian realisation of spectra.
+
+    Parameters
+    ----------
+    key : of jax.random
+    spectra : C_l of TT, EE, BB, TE, in any unit squared
+    stokes : "QU" or "IQU"
+
+    Raises
+    ------
+    ValueError
+        If `stokes` is neither.
+    """
+    if stokes not in ("QU", "IQU"):
+        raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")
+    TT, EE, BB, TE = jnp.asarray(spectra)
+    ell = alm_ell(TT.size - 1)
+    white = jax.random.normal(key, (3, ell.size), TT.dtype)
+    correlated = TE / jnp.sqrt(jnp.where(TT > 0, TT, 1.0))
+    rest = jnp.sqrt(jnp.maximum(EE - correlated**2, 0.0))
+    temperature = jnp.sqrt(TT)[ell] * white[0]
+    E = correlated[ell] * white[0] + rest[ell] * white[1]
+    B = jnp.sqrt(BB)[ell] * white[2]
+    return jnp.stack([temperature, E, B] if stokes == "IQU" else [E, B])

@@ -1,0 +1,77 @@
+"""White noise of maps: draws from the covariance of each pixel, and estimates from the maps."""
+
+import healpy
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxsky.harmonics import children
+
+__all__ = ["cholesky", "draw", "estimate_variance", "uniform_covariance"]
+
+
+def uniform_covariance(
+    noise: float, nside: int, stokes: int = 2
+) -> Float[Array, "stokes stokes pix"]:
+    """Covariance of each pixel for a uniform noise level.
+
+    Parameters
+    ----------
+    noise : noise [u arcmin], u being the unit of the maps
+    nside : resolution
+    stokes : number of Stokes parameters, all with this noise
+    """
+    sigma = noise / (healpy.nside2resol(nside, arcmin=True))
+    return jnp.eye(stokes)[..., None] * jnp.full(healpy.nside2npix(nside), sigma**2)
+
+
+def cholesky(covariance: Float[Array, "stokes stokes pix"]) -> Float[Array, "stokes stokes pix"]:
+    """Lower Cholesky factor of the covariance of each pixel, written out element by element."""
+    n = len(covariance)
+    lower = [[jnp.zeros_like(covariance[0, 0])] * n for _ in range(n)]
+    for i in range(n):
+        for j in range(i + 1):
+            rest = covariance[i, j] - sum(lower[i][k] * lower[j][k] for k in range(j))
+            if i == j:
+                lower[i][j] = jnp.sqrt(rest)
+            else:
+                lower[i][j] = rest / jnp.where(lower[j][j] > 0, lower[j][j], 1.0)
+    return jnp.stack([jnp.stack(row) for row in lower])
+
+
+@jax.jit
+def draw(key: Array, covariance: Float[Array, "stokes stokes pix"]) -> Float[Array, "stokes pix"]:
+    """A realisation L n of noise with a covariance in each pixel, independent between pixels.
+
+    Parameters
+    ----------
+    key : of jax.random
+    covariance : of the Stokes parameters in each pixel, positive semi-definite
+    """
+    white = jax.random.normal(key, covariance.shape[1:], covariance.dtype)
+    return jnp.einsum("stp,tp->sp", cholesky(covariance), white)
+
+
+def estimate_variance(
+    maps: Float[Array, "stokes pix"], used: Bool[Array, " pix"]
+) -> Float[Array, "stokes"]:
+    """Noise variance per pixel from the scatter inside groups of four neighbouring pixels.
+
+    What varies little over such a group cancels, which leaves the noise where the sky is smooth.
+
+    Parameters
+    ----------
+    maps : maps with white noise, RING
+    used : pixels to use; groups of which all four are used count
+
+    Raises
+    ------
+    ValueError
+        If no complete group is left.
+    """
+    nside = healpy.npix2nside(maps.shape[-1])
+    whole = children(used, nside // 2).all(axis=-1)
+    if not bool(whole.any()):
+        raise ValueError("Estimating the noise needs groups of four pixels that are all used.")
+    scatter = jnp.var(children(maps, nside // 2), axis=-1, ddof=1)
+    return jnp.sum(scatter * whole, axis=-1) / jnp.sum(whole)

@@ -4,13 +4,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
 
 from fits.likelihood import Likelihood, chi2
 from fits.priors import Prior, bounds, log_prior
 from fits.results import FitResult
+from jaxsky.types import Numeric
 
 __all__ = ["grid_fit"]
 
@@ -67,7 +66,7 @@ def _narrow(axis: np.ndarray, profile: np.ndarray) -> tuple[float, float]:
 
 def grid_fit(
     like: Likelihood,
-    start: Mapping[str, ArrayLike],
+    start: Mapping[str, Numeric],
     priors: Mapping[str, Prior],
     *,
     points: int = 200,
@@ -114,9 +113,7 @@ def grid_fit(
         for i, name in enumerate(free):
             others = tuple(j for j in range(len(free)) if j != i)
             narrowed[name] = _narrow(values[i], log_posterior.max(axis=others))
-        shrunk = [
-            (narrowed[n][1] - narrowed[n][0]) / (ranges[n][1] - ranges[n][0]) for n in free
-        ]
+        shrunk = [(narrowed[n][1] - narrowed[n][0]) / (ranges[n][1] - ranges[n][0]) for n in free]
         if min(shrunk) > 0.8:
             break
         ranges = narrowed

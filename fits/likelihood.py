@@ -22,8 +22,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from fits.compress import gram, square_root
 from jaxsky import Bandpass, Sky, observe_components, parameter_names, set_parameters
@@ -31,6 +30,7 @@ from jaxsky.checks import as_array
 from jaxsky.interpolation import Nodes
 from jaxsky.parameters import OFFSET, unknown_parameter
 from jaxsky.sky import interpolation_nodes
+from jaxsky.types import Numeric
 
 __all__ = ["Likelihood", "PixelLikelihood", "TemplateLikelihood", "chi2", "likelihood"]
 
@@ -72,11 +72,11 @@ class Likelihood(eqx.Module):
     sky: Sky
     bands: Bands
 
-    def residuals(self, params: Mapping[str, ArrayLike]) -> Float[Array, " row"]:
+    def residuals(self, params: Mapping[str, Numeric]) -> Float[Array, " row"]:
         """Residuals at values of any of the parameters by name; the others keep theirs."""
         raise TypeError(f"{type(self).__name__} must define `residuals`.")
 
-    def check(self, params: Mapping[str, ArrayLike]) -> dict[str, Array]:
+    def check(self, params: Mapping[str, Numeric]) -> dict[str, Array]:
         """The parameters as numbers.
 
         Raises
@@ -98,7 +98,7 @@ class Likelihood(eqx.Module):
 
 
 @jax.jit
-def chi2(like: Likelihood, params: Mapping[str, ArrayLike]) -> Float[Array, ""]:
+def chi2(like: Likelihood, params: Mapping[str, Numeric]) -> Float[Array, ""]:
     """Sum of squares of the residuals: chi^2, or -2 log L up to a constant."""
     return jnp.sum(like.residuals(params) ** 2)
 
@@ -141,7 +141,7 @@ class PixelLikelihood(Likelihood):
         if self.rows is None:
             return ((self.data - model) * self.root_weights).ravel()
         products = jnp.einsum("brsp,bsp->br", self.rows, self.data - model)
-        return self.whitening @ products.ravel()
+        return jnp.asarray(self.whitening) @ products.ravel()
 
 
 def _unit_sky(sky: Sky) -> Sky:
@@ -194,9 +194,9 @@ def _check_maps(sky: Sky, bands: Mapping[str, Any], data: Array, sigma: Array) -
 def likelihood(
     sky: Sky,
     bands: Mapping[str, Bandpass] | Sequence[Bandpass],
-    data: ArrayLike,
-    sigma: ArrayLike,
-    start: Mapping[str, ArrayLike],
+    data: Numeric,
+    sigma: Numeric,
+    start: Mapping[str, Numeric],
     *,
     stokes: str | None = None,
     covariance_of: CovarianceOf | None = None,
@@ -233,7 +233,7 @@ def likelihood(
         For shapes that do not match, sigma that is not positive, data that are not finite, no
         pixel left, unknown Stokes parameters, or templates that cannot be told apart.
     """
-    if not jax.config.jax_enable_x64:
+    if not jax.config.read("jax_enable_x64"):
         raise RuntimeError(
             "fits needs double precision; call jax.config.update('jax_enable_x64', True) first."
         )

@@ -7,17 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import ArrayLike
 
 from fits.likelihood import Likelihood, chi2
 from fits.priors import (
     Prior,
+    bounds,
     from_unbounded,
     log_prior,
     prior_residuals,
     to_unbounded,
 )
 from fits.results import FitResult
+from jaxsky.types import Numeric
 
 __all__ = ["best_fit"]
 
@@ -44,7 +45,7 @@ def _half_hessian(like, params, priors):
 
 def best_fit(
     like: Likelihood,
-    start: Mapping[str, ArrayLike],
+    start: Mapping[str, Numeric],
     *,
     priors: Mapping[str, Prior] | None = None,
     solver: optx.AbstractLeastSquaresSolver | None = None,
@@ -81,7 +82,7 @@ def best_fit(
     # first steps do not depend on units.
     scale = {name: jnp.maximum(jnp.abs(value), 1e-3) for name, value in unbounded.items()}
     scaled = {name: value / scale[name] for name, value in unbounded.items()}
-    solution = optx.least_squares(
+    solution: optx.Solution = optx.least_squares(
         _residuals, solver, scaled, args=(like, priors, scale), max_steps=500, throw=False
     )
     found = from_unbounded({k: v * scale[k] for k, v in solution.value.items()}, priors)
@@ -95,8 +96,9 @@ def best_fit(
     message = "converged" if converged else f"The solver stopped: {solution.result}."
     if converged and not positive:
         converged = False
-        message = "The Hessian at the optimum is not positive definite: the data do not constrain " + (
-            ", ".join(free) + "."
+        message = (
+            "The Hessian at the optimum is not positive definite: the data do not constrain "
+            + (", ".join(free) + ".")
         )
     for name, edge in _at_edge(values, priors).items():
         converged = False
@@ -116,9 +118,9 @@ def best_fit(
 
 def _at_edge(values: Mapping[str, float], priors: Mapping[str, Prior]) -> dict[str, float]:
     edges = {}
-    for name, prior in priors.items():
-        for side in ("low", "high"):
-            edge = getattr(prior, side, None)
-            if edge is not None and abs(values[name] - edge) < EDGE * (prior.high - prior.low):
+    for name, value in values.items():
+        low, high = bounds(name, priors)
+        for edge in (low, high):
+            if abs(value - edge) < EDGE * (high - low) < np.inf:
                 edges[name] = edge
     return edges

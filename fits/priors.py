@@ -5,7 +5,9 @@ from collections.abc import Mapping
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
+
+from jaxsky.types import Numeric
 
 __all__ = ["Gaussian", "Prior", "Uniform", "bounds", "from_unbounded", "log_prior", "to_unbounded"]
 
@@ -13,7 +15,7 @@ __all__ = ["Gaussian", "Prior", "Uniform", "bounds", "from_unbounded", "log_prio
 class Prior(eqx.Module):
     """Base class: a log-density up to a constant, and its share of a sum of squares."""
 
-    def log_density(self, value: Array) -> Array:
+    def log_density(self, value: Numeric) -> Array:
         """Log-density up to a constant; -inf outside the range."""
         raise TypeError(f"{type(self).__name__} must define `log_density`.")
 
@@ -70,13 +72,13 @@ class Gaussian(Prior):
         return -0.5 * ((value - self.mean) / self.sigma) ** 2
 
 
-def log_prior(params: Mapping[str, ArrayLike], priors: Mapping[str, Prior]) -> Float[Array, ""]:
+def log_prior(params: Mapping[str, Numeric], priors: Mapping[str, Prior]) -> Float[Array, ""]:
     """Sum of the log-densities of the parameters that have a prior."""
     return sum((p.log_density(params[name]) for name, p in priors.items()), jnp.zeros(()))
 
 
 def prior_residuals(
-    params: Mapping[str, ArrayLike], priors: Mapping[str, Prior]
+    params: Mapping[str, Numeric], priors: Mapping[str, Prior]
 ) -> Float[Array, " gaussian"]:
     """(value - mean)/sigma of the Gaussian priors: their sum of squares is -2 log_prior."""
     rows = [
@@ -92,8 +94,8 @@ def bounds(name: str, priors: Mapping[str, Prior]) -> tuple[float, float]:
 
 
 def from_unbounded(
-    params: Mapping[str, ArrayLike], priors: Mapping[str, Prior]
-) -> dict[str, ArrayLike]:
+    params: Mapping[str, Numeric], priors: Mapping[str, Prior]
+) -> dict[str, Numeric]:
     """Parameters within their uniform priors from unbounded ones, low + (high-low)(1+sin u)/2.
 
     As in MINUIT: smooth, and flat at the edge, so that an optimum at the edge is a minimum in u.
@@ -105,9 +107,7 @@ def from_unbounded(
     return result
 
 
-def to_unbounded(
-    params: Mapping[str, ArrayLike], priors: Mapping[str, Prior]
-) -> dict[str, ArrayLike]:
+def to_unbounded(params: Mapping[str, Numeric], priors: Mapping[str, Prior]) -> dict[str, Numeric]:
     """The inverse of `from_unbounded`.
 
     Raises

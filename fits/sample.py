@@ -9,12 +9,12 @@ import emcee
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
 
 from fits.likelihood import Likelihood, chi2
 from fits.optimize import best_fit
 from fits.priors import Prior, bounds, log_prior
 from fits.results import FitResult
+from jaxsky.types import Numeric
 
 __all__ = ["ChainFile", "sample"]
 
@@ -94,7 +94,7 @@ def _walkers(result: FitResult, priors: Mapping[str, Prior], nwalkers: int, rng)
 
 def sample(
     like: Likelihood,
-    start: Mapping[str, ArrayLike],
+    start: Mapping[str, Numeric],
     *,
     priors: Mapping[str, Prior] | None = None,
     nwalkers: int = 32,

@@ -8,6 +8,7 @@ the sum over all m of |a_lm|^2. Q and U are one spin-2 field with coefficients E
 Q and U as two scalars would be wrong by several percent.
 """
 
+import math
 from functools import cache, partial
 from importlib.resources import files
 
@@ -25,9 +26,9 @@ __all__ = [
     "alm_from_healpy",
     "alm_to_healpy",
     "analysis",
-    "gaussian_beam",
     "average_pixels",
     "children",
+    "gaussian_beam",
     "resample",
     "synthesis",
 ]
@@ -68,7 +69,7 @@ def gaussian_beam(fwhm: ArrayLike, lmax: int) -> Float[Array, " ell"]:
     fwhm : full width at half maximum [arcmin]
     lmax : largest multipole
     """
-    sigma = jnp.deg2rad(jnp.asarray(fwhm) / 60) / np.sqrt(8 * np.log(2))
+    sigma = jnp.deg2rad(jnp.asarray(fwhm) / 60) / math.sqrt(8 * math.log(2))
     ell = jnp.arange(lmax + 1)
     return jnp.exp(-ell * (ell + 1) * sigma**2 / 2)
 

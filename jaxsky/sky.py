@@ -69,9 +69,7 @@ class Sky(eqx.Module):
         return stokes, npix
 
 
-def interpolation_nodes(
-    sky: Sky, bands: Sequence[Bandpass], tolerance: float
-) -> tuple[Nodes, ...]:
+def interpolation_nodes(sky: Sky, bands: Sequence[Bandpass], tolerance: float) -> tuple[Nodes, ...]:
     """Node counts for each component, as `observe` chooses them and takes them."""
     return tuple(choose_nodes(c, tuple(bands), tolerance) for c in sky.components.values())
 
@@ -117,7 +115,11 @@ def _observe(sky, bands, plan):
 
 
 def observe(
-    sky: Sky, bands: Sequence[Bandpass], *, tolerance: float = 1e-10, nodes: tuple[Nodes, ...] | None = None
+    sky: Sky,
+    bands: Sequence[Bandpass],
+    *,
+    tolerance: float = 1e-10,
+    nodes: tuple[Nodes, ...] | None = None,
 ) -> Float[Array, "band stokes pix"]:
     """The sky seen through a list of bands, the paper's eq. 8.
 
@@ -152,7 +154,11 @@ def observe_band(
 
 
 def observe_components(
-    sky: Sky, bands: Sequence[Bandpass], *, tolerance: float = 1e-10, nodes: tuple[Nodes, ...] | None = None
+    sky: Sky,
+    bands: Sequence[Bandpass],
+    *,
+    tolerance: float = 1e-10,
+    nodes: tuple[Nodes, ...] | None = None,
 ) -> dict[str, Float[Array, "band stokes pix"]]:
     """Each component by itself, as `observe` sees it [uK_RJ]."""
     bands = _check_bands(bands)

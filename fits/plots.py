@@ -1,0 +1,236 @@
+"""Pictures of fits: the grid, the marginal distributions, the posterior of the chains."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from getdist import MCSamples, plots
+
+from fits.results import FitResult
+from fits.spectral_index import Fit
+
+__all__ = ["label", "plot_grids", "plot_marginals", "plot_posterior"]
+
+#: Okabe & Ito's colours, which the colour-blind can tell apart.
+COLORS = {"Q": "#0072B2", "U": "#D55E00", "QU": "#222222"}
+REGION_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
+TRUTH = {"color": "#CC79A7", "linewidth": 1.6}
+STYLE = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.labelsize": 10,
+    "legend.fontsize": 8,
+    "figure.dpi": 150,
+    "savefig.bbox": "tight",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
+#: What the fields of components are called in the literature.
+SYMBOLS = {
+    "beta_dust": r"\beta_{\rm dust}",
+    "T_dust": r"T_{\rm dust}\ [{\rm K}]",
+    "E_dust": r"E_{\rm dust}",
+    "beta_syn": r"\beta_{\rm syn}",
+    "curvature": r"C",
+    "nu_piv": r"\nu_{\rm piv}\ [{\rm GHz}]",
+    "nu_ref": r"\nu_{\rm ref}\ [{\rm GHz}]",
+    "nu_pivot": r"\nu_{\rm pivot}\ [{\rm GHz}]",
+    "polarization_fraction": r"f_{\rm p}",
+    "m60": r"m_{60}",
+    "nu_max": r"\nu_{\rm max}\ [{\rm GHz}]",
+}
+
+
+def label(name: str) -> str:
+    """TeX for a parameter's name, without dollar signs."""
+    parts = name.split(".")
+    if parts[0] == "calibration":
+        return rf"g_{{\rm {parts[1]}}}"
+    if parts[0] == "offset":
+        return rf"o_{{\rm {parts[1]}}}^{parts[2]}\ [\mu{{\rm K}}_{{\rm RJ}}]"
+    shift = r"\Delta " if parts[-1] == "offset" else ""
+    number = "".join(rf"\ ({int(p) + 1})" for p in parts[2:] if p.isdigit())
+    return shift + SYMBOLS.get(parts[1], rf"{{\rm {parts[1]}}}") + number
+
+
+def _tex(name: str) -> str:
+    return f"${label(name)}$"
+
+
+def _save(figure: plt.Figure, path: Path) -> None:
+    partial = path.with_name(f".{path.name}")
+    figure.savefig(partial, format="png")
+    plt.close(figure)
+    partial.replace(path)
+
+
+def _levels(log_posterior: np.ndarray) -> list[float]:
+    """Heights of the contours that hold 95.45 % and 68.27 % of the probability."""
+    density = np.sort(np.exp(log_posterior).ravel())[::-1]
+    held = np.cumsum(density) / density.sum()
+    return [float(np.log(density[np.searchsorted(held, p)])) for p in (0.9545, 0.6827)]
+
+
+def _by_region(fits: Sequence[Fit]) -> dict[str, list[Fit]]:
+    regions: dict[str, list[Fit]] = {}
+    for fit in fits:
+        regions.setdefault(fit.region, []).append(fit)
+    return regions
+
+
+def plot_grids(
+    path: Path, fits: Sequence[Fit], truth: Mapping[str, float] | None, title: str
+) -> bool:
+    """The probability on the grid, Q beside U, a row for each region: the paper's figure.
+
+    Returns False, without a picture, if no fit has a grid of two parameters.
+    """
+    with_grid = [f for f in fits if "grid" in f.results and len(f.results["grid"].free) == 2]
+    if not with_grid:
+        return False
+    regions = _by_region(with_grid)
+    columns = max(len(r) for r in regions.values())
+    with mpl.rc_context(STYLE):
+        figure, axes = plt.subplots(
+            len(regions),
+            columns,
+            figsize=(1.2 + 2.6 * columns, 0.8 + 2.4 * len(regions)),
+            squeeze=False,
+            layout="constrained",
+        )
+        for row, (region, members) in zip(axes, regions.items(), strict=True):
+            for axis in row[len(members) :]:
+                axis.set_visible(False)
+            for axis, fit in zip(row, members, strict=False):
+                _grid_panel(axis, fit.results["grid"], truth)
+                axis.set_title(f"{region}, {' + '.join(fit.stokes)}")
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+        figure.suptitle(title, fontsize=9)
+        _save(figure, path)
+    return True
+
+
+def _grid_panel(axis: plt.Axes, result: FitResult, truth: Mapping[str, float] | None) -> None:
+    x, y = result.free
+    grid = [result.details["axes"][name] for name in (x, y)]
+    log_posterior = result.details["log_posterior"]
+    density = np.exp(log_posterior).T
+    axis.pcolormesh(*grid, density, cmap="Greys", vmin=0, vmax=1.4, rasterized=True)
+    axis.contour(
+        *grid, log_posterior.T, _levels(log_posterior), colors="#0072B2", linestyles=["--", "-"]
+    )
+    axis.plot([], [], color="#0072B2", label=r"1$\sigma$")
+    axis.plot([], [], color="#0072B2", linestyle="--", label=r"2$\sigma$")
+    axis.plot(result.best_fit[x], result.best_fit[y], "k+", ms=9, mew=1.5, label="best fit")
+    if truth and x in truth and y in truth:
+        axis.plot(truth[x], truth[y], "o", mfc="none", mec="#CC79A7", mew=1.6, label="truth")
+    axis.set(xlabel=_tex(x), ylabel=_tex(y))
+    axis.spines[:].set_visible(True)
+
+
+def _samples(result: FitResult, name: str) -> MCSamples:
+    details = result.details
+    chain = details["chain"][details["discard"] :: details["thin"]]
+    return MCSamples(
+        samples=chain.reshape(-1, len(result.free)),
+        names=list(result.free),
+        labels=[label(n) for n in result.free],
+        label=name,
+        settings={"smooth_scale_1D": -1, "smooth_scale_2D": -1, "ignore_rows": 0},
+    )
+
+
+def _density(fit: Fit, name: str) -> tuple[np.ndarray, np.ndarray, FitResult]:
+    """A marginal distribution from the best method there is: grid, chain or Gaussian."""
+    if "grid" in fit.results:
+        result = fit.results["grid"]
+        return result.details["axes"][name], result.details["marginals"][name], result
+    if "mcmc" in fit.results:
+        result = fit.results["mcmc"]
+        density = _samples(result, fit.stokes).get1DDensity(name)
+        return density.x, density.P, result
+    result = fit.results["gradient"]
+    sigma = result.sigma(name)
+    x = result.best_fit[name] + sigma * np.linspace(-5, 5, 201)
+    return x, np.exp(-0.5 * ((x - result.best_fit[name]) / sigma) ** 2), result
+
+
+def plot_marginals(
+    path: Path, fits: Sequence[Fit], truth: Mapping[str, float] | None, title: str
+) -> bool:
+    """Marginal probability of each parameter, for Q, U and both, with 68 % intervals."""
+    free = next(iter(fits[0].results.values())).free
+    regions = _by_region(fits)
+    with mpl.rc_context(STYLE):
+        figure, axes = plt.subplots(
+            len(regions),
+            len(free),
+            figsize=(3.4 * len(free), 0.9 + 2.2 * len(regions)),
+            sharex="col",
+            squeeze=False,
+            layout="constrained",
+        )
+        for row, (region, members) in zip(axes, regions.items(), strict=True):
+            for axis, name in zip(row, free, strict=True):
+                for fit in members:
+                    _marginal_curve(axis, fit, name)
+                if truth and name in truth:
+                    axis.axvline(truth[name], **TRUTH, label="truth")
+                axis.set(ylim=(0, 1.12), ylabel="relative probability", title=region)
+                axis.xaxis.set_tick_params(labelbottom=True)
+        for axis, name in zip(axes[-1], free, strict=True):
+            axis.set_xlabel(_tex(name))
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+        figure.suptitle(title, fontsize=9)
+        _save(figure, path)
+    return True
+
+
+def _marginal_curve(axis: plt.Axes, fit: Fit, name: str) -> None:
+    x, density, result = _density(fit, name)
+    density = density / density.max()
+    color = COLORS[fit.stokes]
+    axis.plot(x, density, color=color, label=f"{' + '.join(fit.stokes)}, 68 % shaded")
+    low, high = result.interval_68[name]
+    inside = (x >= low) & (x <= high)
+    axis.fill_between(x[inside], density[inside], color=color, alpha=0.22, linewidth=0)
+
+
+def plot_posterior(
+    path: Path, fits: Sequence[Fit], truth: Mapping[str, float] | None, title: str
+) -> bool:
+    """The posterior of the chains, a colour for each region, for the most Stokes parameters.
+
+    Returns False, without a picture, if no fit has a chain.
+    """
+    with_chain = [f for f in fits if "mcmc" in f.results]
+    if not with_chain:
+        return False
+    most = max(with_chain, key=lambda f: len(f.stokes)).stokes
+    shown = [f for f in with_chain if f.stokes == most]
+    samples = [_samples(f.results["mcmc"], f"{f.region}, {' + '.join(most)}") for f in shown]
+    free = shown[0].results["mcmc"].free
+    plotter = plots.get_subplot_plotter(width_inch=max(4.0, 1.6 * len(free)))
+    plotter.settings.axes_fontsize = 9
+    plotter.settings.axes_labelsize = 11
+    plotter.settings.legend_fontsize = 9
+    plotter.settings.title_limit_fontsize = 9
+    plotter.triangle_plot(
+        samples,
+        list(free),
+        filled=True,
+        contour_colors=list(REGION_COLORS[: len(samples)]),
+        title_limit=1 if len(samples) == 1 else 0,
+        markers={n: v for n, v in (truth or {}).items() if n in free},
+        marker_args={"color": TRUTH["color"], "lw": TRUTH["linewidth"], "ls": "-"},
+    )
+    plotter.fig.suptitle(title, fontsize=8, y=1.03)
+    with mpl.rc_context(STYLE):
+        _save(plotter.fig, path)
+    return True

@@ -1,0 +1,134 @@
+"""The command line: `jaxsky fit`."""
+
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+import jaxsky
+
+app = typer.Typer(
+    help="A JAX-differentiable model of the polarized microwave sky, with the tools to fit it.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+console = Console(stderr=True)
+
+
+def _version(value: bool) -> None:
+    if value:
+        typer.echo(f"jaxsky {jaxsky.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """A JAX-differentiable model of the polarized microwave sky, with the tools to fit it."""
+
+
+@app.command()
+def fit(
+    settings_file: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[ANALYSIS.toml]", help="Settings; without, the embedded sky is fitted."
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/fit"),
+    init: Annotated[
+        bool, typer.Option("--init", help="Write a commented example of the settings and stop.")
+    ] = False,
+    seed: Annotated[int | None, typer.Option(help="Seed of simulated maps and chains.")] = None,
+    region: Annotated[
+        list[str] | None, typer.Option(help="strip, outside, full or a mask file; repeatable.")
+    ] = None,
+    stokes: Annotated[list[str] | None, typer.Option(help="Q, U or QU; repeatable.")] = None,
+    nside: Annotated[int | None, typer.Option(help="Common nside of the comparison.")] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the chains in --out.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the results that are in --out.")
+    ] = False,
+) -> None:
+    """Fit spectral indices to polarization maps: on a grid, by gradient and by MCMC."""
+    started = time.perf_counter()
+    from fits import settings as fit_settings
+
+    if init:
+        _write_example(settings_file or Path("analysis.toml"), fit_settings.EXAMPLE)
+        return
+    overrides = {"seed": seed, "regions": region, "stokes": stokes, "nside": nside}
+    settings = fit_settings.load_settings(settings_file or fit_settings.EMBEDDED, overrides)
+    chains = _claim(out, resume, overwrite)
+
+    with console.status("starting") as status:
+        from fits import inputs as fit_inputs
+        from fits import report, spectral_index
+
+        status.update("reading and preparing maps")
+        regions = spectral_index.region_masks(settings)
+        inputs = (
+            fit_inputs.embedded_inputs(settings)
+            if settings.embedded
+            else fit_inputs.read_inputs(settings)
+        )
+        prepared = spectral_index.prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
+        console.print(inputs.description, highlight=False)
+        fits = spectral_index.run(settings, prepared, regions, chains, status.update)
+        status.update("drawing")
+        seconds = time.perf_counter() - started
+        written = report.write_report(out, inputs, settings, fits, seconds)
+    Console().print(report.result_table(fits))
+    for one in fits:
+        for method, result in one.results.items():
+            if not result.converged:
+                console.print(
+                    f"[yellow](!)[/] {one.region}, {one.stokes}, {method}: {result.message}"
+                )
+    console.print("Written: " + ", ".join(map(str, [*written, chains])), highlight=False)
+
+
+def _write_example(path: Path, example: Path) -> None:
+    if path.exists():
+        raise ValueError(f"{path}: exists already and is left as it is.")
+    path.write_text(example.read_text())
+    console.print(f"Written: {path}")
+
+
+def _claim(out: Path, resume: bool, overwrite: bool) -> Path:
+    """The place of the chains in a folder that may be written to."""
+    chains = out / "chain.h5"
+    if chains.exists() and not (resume or overwrite):
+        raise ValueError(
+            f"{out}: holds results already; go on with --resume, replace them with --overwrite, "
+            "or choose another --out."
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    if overwrite:
+        chains.unlink(missing_ok=True)
+    return chains
+
+
+def main() -> None:
+    """Run the command line: double precision on, mistakes as one sentence and exit code 2."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    try:
+        app()
+    except (ValueError, KeyError, OSError) as error:
+        message = error.args[0] if isinstance(error, KeyError) else error
+        console.print(f"[red]jaxsky:[/] {message}", highlight=False, soft_wrap=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        console.print("Stopped; go on with --resume.")
+        sys.exit(130)

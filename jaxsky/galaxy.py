@@ -1,0 +1,384 @@
+"""The embedded sky: a model of the Galaxy's polarized emission that needs no download.
+
+Synchrotron and thermal dust are integrated along the line of sight through a spiral magnetic
+field (Page et al. 2007, ApJS 170, 335) with a turbulent part drawn from a seed (Planck
+intermediate results XLIV, 2016; Vansyngel et al. 2017), and scaled to the polarized brightness
+of the real sky. The maps look like the sky on large scales and have structure on all scales, but
+they are a model and not data.
+
+Coordinates are Galactic Cartesian [kpc] with the Galactic centre at the origin: x from the Sun
+to the centre (l = 0), y towards l = 90 degrees, z to the north, so the Sun is at x = -r_sun. The
+cylindrical r, phi, z are right-handed on them; at the Sun phi_hat points to l = 270 degrees. The
+sign of the field itself is not observable here.
+"""
+
+from functools import cache, partial
+from typing import NamedTuple
+
+import equinox as eqx
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxsky.checks import as_array, check_finite, check_positive
+from jaxsky.components import Dust, Synchrotron
+from jaxsky.harmonics import alm_ell, resample, synthesis
+from jaxsky.sky import Sky
+
+__all__ = ["EmbeddedSky", "GalaxyModel", "embedded_sky", "line_of_sight", "magnetic_field"]
+
+#: Reference frequencies of the maps [GHz].
+NU_DUST, NU_SYNCHROTRON = 353.0, 30.0
+#: Standard deviations of Q and U over the real sky at nside 64 [uK_RJ], added in quadrature.
+DUST_RMS, SYNCHROTRON_RMS = np.hypot(14.7, 6.8), np.hypot(17.2, 9.1)
+#: Resolution at which the maps are scaled and up to which the turbulence is normalised.
+NSIDE_SCALE = 64
+#: Intrinsic polarization fraction of the synchrotron, (p + 1)/(p + 7/3) for electrons E^-3.
+SYNCHROTRON_FRACTION = 0.75
+#: Steps along the line of sight; the maps are then converged to about 1e-3 of their rms.
+STEPS = 96
+#: The steps grow from STEP_SCALE * d ln s near the Sun; the integral ends at FARTHEST [kpc].
+STEP_SCALE, FARTHEST = 0.1, 30.0
+#: Distances of the shells of independent turbulence [kpc].
+SHELLS = 0.05 * 3.0 ** np.arange(6)
+#: The direction of the field is smoothed over this distance from the Galactic axis [kpc].
+CORE = 0.1
+
+
+def _number(name: str, default: float, positive: bool = False):
+    """Field of a model: a finite number, or positive."""
+
+    def convert(value):
+        array = as_array(name, value)
+        if array.shape:
+            raise ValueError(f"Argument `{name}` must be a number, but has shape {array.shape}.")
+        (check_positive if positive else check_finite)(name, array)
+        return array
+
+    return eqx.field(default=default, converter=convert)
+
+
+class GalaxyModel(eqx.Module):
+    """Parameters of the magnetic field, of the emitting matter and of the turbulence.
+
+    Parameters
+    ----------
+    psi0, psi1 : angle of the field to the azimuthal direction [deg], psi0 + psi1 ln(r / r_sun)
+    chi0, chi_height : angle to the Galactic plane chi0 tanh(z / chi_height) [deg], [kpc]
+    r_sun : distance of the Sun from the Galactic centre [kpc]
+    electron_radius, electron_height : scale lengths of the cosmic-ray electrons [kpc]
+    dust_radius, dust_height : scale lengths of the dust [kpc]
+    p0 : intrinsic polarization fraction of the dust, about 0.2 (Planck int. results XX, 2015)
+    turbulence : rms of the turbulent field relative to the regular one; 0.9 in Planck XLIV
+    slope : exponent of its power spectrum, C_l ~ l^slope for l >= 2
+
+    Raises
+    ------
+    TypeError, ValueError
+        For units, values that are not finite numbers, lengths or p0 that are not positive.
+
+    Examples
+    --------
+    >>> float(GalaxyModel(turbulence=0.5).psi0)
+    27.0
+    """
+
+    psi0: Float[Array, ""] = _number("psi0", 27.0)
+    psi1: Float[Array, ""] = _number("psi1", 0.9)
+    chi0: Float[Array, ""] = _number("chi0", 25.0)
+    chi_height: Float[Array, ""] = _number("chi_height", 1.0, positive=True)
+    r_sun: Float[Array, ""] = _number("r_sun", 8.0, positive=True)
+    electron_radius: Float[Array, ""] = _number("electron_radius", 5.0, positive=True)
+    electron_height: Float[Array, ""] = _number("electron_height", 1.0, positive=True)
+    dust_radius: Float[Array, ""] = _number("dust_radius", 3.0, positive=True)
+    dust_height: Float[Array, ""] = _number("dust_height", 0.1, positive=True)
+    p0: Float[Array, ""] = _number("p0", 0.2, positive=True)
+    turbulence: Float[Array, ""] = _number("turbulence", 0.9)
+    slope: Float[Array, ""] = _number("slope", -2.4)
+
+
+class EmbeddedSky(eqx.Module):
+    """Maps of the model Galaxy, from `embedded_sky`.
+
+    Parameters
+    ----------
+    dust, synchrotron : I, Q, U at their reference frequencies [uK_RJ], shape (3, pix)
+    nu_dust, nu_synchrotron : reference frequencies [GHz]
+    seed : of the turbulence
+    description : what the maps are, for headers and captions
+    """
+
+    dust: Float[Array, "3 pix"]
+    synchrotron: Float[Array, "3 pix"]
+    nu_dust: float = eqx.field(static=True)
+    nu_synchrotron: float = eqx.field(static=True)
+    seed: int = eqx.field(static=True)
+    description: str = eqx.field(static=True)
+
+    @property
+    def nside(self) -> int:
+        """Resolution of the maps."""
+        return healpy.npix2nside(self.dust.shape[-1])
+
+    def sky(self, stokes: str = "QU") -> Sky:
+        """A sky of dust and synchrotron with the paper's baseline spectral parameters.
+
+        Parameters
+        ----------
+        stokes : "QU" or "IQU"
+
+        Raises
+        ------
+        ValueError
+            If `stokes` is neither.
+        """
+        if stokes not in ("QU", "IQU"):
+            raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")
+        rows = slice(3 - len(stokes), 3)
+        return Sky(
+            {
+                "dust": Dust(self.dust[rows], nu_ref=self.nu_dust),
+                "synchrotron": Synchrotron(self.synchrotron[rows], nu_ref=self.nu_synchrotron),
+            }
+        )
+
+
+class _Geometry(NamedTuple):
+    """What depends on the resolution only."""
+
+    theta: Float[np.ndarray, " pix"]
+    phi: Float[np.ndarray, " pix"]
+    #: Multipole of each packed coefficient, and its place in a draw that is sorted by multipole.
+    ell: Int[np.ndarray, " alm"]
+    place: Int[np.ndarray, " alm"]
+
+
+@cache
+def _geometry(nside: int) -> _Geometry:
+    ell = alm_ell(3 * nside - 1)
+    # Stable, so a coefficient keeps its place when higher multipoles are added.
+    order = np.argsort(ell, kind="stable")
+    place = np.empty_like(order)
+    place[order] = np.arange(order.size)
+    theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
+    return _Geometry(theta, phi, ell, place)
+
+
+def _radius(x, y):
+    return jnp.sqrt(x**2 + y**2 + CORE**2)
+
+
+def magnetic_field(
+    model: GalaxyModel, x: Float[Array, "..."], y: Float[Array, "..."], z: Float[Array, "..."]
+) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+    """Cartesian components of the regular field, of strength 1: logarithmic spiral arms.
+
+    sin psi(r) cos chi(z) r_hat + cos psi(r) cos chi(z) phi_hat + sin chi(z) z_hat, eq. 9 of Page
+    et al. (2007) with the first two terms as the hammurabi code has them (Waelkens et al. 2009,
+    A&A 495, 697). With sine and cosine exchanged the field near the Sun would point to
+    l = 27 degrees; so it points to 63, near the 70 that Planck XLIV measured, and only so do the
+    maps of both components agree with the observed ones at high latitude.
+
+    Parameters
+    ----------
+    model : the parameters
+    x, y, z : Galactocentric position [kpc]; the Sun is at (-r_sun, 0, 0)
+    """
+    r = _radius(x, y)
+    psi = jnp.deg2rad(model.psi0 + model.psi1 * jnp.log(r / model.r_sun))
+    chi = jnp.deg2rad(model.chi0 * jnp.tanh(z / model.chi_height))
+    radial, azimuthal = jnp.cos(chi) * jnp.sin(psi) / r, jnp.cos(chi) * jnp.cos(psi) / r
+    return radial * x - azimuthal * y, radial * y + azimuthal * x, jnp.sin(chi)
+
+
+def _density(r, z, r_sun, radius, height):
+    """exp(-(r - r_sun)/radius) sech^2(z/height), 1 at the Sun."""
+    falling = jnp.exp(-2 * jnp.abs(z) / height)
+    return jnp.exp((r_sun - r) / radius) * 4 * falling / (1 + falling) ** 2
+
+
+def _turbulence(key, slope, geometry, basis):
+    """Gaussian vector fields of rms 1 on each shell, in the local basis; (shell, 3, pix)."""
+    nside = healpy.npix2nside(len(geometry.theta))
+    dtype = basis.dtype
+    # The normalisation ends at one multipole for all resolutions, so that all see one field.
+    reference = jnp.arange(2, 3 * NSIDE_SCALE, dtype=dtype)
+    variance = jnp.sum((2 * reference + 1) / (4 * np.pi) * reference**slope)
+    ell = jnp.maximum(geometry.ell, 1).astype(dtype)
+    scale = jnp.where(geometry.ell >= 2, jnp.sqrt(ell**slope / (3 * variance)), 0.0)
+
+    def component(index):
+        # In single precision always, so that a seed means one sky in either precision.
+        white = jax.random.normal(jax.random.fold_in(key, index), ell.shape, jnp.float32)
+        return synthesis((white[geometry.place] * scale)[None], nside)[0]
+
+    def shell(index):
+        cartesian = jax.lax.map(component, 3 * index + jnp.arange(3))
+        return jnp.einsum("icp,cp->ip", basis, cartesian)
+
+    return jax.lax.map(shell, jnp.arange(len(SHELLS)))
+
+
+@cache
+def _path(steps: int) -> dict[str, np.ndarray]:
+    """Distances and lengths of the steps [kpc], and the two shells that each lies between."""
+    step = np.log1p(FARTHEST / STEP_SCALE) / steps
+    t = (np.arange(steps) + 0.5) * step
+    s = STEP_SCALE * np.expm1(t)
+    last = len(SHELLS) - 1
+    u = np.clip(np.interp(np.log(s), np.log(SHELLS), np.arange(last + 1)), 0, last)
+    near = np.minimum(u.astype(int), last - 1)
+    # Cosine and sine, so that the variance of the sum is the same everywhere.
+    angle = np.pi / 2 * (u - near)
+    ds = STEP_SCALE * np.exp(t) * step
+    return {"s": s, "ds": ds, "near": near, "cos": np.cos(angle), "sin": np.sin(angle)}
+
+
+@partial(jax.jit, static_argnames="steps")
+def _integrate(
+    model: GalaxyModel, key: Array, geometry: _Geometry, steps: int
+) -> Float[Array, "2 3 pix"]:
+    dtype = jnp.result_type(float)
+    theta, phi = (jnp.asarray(angle, dtype) for angle in geometry[:2])
+    st, ct, sp, cp = jnp.sin(theta), jnp.cos(theta), jnp.sin(phi), jnp.cos(phi)
+    direction = jnp.stack([st * cp, st * sp, ct])
+    basis = jnp.stack(
+        [jnp.stack([ct * cp, ct * sp, -st]), jnp.stack([-sp, cp, jnp.zeros_like(sp)]), direction]
+    )
+    turbulence = model.turbulence * _turbulence(key, model.slope, geometry, basis)
+
+    @jax.checkpoint
+    def emission(step):
+        x, y, z = direction * step["s"]
+        x = x - model.r_sun
+        Bx, By, Bz = magnetic_field(model, x, y, z)
+        near, far = turbulence[step["near"]], turbulence[step["near"] + 1]
+        random = step["cos"] * near + step["sin"] * far
+        Bt, Bp, Bs = (
+            e[0] * Bx + e[1] * By + e[2] * Bz + part
+            for e, part in zip(basis, random, strict=True)
+        )
+        across = Bt**2 + Bp**2
+        fraction = model.p0 / (across + Bs**2)
+        # Polarized perpendicular to the field: along theta_hat (Q > 0) for one along phi_hat.
+        Q, U = Bp**2 - Bt**2, -2 * Bt * Bp
+        r = _radius(x, y)
+        dust = _density(r, z, model.r_sun, model.dust_radius, model.dust_height)
+        electrons = _density(r, z, model.r_sun, model.electron_radius, model.electron_height)
+        dust, electrons = dust * step["ds"], electrons * step["ds"]
+        polarized = SYNCHROTRON_FRACTION * electrons
+        return (
+            dust * (1 + model.p0 * 2 / 3 - fraction * across),
+            dust * fraction * Q,
+            dust * fraction * U,
+            electrons * across,
+            polarized * Q,
+            polarized * U,
+        )
+
+    def add(total, step):
+        return tuple(map(jnp.add, total, emission(step))), None
+
+    # Six maps rather than one array, which XLA would fill with one pass a row.
+    start = (jnp.zeros(theta.size, dtype),) * 6
+    path = {name: jnp.asarray(values) for name, values in _path(steps).items()}
+    return jnp.stack(jax.lax.scan(add, start, path)[0]).reshape(2, 3, -1)
+
+
+def _check(nside: object, seed: object, steps: object) -> None:
+    for name, value in {"nside": nside, "seed": seed, "steps": steps}.items():
+        if not isinstance(value, int) or isinstance(value, bool):
+            raise TypeError(f"Argument `{name}` must be an int, but is {value!r}.")
+    if not healpy.isnsideok(nside, nest=True):
+        raise ValueError(f"Argument `nside` must be a power of two, but is {nside}.")
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"Argument `seed` must be from 0 to 2^32 - 1, but is {seed}.")
+    if steps < 1:
+        raise ValueError(f"Argument `steps` must be positive, but is {steps}.")
+
+
+def line_of_sight(
+    model: GalaxyModel, nside: int, seed: int = 0, *, steps: int = STEPS
+) -> Float[Array, "2 3 pix"]:
+    """I, Q, U of dust and of synchrotron, integrated along the line of sight, not yet scaled.
+
+    With B_t, B_p the components of the field along theta_hat and phi_hat (COSMO), alpha its
+    angle to the line of sight, and the densities n in units of those at the Sun,
+
+    dust         int n_d [1 - p0 (sin^2 alpha - 2/3), p0 (B_p^2 - B_t^2)/B^2, -2 p0 B_t B_p/B^2] ds
+    synchrotron  int n_e [B_t^2 + B_p^2, 3/4 (B_p^2 - B_t^2), -3/4 2 B_t B_p] ds
+
+    the dust as in Planck int. results XX (2015), the synchrotron for electrons E^-3.
+    Differentiable in the parameters of the model.
+
+    Parameters
+    ----------
+    model : the parameters
+    nside : resolution; the maps are samples at the pixel centres
+    seed : of the turbulence; at another nside it is the same sky with more detail or less
+    steps : number of steps along the line of sight
+
+    Returns
+    -------
+    Maps [kpc], shape (2, 3, pix): dust and synchrotron, I, Q, U.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If nside is not a power of two, or the seed or the steps are not suitable integers.
+    """
+    _check(nside, seed, steps)
+    return _integrate(model, jax.random.key(seed), _geometry(nside), steps)
+
+
+def embedded_sky(
+    nside: int, seed: int = 0, model: GalaxyModel | None = None, *, steps: int = STEPS
+) -> EmbeddedSky:
+    """A model of the polarized Galaxy: dust at 353 GHz and synchrotron at 30 GHz; not data.
+
+    Each component of `line_of_sight` times one number, by which the standard deviations of Q and
+    U at nside 64 add in quadrature to those of the real sky: (14.7, 6.8) uK_RJ for the dust and
+    (17.2, 9.1) for the synchrotron. That number is the same at all resolutions.
+
+    Parameters
+    ----------
+    nside : resolution. Below 64 the maps are those at 64, cut at l = 3 nside - 1, because their
+        pixels are too wide to sample the Galactic plane.
+    seed : of the turbulence; at another nside it is the same sky with more detail or less
+    model : the parameters, by default `GalaxyModel()`
+    steps : number of steps along the line of sight
+
+    Raises
+    ------
+    TypeError, ValueError
+        If nside is not a power of two, or the seed or the steps are not suitable integers.
+
+    Examples
+    --------
+    >>> galaxy = embedded_sky(16, seed=1)
+    >>> galaxy.description[:32]
+    'Model of the Galaxy (not data): '
+    >>> galaxy.sky().shape
+    (2, 3072)
+    """
+    _check(nside, seed, steps)
+    model = GalaxyModel() if model is None else model
+    calibrator = line_of_sight(model, NSIDE_SCALE, seed, steps=steps)
+    spread = jnp.sqrt(jnp.var(calibrator[:, 1:], axis=-1).sum(axis=-1))
+    factors = jnp.array([DUST_RMS, SYNCHROTRON_RMS]) / spread
+    if nside > NSIDE_SCALE:
+        maps = line_of_sight(model, nside, seed, steps=steps)
+    elif nside == NSIDE_SCALE:
+        maps = calibrator
+    else:
+        cut = jnp.ones(3 * nside, calibrator.dtype)
+        maps = jnp.stack([resample(component, cut, nside) for component in calibrator])
+    dust, synchrotron = factors[:, None, None] * maps
+    description = (
+        "Model of the Galaxy (not data): line-of-sight integral through the spiral magnetic field "
+        f"of Page et al. (2007) with Gaussian turbulence, seed {seed}, scaled to the polarized "
+        "rms of the real sky."
+    )
+    return EmbeddedSky(dust, synchrotron, NU_DUST, NU_SYNCHROTRON, seed, description)

@@ -1,0 +1,177 @@
+"""An experiment as a list of channels: band, beam and noise, with presets as data."""
+
+import tomllib
+from collections.abc import Iterator, Sequence
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxsky.bandpass import Bandpass
+from jaxsky.checks import as_array, check_positive
+from jaxsky.units import parse_unit
+
+__all__ = ["Channel", "Instrument", "instrument_names", "load_instrument"]
+
+
+class Channel(eqx.Module):
+    """One channel: a top-hat band, a Gaussian beam and white noise.
+
+    Parameters
+    ----------
+    name : name of the channel
+    center, width : middle and full width of the band [GHz]
+    fwhm : full width at half maximum of the beam [arcmin]
+    noise : noise of Q and of U [noise_unit arcmin]
+    noise_unit : unit of temperature of the noise, "uK_CMB" or another name of `jaxsky.units`
+
+    Raises
+    ------
+    TypeError
+        If a number carries a unit or is none.
+    ValueError
+        For numbers that are not scalar and positive, a band that reaches down to 0 GHz, or an
+        unknown unit.
+    """
+
+    name: str = eqx.field(static=True)
+    center: Float[Array, ""]
+    width: Float[Array, ""]
+    fwhm: Float[Array, ""]
+    noise: Float[Array, ""]
+    noise_unit: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        name: str,
+        center: ArrayLike,
+        width: ArrayLike,
+        fwhm: ArrayLike,
+        noise: ArrayLike,
+        noise_unit: str = "uK_CMB",
+    ) -> None:
+        self.name = name
+        self.center = self._number("center", center)
+        self.width = self._number("width", width)
+        self.fwhm = self._number("fwhm", fwhm)
+        self.noise = self._number("noise", noise)
+        check_positive("center - width / 2", self.center - self.width / 2)
+        parse_unit(noise_unit)
+        self.noise_unit = noise_unit
+
+    @staticmethod
+    def _number(name: str, value: ArrayLike) -> Array:
+        array = as_array(name, value)
+        if array.shape != ():
+            raise ValueError(f"Argument `{name}` must be a number, but has shape {array.shape}.")
+        check_positive(name, array)
+        return array
+
+    def band(self, samples: int = 51, convention: str = "RJ") -> Bandpass:
+        """The top-hat band; see `Bandpass.top_hat`."""
+        return Bandpass.top_hat(self.center, self.width, convention, samples)
+
+
+class Instrument(eqx.Module):
+    """Channels in order, looked up by name.
+
+    Parameters
+    ----------
+    name : name of the instrument
+    channels : channels with different names
+
+    Raises
+    ------
+    TypeError
+        If an entry of `channels` is no `Channel`.
+    ValueError
+        If there is no channel, or two have one name.
+
+    Examples
+    --------
+    >>> planck = load_instrument("planck").select(["30", "353"])
+    >>> planck.names, f"{planck['353'].center:.1f}"
+    (('30', '353'), '361.3')
+    """
+
+    name: str = eqx.field(static=True)
+    channels: tuple[Channel, ...]
+
+    def __init__(self, name: str, channels: Sequence[Channel]) -> None:
+        self.name = name
+        self.channels = tuple(channels)
+        for i, channel in enumerate(self.channels):
+            if not isinstance(channel, Channel):
+                raise TypeError(
+                    f"Entry {i} of `channels` must be a Channel, not {type(channel).__name__}."
+                )
+        if not self.channels:
+            raise ValueError("Argument `channels` must have at least one channel.")
+        if len(set(self.names)) < len(self.names):
+            raise ValueError(f"Channels must have different names, but are {list(self.names)}.")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the channels."""
+        return tuple(channel.name for channel in self.channels)
+
+    def __getitem__(self, name: str) -> Channel:
+        try:
+            return self.channels[self.names.index(name)]
+        except ValueError:
+            known = ", ".join(self.names)
+            raise KeyError(f"{self.name} has no channel {name!r}; it has {known}.") from None
+
+    def __iter__(self) -> Iterator[Channel]:
+        return iter(self.channels)
+
+    def __len__(self) -> int:
+        return len(self.channels)
+
+    def select(self, names: Sequence[str]) -> "Instrument":
+        """The instrument with these channels only, in this order; KeyError for an unknown one."""
+        if isinstance(names, str):
+            raise TypeError(f"Argument `names` must be a list of names, not the string {names!r}.")
+        return Instrument(self.name, [self[name] for name in names])
+
+    def bands(self, samples: int = 51, convention: str = "RJ") -> list[Bandpass]:
+        """The top-hat bands of all channels; see `Bandpass.top_hat`."""
+        return [channel.band(samples, convention) for channel in self.channels]
+
+
+@cache
+def _presets() -> dict[str, dict[str, Any]]:
+    return tomllib.loads((files("jaxsky") / "instruments.toml").read_text())
+
+
+def instrument_names() -> list[str]:
+    """Names that `load_instrument` takes.
+
+    Examples
+    --------
+    >>> instrument_names()
+    ['planck', 'wmap', 'core', 'litebird']
+    """
+    return list(_presets())
+
+
+def load_instrument(name: str) -> Instrument:
+    """An instrument of `instruments.toml`, where the source of every figure is given.
+
+    Parameters
+    ----------
+    name : one of `instrument_names()`
+
+    Raises
+    ------
+    KeyError
+        If the name is unknown; lists the known ones.
+    """
+    presets = _presets()
+    if name not in presets:
+        raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(presets)}.")
+    preset = presets[name]
+    unit = preset["noise_unit"]
+    return Instrument(preset["title"], [Channel(*[*row, unit]) for row in preset["channels"]])

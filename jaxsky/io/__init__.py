@@ -1,0 +1,25 @@
+"""The border: maps, masks and bandpasses in files, and quantities with units.
+
+Inside the package there are only bare arrays (GHz, uK_RJ, K, arcmin; Galactic, RING, COSMO).
+Everything else is converted and checked here, once. A file that cannot be used raises
+`InputError`, a sentence with the file, the argument and the value.
+"""
+
+from jaxsky.io.bandpasses import read_bandpass
+from jaxsky.io.maps import Maps, read_maps, write_maps
+from jaxsky.io.masks import degrade_mask, read_mask
+from jaxsky.io.quantities import from_quantity, unit_factor, unit_name
+from jaxsky.io.tables import InputError
+
+__all__ = [
+    "InputError",
+    "Maps",
+    "degrade_mask",
+    "from_quantity",
+    "read_bandpass",
+    "read_maps",
+    "read_mask",
+    "unit_factor",
+    "unit_name",
+    "write_maps",
+]

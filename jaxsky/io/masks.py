@@ -1,0 +1,130 @@
+"""Masks: 1 = used, RING, Galactic."""
+
+import zipfile
+from pathlib import Path
+
+import healpy
+import numpy as np
+from jaxtyping import Bool
+
+from jaxsky.io.maps import default_fields
+from jaxsky.io.tables import COORDINATES, ORDERINGS, HealpixTable, InputError, open_fits
+
+__all__ = ["degrade_mask", "read_mask"]
+
+
+def _choose(path: Path, key: str | None, known: list[str]) -> str:
+    if key is None and len(known) == 1:
+        return known[0]
+    if key not in known:
+        problem = "give `key`, as it has several masks" if key is None else f"no mask {key!r}"
+        raise InputError(f"{path}: {problem}; it has {', '.join(known)}.")
+    return key
+
+
+def _read_npz(path: Path, key: str | None) -> np.ndarray:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file.")
+    try:
+        with np.load(path) as archive:
+            return np.asarray(archive[_choose(path, key, list(archive))]).ravel()
+    except InputError:
+        raise
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: not a readable .npz archive ({error}).") from error
+
+
+def _in_galactic(mask: np.ndarray, coordinates: str) -> np.ndarray:
+    """The mask at the pixel centers of the Galactic frame."""
+    nside = healpy.npix2nside(mask.size)
+    directions = healpy.pix2ang(nside, np.arange(mask.size))
+    return mask[healpy.ang2pix(nside, *healpy.Rotator(coord=["G", coordinates])(*directions))]
+
+
+def read_mask(
+    path: str | Path,
+    *,
+    key: str | None = None,
+    hdu: int | str = 1,
+    nside: int | None = None,
+    ordering: str | None = None,
+) -> Bool[np.ndarray, " pix"]:
+    """A mask from a FITS file or an .npz archive.
+
+    Parameters
+    ----------
+    path : FITS file or .npz archive
+    key : column of the table or array of the archive, for example "GAL040"; may be left out
+        where there is only one, or an I column (the WMAP masks)
+    hdu : number or name of the FITS table
+    nside : resolution that is expected
+    ordering : "RING" or "NESTED" where the header does not say; an archive is RING unless it is
+        given. A FITS mask without coordinates is taken to be Galactic.
+
+    Returns
+    -------
+    True in used pixels; RING, Galactic, shape (pix,).
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or not HEALPix; the mask in it is not found; it has
+        values other than 0 and 1 (read an apodized mask with `read_maps`), the wrong nside, or
+        leaves no pixel.
+    """
+    path = Path(path)
+    frame = "G"
+    if path.suffix == ".npz":
+        order = ORDERINGS.get((ordering or "RING").upper(), "")
+        if not order:
+            raise InputError(f"Argument `ordering` must be RING or NESTED, not {ordering!r}.")
+        values = _read_npz(path, key)
+        if not healpy.isnpixok(values.size):
+            raise InputError(f"{path}: not a HEALPix mask, {values.size} is not 12 nside^2 pixels.")
+    else:
+        with open_fits(path) as hdus:
+            table = HealpixTable(path, hdus, hdu)
+            column = default_fields(table)[0] if key is None else table.index(key)
+            order = table.state("ordering", ordering, ("ORDERING",), ORDERINGS)
+            frame = table.state("coordinates", None, ("COORDSYS", "SKYCOORD"), COORDINATES, "G")
+            values = table.values(column)
+    found = healpy.npix2nside(values.size)
+    if nside is not None and nside != found:
+        raise InputError(f"{path}: nside is {found}, but {nside} is expected.")
+    if odd := int(np.sum((values != 0) & (values != 1))):
+        raise InputError(
+            f"{path}: a mask has values 0 and 1, but {odd} of {values.size} pixels have others."
+        )
+    mask = values.astype(bool)
+    if not mask.any():
+        raise InputError(f"{path}: the mask leaves no pixel.")
+    if order == "NESTED":
+        mask = mask[healpy.ring2nest(found, np.arange(mask.size))]
+    return mask if frame == "G" else _in_galactic(mask, frame)
+
+
+def degrade_mask(
+    mask: Bool[np.ndarray, " pix"], nside: int, threshold: float = 0.5
+) -> Bool[np.ndarray, " pix"]:
+    """A mask at lower resolution: pixels of which at least a fraction is used.
+
+    Parameters
+    ----------
+    mask : True in used pixels, RING, shape (pix,)
+    nside : resolution of the result
+    threshold : smallest used fraction of a pixel, 0 < threshold <= 1
+
+    Raises
+    ------
+    ValueError
+        If nside is not a power of 2 up to that of the mask, or the threshold is outside (0, 1].
+    """
+    found = healpy.npix2nside(np.size(mask))
+    if not healpy.isnsideok(nside, nest=True) or nside > found:
+        raise ValueError(
+            f"Argument `nside` must be a power of 2 up to that of the mask, {found}, not {nside}."
+        )
+    if not 0 < threshold <= 1:
+        raise ValueError(f"Argument `threshold` must be within (0, 1], but is {threshold}.")
+    # The means of 0 and 1 over powers of 4 are exact, so a threshold of 1 keeps full pixels.
+    return healpy.ud_grade(np.asarray(mask, dtype=float), nside) >= threshold

@@ -1,0 +1,164 @@
+"""Names of units as files and astropy write them, and factors between them."""
+
+import re
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+
+from jaxsky.bandpass import Bandpass
+from jaxsky.types import Numeric
+from jaxsky.units import UNITS, conversion, parse_unit
+
+__all__ = ["from_quantity", "is_ambiguous", "unit_factor", "unit_name"]
+
+_DIMENSIONLESS = {"", "1", "none", "n/a", "na", "unitless", "dimensionless", "index", "ratio"}
+_SQUARE = r"(?P<square>(?:\^|\*\*)?2)?"
+_KELVIN = re.compile(r"(?P<prefix>mu|micro|[mun\u00b5\u03bc])?K(?P<kind>[a-zA-Z]*)" + _SQUARE)
+_KINDS = {
+    "": "",
+    **dict.fromkeys(("cmb", "thermodynamic", "thermo"), "_CMB"),
+    **dict.fromkeys(("rj", "antenna", "a"), "_RJ"),
+}
+_JANSKY = re.compile(
+    r"(?P<prefix>[kM]?)[Jj]y(?P<inner>2)?(?:/sr2?|[.*]?sr(?:\^|\*\*)?-[12])" + _SQUARE
+)
+
+
+def unit_name(text: str) -> str:
+    """The package's name for a unit as FITS headers and astropy spell it.
+
+    Parameters
+    ----------
+    text : for example "K_CMB", "Kcmb", "mK,thermodynamic", "uK_RJ", "MJy sr-1", "(K_CMB)^2"
+
+    Returns
+    -------
+    A name of `jaxsky.units`, with "^2" for a square; "" for a pure number; "K", "mK", "uK" or
+    "nK" where the text does not say whether antenna or thermodynamic; else astropy's name.
+
+    Raises
+    ------
+    ValueError
+        If the text names no unit.
+
+    Examples
+    --------
+    >>> [unit_name(text) for text in ("Kcmb", "mK,thermodynamic", "MJy / sr", "(K_CMB)^2")]
+    ['K_CMB', 'mK_CMB', 'MJy/sr', 'K_CMB^2']
+    """
+    if text.strip().lower() in _DIMENSIONLESS:
+        return ""
+    squeezed = re.sub(r"[\s_,(){}]", "", text)
+    if (match := _JANSKY.fullmatch(squeezed)) is not None:
+        square = "^2" if match["square"] or match["inner"] else ""
+        return f"{match['prefix']}Jy/sr{square}"
+    match = _KELVIN.fullmatch(squeezed)
+    if match is not None and match["kind"].lower() in _KINDS:
+        prefix = {"m": "m", "n": "n", None: ""}.get(match["prefix"], "u")
+        square = "^2" if match["square"] else ""
+        return f"{prefix}K{_KINDS[match['kind'].lower()]}{square}"
+    try:
+        return u.Unit(text).to_string()
+    except ValueError:
+        raise ValueError(f"Unknown unit {text!r}; known units are {', '.join(UNITS)}.") from None
+
+
+def is_ambiguous(name: str) -> bool:
+    """True for kelvins that may be antenna or thermodynamic temperature."""
+    return name.removesuffix("^2") in ("K", "mK", "uK", "nK")
+
+
+def _base(name: str) -> tuple[str, int]:
+    name = unit_name(name)
+    return (name[:-2], 2) if name.endswith("^2") else (name, 1)
+
+
+def unit_factor(
+    source: str,
+    target: str,
+    at: Numeric | Bandpass | u.Quantity | None = None,
+    nu_ref: float | None = None,
+) -> float:
+    """Factor by which values in one unit become values in another.
+
+    Parameters
+    ----------
+    source, target : names of units, in any spelling `unit_name` takes; squares ("K_CMB^2",
+        covariances) convert with the square of the factor
+    at : frequency [GHz] or band, needed between K_RJ, K_CMB and MJy/sr; in a band the factor is
+        that of `Bandpass.conversion`
+    nu_ref : frequency at which a band's MJy/sr is quoted [GHz], default its center
+
+    Raises
+    ------
+    ValueError
+        If a unit is unknown, they do not convert, or `at` is missing.
+
+    Examples
+    --------
+    >>> round(unit_factor("K_CMB^2", "uK_RJ^2", at=100.0) / 1e12, 4)
+    0.6041
+    """
+    (source_base, power), (target_base, target_power) = _base(source), _base(target)
+    if power != target_power or (source_base in UNITS) != (target_base in UNITS):
+        hint = "; say K_CMB or K_RJ" if is_ambiguous(source_base) and target_base in UNITS else ""
+        raise ValueError(f"Unit {source!r} does not convert to {target!r}{hint}.")
+    if source_base not in UNITS:
+        try:
+            return u.Unit(source_base).to(u.Unit(target_base)) ** power
+        except u.UnitConversionError:
+            raise ValueError(f"Unit {source!r} does not convert to {target!r}.") from None
+    (source_size, source_kind), (target_size, target_kind) = map(
+        parse_unit, (source_base, target_base)
+    )
+    if source_kind == target_kind:
+        return (source_size / target_size) ** power
+    if at is None:
+        raise ValueError(
+            f"The factor from {source!r} to {target!r} depends on frequency; "
+            "give `at`, a frequency [GHz] or a Bandpass."
+        )
+    if isinstance(at, Bandpass):
+        return float(at.conversion(source_base, target_base, nu_ref)) ** power
+    nu = at.to_value(u.GHz) if isinstance(at, u.Quantity) else at
+    return float(conversion(source_base, target_base, nu)) ** power
+
+
+def from_quantity(
+    quantity: Any,
+    unit: str,
+    *,
+    at: Numeric | Bandpass | u.Quantity | None = None,
+    nu_ref: float | None = None,
+) -> np.ndarray:
+    """An astropy Quantity as a bare array in a unit of the package.
+
+    Units are taken by name, so those of `pysm3.units` (uK_RJ, K_CMB) work as well as astropy's.
+
+    Parameters
+    ----------
+    quantity : number or array with a unit
+    unit : unit of the result: "uK_RJ", "K_CMB", "MJy/sr", "GHz", "arcmin", "K", ...
+    at, nu_ref : see `unit_factor`
+
+    Returns
+    -------
+    Array of float64.
+
+    Raises
+    ------
+    TypeError
+        If the quantity has no unit.
+    ValueError
+        If the units do not convert, or `at` is missing.
+
+    Examples
+    --------
+    >>> float(from_quantity(0.5 * u.deg, "arcmin"))
+    30.0
+    """
+    if not hasattr(quantity, "unit"):
+        raise TypeError(f"Argument `quantity` must carry a unit, but is {type(quantity).__name__}.")
+    factor = unit_factor(str(quantity.unit), unit, at, nu_ref)
+    return np.asarray(quantity.value, dtype=np.float64) * factor

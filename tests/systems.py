@@ -1,0 +1,46 @@
+"""Small skies with known answers, shared by the tests."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsky import AME, CMB, Bandpass, Component, Dust, Sky, Synchrotron
+
+NPIX = 48
+
+
+def random_maps(seed: int, stokes: int = 2, npix: int = NPIX) -> jnp.ndarray:
+    return jnp.asarray(np.random.default_rng(seed).normal(size=(stokes, npix)) * 10)
+
+
+def spread(center: float, width: float, npix: int = NPIX) -> jnp.ndarray:
+    """A map of a parameter, even over center +- width."""
+    return jnp.asarray(center + width * np.random.default_rng(9).uniform(-1, 1, npix))
+
+
+def components(stokes: int = 2) -> dict[str, Component]:
+    """One component of each kind, every parameter at a value at which it matters."""
+    maps = random_maps(1, stokes)
+    dust = random_maps(2, stokes)
+    return {
+        "synchrotron": Synchrotron(maps, 3.1, curvature=-0.2, nu_piv=23.0, nu_ref=30.0),
+        "dust": Dust(maps, 1.53, 21.0, nu_ref=353.0),
+        "two_body_dust": Dust(
+            maps, (1.67, 2.70), (9.4, 16.2), (0.49, 1.0), nu_ref=353.0, nu_pivot=3000.0
+        ),
+        "ame": AME.from_dust_angles(jnp.abs(maps[0]), dust, 0.01, nu_ref=22.8),
+        "cmb": CMB(maps),
+    }
+
+
+def bands() -> list[Bandpass]:
+    nu = np.linspace(60.0, 80.0, 21)
+    return [Bandpass(nu, np.hanning(23)[1:-1], "power"), Bandpass.top_hat(143.0, 40.0, samples=15)]
+
+
+def dust_and_synchrotron(npix: int = NPIX) -> Sky:
+    return Sky(
+        {
+            "dust": Dust(random_maps(3, npix=npix), 1.53, 21.0),
+            "synchrotron": Synchrotron(random_maps(4, npix=npix), 3.1),
+        }
+    )

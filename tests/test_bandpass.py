@@ -1,0 +1,143 @@
+"""Bandpasses: conventions, averages, shifts, and what is refused."""
+
+import astropy.units as u
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jaxsky import Bandpass, sed
+from jaxsky.bandpass import CONVENTIONS, average
+from jaxsky.units import conversion
+
+NU = np.linspace(60.0, 80.0, 81)
+
+
+def power_law(nu):
+    return sed.power_law(nu, 3.0, 30.0)
+
+
+def test_average_of_a_power_is_its_integral():
+    # int nu^3 / int 1 over 60 ... 80; the trapezoid rule on 2001 samples is good to 1e-8.
+    band = Bandpass.top_hat(70.0, 20.0, samples=2001)
+    expected = (80.0**4 - 60.0**4) / 4 / 20.0
+    assert float(average(lambda nu: nu**3, band)) == pytest.approx(expected, rel=1e-7)
+
+
+def test_conventions_describe_one_detector():
+    """The same response tabulated in three conventions observes the same sky."""
+    rj = np.exp(-0.5 * ((NU - 70) / 5) ** 2)
+    tables = {
+        "RJ": rj,
+        "power": rj / NU**2,
+        "CMB": rj * np.asarray(conversion("K_CMB", "K_RJ", NU)),
+    }
+    assert set(tables) == set(CONVENTIONS)
+    seen = [float(average(power_law, Bandpass(NU, w, c))) for c, w in tables.items()]
+    np.testing.assert_allclose(seen, seen[0], rtol=1e-13)
+
+
+def test_power_convention_is_pysms_formula():
+    weights = np.linspace(1.0, 2.0, NU.size)
+    S = np.asarray(power_law(NU))
+    expected = np.trapezoid(weights * NU**2 * S, NU) / np.trapezoid(weights * NU**2, NU)
+    assert float(average(power_law, Bandpass(NU, weights, "power"))) == pytest.approx(
+        expected, rel=1e-13
+    )
+
+
+def test_uneven_samples_and_normalisation():
+    nu = np.array([60.0, 61.0, 65.0, 72.0, 80.0])
+    weights = np.array([1.0, 3.0, 2.0, 5.0, 1.0])
+    S = np.asarray(power_law(nu))
+    expected = np.trapezoid(weights * S, nu) / np.trapezoid(weights, nu)
+    for factor in (1.0, 1e-20, 1e20):
+        band = Bandpass(nu, factor * weights)
+        assert float(average(power_law, band)) == pytest.approx(expected, rel=1e-13)
+        assert float(band.quadrature.sum()) == pytest.approx(1.0)
+
+
+def test_delta():
+    assert float(average(power_law, Bandpass.delta(70.0))) == float(power_law(70.0))
+
+
+def test_maps_are_summed_like_numbers():
+    beta = jnp.linspace(2.5, 3.5, 7)
+    band = Bandpass(NU, np.hanning(NU.size), "power")
+    maps = average(lambda nu: sed.power_law(nu, beta, 30.0), band)
+    numbers = [average(lambda nu, b=b: sed.power_law(nu, b, 30.0), band) for b in beta]
+    np.testing.assert_allclose(maps, jnp.stack(numbers), rtol=1e-13)
+
+
+def test_shift_and_stretch_move_the_band_and_keep_it_normalised():
+    band = Bandpass(NU, np.hanning(NU.size), "power")
+    shifted, stretched = band.shifted(1.5), band.stretched(1.2)
+    np.testing.assert_allclose(shifted.nu, NU + 1.5)
+    rj = Bandpass(NU, np.hanning(NU.size))
+    assert float(rj.stretched(1.2).center) == pytest.approx(float(rj.center), rel=1e-13)
+    assert float(np.ptp(stretched.nu)) == pytest.approx(1.2 * np.ptp(NU))
+    for moved in (shifted, stretched):
+        assert float(moved.quadrature.sum()) == pytest.approx(1.0)
+        assert float(average(power_law, moved)) != pytest.approx(float(average(power_law, band)))
+    # A moved table in the power convention is renormalised with nu^2 at its new frequencies.
+    expected = Bandpass(NU + 1.5, np.hanning(NU.size), "power")
+    assert float(average(power_law, shifted)) == float(average(power_law, expected))
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_gradients_against_finite_differences(convention):
+    weights = jnp.asarray(np.hanning(NU.size) + 0.1)
+
+    def seen(delta, factor, w):
+        band = Bandpass(jnp.asarray(NU), w, convention)
+        return 100 * average(power_law, band.shifted(delta).stretched(factor))
+
+    def top_hat(center, width):
+        return 100 * average(power_law, Bandpass.top_hat(center, width, convention))
+
+    check_grads(seen, (jnp.asarray(0.3), jnp.asarray(1.1), weights), order=1, rtol=1e-6)
+    check_grads(top_hat, (jnp.asarray(70.0), jnp.asarray(14.0)), order=1, rtol=1e-6)
+
+
+def test_construction_inside_jit():
+    @jax.jit
+    def center(c, w):
+        return Bandpass.top_hat(c, w).center
+
+    assert float(center(70.0, 14.0)) == pytest.approx(70.0)
+
+
+@pytest.mark.parametrize(
+    ("nu", "weights", "convention", "words"),
+    [
+        ([30.0, 31.0], [1.0, 1.0, 1.0], "RJ", r"must have one shape \(sample,\)"),
+        ([], [], "RJ", r"must have one shape"),
+        ([31.0, 30.0], [1.0, 1.0], "RJ", "`nu` must increase strictly"),
+        ([30.0, 30.0], [1.0, 1.0], "RJ", "`nu` must increase strictly"),
+        ([30.0, 31.0], [0.0, 0.0], "RJ", "`weights` has an integral over `nu` that is not"),
+        ([30.0, 31.0], [1.0, -3.0], "RJ", "`weights` has an integral"),
+        ([30.0, np.nan], [1.0, 1.0], "RJ", "`nu` has 1 of 2 values that are not finite"),
+        ([30.0, 31.0], [1.0, np.inf], "RJ", "`weights` has 1 of 2 values that are not finite"),
+        ([-1.0, 31.0], [1.0, 1.0], "RJ", "`nu` must be positive, but its smallest value is -1"),
+        (
+            [30.0, 31.0],
+            [1.0, 1.0],
+            "flux",
+            "`convention` must be one of RJ, power, CMB, not 'flux'",
+        ),
+    ],
+)
+def test_bad_tables_are_refused(nu, weights, convention, words):
+    with pytest.raises(ValueError, match=words):
+        Bandpass(nu, weights, convention)
+
+
+def test_units_are_refused():
+    with pytest.raises(TypeError, match=r"`nu` carries the unit GHz; .* bare arrays"):
+        Bandpass(NU * u.GHz, np.ones(NU.size))
+
+
+def test_a_width_that_is_not_positive_is_refused():
+    with pytest.raises(ValueError, match="`width` must be positive"):
+        Bandpass.top_hat(70.0, 0.0)

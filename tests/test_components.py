@@ -1,0 +1,182 @@
+"""One sweep over every kind of component, then what is particular to each."""
+
+import astropy.units as u
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+import systems
+from jaxsky import (
+    AME,
+    CMB,
+    Component,
+    Dust,
+    Sky,
+    Synchrotron,
+    get_parameters,
+    observe,
+    observe_components,
+    parameter_names,
+    set_parameters,
+)
+
+NAMES = list(systems.components())
+
+
+def subclasses(cls):
+    return {cls} | {c for child in cls.__subclasses__() for c in subclasses(child)}
+
+
+def spectral(sky):
+    return [name for name in parameter_names(sky) if not name.endswith(".amplitude")]
+
+
+@pytest.fixture(params=NAMES)
+def sky(request):
+    return Sky({request.param: systems.components()[request.param]})
+
+
+def test_the_sweep_covers_every_component():
+    assert {type(c) for c in systems.components().values()} == subclasses(Component) - {Component}
+
+
+def test_eager_jit_and_vmap_agree(sky):
+    bands = systems.bands()
+    eager = observe(sky, bands)
+    jitted = jax.jit(observe)(sky, bands)
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), sky)
+    mapped = jax.vmap(lambda s: observe(s, bands))(batch)
+    np.testing.assert_allclose(jitted, eager, rtol=1e-12)
+    np.testing.assert_allclose(mapped[1], eager, rtol=1e-12)
+
+
+def test_linear_in_the_amplitude(sky):
+    (name,) = sky
+    doubled = set_parameters(sky, {f"{name}.amplitude": 2 * sky[name].amplitude})
+    np.testing.assert_allclose(
+        observe(doubled, systems.bands()), 2 * observe(sky, systems.bands()), rtol=1e-13
+    )
+
+
+def test_every_parameter_changes_the_observation(sky):
+    before = observe(sky, systems.bands())
+    for name in parameter_names(sky):
+        moved = set_parameters(sky, {name: 1.01 * get_parameters(sky, [name])[name]})
+        assert float(jnp.abs(observe(moved, systems.bands()) / before - 1).max()) > 1e-6, name
+
+
+def test_gradients_against_finite_differences(sky):
+    params = get_parameters(sky, spectral(sky))
+
+    def seen(logs):
+        # In units of each parameter, so that one step of the differences suits all.
+        moved = {n: params[n] * (1 + x) for n, x in logs.items()}
+        return observe(set_parameters(sky, moved), systems.bands())[:, :, :3]
+
+    zeros = {name: jnp.zeros(()) for name in params}
+    check_grads(seen, (zeros,), order=1, modes=["fwd", "rev"], rtol=1e-5, atol=1e-4)
+
+
+def test_a_constant_map_of_any_parameter_is_that_number(sky):
+    expected = observe(sky, systems.bands())
+    for name, value in get_parameters(sky, spectral(sky)).items():
+        constant = set_parameters(sky, {name: jnp.full(systems.NPIX, value)})
+        np.testing.assert_allclose(
+            observe(constant, systems.bands()), expected, rtol=1e-9, err_msg=name
+        )
+
+
+@pytest.mark.parametrize("stokes", [2, 3])
+def test_stokes_rows_share_the_law(stokes):
+    for name, component in systems.components(stokes).items():
+        seen = observe(Sky({name: component}), systems.bands())
+        ratio = seen / component.template
+        np.testing.assert_allclose(ratio, ratio[:, :1, :1] * jnp.ones_like(ratio), rtol=1e-12)
+
+
+def test_single_precision_in_single_precision_out(sky):
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), sky)
+    bands = [jax.tree.map(lambda x: x.astype(jnp.float32), b) for b in systems.bands()]
+    seen = observe(single, bands)
+    assert seen.dtype == jnp.float32
+    np.testing.assert_allclose(seen, observe(sky, systems.bands()), rtol=1e-4)
+
+
+def test_components_are_seen_apart_and_sum_up():
+    sky = Sky(systems.components())
+    apart = observe_components(sky, systems.bands())
+    assert set(apart) == set(NAMES)
+    np.testing.assert_allclose(
+        sum(apart.values()), observe(sky, systems.bands()), rtol=1e-12, atol=1e-12
+    )
+
+
+def test_ame_has_the_dusts_angle_and_its_own_fraction():
+    intensity = jnp.abs(systems.random_maps(5)[0])
+    dust = systems.random_maps(6, 3)
+    ame = AME.from_dust_angles(intensity, dust)
+    intensity_seen, Q, U = ame.template
+    np.testing.assert_allclose(intensity_seen, intensity)
+    np.testing.assert_allclose(jnp.hypot(Q, U), 0.01 * intensity, rtol=1e-12)
+    np.testing.assert_allclose(jnp.arctan2(U, Q), jnp.arctan2(dust[2], dust[1]), rtol=1e-12)
+
+
+def test_ame_is_unpolarized_where_the_dust_is():
+    dust = jnp.zeros((2, 12)).at[:, 0].set(1.0)
+    ame = AME.from_dust_angles(jnp.ones(12), dust)
+    assert float(jnp.abs(ame.template[:, 1:]).max()) == 0.0
+    gradient = jax.grad(lambda d: AME.from_dust_angles(jnp.ones(12), d).template.sum())(dust)
+    assert bool(jnp.isfinite(gradient).all())
+
+
+MAPS = np.ones((2, 12))
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "words"),
+    [
+        (
+            lambda: Dust(np.ones(12)),
+            ValueError,
+            r"`amplitude` must have shape \(stokes, pix\).*\(12,\)",
+        ),
+        (lambda: Dust(np.ones((4, 12))), ValueError, r"`amplitude` .* has shape \(4, 12\)"),
+        (lambda: Dust(MAPS, np.ones(11)), ValueError, r"`beta_dust` .* shape \(12,\), .* \(11,\)"),
+        (lambda: Dust(MAPS, T_dust=0.0), ValueError, "`T_dust` must be positive.* is 0"),
+        (lambda: Dust(MAPS, T_dust=-np.ones(12)), ValueError, "`T_dust` must be positive.* is -1"),
+        (lambda: Dust(MAPS * np.nan), ValueError, "`amplitude` has 24 of 24 values that are not"),
+        (lambda: Dust(MAPS, nu_ref=0.0), ValueError, "`nu_ref` must be positive"),
+        (
+            lambda: Dust(MAPS, E_dust=(1.0,)),
+            ValueError,
+            "`E_dust` has no effect with a single body",
+        ),
+        (lambda: Dust(MAPS, nu_pivot=1.0), ValueError, "`nu_pivot` has no effect"),
+        (
+            lambda: Dust(MAPS, (1.6, 2.7), (9.4,), (1.0, 1.0)),
+            ValueError,
+            r"tuples with one entry a body, but have lengths \[2, 1, 2\]",
+        ),
+        (lambda: Dust(MAPS, (1.6, 2.7)), ValueError, "must be tuples with one entry a body"),
+        (lambda: Dust(MAPS * u.K), TypeError, "`amplitude` carries the unit K"),
+        (lambda: Dust(MAPS, T_dust=21 * u.K), TypeError, "`T_dust` carries the unit K"),
+        (lambda: Synchrotron(MAPS, "steep"), TypeError, "`beta_syn` must be a number"),
+        (lambda: Synchrotron(MAPS, 3j), TypeError, "`beta_syn` must be real"),
+        (lambda: Synchrotron(MAPS, np.inf), ValueError, "`beta_syn` has 1 of 1 values"),
+        (lambda: CMB(MAPS, T_cmb=-1.0), ValueError, "`T_cmb` must be positive"),
+        (
+            lambda: AME.from_dust_angles(np.ones(3), MAPS),
+            ValueError,
+            r"`intensity` must have shape",
+        ),
+    ],
+)
+def test_bad_arguments_are_refused(make, error, words):
+    with pytest.raises(error, match=words):
+        make()
+
+
+def test_big_endian_maps_are_taken():
+    assert Dust(MAPS.astype(">f8")).amplitude.dtype == jnp.float64

@@ -1,0 +1,442 @@
+"""Files in and out: conventions, round trips, and a sentence for everything that is wrong."""
+
+import gzip
+
+import healpy
+import numpy as np
+import pysm3.units as pu
+import pytest
+from astropy import units as u
+from astropy.io import fits as pyfits
+
+from jaxsky.bandpass import Bandpass
+from jaxsky.io import (
+    InputError,
+    degrade_mask,
+    from_quantity,
+    read_maps,
+    read_mask,
+    unit_factor,
+    unit_name,
+    write_maps,
+)
+
+NSIDE = 8
+NPIX = 12 * NSIDE**2
+HEADER = {"PIXTYPE": "HEALPIX", "ORDERING": "RING", "NSIDE": NSIDE, "COORDSYS": "G"}
+PLANCK = ["I_STOKES", "Q_STOKES", "U_STOKES", "HITS", "II_COV", "IQ_COV", "IU_COV"]
+PLANCK += ["QQ_COV", "QU_COV", "UU_COV"]
+
+
+def save(path, columns, units=None, hdus=(), **header):
+    """A FITS table as the archives have it; header=None leaves a keyword out."""
+    units = units or {}
+    cols = [
+        pyfits.Column(name=n, format="E", array=v, unit=units.get(n)) for n, v in columns.items()
+    ]
+    table = pyfits.BinTableHDU.from_columns(cols)
+    table.header.update({k: v for k, v in (HEADER | header).items() if v is not None})
+    pyfits.HDUList([pyfits.PrimaryHDU(), table, *hdus]).writeto(path)
+    return path
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture
+def planck(tmp_path, rng):
+    """An LFI frequency map: NESTED, K_CMB, covariances, one pixel UNSEEN in Q only."""
+    maps = {name: rng.normal(size=NPIX).astype(np.float32) for name in PLANCK}
+    maps["Q_STOKES"][5] = healpy.UNSEEN
+    units = {n: "(K_CMB)^2" if "COV" in n else "K_CMB" for n in PLANCK} | {"HITS": "n/a"}
+    header = {"ORDERING": "NESTED", "COORDSYS": "GALACTIC", "POLCCONV": "COSMO", "NSIDE": "8"}
+    return save(tmp_path / "planck.fits", maps, units, **header), maps
+
+
+@pytest.fixture
+def bare(tmp_path, rng):
+    """A map that says nothing about itself, as the WMAP ones."""
+    maps = {f"{s}_STOKES": rng.normal(size=NPIX) for s in "IQU"}
+    return save(tmp_path / "bare.fits", maps, COORDSYS=None)
+
+
+def test_planck_map(planck):
+    path, nested = planck
+    maps = read_maps(path, nside=NSIDE)
+    assert (maps.names, maps.unit, maps.nside) == (tuple(PLANCK[:3]), "K_CMB", NSIDE)
+    assert maps.maps.dtype == np.float64
+    assert maps.maps.dtype.isnative
+    hole = healpy.nest2ring(NSIDE, 5)
+    assert np.flatnonzero(~maps.mask).tolist() == [hole]
+    assert (maps.maps[:, hole] == 0).all()
+    expected = healpy.reorder(np.where(np.arange(NPIX) == 5, 0, nested["U_STOKES"]), n2r=True)
+    np.testing.assert_array_equal(maps.maps[2], expected)
+
+
+def test_covariance_columns_have_squared_units(planck):
+    covariance = read_maps(planck[0], fields=["QQ_COV", 8, "uu_cov"])
+    assert covariance.unit == "K_CMB^2"
+    band = Bandpass.top_hat(30.0, 6.0)
+    converted = covariance.to("uK_RJ^2", at=band)
+    factor = float(band.conversion("K_CMB", "uK_RJ"))
+    np.testing.assert_allclose(converted.maps, covariance.maps * factor**2, rtol=1e-12)
+    assert converted.unit == "uK_RJ^2"
+    assert read_maps(planck[0], fields="HITS").unit == ""
+
+
+def test_wmap_map_needs_unit_and_coordinates(tmp_path, rng):
+    names = ["TEMPERATURE", "Q_POLARISATION", "U_POLARISATION", "N_OBS"]
+    units = dict(zip(names, ["mK", *["mK,thermodynamic"] * 2, "counts"], strict=True))
+    maps = {name: rng.normal(size=NPIX) for name in names}
+    path = save(tmp_path / "wmap.fits", maps, units, ORDERING="NESTED", COORDSYS=None)
+    with pytest.raises(InputError, match=r"TEMPERATURE has the unit 'mK', which leaves open"):
+        read_maps(path, coordinates="G")
+    with pytest.raises(InputError, match=r"wmap.fits, HDU 1: the header has no COORDSYS; give"):
+        read_maps(path, unit="mK_CMB")
+    read = read_maps(path, unit="mK_CMB", coordinates="G")
+    assert (read.unit, read.names) == ("mK_CMB", tuple(names[:3]))
+    np.testing.assert_allclose(read.to("uK_CMB").maps, 1e3 * read.maps)
+
+
+def test_iau_changes_the_sign_of_u(planck, tmp_path):
+    maps = {n: v for n, v in planck[1].items() if n != "HITS"}
+    units = dict.fromkeys(maps, "K_CMB")
+    kwargs = {"fields": list(maps), "unit": "K_CMB"}
+    cosmo = read_maps(save(tmp_path / "cosmo.fits", maps, units), **kwargs).maps
+    for name, header, arg in [("a", {"POLCCONV": "IAU"}, None), ("b", {}, "IAU")]:
+        path = save(tmp_path / f"{name}.fits", maps, units, **header)
+        iau = read_maps(path, **kwargs, polarization=arg).maps
+        flipped = [n in ("U_STOKES", "IU_COV", "QU_COV") for n in maps]
+        np.testing.assert_array_equal(iau, np.where(np.array(flipped)[:, None], -cosmo, cosmo))
+
+
+def test_bad_data_and_not_finite_are_masked(tmp_path):
+    values = np.ones(NPIX)
+    values[:4] = [np.nan, np.inf, -999.0, healpy.UNSEEN]
+    path = save(tmp_path / "m.fits", {"I": values}, {"I": "uK_RJ"}, BAD_DATA=-999.0)
+    read = read_maps(path)
+    assert (~read.mask).nonzero()[0].tolist() == [0, 1, 2, 3]
+    assert read.maps[0].sum() == NPIX - 4
+    empty = save(tmp_path / "e.fits", {"I": 0 * values + np.nan}, {"I": "uK_RJ"})
+    with pytest.raises(InputError, match=r"e.fits.*no pixel has values in I"):
+        read_maps(empty)
+
+
+def test_partial_map_with_explicit_pixels(tmp_path, rng):
+    full = np.full(NPIX, healpy.UNSEEN)
+    full[100:200] = rng.normal(size=100)
+    path = tmp_path / "partial.fits"
+    kwargs = {"column_names": ["I"], "column_units": "uK_CMB", "dtype": np.float64}
+    healpy.write_map(path, full, partial=True, coord="G", **kwargs)
+    read = read_maps(path)
+    np.testing.assert_array_equal(read.mask, full != healpy.UNSEEN)
+    np.testing.assert_array_equal(read.maps[0, 100:200], full[100:200])
+
+
+def celestial(rng, nside, lmax):
+    """A band-limited sky, I, Q, U and a scalar, in Celestial and in Galactic coordinates."""
+    ell = np.arange(lmax + 1.0)
+    spectrum = 1 / (1 + ell) ** 2
+    np.random.seed(int(rng.integers(1 << 30)))
+    alm = healpy.synalm([spectrum] * 3 + [0 * spectrum] * 3, lmax=lmax, new=True)
+    turned = healpy.Rotator(coord=["C", "G"]).rotate_alm(alm)
+    return healpy.alm2map(alm, nside), healpy.alm2map(turned, nside)
+
+
+def test_coordinates_are_turned_with_spin_two(tmp_path, rng):
+    source, expected = celestial(rng, 16, 20)
+    path = tmp_path / "c.fits"
+    healpy.write_map(path, source, coord="C", column_units="uK_RJ", dtype=np.float64)
+    read = read_maps(path)
+    assert np.abs(read.maps - expected).max() < 1e-6 * np.abs(expected).max()
+    assert read.mask.all()
+    pair = read_maps(path, fields=["Q_POLARISATION", "U_POLARISATION"])
+    np.testing.assert_allclose(pair.maps, read.maps[1:], atol=1e-12)
+
+
+def test_masked_maps_are_turned_between_pixels(tmp_path, rng):
+    source, expected = celestial(rng, 64, 8)
+    source[1, healpy.query_disc(64, [1, 0, 0], 0.3)] = healpy.UNSEEN
+    path = tmp_path / "c.fits"
+    healpy.write_map(path, source, coord="C", column_units="uK_RJ", dtype=np.float64)
+    read = read_maps(path)
+    center = healpy.Rotator(coord=["C", "G"])(np.array([1.0, 0, 0]))
+    hole = np.isin(np.arange(read.mask.size), healpy.query_disc(64, center, 0.29))
+    assert not read.mask[hole].any()
+    assert read.mask[~hole].mean() > 0.98
+    assert np.abs(read.maps - expected)[:, read.mask].max() < 0.01 * np.abs(expected).max()
+
+
+def test_round_trip_is_exact(tmp_path, rng):
+    maps, mask = rng.normal(size=(3, NPIX)), rng.random(NPIX) > 0.1
+    path = tmp_path / "out.fits"
+    names, unit = ["I_STOKES", "Q_STOKES", "U_STOKES"], "uK_CMB"
+    write_maps(path, maps, names=names, unit=unit, mask=mask, extra_header={"FWHM": 60.0})
+    read = read_maps(path)
+    np.testing.assert_array_equal(read.maps, np.where(mask, maps, 0))
+    np.testing.assert_array_equal(read.mask, mask)
+    assert (list(read.names), read.unit) == (names, unit)
+    header = pyfits.getheader(path, 1)
+    assert [header[k] for k in ("ORDERING", "COORDSYS", "POLCCONV")] == ["RING", "G", "COSMO"]
+    assert (header["TUNIT3"], header["NSIDE"], header["FWHM"]) == (unit, NSIDE, 60.0)
+    peer = healpy.read_map(path, field=(0, 1, 2), dtype=None)
+    np.testing.assert_array_equal(peer, np.where(mask, maps, healpy.UNSEEN))
+    assert [p.name for p in tmp_path.iterdir()] == ["out.fits"]
+
+
+def test_units_of_each_column_survive(tmp_path):
+    path = tmp_path / "parameters.fits.gz"
+    names, unit = ["beta_dust", "T_dust"], ["", "K"]
+    write_maps(path, np.ones((2, NPIX)), names=names, unit=unit)
+    assert gzip.open(path).read(6) == b"SIMPLE"
+    assert read_maps(path, fields="beta_dust").unit == ""
+    assert read_maps(path, fields="T_dust", unit="K").unit == "K"
+
+
+def test_writing_never_overwrites_unasked(tmp_path):
+    path = tmp_path / "out.fits"
+    write_maps(path, np.ones(NPIX), names="I", unit="uK_RJ")
+    before = path.read_bytes()
+    with pytest.raises(FileExistsError, match=r"out.fits: file exists"):
+        write_maps(path, np.zeros(NPIX), names="I", unit="uK_RJ")
+    assert path.read_bytes() == before
+    write_maps(path, np.zeros(NPIX), names="I", unit="uK_RJ", overwrite=True)
+    assert read_maps(path).maps.sum() == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"maps": np.ones(100)}, r"12 nside\^2 pixels, but has shape \(1, 100\)"),
+        ({"maps": np.full(NPIX, np.nan)}, "768 of 768 values that are not finite"),
+        ({"names": ["Q", "U"]}, "`names` has 2 entries for 1 maps"),
+        ({"unit": "furlong_CMB"}, "Unknown unit 'furlong_CMB'"),
+        ({"mask": np.ones(4, bool)}, r"`mask` must have shape \(768,\), but has shape \(4,\)"),
+        ({"extra_header": {"ordering": "NESTED"}}, "must not set ordering"),
+        ({"path": "no/such/out.fits"}, "folder .* does not exist"),
+    ],
+)
+def test_bad_output_leaves_nothing(tmp_path, change, words):
+    arguments = {"path": "out.fits", "maps": np.ones(NPIX), "names": "I", "unit": "uK_RJ"} | change
+    path = tmp_path / arguments.pop("path")
+    with pytest.raises(ValueError, match=words):
+        write_maps(path, arguments.pop("maps"), **arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_failure_while_writing_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "out.fits"
+    path.write_bytes(b"old")
+
+    def fail(self, name, **kwargs):
+        name.write_bytes(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(pyfits.HDUList, "writeto", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_maps(path, np.ones(NPIX), names="I", unit="uK_RJ", overwrite=True)
+    assert path.read_bytes() == b"old"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+GOOD = {"unit": "uK_CMB", "coordinates": "G"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"unit": None}, r"I_STOKES has no unit; give `unit`"),
+        ({"coordinates": None}, "the header has no COORDSYS; give `coordinates`, one of G, C, E"),
+        ({"ordering": "NESTED"}, "`ordering` is NESTED, but the header says RING"),
+        ({"ordering": "spiral"}, "`ordering` must be one of RING, NESTED, not 'spiral'"),
+        ({"nside": 16}, "nside is 8, but 16 is expected"),
+        ({"fields": "Q_ML"}, "no column 'Q_ML'; it has I_STOKES, Q_STOKES, U_STOKES"),
+        ({"fields": 3}, "no column 3; it has I_STOKES"),
+        ({"hdu": 2}, r"no HDU 2; it has 0 \(PRIMARY\), 1"),
+        ({"hdu": "COV"}, "no HDU 'COV'"),
+        ({"hdu": 0}, "HDU 0 holds no binary table"),
+        ({"fields": ["Q_STOKES"], "coordinates": "C"}, "Q_STOKES cannot be turned to Galactic"),
+        ({"unit": "uK_BANANA"}, "Unknown unit 'uK_BANANA'"),
+    ],
+)
+def test_bad_arguments(bare, arguments, words):
+    before = bare.read_bytes()
+    with pytest.raises(ValueError, match=words):
+        read_maps(bare, **(GOOD | arguments))
+    assert bare.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("header", "arguments", "words"),
+    [
+        ({"ORDERING": None}, {}, "the header has no ORDERING; give `ordering`"),
+        ({"ORDERING": "NESTED"}, {"ordering": "RING"}, "is RING, but the header says NESTED"),
+        ({"COORDSYS": "X"}, {}, "COORDSYS is X, which is none of G, C, E"),
+        ({"COORDSYS": "C"}, {"coordinates": "G"}, "is G, but the header says C"),
+        ({"POLCCONV": "IAU"}, {"polarization": "COSMO"}, "is COSMO, but the header says IAU"),
+        ({"NSIDE": 16}, {}, r"NSIDE is 16, but its columns have 768 pixels \(nside 8\)"),
+        ({"PIXTYPE": "CAR"}, {}, "not a HEALPix map, PIXTYPE is CAR"),
+        ({"INDXSCHM": "EXPLICIT"}, {}, "no column 'PIXEL'"),
+        ({"INDXSCHM": "EXPLICIT", "NSIDE": None}, {}, "explicit indexing without NSIDE"),
+        ({}, {"unit": "uK_RJ"}, "`unit` is uK_RJ, but column Q_X is in uK_CMB"),
+        ({}, {"fields": ["Q_X", "T_D"]}, "column T_D has the unit 'K', which leaves open"),
+        ({}, {"fields": ["Q_X", "V"]}, r"different units.*: Q_X \[uK_CMB\], V \[MJy/sr\]"),
+    ],
+)
+def test_bad_headers(tmp_path, header, arguments, words):
+    maps, units = {k: np.ones(NPIX) for k in ("Q_X", "T_D", "V")}, ("uK_CMB", "K", "MJy/sr")
+    path = save(tmp_path / "m.fits", maps, dict(zip(maps, units, strict=True)), **header)
+    with pytest.raises(InputError, match=words) as info:
+        read_maps(path, **arguments)
+    assert str(path) in str(info.value)
+    assert "\n" not in str(info.value)
+
+
+def test_files_that_are_no_maps(tmp_path, bare):
+    with pytest.raises(InputError, match=r"none.fits: no such file"):
+        read_maps(tmp_path / "none.fits")
+    text = tmp_path / "text.fits"
+    text.write_text("not a map")
+    with pytest.raises(InputError, match=r"text.fits: not a FITS file"):
+        read_maps(text, **GOOD)
+    odd = save(tmp_path / "odd.fits", {"I": np.ones(100)}, NSIDE=None)
+    with pytest.raises(InputError, match="its columns have 100 values"):
+        read_maps(odd, unit="K_RJ")
+    two = save(tmp_path / "two.fits", {"A": np.ones(NPIX), "B": np.ones(NPIX)})
+    with pytest.raises(InputError, match="no column is named as I, Q or U; give `fields` out of"):
+        read_maps(two, unit="K_RJ")
+    whole = bare.read_bytes()
+    for length in (100, 2880, 3500, 6000, len(whole) - 2881, len(whole) - 1):
+        cut = tmp_path / "cut.fits"
+        cut.write_bytes(whole[:length])
+        with pytest.raises(InputError, match=r"cut.fits.*(truncated|no HDU 1)"):
+            read_maps(cut, **GOOD)
+        assert cut.read_bytes() == whole[:length]
+
+
+def test_real_maps(data_dir):
+    dust = read_maps(data_dir / "templates" / "dust_d1_353GHz_n64.fits", nside=64)
+    assert (dust.unit, dust.maps.shape, dust.mask.all()) == ("uK_RJ", (3, 49152), True)
+    path = data_dir / "templates" / "pysm2_d1_QU353GHz_betad_Td_n64.fits"
+    assert read_maps(path, fields="BETA_D", unit="").maps.mean() == pytest.approx(1.54, abs=0.01)
+    path = data_dir / "wmap7" / "wmap_band_iqumap_r9_7yr_V_v4_udgraded32.fits"
+    wmap = read_maps(path, unit="mK_CMB", coordinates="G").to("uK_RJ", at=61.0)
+    assert 1 < wmap.maps[1].std() < 20
+
+
+# Masks
+
+
+def test_masks(tmp_path, rng):
+    mask = rng.random(NPIX) > 0.4
+    nested = save(tmp_path / "n.fits", {"GAL": healpy.reorder(mask, r2n=True)}, ORDERING="NEST")
+    np.testing.assert_array_equal(read_mask(nested, nside=NSIDE), mask)
+    np.savez(tmp_path / "m.npz", A=mask, B=~mask)
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.npz", key="B"), ~mask)
+    np.savez(tmp_path / "one.npz", A=healpy.reorder(mask, r2n=True).astype(np.uint8))
+    np.testing.assert_array_equal(read_mask(tmp_path / "one.npz", ordering="NESTED"), mask)
+    # A disc about the celestial pole, which lies at b = 27 degrees.
+    cap = np.isin(np.arange(NPIX), healpy.query_disc(NSIDE, [0, 0, 1], 0.5))
+    turned = read_mask(save(tmp_path / "c.fits", {"M": cap}, COORDSYS="C"))
+    pole = healpy.Rotator(coord=["C", "G"])(np.array([0.0, 0, 1]))
+    near = np.isin(np.arange(NPIX), healpy.query_disc(NSIDE, pole, 0.4))
+    far = ~np.isin(np.arange(NPIX), healpy.query_disc(NSIDE, pole, 0.6))
+    assert turned[near].all()
+    assert not turned[far].any()
+
+
+def test_bad_masks(tmp_path):
+    half = save(tmp_path / "h.fits", {"M": np.full(NPIX, 0.5)})
+    two = save(tmp_path / "two.fits", {"A": np.ones(NPIX), "B": np.zeros(NPIX)}, ORDERING=None)
+    np.savez(tmp_path / "m.npz", A=np.ones(NPIX), B=np.ones(100))
+    (tmp_path / "bad.npz").write_bytes(b"PK not really")
+    for path, arguments, words in [
+        (half, {}, r"h.fits: a mask has values 0 and 1, but 768 of 768 pixels have others"),
+        (two, {}, r"no column is named .* out of A, B"),
+        (two, {"key": "C"}, "no column 'C'; it has A, B"),
+        (two, {"key": "A"}, "no ORDERING; give `ordering`"),
+        (two, {"key": "B", "ordering": "RING"}, r"two.fits: the mask leaves no pixel"),
+        (two, {"key": "A", "ordering": "RING", "nside": 4}, "nside is 8, but 4 is expected"),
+        (tmp_path / "m.npz", {}, "give `key`, as it has several masks; it has A, B"),
+        (tmp_path / "m.npz", {"key": "C"}, "no mask 'C'; it has A, B"),
+        (tmp_path / "m.npz", {"key": "B"}, r"100 is not 12 nside\^2 pixels"),
+        (tmp_path / "m.npz", {"key": "A", "ordering": "up"}, "RING or NESTED, not 'up'"),
+        (tmp_path / "bad.npz", {}, r"bad.npz: not a readable .npz archive"),
+        (tmp_path / "none.npz", {}, r"none.npz: no such file"),
+        (tmp_path / "none.fits", {}, r"none.fits: no such file"),
+    ]:
+        with pytest.raises(InputError, match=words):
+            read_mask(path, **arguments)
+
+
+def test_degrade_mask(rng):
+    mask = rng.random(NPIX) > 0.4
+    fraction = healpy.reorder(mask.astype(float), r2n=True).reshape(-1, 4).mean(axis=1)
+    for threshold in (0.25, 0.5, 1.0):
+        expected = healpy.reorder(fraction, n2r=True) >= threshold
+        np.testing.assert_array_equal(degrade_mask(mask, NSIDE // 2, threshold), expected)
+    for nside in (16, 3):
+        with pytest.raises(ValueError, match=f"power of 2 up to that of the mask, 8, not {nside}"):
+            degrade_mask(mask, nside)
+    with pytest.raises(ValueError, match=r"`threshold` must be within \(0, 1\], but is 0"):
+        degrade_mask(mask, 4, 0)
+
+
+def test_real_masks(data_dir):
+    path = data_dir / "masks" / "GAL_PlanckMasks_64.npz"
+    assert read_mask(path, key="GAL040").mean() == pytest.approx(0.4, abs=0.01)
+    path = data_dir / "wmap7" / "wmap_temperature_analysis_mask_r9_7yr_v4_udgraded32.fits"
+    assert 0.5 < read_mask(path, nside=32).mean() < 0.8
+
+
+# Units
+
+
+def test_unit_names():
+    spellings = {
+        "uK_RJ": ["uK_RJ", "uK RJ", "muK_rj", "\u03bcK_A", "microK_RJ", "uKantenna"],
+        "K_CMB": ["K_CMB", "Kcmb", "K CMB", "K_cmb", "K,thermodynamic", "KCMB"],
+        "mK_CMB^2": ["mK_CMB^2", "(mK_CMB)^2", "mKcmb**2", "mK_CMB2"],
+        "MJy/sr": ["MJy/sr", "MJy sr-1", "MJy sr^-1", "Mjy/sr", "MJy / sr", "MJy.sr-1"],
+        "MJy/sr^2": ["(MJy/sr)^2", "MJy2 / sr2"],
+        "mK": ["mK"],
+        "": ["", "1", "n/a", "dimensionless"],
+        "GHz": ["GHz"],
+    }
+    for name, texts in spellings.items():
+        assert {unit_name(text) for text in texts} == {name}
+    for text in ("K_BANANA", "MK_CMB", "counts of sheep"):
+        with pytest.raises(ValueError, match="Unknown unit"):
+            unit_name(text)
+
+
+def test_quantities():
+    band = Bandpass.top_hat(353.0, 80.0)
+    assert from_quantity(353 * u.GHz, "GHz") == 353
+    assert from_quantity([1.0, 2.0] * u.deg, "arcmin").tolist() == [60, 120]
+    assert from_quantity(20000 * u.mK, "K") == pytest.approx(20)
+    assert from_quantity(2 * pu.uK_CMB, "K_CMB") == pytest.approx(2e-6)
+    assert from_quantity(1 * pu.MJy / pu.sr, "kJy/sr") == pytest.approx(1e3)
+    # The CMB temperatures differ: 2.72548 K here, 2.7255 K in PySM.
+    peer = (1 * pu.K_CMB).to("uK_RJ", equivalencies=pu.cmb_equivalencies(353 * u.GHz)).value
+    for at in (353.0, 0.353 * u.THz):
+        assert from_quantity(1 * pu.K_CMB, "uK_RJ", at=at) == pytest.approx(peer, rel=5e-5)
+    expected = float(band.conversion("K_CMB", "MJy/sr", 353.0))
+    factor = from_quantity(1 * pu.K_CMB, "MJy/sr", at=band, nu_ref=353.0)
+    assert factor == pytest.approx(expected, rel=1e-12)
+    assert unit_factor("K_CMB^2", "mK_CMB^2") == pytest.approx(1e6)
+
+
+def test_bad_quantities():
+    with pytest.raises(TypeError, match="`quantity` must carry a unit, but is float"):
+        from_quantity(353.0, "GHz")
+    for quantity, unit, words in [
+        (1 * pu.K_CMB, "K_RJ", "'K_CMB' to 'K_RJ' depends on frequency; give `at`"),
+        (1 * u.K, "K_RJ", "'K' does not convert to 'K_RJ'; say K_CMB or K_RJ"),
+        (1 * u.GHz, "arcmin", "'GHz' does not convert to 'arcmin'"),
+        (1 * pu.K_CMB**2, "K_CMB", "does not convert to 'K_CMB'"),
+    ]:
+        with pytest.raises(ValueError, match=words):
+            from_quantity(quantity, unit)

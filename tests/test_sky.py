@@ -1,0 +1,132 @@
+"""Skies, parameters by name, and what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import systems
+from jaxsky import (
+    Bandpass,
+    Dust,
+    Sky,
+    Synchrotron,
+    get_parameters,
+    observe,
+    observe_band,
+    parameter_names,
+    set_parameters,
+)
+
+
+def test_one_band_is_a_row_of_a_list():
+    sky, bands = systems.dust_and_synchrotron(), systems.bands()
+    seen = observe(sky, bands)
+    assert seen.shape == (2, 2, systems.NPIX)
+    np.testing.assert_allclose(observe_band(sky, bands[1]), seen[1], rtol=1e-14)
+
+
+def test_nothing_is_special_at_the_reference_frequency():
+    sky = Sky({"dust": Dust(systems.random_maps(1), nu_ref=545.0)})
+    at = observe_band(sky, Bandpass.delta(545.0))
+    near = observe_band(sky, Bandpass.delta(545.0 * (1 + 1e-9)))
+    np.testing.assert_allclose(at, sky["dust"].amplitude, rtol=1e-14)
+    np.testing.assert_allclose(near, at, rtol=1e-8)
+
+
+def test_names_follow_the_tree():
+    sky = Sky({"a": systems.components()["two_body_dust"], "b": Synchrotron(np.ones((2, 48)))})
+    names = parameter_names(sky)
+    assert {"a.beta_dust.0", "a.T_dust.1", "a.E_dust.0", "a.nu_pivot", "b.beta_syn"} <= set(names)
+
+
+def test_set_and_get_are_inverse_and_leave_the_original():
+    sky = systems.dust_and_synchrotron()
+    values = {"dust.beta_dust": 1.7, "synchrotron.beta_syn": systems.spread(3.0, 0.1)}
+    changed = set_parameters(sky, values)
+    for name, value in get_parameters(changed, values).items():
+        np.testing.assert_array_equal(value, values[name])
+    assert float(sky["dust"].beta_dust) == 1.53
+
+
+def test_offset_shifts_a_map_as_a_whole():
+    beta = systems.spread(1.5, 0.1)
+    sky = Sky({"dust": Dust(systems.random_maps(1), beta)})
+    moved = set_parameters(sky, {"dust.beta_dust.offset": 0.05})
+    np.testing.assert_allclose(moved["dust"].beta_dust, beta + 0.05)
+
+
+def test_a_dictionary_of_parameters_can_be_differentiated():
+    sky, bands = systems.dust_and_synchrotron(), systems.bands()
+
+    def loss(params):
+        return jnp.sum(observe(set_parameters(sky, params), bands) ** 2)
+
+    params = {"dust.beta_dust": jnp.asarray(1.6), "synchrotron.beta_syn": jnp.asarray(3.0)}
+    gradient = jax.grad(loss)(params)
+    step = 1e-6
+    for name in params:
+        up, down = ({**params, name: params[name] + s} for s in (step, -step))
+        assert float(gradient[name]) == pytest.approx(
+            float(loss(up) - loss(down)) / (2 * step), rel=1e-6
+        )
+
+
+def test_unknown_names_are_answered_with_the_known_ones():
+    sky = systems.dust_and_synchrotron()
+    for call in (
+        lambda: get_parameters(sky, ["dust.beta"]),
+        lambda: set_parameters(sky, {"dust.beta": 1.5}),
+        lambda: set_parameters(sky, {"dust.beta.offset": 1.5}),
+    ):
+        with pytest.raises(KeyError, match=r"Unknown parameter 'dust\.beta.*dust\.beta_dust, dust"):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda s: Sky({}), ValueError, "at least one component"),
+        (lambda s: Sky({"dust": np.ones(3)}), TypeError, "'dust' must be a jaxsky Component"),
+        (
+            lambda s: Sky({"a": s["dust"], "b": Dust(np.ones((2, 12)))}),
+            ValueError,
+            r"share one shape \(stokes, pix\), but have .*\(2, 12\)",
+        ),
+        (
+            lambda s: observe(s, Bandpass.delta(30.0)),
+            TypeError,
+            "a list of Bandpass; .*observe_band",
+        ),
+        (
+            lambda s: observe(s, [30.0]),
+            TypeError,
+            "Entry 0 of `bands` must be a Bandpass, not float",
+        ),
+        (lambda s: observe(s, []), ValueError, "at least one band"),
+        (
+            lambda s: set_parameters(s, {"dust.beta_dust": np.ones(5)}),
+            ValueError,
+            r"'dust.beta_dust' must be a number or of shape \(48,\), but has shape \(5,\)",
+        ),
+        (
+            lambda s: set_parameters(s, {"dust.amplitude": 1.0}),
+            ValueError,
+            r"'dust.amplitude' must be shape \(2, 48\)",
+        ),
+    ],
+)
+def test_bad_arguments_are_refused(call, error, words):
+    with pytest.raises(error, match=words):
+        call(systems.dust_and_synchrotron())
+
+
+def test_importing_jaxsky_touches_neither_healpy_nor_precision():
+    import subprocess
+    import sys
+
+    code = (
+        "import sys, jax, jaxsky; assert not {'healpy', 'astropy'} & set(sys.modules);"
+        "assert not jax.config.read('jax_enable_x64')"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

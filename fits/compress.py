@@ -50,6 +50,7 @@ def gram(
         rows = jnp.where(w[:, :, None] > 0, rows, 0)
         return jnp.einsum("bsip,bsp,bsjp->bsij", rows, w, rows)
 
+    chunk = min(chunk, npix)
     whole = npix // chunk * chunk
 
     def add(total, start):

@@ -23,6 +23,8 @@ class Fluctuations(eqx.Module):
     ----------
     preparations : operator with which each band was brought to the common resolution
     noise : for each band, covariance of Q and U in each pixel before that [uK_RJ^2]
+    correlated : for each band, C_l of noise that is correlated between pixels, the same for E and
+        B, in the prepared maps [uK_RJ^2], shape (ell,); None where there is none
     cmb_spectra : C_l of EE and BB times the window of the prepared maps squared [uK_CMB^2],
         shape (2, ell); None without CMB
     cmb_factors : uK_RJ per uK_CMB in each band, shape (band,)
@@ -30,6 +32,7 @@ class Fluctuations(eqx.Module):
 
     preparations: tuple[Preparation, ...]
     noise: tuple[Float[Array, "stokes stokes pix"], ...]
+    correlated: tuple[Float[Array, " ell"] | None, ...]
     cmb_spectra: Float[Array, "stokes ell"] | None
     cmb_factors: Float[Array, " band"]
 
@@ -42,25 +45,39 @@ class Fluctuations(eqx.Module):
         for b, (preparation, noise) in enumerate(zip(self.preparations, self.noise, strict=True)):
             before = jnp.stack([preparation.transpose(row) for row in rows[b]])
             block = jnp.einsum("isp,stp,jtp->ij", before, noise, before)
+            if self.correlated[b] is not None:
+                modes = _modes(rows[b], jnp.stack([self.correlated[b]] * 2))
+                block = block + modes @ modes.T
             total = total.at[b, :, b, :].add(block)
         total = total.reshape(bands * count, bands * count)
-        if self.cmb_spectra is None:
-            return total
-        lmax = self.cmb_spectra.shape[-1] - 1
-        root = jnp.sqrt(self.cmb_spectra)[:, alm_ell(lmax)]
-        modes = jnp.stack(
-            [
-                factor * (root * adjoint_synthesis(row, lmax)).ravel()
-                for factor, band in zip(self.cmb_factors, rows, strict=True)
-                for row in band
-            ]
-        )
-        return total + modes @ modes.T
+        if self.cmb_spectra is not None:
+            modes = jnp.concatenate(
+                [
+                    factor * _modes(band, self.cmb_spectra)
+                    for factor, band in zip(self.cmb_factors, rows, strict=True)
+                ]
+            )
+            total = total + modes @ modes.T
+        return total
 
     def sigma(self) -> Float[Array, "band stokes pix"]:
         """Standard deviation of the noise in each pixel of the prepared maps [uK_RJ]."""
-        variances = [
-            preparation.variance(jnp.diagonal(noise, axis1=0, axis2=1).T)
-            for preparation, noise in zip(self.preparations, self.noise, strict=True)
-        ]
+        variances = []
+        for preparation, noise, spectrum in zip(
+            self.preparations, self.noise, self.correlated, strict=True
+        ):
+            variance = preparation.variance(jnp.diagonal(noise, axis1=0, axis2=1).T)
+            if spectrum is not None:
+                modes = 2 * jnp.arange(spectrum.size) + 1
+                variance = variance + jnp.sum(modes * spectrum) / (4 * jnp.pi)
+            variances.append(variance)
         return jnp.sqrt(jnp.stack(variances))
+
+
+def _modes(
+    rows: Float[Array, "row stokes pix"], spectra: Float[Array, "stokes ell"]
+) -> Float[Array, "row mode"]:
+    """Rows as seen by independent modes of unit variance that have the spectra of E and B."""
+    lmax = spectra.shape[-1] - 1
+    root = jnp.sqrt(spectra)[:, alm_ell(lmax)]
+    return jnp.stack([(root * adjoint_synthesis(row, lmax)).ravel() for row in rows])

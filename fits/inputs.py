@@ -7,9 +7,6 @@ import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxsky.galaxy import embedded_sky
-from jaxsky.instrument import load_instrument
-from jaxsky.io import Maps, read_bandpass, read_maps
 from jaxtyping import Array, Bool, Float
 
 from fits.settings import Band as BandSettings
@@ -29,8 +26,17 @@ from jaxsky import (
     set_parameters,
 )
 from jaxsky.cmb import camb_spectra, realisation
+from jaxsky.galaxy import embedded_sky
 from jaxsky.harmonics import gaussian_beam, resample, synthesis
-from jaxsky.noise import draw, estimate_variance, uniform_covariance
+from jaxsky.instrument import load_instrument
+from jaxsky.io import Maps, read_bandpass, read_maps
+from jaxsky.noise import (
+    draw,
+    estimate_variance,
+    fit_knee,
+    knee_spectrum,
+    uniform_covariance,
+)
 from jaxsky.units import conversion
 
 __all__ = ["Band", "Inputs", "Template", "embedded_inputs", "read_inputs"]
@@ -47,13 +53,18 @@ class Template(NamedTuple):
 
 
 class Band(NamedTuple):
-    """Observed Q and U [uK_RJ] of a band at the resolution of the map."""
+    """Observed Q and U [uK_RJ] of a band at the resolution of the map.
+
+    `noise` is the covariance of Q and U in each pixel, `correlated` the spectrum of noise
+    beyond that, if there is any [uK_RJ^2].
+    """
 
     maps: Float[Array, "stokes pix"]
     used: Bool[np.ndarray, " pix"]
     bandpass: Bandpass
     fwhm: float
     noise: Float[Array, "stokes stokes pix"]
+    correlated: Float[Array, " ell"] | None = None
 
 
 class Inputs(NamedTuple):
@@ -200,21 +211,33 @@ def _read_band(folder: Path, spec: BandSettings) -> Band:
     bandpass = _bandpass(folder, spec.bandpass)
     factor = bandpass.conversion(read.unit, "uK_RJ")
     maps, used = jnp.asarray(read.maps[-2:]) * factor, np.asarray(read.mask)
-    noise, known = _noise(folder, spec, read, maps, used, factor, bandpass)
+    if spec.noise.estimate_above is not None:
+        noise, correlated = _estimated_noise(spec.noise, maps, used)
+        return Band(maps, used, bandpass, spec.fwhm, noise, correlated)
+    noise, known = _given_noise(folder, spec, maps, factor, bandpass)
     return Band(jnp.where(known, maps, 0), used & known, bandpass, spec.fwhm, noise)
 
 
-def _noise(folder, spec, read, maps, used, factor, bandpass):
+def _estimated_noise(noise, maps, used):
+    """Covariance of Q and U in each pixel and spectrum of the rest, from the maps themselves."""
+    nside, npix = healpy.npix2nside(maps.shape[-1]), maps.shape[-1]
+    latitude = healpy.pix2ang(nside, np.arange(npix), lonlat=True)[1]
+    quiet = used & (np.abs(latitude) >= noise.estimate_above)
+    if not noise.correlated:
+        variance = estimate_variance(maps, quiet)
+        return jnp.eye(2)[..., None] * variance[:, None, None] * jnp.ones(npix), None
+    white, knee, slope = fit_knee(maps, quiet, 2 * nside)
+    covariance = jnp.eye(2)[..., None] * jnp.full(npix, white / healpy.nside2pixarea(nside))
+    excess = knee_spectrum(white, knee, slope, 3 * nside - 1) - white
+    return covariance, excess.at[:2].set(0.0)
+
+
+def _given_noise(folder, spec, maps, factor, bandpass):
     """Covariance of Q and U in each pixel [uK_RJ^2], and where it is known."""
     npix = maps.shape[-1]
     noise, eye = spec.noise, jnp.eye(2)[..., None]
-    known = np.ones(npix, bool)
     if noise.rms is not None:
-        return eye * jnp.full(npix, (noise.rms * factor) ** 2), known
-    if noise.estimate_above is not None:
-        latitude = healpy.pix2ang(read.nside, np.arange(npix), lonlat=True)[1]
-        variance = estimate_variance(maps, used & (np.abs(latitude) >= noise.estimate_above))
-        return eye * variance[:, None, None] * jnp.ones(npix), known
+        return eye * jnp.full(npix, (noise.rms * factor) ** 2), np.ones(npix, bool)
     if noise.map is not None:
         rms = _read(folder, noise.map)
         known = np.asarray(rms.mask)

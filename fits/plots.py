@@ -102,17 +102,28 @@ def plot_grids(
             squeeze=False,
             layout="constrained",
         )
+        x, y = with_grid[0].results["grid"].free
+        limits = {"xlim": _limits(with_grid, x), "ylim": _limits(with_grid, y)}
         for row, (region, members) in zip(axes, regions.items(), strict=True):
             for axis in row[len(members) :]:
                 axis.set_visible(False)
             for axis, fit in zip(row, members, strict=False):
                 _grid_panel(axis, fit.results["grid"], truth)
+                axis.set(**limits)
                 axis.set_title(f"{region}, {' + '.join(fit.stokes)}")
         handles, labels = axes[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
         figure.suptitle(title, fontsize=9)
         _save(figure, path)
     return True
+
+
+def _limits(fits: Sequence[Fit], name: str) -> tuple[float, float]:
+    """Range of a parameter that shows all fits to four standard deviations."""
+    results = [next(iter(fit.results.values())) for fit in fits]
+    low = min(r.best_fit[name] - 4 * r.sigma(name) for r in results)
+    high = max(r.best_fit[name] + 4 * r.sigma(name) for r in results)
+    return low, high
 
 
 def _grid_panel(axis: plt.Axes, result: FitResult, truth: Mapping[str, float] | None) -> None:
@@ -141,7 +152,6 @@ def _samples(result: FitResult, name: str) -> MCSamples:
         names=list(result.free),
         labels=[label(n) for n in result.free],
         label=name,
-        settings={"smooth_scale_1D": -1, "smooth_scale_2D": -1, "ignore_rows": 0},
     )
 
 
@@ -184,7 +194,7 @@ def plot_marginals(
                 axis.set(ylim=(0, 1.12), ylabel="relative probability", title=region)
                 axis.xaxis.set_tick_params(labelbottom=True)
         for axis, name in zip(axes[-1], free, strict=True):
-            axis.set_xlabel(_tex(name))
+            axis.set(xlabel=_tex(name), xlim=_limits(fits, name))
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
         figure.suptitle(title, fontsize=9)
@@ -231,6 +241,6 @@ def plot_posterior(
         marker_args={"color": TRUTH["color"], "lw": TRUTH["linewidth"], "ls": "-"},
     )
     plotter.fig.suptitle(title, fontsize=8, y=1.03)
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(STYLE | {"savefig.dpi": 200}):
         _save(plotter.fig, path)
     return True

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.table import Table
 
 from fits import plots
@@ -16,8 +17,10 @@ from fits.inputs import Inputs
 from fits.settings import Settings
 from fits.spectral_index import Fit
 
-__all__ = ["result_table", "write_report"]
+__all__ = ["result_table", "warnings", "write_report"]
 
+#: A fit with a smaller probability to exceed its chi^2 is pointed out.
+UNLIKELY = 0.01
 PACKAGES = ("jaxsky", "jax", "numpy", "healpy", "optimistix", "emcee", "getdist", "camb", "ducc0")
 
 
@@ -41,7 +44,11 @@ def _result(fit: Fit, method: str) -> dict[str, Any]:
         "message": result.message,
     }
     if fit.dof_amplitudes is not None:
-        numbers |= {"chi2_amplitudes": result.chi2, "dof_amplitudes": fit.dof_amplitudes}
+        numbers |= {
+            "chi2_amplitudes": result.chi2,
+            "dof_amplitudes": fit.dof_amplitudes,
+            "pte_amplitudes": fit.probability_to_exceed(method),
+        }
     for key in ("tau", "acceptance", "discard", "steps"):
         if key in result.details:
             numbers[key] = result.details[key]
@@ -62,24 +69,55 @@ def result_json(inputs: Inputs, settings: Settings, fits: Sequence[Fit]) -> dict
     }
 
 
+def _with_errors(best: float, low: float, high: float) -> str:
+    """A value with its interval as differences, to two digits of the smaller one."""
+    smaller = min(abs(high - best), abs(best - low))
+    usable = np.isfinite(smaller) and smaller > 0
+    digits = max(0, 1 - int(np.floor(np.log10(smaller)))) if usable else 4
+    return f"{best:.{digits}f} {low - best:+.{digits}f} {high - best:+.{digits}f}"
+
+
+def _short_names(names: Sequence[str]) -> list[str]:
+    """Names without their component where that leaves them different."""
+    short = [name.split(".", 1)[1] for name in names]
+    return [s if short.count(s) == 1 else name for name, s in zip(names, short, strict=True)]
+
+
 def result_table(fits: Sequence[Fit]) -> Table:
     """The best fits and 68 % intervals for the terminal."""
     free = next(iter(fits[0].results.values())).free
     table = Table(caption="best fit and central 68 % interval; chi2 is the sum over pixels")
-    for column in ("region", "Stokes", "method", *free, "chi2 / dof"):
-        table.add_column(column, justify="left" if column == "region" else "right")
+    for column in ("region", "Stokes", "method"):
+        table.add_column(column)
+    for column in (*_short_names(free), "chi2/dof"):
+        table.add_column(column, justify="right", overflow="fold")
     for fit in fits:
         for method, result in fit.results.items():
-            cells = []
-            for name in free:
-                low, high = result.interval_68[name]
-                best = result.best_fit[name]
-                cells.append(f"{best:.4g} [{low:.4g}, {high:.4g}]")
+            cells = [_with_errors(result.best_fit[n], *result.interval_68[n]) for n in free]
             mark = "" if result.converged else " (!)"
-            chi2 = f"{fit.chi2[method]:.0f} / {fit.dof}"
+            chi2 = f"{fit.chi2[method] / fit.dof:.3f}"
             table.add_row(fit.region, fit.stokes, method + mark, *cells, chi2)
         table.add_section()
     return table
+
+
+def warnings(fits: Sequence[Fit]) -> list[str]:
+    """What a user should know before using the numbers, a sentence each."""
+    sentences = []
+    for fit in fits:
+        where = f"{fit.region}, {fit.stokes}"
+        for method, result in fit.results.items():
+            if not result.converged:
+                sentences.append(f"{where}, {method}: {result.message}")
+        method, result = next(iter(fit.results.items()))
+        probability = fit.probability_to_exceed(method)
+        if probability is not None and probability < UNLIKELY:
+            sentences.append(
+                f"{where}: the model does not fit the amplitudes of the templates (chi2 "
+                f"{result.chi2:.1f} for {fit.dof_amplitudes} degrees of freedom, probability "
+                f"{probability:.1g}); its errors are too small."
+            )
+    return sentences
 
 
 def write_report(
@@ -96,7 +134,7 @@ def write_report(
         "marginals.png": plots.plot_marginals,
         "posterior.png": plots.plot_posterior,
     }.items():
-        if plot(out / name, fits, inputs.truth, inputs.description):
+        if plot(out / name, fits, inputs.truth, settings.title):
             written.append(out / name)
     log = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -1,5 +1,6 @@
 """Posterior samples with emcee: vectorised, stored in HDF5, resumable."""
 
+import copy
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -36,8 +37,8 @@ class ChainFile(emcee.backends.HDFBackend):
 
     def save_step(self, state: Any, accepted: np.ndarray) -> None:
         """Keep a step, and write when enough have come together."""
-        self._check(state, accepted)
-        self._pending.append((state, accepted))
+        # emcee goes on to change the arrays of the state it hands over.
+        self._pending.append((copy.deepcopy(state), accepted.copy()))
         if len(self._pending) >= self.every:
             self.flush()
 
@@ -168,7 +169,7 @@ def sample(
 
 def _summary(sampler: emcee.EnsembleSampler, like: Likelihood, free: tuple[str, ...]) -> FitResult:
     chain, log_prob = sampler.get_chain(), sampler.get_log_prob()
-    tau = emcee.autocorr.integrated_time(chain, quiet=True)
+    tau = emcee.autocorr.integrated_time(chain, tol=0)
     worst = float(np.nanmax(tau)) if np.isfinite(tau).any() else float(len(chain))
     discard = min(int(np.ceil(2 * worst)), len(chain) // 2)
     thin = max(1, int(worst / 2))

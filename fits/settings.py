@@ -131,6 +131,7 @@ class Noise(_Table):
     map: MapFile | None = None
     covariance: tuple[str, str, str] | None = None
     estimate_above: float | None = Field(None, ge=0, lt=90)
+    correlated: bool = False
 
     @model_validator(mode="after")
     def _one_kind(self) -> "Noise":
@@ -144,6 +145,8 @@ class Noise(_Table):
                 "give the noise as exactly one of rms, map, covariance (columns QQ, QU, UU) or "
                 f"estimate_above (a latitude), not {', '.join(given) or 'none'}"
             )
+        if self.correlated and self.estimate_above is None:
+            raise ValueError("correlated goes with estimate_above only")
         return self
 
 
@@ -159,7 +162,7 @@ class Band(MapFile):
 class Embedded(_Table):
     """The embedded model of the Galaxy, observed with channels of an instrument."""
 
-    instrument: str = "Planck"
+    instrument: str = "planck"
     channels: list[str] = Field(["44", "70"], min_length=1)
     nside: int = Field(128, gt=0)
 

@@ -13,7 +13,7 @@ import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxsky.io import degrade_mask, read_mask
+import scipy.stats
 from jaxtyping import Array, Bool, Float
 
 from fits.covariance import Fluctuations
@@ -26,7 +26,8 @@ from fits.results import FitResult
 from fits.sample import ChainFile, sample
 from fits.settings import Settings, SettingsError, known_regions
 from jaxsky import Bandpass, Sky
-from jaxsky.harmonics import gaussian_beam
+from jaxsky.harmonics import gaussian_beam, pixel_window
+from jaxsky.io import degrade_mask, read_mask
 
 __all__ = ["Fit", "Prepared", "prepare", "region_masks", "run"]
 
@@ -59,6 +60,12 @@ class Fit(NamedTuple):
     chi2: dict[str, float]
     dof: int
     dof_amplitudes: int | None
+
+    def probability_to_exceed(self, method: str) -> float | None:
+        """Probability of a larger chi^2 of the amplitudes; None for the diagonal likelihood."""
+        if not self.dof_amplitudes:
+            return None
+        return float(scipy.stats.chi2.sf(self.results[method].chi2, self.dof_amplitudes))
 
 
 def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
@@ -112,11 +119,28 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
         beams = [fwhm] if fwhm else [b.fwhm for b in inputs.bands.values()]
         window = gaussian_beam(max(beams), lmax)
         if not fwhm:
-            window = window * healpy.pixwin(nside, lmax=lmax)
+            window = window * pixel_window(nside, lmax)
         spectra = jnp.asarray(inputs.cmb)[1:3, : lmax + 1] * window**2
     noise = tuple(band.noise for band in inputs.bands.values())
-    fluctuations = Fluctuations(preparations, noise, spectra, factors)
+    correlated = tuple(
+        _prepared_spectrum(band.correlated, op, lmax)
+        for op, band in zip(preparations, inputs.bands.values(), strict=True)
+    )
+    fluctuations = Fluctuations(preparations, noise, correlated, spectra, factors)
     return Prepared(sky, bandpasses, data, fluctuations.sigma(), used, fluctuations)
+
+
+def _prepared_spectrum(
+    spectrum: Float[Array, " ell"] | None, preparation: Preparation, lmax: int
+) -> Float[Array, " ell"] | None:
+    """Spectrum of a prepared map, from that before."""
+    if spectrum is None:
+        return None
+    window = preparation.window
+    if window is None:
+        pixels = pixel_window(preparation.nside, lmax) / pixel_window(preparation.nside_in, lmax)
+        window = jnp.asarray(pixels)
+    return spectrum[: lmax + 1] * window**2
 
 
 def region_masks(settings: Settings) -> dict[str, Bool[np.ndarray, " pix"]]:

@@ -88,12 +88,8 @@ def fit(
         seconds = time.perf_counter() - started
         written = report.write_report(out, inputs, settings, fits, seconds)
     Console().print(report.result_table(fits))
-    for one in fits:
-        for method, result in one.results.items():
-            if not result.converged:
-                console.print(
-                    f"[yellow](!)[/] {one.region}, {one.stokes}, {method}: {result.message}"
-                )
+    for sentence in report.warnings(fits):
+        console.print(f"[yellow](!)[/] {sentence}", highlight=False)
     console.print("Written: " + ", ".join(map(str, [*written, chains])), highlight=False)
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from astropy.io import fits as pyfits
 from jaxbind.contrib.jaxducc0 import get_healpix_sht
 from jaxtyping import Array, ArrayLike, Float
+from scipy.special import j1
 
 __all__ = [
     "adjoint_synthesis",
@@ -29,6 +30,7 @@ __all__ = [
     "average_pixels",
     "children",
     "gaussian_beam",
+    "pixel_window",
     "resample",
     "synthesis",
 ]
@@ -72,6 +74,17 @@ def gaussian_beam(fwhm: ArrayLike, lmax: int) -> Float[Array, " ell"]:
     sigma = jnp.deg2rad(jnp.asarray(fwhm) / 60) / math.sqrt(8 * math.log(2))
     ell = jnp.arange(lmax + 1)
     return jnp.exp(-ell * (ell + 1) * sigma**2 / 2)
+
+
+def pixel_window(nside: int, lmax: int) -> Float[np.ndarray, " ell"]:
+    """Window of averaging over pixels, that of a disc of the pixel's area, 2 J_1(x)/x.
+
+    healpy has its own tables, but fetches them over the network.
+    """
+    x = np.sqrt(np.arange(lmax + 1) * np.arange(1, lmax + 2)) * math.sqrt(
+        healpy.nside2pixarea(nside) / np.pi
+    )
+    return np.where(x > 0, 2 * j1(x) / np.where(x > 0, x, 1), 1.0)
 
 
 @cache

@@ -3,11 +3,20 @@
 import healpy
 import jax
 import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from jaxsky.harmonics import children
+from jaxsky.harmonics import alm_ell, analysis, children
 
-__all__ = ["cholesky", "draw", "estimate_variance", "uniform_covariance"]
+__all__ = [
+    "cholesky",
+    "draw",
+    "estimate_variance",
+    "fit_knee",
+    "knee_spectrum",
+    "uniform_covariance",
+]
 
 
 def uniform_covariance(
@@ -75,3 +84,54 @@ def estimate_variance(
         raise ValueError("Estimating the noise needs groups of four pixels that are all used.")
     scatter = jnp.var(children(maps, nside // 2), axis=-1, ddof=1)
     return jnp.sum(scatter * whole, axis=-1) / jnp.sum(whole)
+
+
+def knee_spectrum(white: float, ell_knee: float, slope: float, lmax: int) -> Float[Array, " ell"]:
+    """Noise with a white level and excess at large scales, N_l = white [1 + (l/l_knee)^-slope].
+
+    Zero at l < 2, where polarization has no modes.
+    """
+    ell = jnp.arange(2, lmax + 1)
+    return jnp.concatenate([jnp.zeros(2), white * (1 + (ell / ell_knee) ** -slope)])
+
+
+def fit_knee(
+    maps: Float[Array, "stokes pix"], used: Bool[Array, " pix"], lmax: int
+) -> tuple[float, float, float]:
+    """White level, knee and slope (`knee_spectrum`) of the noise of Q, U maps.
+
+    The most probable values given the spectrum (EE + BB)/2 of the masked maps divided by the
+    fraction of the sky, whose values are taken as independent between multipoles. Whatever the
+    sky itself shows in these pixels counts as noise.
+
+    Parameters
+    ----------
+    maps : Q and U, RING
+    used : pixels to use; the fewer, the coarser the estimate
+    lmax : largest multipole to use
+
+    Raises
+    ------
+    ValueError
+        If no pixel is left, or the fit does not converge.
+    """
+    fraction = float(np.mean(used))
+    if not fraction:
+        raise ValueError("Estimating the noise needs pixels, but none is left.")
+    alm = np.asarray(analysis(jnp.where(used, maps, 0.0), lmax))
+    degree = alm_ell(lmax)
+    power = np.bincount(degree, (alm**2).sum(axis=0)) / (2 * (2 * np.arange(lmax + 1) + 1))
+    measured = jnp.asarray(power[2:] / fraction)
+    modes = 2 * (2 * jnp.arange(2, lmax + 1) + 1) * fraction
+    level = jnp.median(measured[-lmax // 4 :])
+
+    def deviance(theta, _):
+        spectrum = knee_spectrum(level * jnp.exp(theta[0]), *jnp.exp(theta[1:]), lmax)[2:]
+        return jnp.sum(modes * (jnp.log(spectrum / level) + measured / spectrum))
+
+    start = jnp.log(jnp.array([1.0, 10.0, 1.5]))
+    solution = optx.minimise(deviance, optx.BFGS(1e-6, 1e-6), start, max_steps=500, throw=False)
+    if solution.result != optx.RESULTS.successful:
+        raise ValueError("The spectrum of the noise could not be fitted.")
+    white, knee, slope = np.exp(np.asarray(solution.value))
+    return float(level * white), float(knee), float(slope)

@@ -1,23 +1,18 @@
-"""Files in and out: conventions, round trips, and a sentence for everything that is wrong."""
+"""Maps and masks in and out: conventions, round trips, a sentence for whatever is wrong."""
 
 import gzip
 
 import healpy
 import numpy as np
-import pysm3.units as pu
 import pytest
-from astropy import units as u
 from astropy.io import fits as pyfits
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.io import (
     InputError,
     degrade_mask,
-    from_quantity,
     read_maps,
     read_mask,
-    unit_factor,
-    unit_name,
     write_maps,
 )
 
@@ -28,7 +23,7 @@ PLANCK = ["I_STOKES", "Q_STOKES", "U_STOKES", "HITS", "II_COV", "IQ_COV", "IU_CO
 PLANCK += ["QQ_COV", "QU_COV", "UU_COV"]
 
 
-def save(path, columns, units=None, hdus=(), **header):
+def save(path, columns, units=None, before=(), **header):
     """A FITS table as the archives have it; header=None leaves a keyword out."""
     units = units or {}
     cols = [
@@ -36,7 +31,7 @@ def save(path, columns, units=None, hdus=(), **header):
     ]
     table = pyfits.BinTableHDU.from_columns(cols)
     table.header.update({k: v for k, v in (HEADER | header).items() if v is not None})
-    pyfits.HDUList([pyfits.PrimaryHDU(), table, *hdus]).writeto(path)
+    pyfits.HDUList([pyfits.PrimaryHDU(), *before, table]).writeto(path)
     return path
 
 
@@ -119,9 +114,16 @@ def test_bad_data_and_not_finite_are_masked(tmp_path):
     read = read_maps(path)
     assert (~read.mask).nonzero()[0].tolist() == [0, 1, 2, 3]
     assert read.maps[0].sum() == NPIX - 4
-    empty = save(tmp_path / "e.fits", {"I": 0 * values + np.nan}, {"I": "uK_RJ"})
+    empty = save(tmp_path / "e.fits", {"I": np.full(NPIX, np.nan)}, {"I": "uK_RJ"})
     with pytest.raises(InputError, match=r"e.fits.*no pixel has values in I"):
         read_maps(empty)
+
+
+def test_maps_in_another_hdu(tmp_path):
+    other = pyfits.BinTableHDU.from_columns([pyfits.Column(name="I", format="D", array=[1.0])])
+    path = save(tmp_path / "m.fits", {"I": np.ones(NPIX)}, {"I": "K_CMB"}, before=[other])
+    assert read_maps(path, hdu=2).maps.sum() == NPIX
+    assert read_mask(path, hdu=2).all()
 
 
 def test_partial_map_with_explicit_pixels(tmp_path, rng):
@@ -137,10 +139,10 @@ def test_partial_map_with_explicit_pixels(tmp_path, rng):
 
 def celestial(rng, nside, lmax):
     """A band-limited sky, I, Q, U and a scalar, in Celestial and in Galactic coordinates."""
-    ell = np.arange(lmax + 1.0)
-    spectrum = 1 / (1 + ell) ** 2
-    np.random.seed(int(rng.integers(1 << 30)))
-    alm = healpy.synalm([spectrum] * 3 + [0 * spectrum] * 3, lmax=lmax, new=True)
+    ell, m = healpy.Alm.getlm(lmax)
+    alm = rng.normal(size=(2, 3, ell.size)) / (1 + ell) ** 1.5
+    alm = alm[0] + 1j * np.where(m > 0, alm[1], 0)
+    alm[1:, ell < 2] = 0
     turned = healpy.Rotator(coord=["C", "G"]).rotate_alm(alm)
     return healpy.alm2map(alm, nside), healpy.alm2map(turned, nside)
 
@@ -152,7 +154,9 @@ def test_coordinates_are_turned_with_spin_two(tmp_path, rng):
     read = read_maps(path)
     assert np.abs(read.maps - expected).max() < 1e-6 * np.abs(expected).max()
     assert read.mask.all()
-    pair = read_maps(path, fields=["Q_POLARISATION", "U_POLARISATION"])
+    silent = tmp_path / "silent.fits"
+    healpy.write_map(silent, source[1:], column_units="uK_RJ", dtype=np.float64)
+    pair = read_maps(silent, fields=[0, 1], coordinates="equatorial")
     np.testing.assert_allclose(pair.maps, read.maps[1:], atol=1e-12)
 
 
@@ -190,7 +194,7 @@ def test_units_of_each_column_survive(tmp_path):
     path = tmp_path / "parameters.fits.gz"
     names, unit = ["beta_dust", "T_dust"], ["", "K"]
     write_maps(path, np.ones((2, NPIX)), names=names, unit=unit)
-    assert gzip.open(path).read(6) == b"SIMPLE"
+    assert gzip.decompress(path.read_bytes()).startswith(b"SIMPLE")
     assert read_maps(path, fields="beta_dust").unit == ""
     assert read_maps(path, fields="T_dust", unit="K").unit == "K"
 
@@ -253,6 +257,7 @@ GOOD = {"unit": "uK_CMB", "coordinates": "G"}
         ({"ordering": "spiral"}, "`ordering` must be one of RING, NESTED, not 'spiral'"),
         ({"nside": 16}, "nside is 8, but 16 is expected"),
         ({"fields": "Q_ML"}, "no column 'Q_ML'; it has I_STOKES, Q_STOKES, U_STOKES"),
+        ({"fields": []}, "`fields` is empty"),
         ({"fields": 3}, "no column 3; it has I_STOKES"),
         ({"hdu": 2}, r"no HDU 2; it has 0 \(PRIMARY\), 1"),
         ({"hdu": "COV"}, "no HDU 'COV'"),
@@ -304,6 +309,10 @@ def test_files_that_are_no_maps(tmp_path, bare):
     odd = save(tmp_path / "odd.fits", {"I": np.ones(100)}, NSIDE=None)
     with pytest.raises(InputError, match="its columns have 100 values"):
         read_maps(odd, unit="K_RJ")
+    cut = tmp_path / "cut.fits.gz"
+    cut.write_bytes(gzip.compress(bare.read_bytes())[:-2000])
+    with pytest.raises(InputError, match=r"cut.fits.gz.*truncated"):
+        read_maps(cut, **GOOD)
     two = save(tmp_path / "two.fits", {"A": np.ones(NPIX), "B": np.ones(NPIX)})
     with pytest.raises(InputError, match="no column is named as I, Q or U; give `fields` out of"):
         read_maps(two, unit="K_RJ")
@@ -311,7 +320,7 @@ def test_files_that_are_no_maps(tmp_path, bare):
     for length in (100, 2880, 3500, 6000, len(whole) - 2881, len(whole) - 1):
         cut = tmp_path / "cut.fits"
         cut.write_bytes(whole[:length])
-        with pytest.raises(InputError, match=r"cut.fits.*(truncated|no HDU 1)"):
+        with pytest.raises(InputError, match=r"cut.fits.*truncated"):
             read_maps(cut, **GOOD)
         assert cut.read_bytes() == whole[:length]
 
@@ -354,7 +363,7 @@ def test_bad_masks(tmp_path):
     (tmp_path / "bad.npz").write_bytes(b"PK not really")
     for path, arguments, words in [
         (half, {}, r"h.fits: a mask has values 0 and 1, but 768 of 768 pixels have others"),
-        (two, {}, r"no column is named .* out of A, B"),
+        (two, {}, r"no column is named .* give `key` out of A, B"),
         (two, {"key": "C"}, "no column 'C'; it has A, B"),
         (two, {"key": "A"}, "no ORDERING; give `ordering`"),
         (two, {"key": "B", "ordering": "RING"}, r"two.fits: the mask leaves no pixel"),
@@ -389,54 +398,3 @@ def test_real_masks(data_dir):
     assert read_mask(path, key="GAL040").mean() == pytest.approx(0.4, abs=0.01)
     path = data_dir / "wmap7" / "wmap_temperature_analysis_mask_r9_7yr_v4_udgraded32.fits"
     assert 0.5 < read_mask(path, nside=32).mean() < 0.8
-
-
-# Units
-
-
-def test_unit_names():
-    spellings = {
-        "uK_RJ": ["uK_RJ", "uK RJ", "muK_rj", "\u03bcK_A", "microK_RJ", "uKantenna"],
-        "K_CMB": ["K_CMB", "Kcmb", "K CMB", "K_cmb", "K,thermodynamic", "KCMB"],
-        "mK_CMB^2": ["mK_CMB^2", "(mK_CMB)^2", "mKcmb**2", "mK_CMB2"],
-        "MJy/sr": ["MJy/sr", "MJy sr-1", "MJy sr^-1", "Mjy/sr", "MJy / sr", "MJy.sr-1"],
-        "MJy/sr^2": ["(MJy/sr)^2", "MJy2 / sr2"],
-        "mK": ["mK"],
-        "": ["", "1", "n/a", "dimensionless"],
-        "GHz": ["GHz"],
-    }
-    for name, texts in spellings.items():
-        assert {unit_name(text) for text in texts} == {name}
-    for text in ("K_BANANA", "MK_CMB", "counts of sheep"):
-        with pytest.raises(ValueError, match="Unknown unit"):
-            unit_name(text)
-
-
-def test_quantities():
-    band = Bandpass.top_hat(353.0, 80.0)
-    assert from_quantity(353 * u.GHz, "GHz") == 353
-    assert from_quantity([1.0, 2.0] * u.deg, "arcmin").tolist() == [60, 120]
-    assert from_quantity(20000 * u.mK, "K") == pytest.approx(20)
-    assert from_quantity(2 * pu.uK_CMB, "K_CMB") == pytest.approx(2e-6)
-    assert from_quantity(1 * pu.MJy / pu.sr, "kJy/sr") == pytest.approx(1e3)
-    # The CMB temperatures differ: 2.72548 K here, 2.7255 K in PySM.
-    peer = (1 * pu.K_CMB).to("uK_RJ", equivalencies=pu.cmb_equivalencies(353 * u.GHz)).value
-    for at in (353.0, 0.353 * u.THz):
-        assert from_quantity(1 * pu.K_CMB, "uK_RJ", at=at) == pytest.approx(peer, rel=5e-5)
-    expected = float(band.conversion("K_CMB", "MJy/sr", 353.0))
-    factor = from_quantity(1 * pu.K_CMB, "MJy/sr", at=band, nu_ref=353.0)
-    assert factor == pytest.approx(expected, rel=1e-12)
-    assert unit_factor("K_CMB^2", "mK_CMB^2") == pytest.approx(1e6)
-
-
-def test_bad_quantities():
-    with pytest.raises(TypeError, match="`quantity` must carry a unit, but is float"):
-        from_quantity(353.0, "GHz")
-    for quantity, unit, words in [
-        (1 * pu.K_CMB, "K_RJ", "'K_CMB' to 'K_RJ' depends on frequency; give `at`"),
-        (1 * u.K, "K_RJ", "'K' does not convert to 'K_RJ'; say K_CMB or K_RJ"),
-        (1 * u.GHz, "arcmin", "'GHz' does not convert to 'arcmin'"),
-        (1 * pu.K_CMB**2, "K_CMB", "does not convert to 'K_CMB'"),
-    ]:
-        with pytest.raises(ValueError, match=words):
-            from_quantity(quantity, unit)

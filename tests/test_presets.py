@@ -1,0 +1,137 @@
+"""Presets against PySM 3, whose own functions are run on the same arrays."""
+
+import tomllib
+from importlib.resources import files
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pysm3 import utils
+from pysm3.models import dust, power_law
+
+from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe_band
+from jaxsky.io import read_maps
+from jaxsky.presets import baseline, from_pysm_beta, preset, preset_names
+
+NPIX = 48
+RNG = np.random.default_rng(0)
+MAPS = RNG.normal(size=(3, NPIX))
+BETA_D, T_D = RNG.normal(1.55, 0.1, NPIX), RNG.uniform(15, 25, NPIX)
+BETA_S = RNG.normal(-3.0, 0.1, NPIX)
+
+#: Monochromatic, and with weights in power units (Jy/sr), as PySM takes them.
+BANDS = {
+    "23 GHz": ([23.0], [1.0]),
+    "100 GHz": ([100.0], [1.0]),
+    "857 GHz": ([857.0], [1.0]),
+    "30 GHz band": (np.linspace(24.0, 36.0, 13), 1 + RNG.random(13)),
+    "353 GHz band": ([290.0, 300.0, 340.0, 355.0, 420.0], [0.1, 1.0, 2.0, 1.0, 0.3]),
+}
+
+
+def pysm(name, band, maps, *parameters):
+    """PySM's emission, by its functions as they are before compilation.
+
+    All templates refer to PySM's frequency for Q and U.
+    """
+    nu = np.asarray(band[0])
+    weights = utils.normalize_weights(nu, np.asarray(band[1]))
+    if name.startswith("d"):
+        return dust.get_emission_numba.py_func(nu, weights, *maps, 353.0, 353.0, *parameters)
+    arguments = (nu, weights, *maps, 23.0, 23.0, *parameters)
+    if name == "s3":
+        return power_law.get_emission_numba_IQU_curved.py_func(*arguments, 23.0, -0.052)
+    return power_law.get_emission_numba_IQU.py_func(*arguments)
+
+
+def seen(component, band):
+    sky = Sky({"component": component})
+    return observe_band(sky, Bandpass(*band, "power"), tolerance=1e-13)
+
+
+@pytest.mark.parametrize("band", BANDS)
+@pytest.mark.parametrize("name", ["d0", "d1", "s0", "s1", "s3"])
+def test_presets_agree_with_pysm(name, band):
+    parameters, arguments = {
+        "d0": ((1.54, 20.0), {}),
+        "d1": ((BETA_D, T_D), {"beta_dust": BETA_D, "T_dust": T_D}),
+        "s0": ((-3.0,), {}),
+        "s1": ((BETA_S,), {"beta_syn": from_pysm_beta(BETA_S)}),
+        "s3": ((BETA_S,), {"beta_syn": from_pysm_beta(BETA_S)}),
+    }[name]
+    expected = pysm(name, BANDS[band], MAPS, *parameters)
+    mine = seen(preset(name, MAPS, **arguments), BANDS[band])
+    np.testing.assert_allclose(mine, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("band", ["100 GHz", "30 GHz band", "353 GHz band"])
+def test_real_templates_agree_with_pysm(data_dir, band):
+    folder = data_dir / "templates"
+    path = folder / "pysm2_d1_QU353GHz_betad_Td_n64.fits"
+    Q, U = read_maps(path).maps
+    beta = read_maps(path, fields="BETA_D", unit="").maps[0]
+    T = read_maps(path, fields="T_D", unit="K").maps[0]
+    expected = pysm("d1", BANDS[band], (Q, Q, U), beta, T)[1:]
+    component = preset("d1", np.array([Q, U]), beta_dust=beta, T_dust=T)
+    np.testing.assert_allclose(seen(component, BANDS[band]), expected, rtol=1e-12)
+
+    path = folder / "pysm2_s1_QU23GHz_betas_n64.fits"
+    Q, U = read_maps(path).maps
+    beta = read_maps(path, fields="BETA_S", unit="").maps[0]
+    for name in ("s1", "s3"):
+        expected = pysm(name, BANDS[band], (Q, Q, U), beta)[1:]
+        component = preset(name, np.array([Q, U]), beta_syn=from_pysm_beta(beta))
+        np.testing.assert_allclose(seen(component, BANDS[band]), expected, rtol=1e-12)
+
+
+def test_constants_are_those_of_pysm():
+    theirs = tomllib.loads((files("pysm3") / "data" / "presets.cfg").read_text())
+    d0, s0 = preset("d0", MAPS), preset("s0", MAPS)
+    s3 = preset("s3", MAPS, beta_syn=from_pysm_beta(BETA_S))
+    assert float(d0.beta_dust) == theirs["d0"]["map_mbb_index"]
+    assert float(d0.T_dust) == theirs["d0"]["map_mbb_temperature"]
+    assert -float(s0.beta_syn) == theirs["s0"]["map_pl_index"]
+    assert float(s3.curvature) == theirs["s3"]["spectral_curvature"]
+    assert f"{float(s3.nu_piv):g} GHz" == theirs["s3"]["freq_curve"]
+    d1 = preset("d1", MAPS, beta_dust=1.5, T_dust=20.0)
+    s1 = preset("s1", MAPS, beta_syn=3.0)
+    for name, component in {"d0": d0, "d1": d1, "s0": s0, "s1": s1, "s3": s3}.items():
+        assert f"{float(component.nu_ref):g} GHz" == theirs[name]["freq_ref_P"]
+
+
+def test_the_sign_of_beta():
+    # PySM's -3 is this package's 3: both fall as frequency rises.
+    assert float(from_pysm_beta(-3.0)) == 3.0
+    falling = preset("s1", MAPS, beta_syn=from_pysm_beta(np.full(NPIX, -3.0)))
+    np.testing.assert_allclose(falling.sed(46.0), 1 / 8, rtol=1e-14)
+    with pytest.raises(ValueError, match=r"`beta_syn` of preset 's1' is negative.*from_pysm_beta"):
+        preset("s1", MAPS, beta_syn=BETA_S)
+
+
+def test_baseline():
+    sky = baseline(MAPS[1:], 2 * MAPS[1:])
+    assert isinstance(sky["dust"], Dust)
+    assert isinstance(sky["synchrotron"], Synchrotron)
+    dust, synchrotron = sky["dust"], sky["synchrotron"]
+    assert [float(x) for x in (dust.beta_dust, dust.T_dust, dust.nu_ref)] == [1.53, 21.0, 353.0]
+    assert [float(x) for x in (synchrotron.beta_syn, synchrotron.nu_ref)] == [3.1, 30.0]
+    assert float(synchrotron.curvature) == 0
+    np.testing.assert_array_equal(synchrotron.amplitude, 2 * MAPS[1:])
+
+
+def test_names_and_maps():
+    assert preset_names() == ["baseline_dust", "baseline_synchrotron", "d0", "d1", "s0", "s1", "s3"]
+    for arguments, error, words in [
+        ({"name": "d9"}, KeyError, "Unknown preset 'd9'; known are baseline_dust"),
+        ({"name": "d1", "beta_dust": 1.5}, TypeError, "Preset 'd1' needs the map `T_dust`"),
+        ({"name": "s3"}, TypeError, "Preset 's3' needs the map `beta_syn`"),
+        ({"name": "d0", "beta_dust": 1.5}, TypeError, "has no argument `beta_dust`; .* no maps"),
+        (
+            {"name": "s1", "beta_syn": 3.0, "beta": 1.0},
+            TypeError,
+            "has no argument `beta`; it takes `beta_syn`",
+        ),
+        ({"name": "s1", "beta_syn": jnp.ones(5)}, ValueError, r"`beta_syn` must be a number or"),
+    ]:
+        with pytest.raises(error, match=words):
+            preset(arguments.pop("name"), MAPS, **arguments)

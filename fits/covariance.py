@@ -45,8 +45,8 @@ class Fluctuations(eqx.Module):
         for b, (preparation, noise) in enumerate(zip(self.preparations, self.noise, strict=True)):
             before = jnp.stack([preparation.transpose(row) for row in rows[b]])
             block = jnp.einsum("isp,stp,jtp->ij", before, noise, before)
-            if self.correlated[b] is not None:
-                modes = _modes(rows[b], jnp.stack([self.correlated[b]] * 2))
+            if (spectrum := self.correlated[b]) is not None:
+                modes = _modes(rows[b], jnp.stack([spectrum, spectrum]))
                 block = block + modes @ modes.T
             total = total.at[b, :, b, :].add(block)
         total = total.reshape(bands * count, bands * count)

@@ -29,7 +29,7 @@ from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.galaxy import embedded_sky
 from jaxsky.harmonics import gaussian_beam, resample, synthesis
 from jaxsky.instrument import load_instrument
-from jaxsky.io import Maps, read_bandpass, read_maps
+from jaxsky.io import Maps, read_bandpass, read_maps, unit_factor
 from jaxsky.noise import (
     draw,
     estimate_variance,
@@ -104,12 +104,14 @@ def embedded_inputs(settings: Settings) -> Inputs:
     bands = {}
     used = np.ones(healpy.nside2npix(embedded.nside), bool)
     for channel, bandpass, maps, key in zip(
-        instrument.channels, instrument.bands(), seen, noise_keys, strict=True
+        instrument, instrument.bands(), seen, noise_keys, strict=True
     ):
-        factor = bandpass.conversion("uK_CMB", "uK_RJ")
-        noise = uniform_covariance(channel.noise, embedded.nside) * factor**2
+        factor = bandpass.conversion(channel.noise_unit, "uK_RJ")
+        noise = uniform_covariance(channel.noise * factor, embedded.nside)
         smoothed = resample(maps, gaussian_beam(channel.fwhm, lmax), embedded.nside)
-        bands[channel.name] = Band(smoothed + draw(key, noise), used, bandpass, channel.fwhm, noise)
+        bands[channel.name] = Band(
+            smoothed + draw(key, noise), used, bandpass, float(channel.fwhm), noise
+        )
     templates = {name: Template(sky[name], 0.0, used) for name in sky}
     known = parameter_names(sky)
     free = get_parameters(sky, [name for name in settings.free if name in known])
@@ -248,13 +250,9 @@ def _given_noise(folder, spec, maps, factor, bandpass):
     columns = spec.model_copy(update={"fields": list(noise.covariance), "unit": None})
     read = _read(folder, columns)
     known = np.asarray(read.mask)
-    QQ, QU, UU = jnp.asarray(read.maps) * bandpass.conversion(_root(read.unit), "uK_RJ") ** 2
+    QQ, QU, UU = jnp.asarray(read.maps) * unit_factor(read.unit, "uK_RJ^2", bandpass)
     _check_noise(spec, jnp.stack([QQ, UU, QQ * UU - QU**2]), known)
     return jnp.stack([jnp.stack([QQ, QU]), jnp.stack([QU, UU])]), known
-
-
-def _root(unit: str) -> str:
-    return unit.removesuffix("^2")
 
 
 def _check_noise(spec: BandSettings, rows: Array, known: np.ndarray) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 
@@ -19,7 +20,7 @@ __all__ = ["label", "plot_grids", "plot_marginals", "plot_posterior"]
 COLORS = {"Q": "#0072B2", "U": "#D55E00", "QU": "#222222"}
 REGION_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 TRUTH = {"color": "#CC79A7", "linewidth": 1.6}
-STYLE = {
+STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.labelsize": 10,

@@ -8,6 +8,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from jaxsky.harmonics import alm_ell, analysis, children
+from jaxsky.types import Numeric
 
 __all__ = [
     "cholesky",
@@ -20,7 +21,7 @@ __all__ = [
 
 
 def uniform_covariance(
-    noise: float, nside: int, stokes: int = 2
+    noise: Numeric, nside: int, stokes: int = 2
 ) -> Float[Array, "stokes stokes pix"]:
     """Covariance of each pixel for a uniform noise level.
 
@@ -86,7 +87,9 @@ def estimate_variance(
     return jnp.sum(scatter * whole, axis=-1) / jnp.sum(whole)
 
 
-def knee_spectrum(white: float, ell_knee: float, slope: float, lmax: int) -> Float[Array, " ell"]:
+def knee_spectrum(
+    white: Numeric, ell_knee: Numeric, slope: Numeric, lmax: int
+) -> Float[Array, " ell"]:
     """Noise with a white level and excess at large scales, N_l = white [1 + (l/l_knee)^-slope].
 
     Zero at l < 2, where polarization has no modes.
@@ -126,11 +129,14 @@ def fit_knee(
     level = jnp.median(measured[-lmax // 4 :])
 
     def deviance(theta, _):
-        spectrum = knee_spectrum(level * jnp.exp(theta[0]), *jnp.exp(theta[1:]), lmax)[2:]
+        white, knee, slope = jnp.exp(theta)
+        spectrum = knee_spectrum(level * white, knee, slope, lmax)[2:]
         return jnp.sum(modes * (jnp.log(spectrum / level) + measured / spectrum))
 
     start = jnp.log(jnp.array([1.0, 10.0, 1.5]))
-    solution = optx.minimise(deviance, optx.BFGS(1e-6, 1e-6), start, max_steps=500, throw=False)
+    solution: optx.Solution = optx.minimise(
+        deviance, optx.BFGS(1e-6, 1e-6), start, max_steps=500, throw=False
+    )
     if solution.result != optx.RESULTS.successful:
         raise ValueError("The spectrum of the noise could not be fitted.")
     white, knee, slope = np.exp(np.asarray(solution.value))

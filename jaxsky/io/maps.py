@@ -1,6 +1,7 @@
 """HEALPix maps in FITS files: read into the package's conventions, written in full."""
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ __all__ = ["Maps", "read_maps", "write_maps"]
 POLARIZATIONS = {"COSMO": "COSMO", "IAU": "IAU"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Maps:
     """Maps in the package's conventions: RING, Galactic, COSMO sign of U, float64.
 
@@ -50,7 +51,7 @@ class Maps:
         return replace(self, maps=self.maps * factor, unit=unit_name(unit))
 
 
-def default_fields(table: HealpixTable) -> list[int]:
+def default_fields(table: HealpixTable, argument: str = "fields") -> list[int]:
     """The first I, Q and U columns that are there, by their names; else a column that is alone."""
     kinds = [stokes(name) for name in table.names]
     found = [kinds.index(kind) for kind in "IQU" if kind in kinds]
@@ -60,9 +61,14 @@ def default_fields(table: HealpixTable) -> list[int]:
     if len(columns) == 1:
         return columns
     raise InputError(
-        f"{table.where}: no column is named as I, Q or U; give `fields` out of "
+        f"{table.where}: no column is named as I, Q or U; give `{argument}` out of "
         f"{', '.join(table.names)}."
     )
+
+
+def _agree(given: str, found: str) -> bool:
+    """True if a unit from an argument is the header's, or makes its bare kelvins definite."""
+    return given == found or (is_ambiguous(found) and re.sub("_(CMB|RJ)", "", given) == found)
 
 
 def _unit(table: HealpixTable, columns: list[int], given: str | None) -> str:
@@ -82,8 +88,7 @@ def _unit(table: HealpixTable, columns: list[int], given: str | None) -> str:
                 f'{table.where}: column {name} {says}; give `unit`, such as "uK_CMB", "K_RJ", '
                 '"MJy/sr", "K" for a temperature of matter or "" for a pure number.'
             )
-        bare = None if given is None else given.replace("_CMB", "").replace("_RJ", "")
-        if given and found is not None and found not in (given, bare if is_ambiguous(found) else 0):
+        if given is not None and found is not None and not _agree(given, found):
             raise InputError(
                 f"{table.where}: argument `unit` is {given}, but column {name} is in {found}."
             )
@@ -96,16 +101,16 @@ def _unit(table: HealpixTable, columns: list[int], given: str | None) -> str:
     return str(units[0])
 
 
-def _blocks(table: HealpixTable, names: Sequence[str]) -> list[tuple[int, ...]]:
+def _blocks(table: HealpixTable, names: Sequence[str]) -> list[list[int]]:
     """Rows that turn together when the coordinates change: (Q, U) pairs, and single scalars."""
     kinds = [stokes(name) for name in names]
-    blocks: list[tuple[int, ...]] = []
+    blocks: list[list[int]] = []
     row = 0
     while row < len(kinds):
         if kinds[row : row + 2] == ["Q", "U"]:
-            blocks.append((row, row + 1))
+            blocks.append([row, row + 1])
         elif kinds[row] in ("", "I"):
-            blocks.append((row,))
+            blocks.append([row])
         else:
             raise InputError(
                 f"{table.where}: column {names[row]} cannot be turned to Galactic coordinates; "
@@ -115,29 +120,61 @@ def _blocks(table: HealpixTable, names: Sequence[str]) -> list[tuple[int, ...]]:
     return blocks
 
 
+def _turned(block: np.ndarray, rotator: healpy.Rotator) -> np.ndarray:
+    """A scalar (1, pix) or Q and U (2, pix), turned in harmonic space."""
+    nside = healpy.npix2nside(block.shape[-1])
+    # Ring weights and eight iterations reach 1e-7 up to here; nothing does at 3 nside.
+    lmax = 5 * nside // 2
+    weights = nside > 1 and healpy.isnsideok(nside, nest=True)
+    maps = block[0] if len(block) == 1 else [np.zeros_like(block[0]), *block]
+    alm = healpy.map2alm(maps, lmax=lmax, iter=8, use_weights=weights)
+    turned = healpy.alm2map(rotator.rotate_alm(alm), nside, lmax=lmax)
+    return np.atleast_2d(turned)[-len(block) :]
+
+
+def _tangents(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    """Unit vectors to the south and the east, shape (2, 3, pix)."""
+    south = [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)]
+    return np.array([south, [-np.sin(phi), np.cos(phi), np.zeros_like(phi)]])
+
+
+def _interpolated(block: np.ndarray, rotator: healpy.Rotator) -> np.ndarray:
+    """A scalar (1, pix) or Q and U (2, pix), turned by interpolation between pixels.
+
+    Q and U turn fast about the poles, so it is the tensor Q (ss - ee) + U (se + es) of the
+    directions south and east that is interpolated, by its Cartesian components.
+    """
+    directions = healpy.pix2ang(healpy.npix2nside(block.shape[-1]), np.arange(block.shape[-1]))
+    source = rotator.I(*directions)
+    if len(block) == 1:
+        return healpy.get_interp_val(block[0], *source)[None]
+    s, e = _tangents(*directions)
+    tensor = block[0] * (s[:, None] * s - e[:, None] * e) + block[1] * (
+        s[:, None] * e + e[:, None] * s
+    )
+    tensor = healpy.get_interp_val(tensor.reshape(9, -1), *source).reshape(3, 3, -1)
+    s, e = np.einsum("ji,kjp->kip", rotator.mat, _tangents(*directions))
+    project = "ip,ijp,jp->p"
+    ss, ee = np.einsum(project, s, tensor, s), np.einsum(project, e, tensor, e)
+    return np.array([(ss - ee) / 2, np.einsum(project, s, tensor, e)])
+
+
 def _to_galactic(
-    maps: np.ndarray, mask: np.ndarray, blocks: list[tuple[int, ...]], coordinates: str
+    maps: np.ndarray, mask: np.ndarray, blocks: list[list[int]], coordinates: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Maps turned to Galactic coordinates, Q and U as the spin-2 field they are.
 
-    Complete maps are turned in harmonic space up to l = 3 nside - 1, which is exact for a
-    band-limited sky. A map with pixels missing has no spherical harmonics: it is interpolated
-    between the four nearest pixels, and pixels next to missing ones are lost.
+    Complete maps are turned in harmonic space, which is exact for a sky without structure above
+    l = 2.5 nside and cuts what is above. A map with pixels missing has no spherical harmonics:
+    it is interpolated between the four nearest pixels, and pixels next to missing ones are lost.
     """
     rotator = healpy.Rotator(coord=[coordinates, "G"])
-    complete = bool(mask.all())
+    turn = _turned if mask.all() else _interpolated
     turned = np.zeros_like(maps)
     for rows in blocks:
-        block = maps[list(rows)]
-        if not complete:
-            turned[list(rows)] = rotator.rotate_map_pixel(block if len(rows) > 1 else block[0])
-        elif len(rows) > 1:
-            polarized = rotator.rotate_map_alms([0 * block[0], *block], use_pixel_weights=False)
-            turned[list(rows)] = polarized[1:]
-        else:
-            turned[rows[0]] = rotator.rotate_map_alms(block[0], use_pixel_weights=False)
-    if not complete:
-        mask = rotator.rotate_map_pixel(mask.astype(float)) > 1 - 1e-9
+        turned[rows] = turn(maps[rows], rotator)
+    if not mask.all():
+        mask = _interpolated(mask[None].astype(float), rotator)[0] > 1 - 1e-9
         turned[:, ~mask] = 0
     return turned, mask
 
@@ -195,6 +232,8 @@ def read_maps(
         else:
             wanted = [fields] if isinstance(fields, int | str) else list(fields)
             columns = [table.index(field) for field in wanted]
+        if not columns:
+            raise InputError(f"{table.where}: argument `fields` is empty.")
         names = tuple(table.names[i] for i in columns)
         unit = _unit(table, columns, unit)
         ordering = table.state("ordering", ordering, ("ORDERING",), ORDERINGS)

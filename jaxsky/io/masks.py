@@ -84,7 +84,7 @@ def read_mask(
     else:
         with open_fits(path) as hdus:
             table = HealpixTable(path, hdus, hdu)
-            column = default_fields(table)[0] if key is None else table.index(key)
+            column = default_fields(table, "key")[0] if key is None else table.index(key)
             order = table.state("ordering", ordering, ("ORDERING",), ORDERINGS)
             frame = table.state("coordinates", None, ("COORDSYS", "SKYCOORD"), COORDINATES, "G")
             values = table.values(column)

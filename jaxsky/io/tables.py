@@ -2,6 +2,7 @@
 
 import re
 import warnings
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,15 @@ from astropy.io import fits as pyfits
 from astropy.utils.exceptions import AstropyUserWarning
 from jaxtyping import Float
 
-__all__ = ["COORDINATES", "ORDERINGS", "HealpixTable", "InputError", "open_fits", "select_hdu"]
+__all__ = [
+    "COORDINATES",
+    "ORDERINGS",
+    "HealpixTable",
+    "InputError",
+    "open_fits",
+    "select_hdu",
+    "stokes",
+]
 
 #: Spellings in headers and arguments, upper case -> the package's.
 ORDERINGS = {"RING": "RING", "NESTED": "NESTED", "NEST": "NESTED"}
@@ -21,6 +30,10 @@ COORDINATES = {
     **dict.fromkeys(("C", "Q", "CEL", "CELESTIAL", "EQUATORIAL", "ICRS", "FK5"), "C"),
     **dict.fromkeys(("E", "ECL", "ECLIPTIC"), "E"),
 }
+
+
+#: What astropy raises at files that are cut short or no FITS files at all.
+_DAMAGE = (OSError, EOFError, ValueError, TypeError, IndexError, zlib.error, AstropyUserWarning)
 
 
 class InputError(ValueError):
@@ -41,7 +54,7 @@ def open_fits(path: Path) -> Iterator[pyfits.HDUList]:
                 yield hdus
         except InputError:
             raise
-        except (OSError, EOFError, ValueError, TypeError, IndexError, AstropyUserWarning) as error:
+        except _DAMAGE as error:
             reason = " ".join(str(error).split())
             raise InputError(f"{path}: not a FITS file, or a truncated one ({reason}).") from error
 
@@ -52,7 +65,9 @@ def select_hdu(path: Path, hdus: pyfits.HDUList, hdu: int | str) -> pyfits.BinTa
         found = hdus[hdu]
     except (IndexError, KeyError):
         names = ", ".join(f"{i} ({h.name})" for i, h in enumerate(hdus))
-        raise InputError(f"{path}: no HDU {hdu!r}; it has {names}.") from None
+        raise InputError(
+            f"{path}: no HDU {hdu!r}; it has {names}, and is truncated if there should be more."
+        ) from None
     if not isinstance(found, pyfits.BinTableHDU):
         raise InputError(
             f"{path}: HDU {hdu!r} holds no binary table; HEALPix maps are columns of one."

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from fits.likelihood import Likelihood, chi2
-from fits.priors import Prior, bounds, log_prior
+from fits.priors import Prior, bounds, check_priors, log_prior
 from fits.results import FitResult
 from jaxsky.types import Numeric
 
@@ -95,6 +95,7 @@ def grid_fit(
         For unknown parameters, more than two of them, or one without a uniform prior.
     """
     free = tuple(sorted(like.check(start)))
+    priors = check_priors(priors, free)
     if len(free) > 2:
         raise ValueError(
             f"A grid takes one or two free parameters, not {len(free)} ({', '.join(free)}); "
@@ -106,7 +107,7 @@ def grid_fit(
             raise ValueError(f"A grid needs a uniform prior for {name!r}, to know its range.")
     for _ in range(6):
         axes = {name: np.linspace(low, high, points) for name, (low, high) in ranges.items()}
-        log_posterior, chi2s = (np.asarray(a) for a in _log_posterior(like, axes, dict(priors)))
+        log_posterior, chi2s = (np.asarray(a) for a in _log_posterior(like, axes, priors))
         log_posterior = log_posterior - log_posterior.max()
         values = list(axes.values())
         narrowed = {}

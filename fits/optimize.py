@@ -12,6 +12,7 @@ from fits.likelihood import Likelihood, chi2
 from fits.priors import (
     Prior,
     bounds,
+    check_priors,
     from_unbounded,
     log_prior,
     prior_residuals,
@@ -73,8 +74,8 @@ def best_fit(
     FitError
         If it did not converge, unless throw=False; the result is in its `.result`.
     """
-    priors = dict(priors or {})
     params = like.check(start)
+    priors = check_priors(priors, params)
     solver = solver or optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)
     free = tuple(sorted(params))
     unbounded = to_unbounded(params, priors)

@@ -1,6 +1,6 @@
 """Priors on parameters, and the map from unbounded numbers to their range."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -75,6 +75,23 @@ class Gaussian(Prior):
 def log_prior(params: Mapping[str, Numeric], priors: Mapping[str, Prior]) -> Float[Array, ""]:
     """Sum of the log-densities of the parameters that have a prior."""
     return sum((p.log_density(params[name]) for name, p in priors.items()), jnp.zeros(()))
+
+
+def check_priors(priors: Mapping[str, Prior] | None, free: Iterable[str]) -> dict[str, Prior]:
+    """The priors, once each is known to belong to a free parameter.
+
+    Raises
+    ------
+    KeyError
+        If one does not.
+    """
+    free = list(free)
+    for name in priors or {}:
+        if name not in free:
+            raise KeyError(
+                f"There is a prior for {name!r}, which is not free; free are {', '.join(free)}."
+            )
+    return dict(priors or {})
 
 
 def prior_residuals(

@@ -13,7 +13,7 @@ import numpy as np
 
 from fits.likelihood import Likelihood, chi2
 from fits.optimize import best_fit
-from fits.priors import Prior, bounds, log_prior
+from fits.priors import Prior, bounds, check_priors, log_prior
 from fits.results import FitResult
 from jaxsky.types import Numeric
 
@@ -133,8 +133,8 @@ def sample(
     FitError
         If the chain is too short, unless throw=False; the result is in its `.result`.
     """
-    priors = dict(priors or {})
     free = tuple(sorted(like.check(start)))
+    priors = check_priors(priors, free)
     if nwalkers < 2 * len(free) or nsteps < 1:
         raise ValueError(
             f"MCMC needs at least {2 * len(free)} walkers and a step for {len(free)} parameters, "

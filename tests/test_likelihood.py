@@ -1,0 +1,338 @@
+"""Likelihoods against dense sums over pixels, each other, and finite differences."""
+
+import subprocess
+import sys
+
+import equinox as eqx
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+import systems
+from fits.compress import gram, square_root
+from fits.covariance import Fluctuations
+from fits.likelihood import chi2, likelihood
+from fits.preparation import Preparation
+from jaxsky import AME, Bandpass, Dust, Sky, Synchrotron, observe, parameter_names, set_parameters
+from jaxsky.cmb import camb_spectra
+from jaxsky.harmonics import adjoint_synthesis, alm_ell, gaussian_beam
+from jaxsky.noise import uniform_covariance
+
+NSIDE = 4
+NPIX = healpy.nside2npix(NSIDE)
+BANDS = {
+    "44": Bandpass.top_hat(44.0, 10.0, samples=11),
+    "70": Bandpass(np.linspace(63.0, 77.0, 15), np.hanning(17)[1:-1], "power"),
+}
+START = {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}
+
+
+def problem(seed: int = 0, sky: Sky | None = None):
+    sky = sky or systems.dust_and_synchrotron(NPIX)
+    rng = np.random.default_rng(seed)
+    data = observe(sky, list(BANDS.values()))
+    sigma = jnp.asarray(rng.uniform(0.5, 1.5, data.shape))
+    return sky, data + sigma * rng.normal(size=data.shape), sigma
+
+
+def papers_chi2(sky, params, data, sigma, calibration=(1.0, 1.0), offset=0.0):
+    """The formula of the paper, summed with numpy."""
+    model = np.asarray(observe(set_parameters(sky, params), list(BANDS.values())))
+    model = model * np.asarray(calibration)[:, None, None] + offset
+    return np.sum(((np.asarray(data) - model) / np.asarray(sigma)) ** 2)
+
+
+def fluctuations(cmb: bool = True) -> Fluctuations:
+    """Noise at nside 8, smoothed to nside 4; correlated noise in one band; CMB."""
+    lmax, nside_in = 8, 8
+    preparations = tuple(
+        Preparation.smoothing(nside_in, own, NSIDE, 1500.0, lmax) for own in (900.0, 300.0)
+    )
+    tilt = 1 + 0.5 * healpy.pix2vec(nside_in, np.arange(healpy.nside2npix(nside_in)))[2]
+    noise = tuple(uniform_covariance(s, nside_in) * tilt for s in (2000.0, 3000.0))
+    noise = (
+        noise[0].at[0, 1].set(0.3 * noise[0][0, 0]).at[1, 0].set(0.3 * noise[0][0, 0]),
+        noise[1],
+    )
+    spectra = jnp.asarray(camb_spectra(lmax))[1:3] * 1e4 * gaussian_beam(1500.0, lmax) ** 2
+    correlated = (None, jnp.zeros(lmax + 1).at[2:].set(3.0 / jnp.arange(2, lmax + 1) ** 2))
+    return Fluctuations(
+        preparations, noise, correlated, spectra if cmb else None, jnp.array([0.95, 0.9])
+    )
+
+
+def dense_covariance(model: Fluctuations) -> np.ndarray:
+    """Covariance of all values (band, stokes, pix) of the prepared maps, mode by mode."""
+    blocks = []
+    for b, (preparation, noise) in enumerate(zip(model.preparations, model.noise, strict=True)):
+        npix_in = noise.shape[-1]
+        basis = jnp.eye(2 * npix_in).reshape(-1, 2, npix_in)
+        A = np.stack([np.asarray(preparation(e)).ravel() for e in basis], axis=1)
+        N = np.zeros((2, npix_in, 2, npix_in))
+        for s in range(2):
+            for t in range(2):
+                N[s, :, t, :] = np.diag(noise[s, t])
+        block = A @ N.reshape(2 * npix_in, -1) @ A.T
+        if model.correlated[b] is not None:
+            Y = synthesis_matrix(model.correlated[b].size - 1)
+            block = block + Y @ np.diag(np.tile(model.correlated[b][alm_ell(8)], 2)) @ Y.T
+        blocks.append(block)
+    total = np.zeros((2, blocks[0].shape[0], 2, blocks[0].shape[0]))
+    for b in range(2):
+        total[b, :, b, :] = blocks[b]
+    if model.cmb_spectra is not None:
+        Y = synthesis_matrix(8)
+        cmb = Y @ np.diag(np.asarray(model.cmb_spectra)[:, alm_ell(8)].ravel()) @ Y.T
+        f = np.asarray(model.cmb_factors)
+        total += np.einsum("a,b,ij->aibj", f, f, cmb)
+    return total.reshape(2 * blocks[0].shape[0], -1)
+
+
+def synthesis_matrix(lmax: int) -> np.ndarray:
+    rows = jnp.eye(2 * NPIX).reshape(-1, 2, NPIX)
+    return np.stack([np.asarray(adjoint_synthesis(r, lmax)).ravel() for r in rows])
+
+
+def test_inner_products_do_not_depend_on_chunks_and_add_up():
+    sky, data, sigma = problem()
+    templates = jnp.stack([c.amplitude for c in sky.components.values()])
+    weights = 1 / sigma**2
+    whole = gram(data, templates, weights)
+    rows = np.concatenate(
+        [
+            data[:, :, None],
+            np.broadcast_to(templates, (2, *templates.shape)).swapaxes(1, 2),
+            np.ones((2, 2, 1, NPIX)),
+        ],
+        axis=2,
+    )
+    dense = np.einsum("bsip,bsp,bsjp->bsij", rows, weights, rows)
+    np.testing.assert_allclose(whole, dense, rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(gram(data, templates, weights, chunk=50), dense, atol=1e-9)
+    north = jnp.arange(NPIX) < 70
+    parts = [gram(data, templates, weights * half) for half in (north, ~north)]
+    np.testing.assert_allclose(parts[0] + parts[1], dense, atol=1e-9)
+
+
+def test_square_root_of_singular_and_badly_scaled_matrices():
+    rows = np.random.default_rng(0).normal(size=(4, 9)) * np.array([1e8, 1, 1e-8, 0])[:, None]
+    rows[1] = 2e-8 * rows[0]
+    G = jnp.asarray(rows @ rows.T)
+    R = square_root(G)
+    scale = np.sqrt(np.maximum(np.diag(G), 1e-300))
+    np.testing.assert_allclose(
+        R.T @ R / np.outer(scale, scale), G / np.outer(scale, scale), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("pixelwise", [False, True])
+@pytest.mark.parametrize("stokes", ["Q", "U", "QU"])
+def test_diagonal_likelihood_is_the_papers_chi2(stokes, pixelwise):
+    sky, data, sigma = problem()
+    like = likelihood(sky, BANDS, data, sigma, START, stokes=stokes, pixelwise=pixelwise)
+    kept = jnp.where(jnp.array([s in stokes for s in "QU"])[:, None], sigma, jnp.inf)
+    for params in (START, {"dust.beta_dust": 1.2, "synchrotron.beta_syn": 3.7}):
+        expected = papers_chi2(sky, params, data, kept)
+        assert float(chi2(like, params)) == pytest.approx(expected, rel=1e-11)
+
+
+@pytest.mark.parametrize("pixelwise", [False, True])
+def test_calibration_offset_and_mask(pixelwise):
+    sky, data, sigma = problem()
+    mask = np.arange(NPIX) % 3 > 0
+    masked = jnp.where(mask, sigma, jnp.inf)
+    holes = data.at[:, :, ~mask].set(jnp.nan)
+    params = {"calibration.70": 1.02, "offset.44.Q": 0.3, "dust.beta_dust": 1.55}
+    like = likelihood(sky, BANDS, holes, masked, params, pixelwise=pixelwise)
+    offset = np.zeros((2, 2, 1))
+    offset[0, 0] = 0.3
+    expected = papers_chi2(sky, {"dust.beta_dust": 1.55}, data, masked, (1.0, 1.02), offset)
+    assert float(chi2(like, params)) == pytest.approx(expected, rel=1e-11)
+
+
+@pytest.mark.parametrize("cmb", [False, True])
+def test_exact_covariance_is_the_dense_one(cmb):
+    model = fluctuations(cmb)
+    rows = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3, 2, NPIX)))
+    dense = dense_covariance(model)
+    flat = np.zeros((2, 3, 2, 2 * NPIX))
+    for b in range(2):
+        flat[b, :, b] = np.asarray(rows[b]).reshape(3, -1)
+    flat = flat.reshape(6, -1)
+    np.testing.assert_allclose(model.covariance(rows), flat @ dense @ flat.T, rtol=1e-9, atol=1e-9)
+    sigma = np.sqrt(np.diag(dense_covariance(fluctuations(False)))).reshape(2, 2, NPIX)
+    # The map of variances neglects the rotation of Q and U within the kernel and their
+    # correlation, which at a beam of 25 degrees is at its worst.
+    np.testing.assert_allclose(model.sigma(), sigma, rtol=0.15)
+
+
+def test_exact_likelihood_is_that_of_the_amplitudes():
+    """Against an independent, dense implementation: y = T^T W d, covariance T^T W C W T."""
+    sky, data, sigma = problem()
+    model = fluctuations()
+    like = likelihood(sky, BANDS, data, sigma, START, covariance_of=model.covariance)
+    dense = dense_covariance(model)
+    rows = []
+    for b in range(2):
+        for s in range(2):
+            for c in sky.components.values():
+                row = np.zeros((2, 2, NPIX))
+                row[b, s] = c.amplitude[s] / sigma[b, s] ** 2
+                rows.append(row.ravel())
+    P = np.stack(rows)
+    for params in (START, {"dust.beta_dust": 1.2, "synchrotron.beta_syn": 3.7}):
+        seen = np.asarray(observe(set_parameters(sky, params), list(BANDS.values())))
+        y = P @ (np.asarray(data) - seen).ravel()
+        expected = y @ np.linalg.solve(P @ dense @ P.T, y)
+        assert float(chi2(like, params)) == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_pixel_and_template_paths_agree(exact):
+    sky, data, sigma = problem()
+    free = {**START, "calibration.44": 1.0, "dust.T_dust": 21.0, "offset.70.U": 0.0}
+    options = {"covariance_of": fluctuations().covariance} if exact else {}
+    templates = likelihood(sky, BANDS, data, sigma, free, **options)
+    pixels = likelihood(sky, BANDS, data, sigma, free, pixelwise=True, **options)
+    rng = np.random.default_rng(5)
+    for _ in range(3):
+        params = {n: v + 0.05 * rng.normal() for n, v in free.items()}
+        assert float(chi2(pixels, params)) == pytest.approx(
+            float(chi2(templates, params)), rel=1e-9
+        )
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_a_constant_map_with_an_offset_is_a_constant(exact):
+    sky, data, sigma = problem()
+    mapped = set_parameters(sky, {"dust.beta_dust": jnp.full(NPIX, 1.5)})
+    options = {"covariance_of": fluctuations().covariance} if exact else {}
+    shift = {"dust.beta_dust.offset": 0.0, "synchrotron.beta_syn": 3.0}
+    by_map = likelihood(mapped, BANDS, data, sigma, shift, **options)
+    by_number = likelihood(sky, BANDS, data, sigma, START, **options)
+    for beta in (1.4, 1.55):
+        a = chi2(by_map, {"dust.beta_dust.offset": beta - 1.5, "synchrotron.beta_syn": 3.1})
+        b = chi2(by_number, {"dust.beta_dust": beta, "synchrotron.beta_syn": 3.1})
+        assert float(a) == pytest.approx(float(b), rel=1e-8)
+
+
+def test_an_offset_on_a_number_stays_on_inner_products():
+    sky, data, sigma = problem()
+    like = likelihood(sky, BANDS, data, sigma, {"dust.beta_dust.offset": 0.1})
+    expected = papers_chi2(sky, {"dust.beta_dust": 1.53 + 0.02}, data, sigma)
+    assert float(chi2(like, {"dust.beta_dust.offset": 0.02})) == pytest.approx(expected, rel=1e-11)
+
+
+def test_a_varying_index_is_fitted_pixel_by_pixel():
+    beta = systems.spread(1.53, 0.2, NPIX)
+    sky = Sky({"dust": Dust(systems.random_maps(3, npix=NPIX), beta)})
+    _, data, sigma = problem(sky=sky)
+    like = likelihood(sky, BANDS, data, sigma, {"dust.beta_dust.offset": 0.0})
+    expected = papers_chi2(sky, {"dust.beta_dust": beta + 0.03}, data, sigma)
+    assert float(chi2(like, {"dust.beta_dust.offset": 0.03})) == pytest.approx(expected, rel=1e-9)
+
+
+EVERYTHING = Sky(
+    {
+        "dust": Dust(
+            systems.random_maps(1, npix=NPIX), (1.67, 2.70), (9.4, 16.2), (0.49, 1.0), 353.0, 3000.0
+        ),
+        "synchrotron": Synchrotron(systems.random_maps(2, npix=NPIX), 3.1, -0.2, 23.0, 30.0),
+        "ame": AME.from_dust_angles(
+            jnp.abs(systems.random_maps(4, npix=NPIX)[0]),
+            systems.random_maps(1, npix=NPIX),
+            nu_ref=22.8,
+        ),
+    }
+)
+
+
+@pytest.mark.parametrize("pixelwise", [False, True])
+def test_gradients_against_finite_differences(pixelwise):
+    """Every parameter of the sky, calibrations, offsets, and centre and width of a band."""
+    sky, data, sigma = problem(sky=EVERYTHING)
+    free = {n: float(_get(sky, n)) for n in parameter_names(sky) if not n.endswith(".amplitude")}
+    free |= {"calibration.44": 1.01, "offset.70.U": 0.1}
+    like = likelihood(sky, BANDS, data, 10 * sigma, free, pixelwise=pixelwise)
+
+    def value(relative, center, width):
+        band = Bandpass.top_hat(center, width, samples=11)
+        moved = eqx.tree_at(lambda k: k.bands.bandpasses[0], like, band)
+        return chi2(moved, {n: v * (1 + relative[n]) for n, v in free.items()}) / 1e3
+
+    zero = {name: jnp.zeros(()) for name in free}
+    args = (zero, jnp.asarray(44.0), jnp.asarray(10.0))
+    check_grads(value, args, order=1, modes=["fwd", "rev"], rtol=1e-5, atol=1e-5)
+    gradients = jax.grad(value, argnums=(0, 1, 2))(*args)
+    assert all(float(jnp.abs(g)) > 0 for g in jax.tree.leaves(gradients))
+
+
+def _get(sky, name):
+    from jaxsky import get_parameters
+
+    return get_parameters(sky, [name])[name]
+
+
+def call(**changes):
+    sky, data, sigma = problem()
+    arguments = {"sky": sky, "bands": BANDS, "data": data, "sigma": sigma, "start": START}
+    return likelihood(**(arguments | changes))
+
+
+def same_templates():
+    maps = systems.random_maps(1, npix=NPIX)
+    return Sky({"dust": Dust(maps), "synchrotron": Synchrotron(2 * maps)})
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"start": {}}, ValueError, "`start` must name at least one free parameter"),
+        (
+            {"start": {"dust.beta": 1.5}},
+            KeyError,
+            "Unknown parameter 'dust.beta'; .*calibration.44",
+        ),
+        ({"start": {"dust.amplitude": 1.5}}, KeyError, "Unknown parameter 'dust.amplitude'"),
+        ({"start": {"calibration.45": 1.0}}, KeyError, "Unknown parameter 'calibration.45'"),
+        ({"start": {"dust.beta_dust": np.ones(NPIX)}}, ValueError, "must be a number, not a map"),
+        (
+            {"data": np.ones((2, 2, 12))},
+            ValueError,
+            r"`data` must have .*\(2, 2, 192\), but",
+        ),
+        ({"sigma": np.ones(7)}, ValueError, r"`sigma` must broadcast to .*\(2, 2, 192\)"),
+        ({"sigma": 0.0}, ValueError, "`sigma` has 1 of 1 values that are not > 0"),
+        ({"sigma": -np.ones((2, 1, 1))}, ValueError, "`sigma` has 2 of 2 values that are not > 0"),
+        ({"sigma": np.nan}, ValueError, "`sigma` has 1 of 1 values"),
+        ({"sigma": np.inf}, ValueError, "No pixel is left"),
+        (
+            {"data": np.full((2, 2, NPIX), np.nan)},
+            ValueError,
+            "`data` has 768 values that are not",
+        ),
+        ({"stokes": "V"}, ValueError, "`stokes` must be among 'QU', not 'V'"),
+        ({"stokes": ""}, ValueError, "`stokes` must be among 'QU', not ''"),
+        (
+            {"sky": same_templates(), "covariance_of": fluctuations().covariance},
+            ValueError,
+            "templates cannot be told apart",
+        ),
+    ],
+)
+def test_bad_input_is_refused(changes, error, words):
+    with pytest.raises(error, match=words):
+        call(**changes)
+
+
+def test_single_precision_is_refused():
+    code = (
+        "from fits.likelihood import likelihood\n"
+        "try: likelihood(None, [], 0, 0, {})\n"
+        "except RuntimeError as e: assert 'fits needs double precision' in str(e)\n"
+        "else: raise SystemExit(1)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

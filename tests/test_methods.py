@@ -1,0 +1,231 @@
+"""Grid, gradient and MCMC: they agree, respect priors, resume, and say when they fail."""
+
+import emcee
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+from fits.grid import grid_fit
+from fits.likelihood import likelihood
+from fits.optimize import best_fit
+from fits.priors import Gaussian, Uniform, from_unbounded, log_prior, to_unbounded
+from fits.results import FitError
+from fits.sample import ChainFile, sample
+from jaxsky import Dust, Sky, observe, set_parameters
+from test_likelihood import BANDS, START, fluctuations, problem
+
+PRIORS = {"dust.beta_dust": Uniform(0.5, 2.5), "synchrotron.beta_syn": Uniform(2.0, 4.5)}
+
+
+@pytest.fixture(scope="module", params=["diagonal", "exact"])
+def like(request):
+    sky, data, sigma = problem()
+    if request.param == "diagonal":
+        return likelihood(sky, BANDS, data, sigma, START)
+    # A tenth of the noise, so that the posterior is close to a Gaussian.
+    model = fluctuations()
+    return likelihood(
+        sky, BANDS, data, sigma, START, covariance_of=lambda rows: model.covariance(rows) / 100
+    )
+
+
+def test_the_three_methods_agree(like):
+    """Best fits within 0.1 sigma, widths within 5 %."""
+    gradient = best_fit(like, START, priors=PRIORS)
+    grid = grid_fit(like, START, PRIORS)
+    mcmc = sample(like, START, priors=PRIORS, nsteps=4000, progress=False)
+    assert gradient.free == grid.free == mcmc.free == tuple(sorted(START))
+    for name in START:
+        sigma = gradient.sigma(name)
+        for other in (grid, mcmc):
+            assert abs(other.best_fit[name] - gradient.best_fit[name]) < 0.1 * sigma
+            assert other.sigma(name) == pytest.approx(sigma, rel=0.05)
+            for a, b in zip(other.interval_68[name], gradient.interval_68[name], strict=True):
+                assert abs(a - b) < 0.1 * sigma
+    assert grid.chi2 == pytest.approx(gradient.chi2, abs=0.02)
+    assert mcmc.chi2 == pytest.approx(gradient.chi2, abs=0.02)
+    assert 0.2 < mcmc.details["acceptance"] < 0.9
+    assert all(20 < tau < 60 for tau in mcmc.details["tau"].values())
+
+
+def test_parameters_are_recovered_without_noise():
+    sky, _, sigma = problem()
+    truth = {"dust.beta_dust": 1.7, "synchrotron.beta_syn": 2.8}
+    data = observe(set_parameters(sky, truth), list(BANDS.values()))
+    like = likelihood(sky, BANDS, data, sigma, START)
+    for solver in (None, optx.GaussNewton(1e-12, 1e-12), optx.Dogleg(1e-12, 1e-12)):
+        found = best_fit(like, START, priors=PRIORS, solver=solver)
+        for name, value in truth.items():
+            assert found.best_fit[name] == pytest.approx(value, abs=1e-7)
+        assert found.chi2 < 1e-9
+
+
+def test_covariance_is_the_inverse_hessian_of_a_linear_fit():
+    sky, data, sigma = problem()
+    names = {"calibration.44": 1.0, "calibration.70": 1.0}
+    found = best_fit(likelihood(sky, BANDS, data, sigma, names), names)
+    model = np.asarray(observe(sky, list(BANDS.values())))
+    information = np.sum((model / np.asarray(sigma)) ** 2, axis=(1, 2))
+    np.testing.assert_allclose(found.covariance, np.diag(1 / information), rtol=1e-9, atol=1e-18)
+
+
+def test_fits_do_not_depend_on_units():
+    """Maps in K instead of uK, templates and noise with them, give the same indices."""
+    sky, data, sigma = problem()
+    small = {f"{n}.amplitude": 1e-6 * sky[n].amplitude for n in sky}
+    a = best_fit(likelihood(sky, BANDS, data, sigma, START), START)
+    rescaled = likelihood(set_parameters(sky, small), BANDS, 1e-6 * data, 1e-6 * sigma, START)
+    b = best_fit(rescaled, START)
+    for name in START:
+        assert b.best_fit[name] == pytest.approx(a.best_fit[name], abs=1e-6)
+    np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-6)
+
+
+def test_a_gaussian_prior_pulls_by_its_weight():
+    sky, data, sigma = problem()
+    name = "calibration.44"
+    like = likelihood(sky, BANDS, data, sigma, {name: 1.0})
+    free = best_fit(like, {name: 1.0})
+    prior = Gaussian(free.best_fit[name] + 1.0, free.sigma(name))
+    pulled = best_fit(like, {name: 1.0}, priors={name: prior})
+    assert pulled.best_fit[name] == pytest.approx(free.best_fit[name] + 0.5, abs=1e-6)
+    assert pulled.sigma(name) == pytest.approx(free.sigma(name) / np.sqrt(2), rel=1e-6)
+
+
+def test_more_free_parameters_by_name():
+    sky, data, sigma = problem()
+    start = {**START, "dust.T_dust": 20.0, "synchrotron.curvature": 0.0, "offset.44.Q": 0.0}
+    priors = {
+        "dust.T_dust": Gaussian(21.0, 1.0),
+        "synchrotron.curvature": Gaussian(0.0, 0.1),
+    }
+    found = best_fit(likelihood(sky, BANDS, data, sigma, start), start, priors=priors)
+    for name, value in (("dust.beta_dust", 1.53), ("offset.44.Q", 0.0), ("dust.T_dust", 21.0)):
+        assert abs(found.best_fit[name] - value) < 4 * found.sigma(name)
+
+
+def test_unbounded_numbers_and_ranges_are_inverse():
+    params = {"a": 0.7, "b": -3.0}
+    priors = {"a": Uniform(0.5, 2.5)}
+    back = from_unbounded(to_unbounded(params, priors), priors)
+    assert {k: float(v) for k, v in back.items()} == pytest.approx(params)
+    assert float(log_prior({"a": 3.0}, priors)) == -np.inf
+    with pytest.raises(ValueError, match=r"Start value 9 of 'a' is not inside its uniform prior"):
+        to_unbounded({"a": 9.0}, priors)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Uniform(2, 1), "low < high, not 2 and 1"),
+        (lambda: Uniform(-np.inf, 1), "finite low < high"),
+        (lambda: Gaussian(0, 0), "a positive sigma, not 0"),
+    ],
+)
+def test_priors_that_make_no_sense_are_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_a_prior_of_a_parameter_that_is_not_free_is_refused(like):
+    start = {"dust.beta_dust": 1.6}
+    for method in (best_fit, sample):
+        with pytest.raises(KeyError, match=r"prior for 'synchrotron.beta_syn', which is not free"):
+            method(like, start, priors=PRIORS)
+
+
+def test_an_optimum_at_the_edge_of_a_prior_is_reported(like):
+    narrow = PRIORS | {"dust.beta_dust": Uniform(2.2, 2.5)}
+    start = START | {"dust.beta_dust": 2.3}
+    with pytest.raises(FitError, match=r"'dust.beta_dust' lies at the edge 2.2") as caught:
+        best_fit(like, start, priors=narrow)
+    assert caught.value.result.best_fit["dust.beta_dust"] == pytest.approx(2.2, abs=1e-3)
+    assert not best_fit(like, start, priors=narrow, throw=False).converged
+    # The grid and the chain pile up at the same edge instead of failing.
+    grid = grid_fit(like, start, narrow)
+    assert grid.best_fit["dust.beta_dust"] == pytest.approx(2.2)
+    assert grid.interval_68["dust.beta_dust"][0] >= 2.2
+
+
+def test_a_parameter_without_effect_is_reported():
+    sky, data, sigma = problem(sky=Sky({"dust": Dust(problem()[0]["dust"].amplitude)}))
+    start = {"dust.nu_ref": 353.0, "calibration.44": 1.0, "calibration.70": 1.0}
+    like = likelihood(sky, BANDS, data, sigma, start)
+    with pytest.raises(FitError, match=r"do not constrain|solver stopped"):
+        best_fit(like, start)
+
+
+def test_too_few_steps_are_reported_by_the_solver():
+    sky, data, sigma = problem()
+    like = likelihood(sky, BANDS, data, sigma, START)
+    slow = optx.GradientDescent(learning_rate=1e-9, rtol=1e-12, atol=1e-12)
+    result = best_fit(like, START, solver=slow, throw=False)
+    assert not result.converged
+    assert "solver stopped" in result.message
+
+
+def test_a_grid_needs_one_or_two_parameters_with_ranges(like):
+    with pytest.raises(ValueError, match=r"one or two free parameters, not 3"):
+        grid_fit(like, START | {"calibration.44": 1.0}, PRIORS)
+    with pytest.raises(ValueError, match=r"uniform prior for 'synchrotron.beta_syn'"):
+        grid_fit(like, START, {"dust.beta_dust": Uniform(1, 2)})
+
+
+def test_a_grid_of_one_parameter(like):
+    start = {"dust.beta_dust": 1.6}
+    priors = {"dust.beta_dust": PRIORS["dust.beta_dust"]}
+    grid, gradient = grid_fit(like, start, priors), best_fit(like, start, priors=priors)
+    assert grid.sigma("dust.beta_dust") == pytest.approx(gradient.sigma("dust.beta_dust"), rel=0.03)
+
+
+def test_a_short_chain_is_reported(like):
+    with pytest.raises(FitError, match=r"100 steps are \d+ autocorrelation times .* at least 50"):
+        sample(like, START, priors=PRIORS, nsteps=100, progress=False)
+    with pytest.raises(ValueError, match=r"at least 4 walkers .*nwalkers=3"):
+        sample(like, START, nwalkers=3, progress=False)
+
+
+def test_a_stopped_chain_goes_on_as_if_it_had_not(like, tmp_path):
+    options = {"priors": PRIORS, "progress": False, "throw": False, "seed": 7}
+    whole = sample(like, START, nsteps=300, **options)
+
+    class Stop(Exception):
+        pass
+
+    class Stopping(ChainFile):
+        def save_step(self, state, accepted):
+            super().save_step(state, accepted)
+            if self.saved == 130:
+                raise Stop
+            self.saved += 1
+
+    stopping = Stopping(tmp_path / "chain.h5", every=50)
+    stopping.saved = 0
+    with pytest.raises(Stop):
+        sample(like, START, nsteps=300, backend=stopping, **options)
+    resumed = ChainFile(tmp_path / "chain.h5")
+    assert 100 <= resumed.iteration < 300
+    gone_on = sample(like, START, nsteps=300, backend=resumed, **options)
+    np.testing.assert_array_equal(gone_on.details["chain"], whole.details["chain"])
+    # A finished chain is read, not made again; emcee itself can open the file.
+    again = sample(like, START, nsteps=300, backend=ChainFile(tmp_path / "chain.h5"), **options)
+    np.testing.assert_array_equal(again.details["chain"], whole.details["chain"])
+    theirs = emcee.backends.HDFBackend(str(tmp_path / "chain.h5"), read_only=True)
+    np.testing.assert_array_equal(theirs.get_chain(), whole.details["chain"])
+
+
+def test_seeds_matter_and_repeat(like):
+    options = {"priors": PRIORS, "progress": False, "throw": False, "nsteps": 20}
+    chains = [sample(like, START, seed=s, **options).details["chain"] for s in (1, 1, 2)]
+    np.testing.assert_array_equal(chains[0], chains[1])
+    assert not np.array_equal(chains[0], chains[2])
+
+
+def test_samples_stay_inside_the_prior(like):
+    narrow = PRIORS | {"dust.beta_dust": Uniform(1.9, 2.5)}
+    start = START | {"dust.beta_dust": 2.0}
+    chain = sample(like, start, priors=narrow, nsteps=200, progress=False, throw=False)
+    values = chain.details["chain"][..., chain.free.index("dust.beta_dust")]
+    assert values.min() >= 1.9
+    assert bool(jnp.isfinite(chain.details["log_prob"]).all())

@@ -92,7 +92,7 @@ def embedded_inputs(settings: Settings) -> Inputs:
     galaxy = embedded_sky(embedded.nside)
     sky = set_parameters(galaxy.sky("QU"), settings.fixed)
     instrument = load_instrument(embedded.instrument).select(embedded.channels)
-    lmax = 3 * embedded.nside - 1
+    lmax = 2 * embedded.nside  # what the pixels resolve without aliasing
     spectra = camb_spectra(lmax, settings.cmb.r) if settings.cmb.include else None
     cmb_key, *noise_keys = jax.random.split(jax.random.key(seed), 1 + len(embedded.channels))
     components = dict(sky.components)

@@ -39,7 +39,7 @@ NSIDE_SCALE = 64
 SYNCHROTRON_FRACTION = 0.75
 #: Steps along the line of sight; the maps are then converged to about 1e-3 of their rms.
 STEPS = 96
-#: The steps grow from STEP_SCALE * d ln s near the Sun; the integral ends at FARTHEST [kpc].
+#: The steps are equal in ln(1 + s / STEP_SCALE), from the Sun to s = FARTHEST [kpc].
 STEP_SCALE, FARTHEST = 0.1, 30.0
 #: Distances of the shells of independent turbulence [kpc].
 SHELLS = 0.05 * 3.0 ** np.arange(6)
@@ -256,8 +256,7 @@ def _integrate(
     def emission(step):
         x, y, z = direction * step["s"]
         x = x - model.r_sun
-        # The barrier makes XLA compute the field once, and not once for each map below.
-        Bx, By, Bz = jax.lax.optimization_barrier(magnetic_field(model, x, y, z))
+        Bx, By, Bz = magnetic_field(model, x, y, z)
         near, far = turbulence[step["near"]], turbulence[step["near"] + 1]
         rms = model.turbulence / jnp.sqrt(1 + step["s"] / model.coherence)
         random = rms * (step["cos"] * near + step["sin"] * far)
@@ -349,8 +348,9 @@ def embedded_sky(
 
     Parameters
     ----------
-    nside : resolution. Below 64 the maps are those at 64, cut at l = 3 nside - 1, because their
-        pixels are too wide to sample the Galactic plane.
+    nside : resolution. Below 64, where pixels are too wide to sample the Galactic plane, the maps
+        are those at 64 cut at l = 3 nside - 1; the dust's intensity then rings about the plane
+        and is negative in places.
     seed : of the turbulence; at another nside it is the same sky with more detail or less
     model : the parameters, by default `GalaxyModel()`
     steps : number of steps along the line of sight

@@ -37,6 +37,8 @@ __all__ = [
 
 #: Jacobi steps of the analysis; with ring weights two reach 1e-7 on band-limited maps.
 ITERATIONS = 2
+#: Multipoles analysed by `resample`, in units of those kept, as far as the map resolves them.
+MARGIN = 3
 
 
 def alm_ell(lmax: int) -> np.ndarray:
@@ -155,6 +157,14 @@ def analysis(
     return alm
 
 
+@cache
+def _kept(lmax_in: int, lmax: int) -> np.ndarray:
+    """Positions of the packed coefficients up to lmax among those up to lmax_in."""
+    ell, m = healpy.Alm.getlm(lmax_in)
+    order = np.concatenate([m[m == 0], np.repeat(m[m > 0], 2)])
+    return np.flatnonzero((alm_ell(lmax_in) <= lmax) & (order <= lmax))
+
+
 @partial(jax.jit, static_argnames="nside")
 def resample(
     maps: Float[Array, "stokes pix"], window: Float[Array, " ell"], nside: int
@@ -171,7 +181,11 @@ def resample(
     nside : resolution of the result
     """
     lmax = len(window) - 1
-    return synthesis(analysis(maps, lmax) * window[alm_ell(lmax)], nside)
+    # Multipoles beyond those that are analysed leak into them, so more are than are kept.
+    wide = max(lmax, min(2 * healpy.npix2nside(maps.shape[-1]), MARGIN * lmax))
+    padded = jnp.concatenate([window, jnp.zeros(wide - lmax, window.dtype)])
+    alm = (analysis(maps, wide) * padded[alm_ell(wide)])[:, _kept(wide, lmax)]
+    return synthesis(alm, nside)
 
 
 @cache

@@ -23,12 +23,26 @@ bench: .venv/.dev
 
 .venv/.run: .venv/bin/python requirements.txt pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps \
+		--no-build-isolation -e .
 	touch $@
 
 .venv/.dev: .venv/.run requirements-dev.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
 	touch $@
+
+# The newest versions of everything, in a fresh environment; run the tests before committing.
+pin:
+	rm -rf .venv
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet hatchling .
+	( sed -n 1p requirements.txt; $(BIN)/python -m pip freeze | grep -v '^jaxsky' ) > .venv/run.txt
+	$(BIN)/python -m pip install --quiet '.[dev]'
+	( sed -n 1p requirements-dev.txt; $(BIN)/python -m pip freeze | grep -v '^jaxsky' \
+		| grep -vxF -f .venv/run.txt ) > requirements-dev.txt.new
+	mv .venv/run.txt requirements.txt
+	mv requirements-dev.txt.new requirements-dev.txt
+	rm -rf .venv
 
 clean:
 	rm -rf .venv results

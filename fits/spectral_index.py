@@ -99,7 +99,11 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
     used = np.ones(healpy.nside2npix(nside), bool)
     for name, (own_used, _) in maps.items():
         if not own_used.all():
-            kept = operators[name](jnp.asarray(own_used[None], float))[0]
+            spread = operators[name]
+            if fwhm:  # the whole beam, without the ringing that the cut at lmax causes
+                window = gaussian_beam(fwhm, 2 * nsides[name])
+                spread = Preparation(window, nsides[name], nside)
+            kept = spread(jnp.asarray(own_used[None], float))[0]
             used &= np.asarray(kept) > 1 - MISSING
     sky = Sky(
         {

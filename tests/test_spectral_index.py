@@ -140,7 +140,7 @@ def test_knee_of_correlated_noise_is_recovered():
     mean, scatter = np.mean(errors, axis=0), np.std(errors, axis=0)
     # The mask mixes multipoles of a steep spectrum, which is a bias of a few percent.
     assert np.all(np.abs(mean) < [0.06, 0.12, 0.12])
-    assert np.all(scatter < [0.05, 0.15, 0.15])
+    assert np.all(scatter < [0.08, 0.15, 0.2])
 
 
 @pytest.fixture(scope="module")
@@ -184,12 +184,12 @@ def test_regions(quick_settings):
 
 @pytest.fixture(scope="module")
 def pulls():
-    """(best fit - truth) / sigma over 300 skies at Planck's level, by likelihood and Stokes.
+    """(best fit - truth) / sigma over 500 skies at Planck's level, by likelihood and Stokes.
 
     The embedded Galaxy is fixed; CMB and white noise are drawn at nside 128, seen with the
     channels' beams, then smoothed to 1 degree and brought to nside 64 together with it.
     """
-    nside_in, nside, fwhm, lmax, skies = 128, 64, 60.0, 191, 300
+    nside_in, nside, fwhm, lmax, skies = 128, 64, 60.0, 191, 500
     instrument = load_instrument("planck").select(["44", "70"])
     bands = {c.name: b for c, b in zip(instrument, instrument.bands(), strict=True)}
     factors = jnp.stack([b.conversion("uK_CMB", "uK_RJ") for b in bands.values()])
@@ -241,11 +241,11 @@ def pulls():
         return cached
 
     values = {}
-    for key in jax.random.split(jax.random.key(2016), skies):
+    for i, key in enumerate(jax.random.split(jax.random.key(2016), skies)):
         data = foregrounds + fluctuate(key)
         for stokes in ("Q", "U", "QU"):
             for kind in ("exact", "diagonal"):
-                if kind == "diagonal" and stokes != "QU":
+                if kind == "diagonal" and (stokes != "QU" or i >= 100):
                     continue
                 like = likelihood(
                     sky,

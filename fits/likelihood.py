@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 
 from fits.compress import gram, square_root
 from jaxsky import Bandpass, Sky, observe_components, parameter_names, set_parameters
-from jaxsky.checks import as_array
+from jaxsky.checks import as_array, check_double
 from jaxsky.interpolation import Nodes
 from jaxsky.parameters import OFFSET, unknown_parameter
 from jaxsky.sky import interpolation_nodes
@@ -233,10 +233,7 @@ def likelihood(
         For shapes that do not match, sigma that is not positive, data that are not finite, no
         pixel left, unknown Stokes parameters, or templates that cannot be told apart.
     """
-    if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError(
-            "fits needs double precision; call jax.config.update('jax_enable_x64', True) first."
-        )
+    check_double("fits")
     bands = named_bands(bands)
     data, sigma = as_array("data", data), as_array("sigma", sigma)
     _check_maps(sky, bands, data, sigma)

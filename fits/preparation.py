@@ -34,8 +34,9 @@ class Preparation(eqx.Module):
         Raises
         ------
         ValueError
-            If the target is finer than `what` is.
+            If the target is finer than `what` is, in beam or pixels.
         """
+        _check_nside(nside_in, nside, what)
         if fwhm < own_fwhm:
             raise ValueError(
                 f"The common resolution of {fwhm:g} arcmin is finer than that of {what}, "
@@ -52,8 +53,7 @@ class Preparation(eqx.Module):
         ValueError
             If the target has smaller pixels than `what` has.
         """
-        if nside > nside_in:
-            raise ValueError(f"The common nside {nside} is larger than that of {what}, {nside_in}.")
+        _check_nside(nside_in, nside, what)
         return cls(None, nside_in, nside)
 
     def __call__(self, maps: Float[Array, "stokes pix"]) -> Float[Array, "stokes pix"]:
@@ -79,6 +79,11 @@ class Preparation(eqx.Module):
         area = healpy.nside2pixarea(self.nside_in)
         rows = [resample(row[None], jnp.asarray(squared), self.nside)[0] for row in variance]
         return area * jnp.stack(rows)
+
+
+def _check_nside(nside_in: int, nside: int, what: str) -> None:
+    if nside > nside_in:
+        raise ValueError(f"The common nside {nside} is larger than that of {what}, {nside_in}.")
 
 
 def _squared_window(window: np.ndarray, highest: int) -> np.ndarray:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-__all__ = ["as_array", "check_finite", "check_positive", "is_concrete"]
+__all__ = ["as_array", "check_double", "check_finite", "check_positive", "is_concrete"]
 
 
 def is_concrete(x: object) -> bool:
@@ -51,4 +51,12 @@ def check_positive(name: str, value: Array) -> None:
     if is_concrete(value) and not bool(jnp.all(value > 0)):
         raise ValueError(
             f"Argument `{name}` must be positive, but its smallest value is {float(value.min()):g}."
+        )
+
+
+def check_double(what: str) -> None:
+    """Raise RuntimeError if JAX is not in double precision, which `what` needs."""
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(
+            f"{what} needs double precision; call jax.config.update('jax_enable_x64', True) first."
         )

@@ -18,6 +18,16 @@ app = typer.Typer(
 )
 console = Console(stderr=True)
 
+#: What a fit leaves in its folder.
+RESULTS = (
+    "result.json",
+    "log.json",
+    "grid.png",
+    "marginals.png",
+    "posterior.png",
+    "chain.h5",
+)
+
 
 def _version(value: bool) -> None:
     if value:
@@ -82,11 +92,11 @@ def fit(
             else fit_inputs.read_inputs(settings)
         )
         prepared = spectral_index.prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
-        console.print(inputs.description, highlight=False)
         fits = spectral_index.run(settings, prepared, regions, chains, status.update)
         status.update("drawing")
         seconds = time.perf_counter() - started
         written = report.write_report(out, inputs, settings, fits, seconds)
+    console.print(inputs.description, highlight=False)
     Console().print(report.result_table(fits))
     for sentence in report.warnings(fits):
         console.print(f"[yellow](!)[/] {sentence}", highlight=False)
@@ -103,14 +113,15 @@ def _write_example(path: Path, example: Path) -> None:
 def _claim(out: Path, resume: bool, overwrite: bool) -> Path:
     """The place of the chains in a folder that may be written to."""
     chains = out / "chain.h5"
-    if chains.exists() and not (resume or overwrite):
+    if any((out / name).exists() for name in RESULTS) and not (resume or overwrite):
         raise ValueError(
             f"{out}: holds results already; go on with --resume, replace them with --overwrite, "
             "or choose another --out."
         )
     out.mkdir(parents=True, exist_ok=True)
     if overwrite:
-        chains.unlink(missing_ok=True)
+        for name in RESULTS:
+            (out / name).unlink(missing_ok=True)
     return chains
 
 

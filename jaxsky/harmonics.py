@@ -21,6 +21,8 @@ from jaxbind.contrib.jaxducc0 import get_healpix_sht
 from jaxtyping import Array, ArrayLike, Float
 from scipy.special import j1
 
+from jaxsky.checks import check_double
+
 __all__ = [
     "adjoint_synthesis",
     "alm_ell",
@@ -109,6 +111,8 @@ def _blocks(stokes: int) -> list[tuple[slice, int]]:
 
 @cache
 def _transform(nside: int, lmax: int, spin: int):
+    # jaxbind passes the geometry of the rings as 64-bit numbers, whatever the maps are.
+    check_double("A spherical harmonic transform")
     return get_healpix_sht(nside, lmax, lmax, spin, nthreads=0)
 
 
@@ -157,14 +161,6 @@ def analysis(
     return alm
 
 
-@cache
-def _kept(lmax_in: int, lmax: int) -> np.ndarray:
-    """Positions of the packed coefficients up to lmax among those up to lmax_in."""
-    ell, m = healpy.Alm.getlm(lmax_in)
-    order = np.concatenate([m[m == 0], np.repeat(m[m > 0], 2)])
-    return np.flatnonzero((alm_ell(lmax_in) <= lmax) & (order <= lmax))
-
-
 @partial(jax.jit, static_argnames="nside")
 def resample(
     maps: Float[Array, "stokes pix"], window: Float[Array, " ell"], nside: int
@@ -184,8 +180,8 @@ def resample(
     # Multipoles beyond those that are analysed leak into them, so more are than are kept.
     wide = max(lmax, min(2 * healpy.npix2nside(maps.shape[-1]), MARGIN * lmax))
     padded = jnp.concatenate([window, jnp.zeros(wide - lmax, window.dtype)])
-    alm = (analysis(maps, wide) * padded[alm_ell(wide)])[:, _kept(wide, lmax)]
-    return synthesis(alm, nside)
+    alm = analysis(maps, wide) * padded[alm_ell(wide)]
+    return synthesis(alm[:, np.flatnonzero(alm_ell(wide) <= lmax)], nside)
 
 
 @cache

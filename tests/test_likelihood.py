@@ -328,11 +328,20 @@ def test_bad_input_is_refused(changes, error, words):
         call(**changes)
 
 
-def test_single_precision_is_refused():
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        ("from fits.likelihood import likelihood; likelihood(None, [], 0, 0, {})", "fits needs"),
+        (
+            "import jax; from jaxsky import harmonics as h; h.synthesis(jax.numpy.ones((2, 9)), 2)",
+            "A spherical harmonic transform needs",
+        ),
+    ],
+)
+def test_single_precision_is_refused(call, words):
     code = (
-        "from fits.likelihood import likelihood\n"
-        "try: likelihood(None, [], 0, 0, {})\n"
-        "except RuntimeError as e: assert 'fits needs double precision' in str(e)\n"
+        f"try: exec({call!r})\n"
+        f"except RuntimeError as e: assert {words!r} + ' double precision' in str(e), e\n"
         "else: raise SystemExit(1)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,63 @@
+"""`python -m benchmarks`."""
+
+import argparse
+import sys
+from pathlib import Path
+
+import jax
+from rich.console import Console
+
+from benchmarks import band_averages, command, likelihoods
+from benchmarks.table import Row, conditions, markdown, rich_table
+
+RESULTS = Path(__file__).with_name("RESULTS.md")
+BENCHMARKS = {
+    "command": command.fit,
+    "beta-map": band_averages.beta_map,
+    "beta-and-T-maps": band_averages.beta_and_T_maps,
+    "samples": band_averages.samples,
+    "nside": band_averages.growth,
+    "compile": band_averages.compilation,
+    "grid": likelihoods.grid,
+    "chain": likelihoods.chain,
+}
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser("python -m benchmarks", description="Times beside peers.")
+    parser.add_argument("--list", action="store_true", help="name the benchmarks and stop")
+    parser.add_argument("--only", choices=BENCHMARKS, help="run one", metavar="NAME")
+    parser.add_argument("--quick", action="store_true", help="small maps, no verdicts")
+    parser.add_argument("--write", action="store_true", help=f"write {RESULTS.name}")
+    arguments = parser.parse_args()
+    if arguments.write and (arguments.only or arguments.quick):
+        parser.error("--write keeps the whole table: without --only and --quick")
+    return arguments
+
+
+def _measure(names: list[str], quick: bool) -> list[Row]:
+    rows: list[Row] = []
+    with Console(stderr=True).status("starting") as status:
+        for name in names:
+            status.update(name)
+            rows += BENCHMARKS[name](quick)
+    return [row._replace(met=None) for row in rows] if quick else rows
+
+
+def main() -> None:
+    arguments = _arguments()
+    console = Console(width=None if sys.stdout.isatty() else 160)
+    if arguments.list:
+        console.print("\n".join(BENCHMARKS), highlight=False)
+        return
+    jax.config.update("jax_enable_x64", True)
+    rows = _measure([arguments.only] if arguments.only else list(BENCHMARKS), arguments.quick)
+    lines = conditions(arguments.quick)
+    console.print(rich_table(rows))
+    console.print("\n".join(lines), highlight=False)
+    if arguments.write:
+        RESULTS.write_text(markdown(rows, lines))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,353 @@
+"""The command line: the fit on files, what it leaves behind, and one sentence for a mistake."""
+
+import json
+import sys
+import tomllib
+
+import h5py
+import healpy
+import jax
+import numpy as np
+import pytest
+
+from fits.settings import EXAMPLE, load_settings
+from jaxsky import Bandpass, Dust, Sky, Synchrotron, cli, observe
+from jaxsky.harmonics import alm_ell, gaussian_beam, synthesis
+from jaxsky.io import write_maps
+from jaxsky.noise import draw, uniform_covariance
+
+NSIDE = 16
+TRUTH = {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}
+SETTINGS = """
+title = "A small sky"
+[analysis]
+nside = 8
+fwhm = 600.0
+regions = ["full"]
+[free]
+"dust.beta_dust" = {{ start = 1.5, uniform = [0.5, 2.5] }}
+"synchrotron.beta_syn" = {{ start = 3.1, uniform = [2.0, 4.5] }}
+[templates.dust]
+law = "dust"
+file = "dust.fits"
+nu_ref = 353.0
+fwhm = 120.0
+[templates.synchrotron]
+law = "synchrotron"
+file = "synchrotron.fits"
+nu_ref = 30.0
+[[bands]]
+name = "44"
+file = "44.fits"
+fields = ["Q_STOKES", "U_STOKES"]
+fwhm = 200.0
+bandpass = {{ file = "44.txt", convention = "RJ" }}
+noise = {noise}
+[[bands]]
+name = "70"
+file = "70.fits"
+fields = ["Q_STOKES", "U_STOKES"]
+fwhm = 150.0
+bandpass = {{ center = 70.0, width = 14.0 }}
+noise = {noise}
+[mcmc]
+nsteps = 2200
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Templates, and maps in the format of Planck's: K_CMB, NESTED, covariance columns."""
+    folder = tmp_path_factory.mktemp("sky")
+    lmax = 2 * NSIDE
+    rng = np.random.default_rng(8)
+    ell = alm_ell(lmax)
+    alms = [
+        np.where(ell > 1, 300 * rng.normal(size=(2, ell.size)) / (1 + ell), 0) for _ in range(2)
+    ]
+    dust, synchrotron = (np.asarray(synthesis(jax.numpy.asarray(a), NSIDE)) for a in alms)
+    beam = np.asarray(gaussian_beam(120.0, lmax))[ell]
+    smoothed = np.asarray(synthesis(jax.numpy.asarray(alms[0] * beam), NSIDE))
+    names = ["Q_STOKES", "U_STOKES"]
+    write_maps(folder / "dust.fits", smoothed, names=names, unit="uK_RJ")
+    write_maps(folder / "synchrotron.fits", synchrotron, names=names, unit="uK_RJ")
+    sky = Sky(
+        {
+            "dust": Dust(dust, TRUTH["dust.beta_dust"]),
+            "synchrotron": Synchrotron(synchrotron, TRUTH["synchrotron.beta_syn"]),
+        }
+    )
+    nu = np.linspace(39.0, 49.0, 21)
+    np.savetxt(folder / "44.txt", np.stack([nu, np.hanning(23)[1:-1]], axis=1))
+    bands = {
+        "44": (Bandpass(nu, np.hanning(23)[1:-1]), 200.0),
+        "70": (Bandpass.top_hat(70.0, 14.0), 150.0),
+    }
+    for i, (name, (band, fwhm)) in enumerate(bands.items()):
+        seen = synthesis_of(sky, band, fwhm, lmax)
+        covariance = uniform_covariance(200.0, NSIDE)  # uK_CMB
+        noise = np.asarray(draw(jax.random.key(i), covariance))
+        maps = 1e-6 * (seen / float(band.conversion("uK_CMB", "uK_RJ")) + noise)
+        QQ, QU, UU = 1e-12 * np.asarray(covariance)[(0, 0, 1), (0, 1, 1)]
+        columns = {
+            "Q_STOKES": maps[0],
+            "U_STOKES": maps[1],
+            "HITS": np.ones(QQ.size),
+            "QQ_COV": QQ,
+            "QU_COV": QU,
+            "UU_COV": UU,
+        }
+        nested = [healpy.reorder(c, r2n=True) for c in columns.values()]
+        healpy.write_map(
+            folder / f"{name}.fits",
+            nested,
+            nest=True,
+            coord="G",
+            column_names=list(columns),
+            column_units=["K_CMB", "K_CMB", "", "K_CMB^2", "K_CMB^2", "K_CMB^2"],
+            dtype=np.float64,
+        )
+    return folder
+
+
+def synthesis_of(sky, band, fwhm, lmax):
+    from jaxsky.harmonics import resample
+
+    return np.asarray(resample(observe(sky, [band])[0], gaussian_beam(fwhm, lmax), NSIDE))
+
+
+def jaxsky(monkeypatch, *arguments) -> int:
+    monkeypatch.setattr(sys, "argv", ["jaxsky", *map(str, arguments)])
+    try:
+        cli.main()
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    return 0
+
+
+def write_settings(
+    folder, name, noise="{ covariance = ['QQ_COV', 'QU_COV', 'UU_COV'] }", **replace
+):
+    text = SETTINGS.format(noise=noise)
+    for old, new in replace.items():
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / f"{name}.toml"
+    path.write_text(text)
+    return path
+
+
+def test_fit_on_files_in_plancks_format(folder, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    assert jaxsky(monkeypatch, "fit", write_settings(folder, "full"), "--out", out) == 0
+    printed = capsys.readouterr()
+    assert "beta_dust" in printed.out
+    assert "result.json" in printed.err
+    assert sorted(p.name for p in out.iterdir()) == [
+        "chain.h5", "grid.png", "log.json", "marginals.png", "posterior.png", "result.json",
+    ]  # fmt: skip
+    for picture in out.glob("*.png"):
+        assert picture.read_bytes().startswith(b"\x89PNG")
+    result = json.loads((out / "result.json").read_text())
+    assert set(result["results"]["full"]) == {"Q", "U", "QU"}
+    for methods in result["results"]["full"].values():
+        assert set(methods) == {"grid", "gradient", "mcmc"}
+        for numbers in methods.values():
+            assert {"best_fit", "interval_68", "covariance", "chi2", "dof", "free"} <= set(numbers)
+            assert numbers["converged"]
+            for i, name in enumerate(numbers["free"]):
+                low, high = numbers["interval_68"][name]
+                assert low < numbers["best_fit"][name] < high
+                sigma = numbers["covariance"][i][i] ** 0.5
+                assert abs(numbers["best_fit"][name] - TRUTH[name]) < 4 * sigma
+    log = json.loads((out / "log.json").read_text())
+    assert {"jax", "jaxsky", "healpy"} <= set(log["versions"])
+    assert log["settings"]["analysis"]["nside"] == 8
+
+
+def test_options_replace_settings_and_results_are_kept(folder, tmp_path, monkeypatch, capsys):
+    path, out = write_settings(folder, "options"), tmp_path / "out"
+    options = ["--stokes", "QU", "--region", "strip", "--seed", "5", "--nside", "4", "--out", out]
+    assert jaxsky(monkeypatch, "fit", path, *options) == 0
+    before = (out / "result.json").read_bytes()
+    assert set(json.loads(before)["results"]) == {"strip"}
+    assert set(json.loads(before)["results"]["strip"]) == {"QU"}
+    capsys.readouterr()
+    assert jaxsky(monkeypatch, "fit", path, *options) == 2
+    assert "holds results already; go on with --resume" in one_sentence(capsys)
+    assert (out / "result.json").read_bytes() == before
+    # Another seed is another chain: it is not gone on with.
+    other = [*options[:4], "--seed", "6", *options[6:]]
+    assert jaxsky(monkeypatch, "fit", path, *other, "--resume") == 2
+    assert "holds a chain of other data or settings" in one_sentence(capsys)
+    assert jaxsky(monkeypatch, "fit", path, *options, "--resume") == 0
+    again = json.loads((out / "result.json").read_text())
+    assert again["results"] == json.loads(before)["results"]
+    assert jaxsky(monkeypatch, "fit", path, *other, "--overwrite") == 0
+
+
+def test_resume_goes_on_with_a_cut_chain(folder, tmp_path, monkeypatch):
+    path, out = write_settings(folder, "resume"), tmp_path / "out"
+    options = ["--stokes", "QU", "--out", out]
+    assert jaxsky(monkeypatch, "fit", path, *options) == 0
+    whole = json.loads((out / "result.json").read_text())
+    (out / "chain.h5").unlink()
+    short = write_settings(folder, "short", **{"nsteps = 2200": "nsteps = 700"})
+    assert jaxsky(monkeypatch, "fit", short, *options) == 0
+    with h5py.File(out / "chain.h5") as file:
+        assert file["full_QU"].attrs["iteration"] == 700
+    assert jaxsky(monkeypatch, "fit", path, *options, "--resume") == 0
+    assert json.loads((out / "result.json").read_text())["results"] == whole["results"]
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [
+        "{ rms = 9e-7 }",
+        "{ estimate_above = 0 }",
+        "{ map = { file = '44.fits', fields = ['QQ_COV'] } }",
+    ],
+)
+def test_noise_can_be_given_in_other_ways(folder, tmp_path, monkeypatch, noise, capsys):
+    path = write_settings(
+        folder, "noise", noise, **{'regions = ["full"]': 'methods = ["gradient"]'}
+    )
+    code = jaxsky(monkeypatch, "fit", path, "--out", tmp_path / "o", "--stokes", "QU")
+    if "map" in noise:  # a covariance is no rms
+        assert code == 2
+        assert "K_CMB^2" in one_sentence(capsys)
+        return
+    assert code == 0
+    result = json.loads((tmp_path / "o" / "result.json").read_text())
+    fit = result["results"]["full"]["QU"]["gradient"]
+    for name, value in TRUTH.items():
+        assert fit["best_fit"][name] == pytest.approx(value, abs=0.2)
+    assert not (tmp_path / "o" / "grid.png").exists()
+
+
+def test_paths_with_variables(folder, tmp_path, monkeypatch):
+    path = write_settings(
+        tmp_path, "elsewhere", **{'title = "A small sky"': 'data_dir = "${SKY_MAPS:-/nowhere}"'}
+    )
+    assert load_settings(path).data_dir == "/nowhere"
+    monkeypatch.setenv("SKY_MAPS", str(folder))
+    assert load_settings(path).data_dir == str(folder.resolve())
+    plain = path.read_text().replace("${SKY_MAPS:-/nowhere}", "$SKY_NOTHING")
+    path.write_text(plain)
+    with pytest.raises(ValueError, match=r"data_dir: the environment variable SKY_NOTHING is not"):
+        load_settings(path)
+
+
+def test_init_writes_an_example_that_is_valid(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "mine.toml"
+    assert jaxsky(monkeypatch, "fit", path, "--init") == 0
+    settings = load_settings(path)
+    assert [band.name for band in settings.bands] == ["44", "70"]
+    # What is commented out is valid, too.
+    assert tomllib.loads(EXAMPLE.read_text())
+    path.write_text("mine")
+    capsys.readouterr()
+    assert jaxsky(monkeypatch, "fit", path, "--init") == 2
+    assert "exists already" in one_sentence(capsys)
+    assert path.read_text() == "mine"
+
+
+def one_sentence(capsys) -> str:
+    """What was printed: one sentence, no traceback."""
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "Traceback" not in printed
+    assert printed.startswith("jaxsky:"), printed
+    return printed
+
+
+FREE_DUST = '"dust.beta_dust" = { start = 1.5, uniform = [0.5, 2.5] }'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("nside = 8", "nside = 9", "analysis.nside: nside must be a power of two, not 9"),
+        ("nside = 8", "nside = 'x'", "analysis.nside: input should be a valid integer"),
+        ("nside = 8", "nsid = 8", "analysis.nsid: unknown key"),
+        ("nside = 8", "nside = ", "is not valid TOML"),
+        ("nside = 8", "nside = 32", "nside 32 is larger than that of"),
+        ("fwhm = 600.0", "fwhm = 60.0", "finer than that of template 'dust', 120 arcmin"),
+        ("[templates.dust]", "[template.dust]", "template: unknown key"),
+        ('law = "dust"', 'law = "dst"', "templates.dust.law: input should be 'dust'"),
+        ('"dust.fits"', '"none.fits"', "none.fits"),
+        ('"dust.fits"', '"44.txt"', "44.txt"),
+        ('["Q_STOKES", "U_STOKES"]', '["Q_STOKES", "V_STOKES"]', "V_STOKES"),
+        ('["Q_STOKES", "U_STOKES"]', '["Q_STOKES"]', "bands.44: fields must name Q and U"),
+        ('["full"]', '["fool"]', "'fool' is neither strip, outside, full nor a file"),
+        ('["full"]', '["full"]\\nstokes = ["I"]', "analysis.stokes.0: input should be 'Q'"),
+        ("start = 1.5", "start = 9.0", "start 9 is not inside the uniform prior"),
+        ("uniform = [0.5, 2.5]", "uniform = [2.5, 0.5]", "free.dust.beta_dust"),
+        ('"dust.beta_dust" =', '"dust.beta" =', "Unknown parameter 'dust.beta'"),
+        (
+            "[templates.dust]",
+            '[fixed]\\n"dust.T" = 3\\n[templates.dust]',
+            "Unknown parameter 'dust.T'",
+        ),
+        (
+            "[templates.dust]",
+            '[fixed]\\n"dust.beta_dust" = 1.5\\n[templates.dust]',
+            "dust.beta_dust cannot be both free and fixed",
+        ),
+        (
+            "[templates.dust]",
+            '[fixed]\\n"ame.m60" = 1.5\\n[templates.dust]',
+            "there is no template 'ame'",
+        ),
+        ("width = 14.0", "width = 14.0, file = '44.txt'", "either as file or as center and width"),
+        ('"44.txt"', '"nothing.txt"', "nothing.txt"),
+        ('name = "70"', 'name = "44"', "names of the bands must differ"),
+        (
+            "nu_ref = 353.0",
+            "nu_ref = -1.0",
+            "templates.dust.nu_ref: input should be greater than 0",
+        ),
+        ("nsteps = 2200", "nwalkers = 2", "mcmc.nwalkers"),
+    ],
+)
+def test_mistakes_in_settings_are_one_sentence(
+    folder, tmp_path, monkeypatch, capsys, old, new, words
+):
+    new = new.replace("\\n", "\n")
+    text = SETTINGS.format(noise="{ rms = 1e-6 }").replace('44.txt"', '44.txt"')
+    old = old if old in text else old.replace("'", '"')
+    assert old in text
+    path = folder / "mistake.toml"
+    path.write_text(text.replace(old, new, 1))
+    out = tmp_path / "out"
+    assert jaxsky(monkeypatch, "fit", path, "--out", out) == 2
+    assert words in one_sentence(capsys)
+    assert not list(out.glob("*")) if out.exists() else True
+
+
+@pytest.mark.parametrize(
+    ("noise", "words"),
+    [
+        ("{ }", "noise as exactly one of"),
+        ("{ rms = 1.0, estimate_above = 30 }", "noise as exactly one of"),
+        ("{ rms = -1.0 }", "bands.0.noise.rms: input should be greater than 0, not -1.0"),
+        ("{ covariance = ['QQ_COV', 'XX', 'UU_COV'] }", "XX"),
+        ("{ covariance = ['QU_COV', 'QQ_COV', 'UU_COV'] }", "not positive definite"),
+        ("{ rms = 1e-6, correlated = true }", "correlated goes with estimate_above only"),
+    ],
+)
+def test_mistakes_in_the_noise_are_one_sentence(
+    folder, tmp_path, monkeypatch, capsys, noise, words
+):
+    path = write_settings(folder, "noise", noise)
+    assert jaxsky(monkeypatch, "fit", path, "--out", tmp_path / "out") == 2
+    assert words in one_sentence(capsys)
+
+
+def test_absent_settings_are_one_sentence(tmp_path, monkeypatch, capsys):
+    assert jaxsky(monkeypatch, "fit", tmp_path / "none.toml", "--out", tmp_path / "out") == 2
+    assert "none.toml: cannot be read (No such file or directory)" in one_sentence(capsys)
+
+
+def test_version(monkeypatch, capsys):
+    assert jaxsky(monkeypatch, "--version") == 0
+    assert capsys.readouterr().out.startswith("jaxsky 0.")

@@ -16,6 +16,8 @@ from fits.spectral_index import Fit
 
 __all__ = ["label", "plot_grids", "plot_marginals", "plot_posterior"]
 
+chains.print_load_details = False  # getdist otherwise prints about burn-in
+
 #: Okabe & Ito's colours, which the colour-blind can tell apart.
 COLORS = {"Q": "#0072B2", "U": "#D55E00", "QU": "#222222"}
 REGION_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")

@@ -8,7 +8,7 @@ from pysm3 import ModifiedBlackBody
 from pysm3 import units as u
 
 from benchmarks.table import Row, time_text
-from benchmarks.timing import interleave, seconds
+from benchmarks.timing import interleave, page_faults, seconds
 from jaxsky import Bandpass, Dust, Sky, observe
 from jaxsky.sky import interpolation_nodes
 
@@ -120,13 +120,15 @@ def _beside_copy(nside: int, rounds: int) -> Row:
     jax.block_until_ready(calls["ours"]())
     times = interleave(calls, rounds)
     ratio = times.ratio("ours", "copy")
+    faults = ", ".join(f"{page_faults(calls[name])}" for name in ("ours", "copy"))
     return Row(
         f"the same, nside {nside}: jaxsky / copy of Q, U",
         f"{ratio:.1f}x",
         "<= 4x",
         ratio <= 4,
         f"{time_text(times['ours'])} / {time_text(times['copy'])}; a copy into memory already "
-        f"there {time_text(times['in place'])}, {times.ratio('ours', 'in place'):.1f}x",
+        f"there {time_text(times['in place'])}, {times.ratio('ours', 'in place'):.1f}x; page "
+        f"faults of new memory {faults}",
     )
 
 

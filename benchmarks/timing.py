@@ -1,6 +1,7 @@
 """Measuring: turns, medians and ratios of times, and the peak memory of a command."""
 
 import json
+import resource
 import subprocess
 import sys
 import time
@@ -10,7 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-__all__ = ["Times", "Usage", "interleave", "seconds", "usage"]
+__all__ = ["Times", "Usage", "interleave", "page_faults", "seconds", "usage"]
 
 # The memory of a process that starts another counts as the other's until it runs its own
 # program, so a small interpreter stands between this process and the command.
@@ -50,6 +51,13 @@ def seconds(function: Callable[[], Any]) -> float:
     start = time.perf_counter()
     jax.block_until_ready(function())
     return time.perf_counter() - start
+
+
+def page_faults(function: Callable[[], Any]) -> int:
+    """Pages of memory that the system hands out in one call."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    jax.block_until_ready(function())
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
 
 def _turn(function: Callable[[], Any], atleast: float) -> float:

@@ -67,8 +67,8 @@ def _narrow(axis: np.ndarray, profile: np.ndarray) -> tuple[float, float]:
 def grid_fit(
     like: Likelihood,
     start: Mapping[str, Numeric],
-    priors: Mapping[str, Prior],
     *,
+    priors: Mapping[str, Prior],
     points: int = 200,
 ) -> FitResult:
     """The posterior on a grid over the ranges of the uniform priors: the paper's test.

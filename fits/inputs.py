@@ -104,7 +104,7 @@ def embedded_inputs(settings: Settings) -> Inputs:
     bands = {}
     used = np.ones(healpy.nside2npix(embedded.nside), bool)
     for channel, bandpass, maps, key in zip(
-        instrument, instrument.bands(), seen, noise_keys, strict=True
+        instrument, instrument.bands().values(), seen, noise_keys, strict=True
     ):
         factor = bandpass.conversion(channel.noise_unit, "uK_RJ")
         noise = uniform_covariance(channel.noise * factor, embedded.nside)

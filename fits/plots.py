@@ -5,11 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-
-mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from getdist import MCSamples, plots
+from getdist import MCSamples, chains, plots
 
 from fits.results import FitResult
 from fits.spectral_index import Fit

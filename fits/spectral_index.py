@@ -5,7 +5,7 @@ region, to Q, to U and to both, on a grid, by gradient and by MCMC.
 """
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +28,7 @@ from fits.settings import Settings, SettingsError, known_regions
 from jaxsky import Bandpass, Sky
 from jaxsky.harmonics import gaussian_beam, pixel_window
 from jaxsky.io import degrade_mask, read_mask
+from jaxsky.types import Numeric
 
 __all__ = ["Fit", "Prepared", "prepare", "region_masks", "run"]
 
@@ -44,6 +45,41 @@ class Prepared(NamedTuple):
     sigma: Float[Array, "band stokes pix"]
     used: Bool[np.ndarray, " pix"]
     fluctuations: Fluctuations
+
+    def likelihood(
+        self,
+        start: Mapping[str, Numeric],
+        *,
+        stokes: str = "QU",
+        region: Bool[np.ndarray, " pix"] | None = None,
+        kind: str = "exact",
+    ) -> Likelihood:
+        """The likelihood of the parameters in `start`; see `fits.likelihood.likelihood`.
+
+        Parameters
+        ----------
+        start : free parameters by name
+        stokes : "Q", "U" or "QU"
+        region : pixels to use, of those that can be; default all
+        kind : "exact", or "diagonal" for the paper's sum over pixels
+
+        Raises
+        ------
+        KeyError, ValueError
+            For unknown parameters, a region without pixels or an unknown kind.
+        """
+        if kind not in ("exact", "diagonal"):
+            raise ValueError(f"Argument `kind` must be 'exact' or 'diagonal', not {kind!r}.")
+        used = self.used if region is None else self.used & region
+        return likelihood(
+            self.sky,
+            self.bands,
+            self.data,
+            jnp.where(used, self.sigma, jnp.inf),
+            start,
+            stokes=stokes,
+            covariance_of=self.fluctuations.covariance if kind == "exact" else None,
+        )
 
 
 class Fit(NamedTuple):
@@ -221,23 +257,17 @@ def fit_pixels(
 ) -> Fit:
     """The fits of one region and choice of Stokes parameters; see `run`."""
     start, priors = settings.start(), settings.priors()
-    sigma = jnp.where(used, prepared.sigma, jnp.inf)
-
-    def make(covariance_of):
-        maps = (prepared.sky, prepared.bands, prepared.data, sigma, start)
-        return likelihood(*maps, stokes=stokes, covariance_of=covariance_of)
-
     report(f"{region}, {stokes}: inner products")
-    diagonal = like = make(None)
-    dof_amplitudes = None
+    diagonal = prepared.likelihood(start, stokes=stokes, region=used, kind="diagonal")
+    like, dof_amplitudes = diagonal, None
     if settings.analysis.likelihood == "exact":
-        like = make(prepared.fluctuations.covariance)
+        like = prepared.likelihood(start, stokes=stokes, region=used)
         dof_amplitudes = like.residuals(start).size - len(start)
     results: dict[str, FitResult] = {}
     for method in settings.analysis.methods:
         report(f"{region}, {stokes}: {method}")
         if method == "grid":
-            results[method] = grid_fit(like, start, priors, points=settings.grid.points)
+            results[method] = grid_fit(like, start, priors=priors, points=settings.grid.points)
         elif method == "gradient":
             results[method] = best_fit(like, start, priors=priors, throw=False)
         else:

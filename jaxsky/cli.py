@@ -81,6 +81,9 @@ def fit(
     chains = _claim(out, resume, overwrite)
 
     with console.status("starting") as status:
+        import matplotlib as mpl
+
+        mpl.use("Agg")  # pictures go to files
         from fits import inputs as fit_inputs
         from fits import report, spectral_index
 

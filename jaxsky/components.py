@@ -5,6 +5,9 @@ law is written once, for a frequency, in `sed`, and everything else (band averag
 parameter names) follows from the fields.
 """
 
+import dataclasses
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -14,7 +17,36 @@ from jaxsky.checks import as_array, check_finite, check_positive
 from jaxsky.constants import T_CMB
 from jaxsky.types import Parameter
 
-__all__ = ["AME", "CMB", "Component", "Dust", "Synchrotron"]
+__all__ = ["AME", "CMB", "Component", "Dust", "Synchrotron", "parameter", "template"]
+
+
+def template() -> Any:
+    """Field of a component for its amplitude, (stokes, pix)."""
+    return eqx.field(converter=_converted)
+
+
+def parameter(default: Any = dataclasses.MISSING, *, positive: bool = False) -> Any:
+    """Field of a component for a spectral parameter: a number, or a map of shape (pix,).
+
+    Parameters
+    ----------
+    default : value if none is given; without, the parameter is required
+    positive : refuse values that are not positive
+    """
+    metadata = {"positive": positive}
+    if default is dataclasses.MISSING:
+        return eqx.field(converter=_converted, metadata=metadata)
+    return eqx.field(converter=_converted, metadata=metadata, default=default)
+
+
+def _converted(value: Any) -> Any:
+    """An array, or several in a tuple; what cannot be one is left for the check by name."""
+    if value is None or isinstance(value, tuple):
+        return value and tuple(map(_converted, value))
+    try:
+        return as_array("value", value)
+    except TypeError:
+        return value
 
 
 class Component(eqx.Module):
@@ -23,8 +55,25 @@ class Component(eqx.Module):
     Stokes parameters are I, Q, U (3 rows) or Q, U (2 rows), in uK_RJ at the component's
     reference frequency, HEALPix RING order, Galactic coordinates, COSMO sign of U.
 
-    A subclass adds its spectral parameters as fields, converts them with `self._parameter` and
-    writes `sed`.
+    A subclass declares its fields with `template` and `parameter`, and writes `sed`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        On construction, for units, wrong shapes, values that are not finite, or not positive
+        where they have to be.
+
+    Examples
+    --------
+    >>> class FreeFree(Component):
+    ...     amplitude: Array = template()
+    ...     beta_ff: Array = parameter(2.13)
+    ...     nu_ref: Array = parameter(30.0, positive=True)
+    ...
+    ...     def sed(self, nu):
+    ...         return sed.power_law(nu, self.beta_ff, self.nu_ref)
+    >>> round(float(FreeFree(jnp.ones((2, 12))).sed(60.0)), 4)
+    0.2285
     """
 
     amplitude: eqx.AbstractVar[Float[Array, "stokes pix"]]
@@ -38,27 +87,33 @@ class Component(eqx.Module):
         """What the law multiplies; the amplitude, unless parameters other than spectral act."""
         return self.amplitude
 
-    @staticmethod
-    def _amplitude(value: ArrayLike) -> Array:
-        array = as_array("amplitude", value)
-        if array.ndim != 2 or array.shape[0] not in (2, 3):
+    def __check_init__(self) -> None:
+        amplitude = as_array("amplitude", self.amplitude)
+        if amplitude.ndim != 2 or amplitude.shape[0] not in (2, 3):
             raise ValueError(
                 "Argument `amplitude` must have shape (stokes, pix) with Stokes Q, U or I, Q, U, "
-                f"but has shape {array.shape}."
+                f"but has shape {amplitude.shape}."
             )
-        check_finite("amplitude", array)
-        return array
+        check_finite("amplitude", amplitude)
+        for field in dataclasses.fields(self):
+            if field.name == "amplitude" or field.metadata.get("static"):
+                continue
+            value = getattr(self, field.name)
+            for entry in value if isinstance(value, tuple) else (value,):
+                if entry is not None:
+                    _check(field.name, entry, amplitude.shape[-1], field.metadata)
 
-    def _parameter(self, name: str, value: ArrayLike, positive: bool = False) -> Array:
-        array = as_array(name, value)
-        npix = self.amplitude.shape[-1]
-        if array.shape not in ((), (npix,)):
-            raise ValueError(
-                f"Argument `{name}` must be a number or a map of shape ({npix},), "
-                f"but has shape {array.shape}."
-            )
-        (check_positive if positive else check_finite)(name, array)
-        return array
+
+def _check(name: str, value: object, npix: int, metadata: Any) -> None:
+    array = as_array(name, value)
+    if array.shape not in ((), (npix,)):
+        raise ValueError(
+            f"Argument `{name}` must be a number or a map of shape ({npix},), "
+            f"but has shape {array.shape}."
+        )
+    if "positive" not in metadata:
+        raise TypeError(f"Field `{name}` must be declared with jaxsky.components.parameter.")
+    (check_positive if metadata["positive"] else check_finite)(name, array)
 
 
 class Synchrotron(Component):
@@ -71,25 +126,13 @@ class Synchrotron(Component):
     curvature : C of the paper, 0 for a pure power law
     nu_piv : pivot frequency of the curvature [GHz]
     nu_ref : reference frequency [GHz]
-
-    Raises
-    ------
-    TypeError, ValueError
-        For units, wrong shapes, values that are not finite, or frequencies that are not positive.
     """
 
-    amplitude: Float[Array, "stokes pix"]
-    beta_syn: Parameter
-    curvature: Parameter
-    nu_piv: Parameter
-    nu_ref: Parameter
-
-    def __init__(self, amplitude, beta_syn=3.10, curvature=0.0, nu_piv=23.0, nu_ref=30.0) -> None:
-        self.amplitude = self._amplitude(amplitude)
-        self.beta_syn = self._parameter("beta_syn", beta_syn)
-        self.curvature = self._parameter("curvature", curvature)
-        self.nu_piv = self._parameter("nu_piv", nu_piv, positive=True)
-        self.nu_ref = self._parameter("nu_ref", nu_ref, positive=True)
+    amplitude: Float[Array, "stokes pix"] = template()
+    beta_syn: Parameter = parameter(3.10)
+    curvature: Parameter = parameter(0.0)
+    nu_piv: Parameter = parameter(23.0, positive=True)
+    nu_ref: Parameter = parameter(30.0, positive=True)
 
     def sed(self, nu):
         return sed.curved_power_law(nu, self.beta_syn, self.curvature, self.nu_piv, self.nu_ref)
@@ -109,9 +152,9 @@ class Dust(Component):
 
     Raises
     ------
-    TypeError, ValueError
-        For units, wrong shapes, values that are not finite, temperatures or frequencies that
-        are not positive, tuples of different lengths, E_dust or nu_pivot with a single body.
+    ValueError
+        For tuples of different lengths, E_dust or nu_pivot with a single body, and what
+        `Component` refuses.
 
     Examples
     --------
@@ -120,40 +163,32 @@ class Dust(Component):
     2
     """
 
-    amplitude: Float[Array, "stokes pix"]
-    beta_dust: Parameter | tuple[Parameter, ...]
-    T_dust: Parameter | tuple[Parameter, ...]
-    E_dust: tuple[Parameter, ...] | None
-    nu_ref: Parameter
-    nu_pivot: Parameter | None
+    amplitude: Float[Array, "stokes pix"] = template()
+    beta_dust: Parameter | tuple[Parameter, ...] = parameter(1.53)
+    T_dust: Parameter | tuple[Parameter, ...] = parameter(21.0, positive=True)
+    E_dust: tuple[Parameter, ...] | None = parameter(None)
+    nu_ref: Parameter = parameter(353.0, positive=True)
+    nu_pivot: Parameter | None = parameter(None, positive=True)
 
-    def __init__(
-        self, amplitude, beta_dust=1.53, T_dust=21.0, E_dust=None, nu_ref=353.0, nu_pivot=None
-    ) -> None:
-        self.amplitude = self._amplitude(amplitude)
-        self.nu_ref = self._parameter("nu_ref", nu_ref, positive=True)
-        if not isinstance(beta_dust, tuple):
-            for name, value in {"E_dust": E_dust, "nu_pivot": nu_pivot}.items():
-                if value is not None:
+    def __post_init__(self) -> None:
+        if isinstance(self.beta_dust, tuple) and self.nu_pivot is None:
+            self.nu_pivot = 3000.0
+
+    def __check_init__(self) -> None:
+        if not isinstance(self.beta_dust, tuple):
+            for name in ("E_dust", "nu_pivot"):
+                if getattr(self, name) is not None:
                     raise ValueError(
                         f"Argument `{name}` has no effect with a single body; give `beta_dust`, "
                         "`T_dust` and `E_dust` as tuples for several."
                     )
-            self.beta_dust = self._parameter("beta_dust", beta_dust)
-            self.T_dust = self._parameter("T_dust", T_dust, positive=True)
-            self.E_dust = self.nu_pivot = None
-            return
-        lengths = [len(v) if isinstance(v, tuple) else None for v in (beta_dust, T_dust, E_dust)]
-        if len(set(lengths)) > 1 or not lengths[0]:
+        bodies = (self.beta_dust, self.T_dust, self.E_dust)
+        lengths = [len(v) if isinstance(v, tuple) else None for v in bodies]
+        if len(set(lengths)) > 1 or lengths[0] == 0:
             raise ValueError(
                 "Arguments `beta_dust`, `T_dust` and `E_dust` must be tuples with one entry a "
                 f"body, but have lengths {lengths}."
             )
-        self.beta_dust = tuple(self._parameter("beta_dust", b) for b in beta_dust)
-        self.T_dust = tuple(self._parameter("T_dust", T, positive=True) for T in T_dust)
-        self.E_dust = tuple(self._parameter("E_dust", E) for E in E_dust)
-        pivot = 3000.0 if nu_pivot is None else nu_pivot
-        self.nu_pivot = self._parameter("nu_pivot", pivot, positive=True)
 
     @property
     def bodies(self) -> int:
@@ -178,35 +213,21 @@ class AME(Component):
     polarization_fraction : what Q and U are multiplied by; 1 for maps that are measured Q and U
     m60, nu_max : slope at 60 GHz and peak frequency in flux [GHz] (below 60)
     nu_ref : reference frequency [GHz]
-
-    Raises
-    ------
-    TypeError, ValueError
-        For units, wrong shapes, values that are not finite, frequencies that are not positive.
     """
 
-    amplitude: Float[Array, "stokes pix"]
-    polarization_fraction: Parameter
-    m60: Parameter
-    nu_max: Parameter
-    nu_ref: Parameter
-
-    def __init__(
-        self, amplitude, polarization_fraction=1.0, m60=4.0, nu_max=19.0, nu_ref=23.0
-    ) -> None:
-        self.amplitude = self._amplitude(amplitude)
-        self.polarization_fraction = self._parameter("polarization_fraction", polarization_fraction)
-        self.m60 = self._parameter("m60", m60)
-        self.nu_max = self._parameter("nu_max", nu_max, positive=True)
-        self.nu_ref = self._parameter("nu_ref", nu_ref, positive=True)
+    amplitude: Float[Array, "stokes pix"] = template()
+    polarization_fraction: Parameter = parameter(1.0)
+    m60: Parameter = parameter(4.0)
+    nu_max: Parameter = parameter(19.0, positive=True)
+    nu_ref: Parameter = parameter(23.0, positive=True)
 
     @classmethod
     def from_dust_angles(
         cls,
         intensity: ArrayLike,
         dust: ArrayLike,
-        polarization_fraction: ArrayLike = 0.01,
-        **parameters: ArrayLike,
+        polarization_fraction: Parameter = 0.01,
+        **parameters: Any,
     ) -> "AME":
         """AME that is polarized along the dust: Q, U = f T (cos, sin)(2 chi), the paper's eq. 5.
 
@@ -218,7 +239,7 @@ class AME(Component):
         polarization_fraction : f, the paper's 1 %
         **parameters : further parameters of `AME`
         """
-        intensity, dust = as_array("intensity", intensity), cls._amplitude(dust)
+        intensity, dust = as_array("intensity", intensity), as_array("dust", dust)
         if intensity.shape != dust.shape[1:]:
             raise ValueError(
                 f"Argument `intensity` must have shape {dust.shape[1:]} like a map of `dust`, "
@@ -246,19 +267,10 @@ class CMB(Component):
     ----------
     amplitude : map in thermodynamic temperature [uK_CMB], shape (stokes, pix)
     T_cmb : temperature of the monopole [K]
-
-    Raises
-    ------
-    TypeError, ValueError
-        For units, wrong shapes, values that are not finite, a temperature that is not positive.
     """
 
-    amplitude: Float[Array, "stokes pix"]
-    T_cmb: Parameter
-
-    def __init__(self, amplitude, T_cmb=T_CMB) -> None:
-        self.amplitude = self._amplitude(amplitude)
-        self.T_cmb = self._parameter("T_cmb", T_cmb, positive=True)
+    amplitude: Float[Array, "stokes pix"] = template()
+    T_cmb: Parameter = parameter(T_CMB, positive=True)
 
     def sed(self, nu):
         return sed.cmb_derivative(nu, self.T_cmb)

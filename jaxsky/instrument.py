@@ -136,9 +136,9 @@ class Instrument(eqx.Module):
             raise TypeError(f"Argument `names` must be a list of names, not the string {names!r}.")
         return Instrument(self.name, [self[name] for name in names])
 
-    def bands(self, samples: int = 51, convention: str = "RJ") -> list[Bandpass]:
-        """The top-hat bands of all channels; see `Bandpass.top_hat`."""
-        return [channel.band(samples, convention) for channel in self.channels]
+    def bands(self, samples: int = 51, convention: str = "RJ") -> dict[str, Bandpass]:
+        """The top-hat bands of all channels by name; see `Bandpass.top_hat`."""
+        return {channel.name: channel.band(samples, convention) for channel in self.channels}
 
 
 @cache

@@ -64,7 +64,7 @@ def draw(key: Array, covariance: Float[Array, "stokes stokes pix"]) -> Float[Arr
 
 def estimate_variance(
     maps: Float[Array, "stokes pix"], used: Bool[Array, " pix"]
-) -> Float[Array, "stokes"]:
+) -> Float[Array, " stokes"]:
     """Noise variance per pixel from the scatter inside groups of four neighbouring pixels.
 
     What varies little over such a group cancels, which leaves the noise where the sky is smooth.

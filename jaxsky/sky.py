@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -11,6 +12,9 @@ from jaxtyping import Array, Float
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import Component
 from jaxsky.interpolation import Nodes, band_sed, choose_nodes
+
+#: Several bands: a list, or by name.
+Bands: TypeAlias = Sequence[Bandpass] | Mapping[str, Bandpass]
 
 __all__ = ["Sky", "interpolation_nodes", "observe", "observe_band", "observe_components"]
 
@@ -42,7 +46,8 @@ class Sky(eqx.Module):
     components: dict[str, Component]
 
     def __init__(self, components: Mapping[str, Component]) -> None:
-        self.components = dict(components)
+        # JAX sorts dictionaries when it takes them apart; sorted here, the order is one everywhere.
+        self.components = {name: components[name] for name in sorted(components)}
         if not self.components:
             raise ValueError("Argument `components` must have at least one component.")
         shapes = {}
@@ -75,6 +80,8 @@ def interpolation_nodes(sky: Sky, bands: Sequence[Bandpass], tolerance: float) -
 
 
 def _check_bands(bands: object) -> tuple[Bandpass, ...]:
+    if isinstance(bands, Mapping):
+        bands = list(bands.values())
     if isinstance(bands, Bandpass) or not isinstance(bands, Sequence):
         raise TypeError("Argument `bands` must be a list of Bandpass; for one, use observe_band.")
     for i, band in enumerate(bands):
@@ -116,7 +123,7 @@ def _observe(sky, bands, plan):
 
 def observe(
     sky: Sky,
-    bands: Sequence[Bandpass],
+    bands: Bands,
     *,
     tolerance: float = 1e-10,
     nodes: tuple[Nodes, ...] | None = None,
@@ -126,7 +133,7 @@ def observe(
     Parameters
     ----------
     sky : the sky
-    bands : list of bands
+    bands : list of bands, or a dictionary of them by name
     tolerance : relative error of the band-averaged laws where parameters are maps; 0 sums
         directly over the bands in every pixel
     nodes : from `interpolation_nodes`, instead of a tolerance. Inside jit, where the range of
@@ -140,7 +147,7 @@ def observe(
     Raises
     ------
     TypeError, ValueError
-        If `bands` is not a list of at least one Bandpass.
+        If `bands` does not hold at least one Bandpass, and nothing else.
     """
     bands = _check_bands(bands)
     return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance))
@@ -155,7 +162,7 @@ def observe_band(
 
 def observe_components(
     sky: Sky,
-    bands: Sequence[Bandpass],
+    bands: Bands,
     *,
     tolerance: float = 1e-10,
     nodes: tuple[Nodes, ...] | None = None,

@@ -7,5 +7,5 @@ from jaxtyping import Array, Float
 
 #: What the spectral laws take: numbers or arrays that broadcast.
 Numeric: TypeAlias = float | Array | np.ndarray
-#: A spectral parameter: a number or a map.
-Parameter: TypeAlias = Float[Array, ""] | Float[Array, " pix"]
+#: A spectral parameter: a number or a map; an array, once a component holds it.
+Parameter: TypeAlias = Float[Array, ""] | Float[Array, " pix"] | float

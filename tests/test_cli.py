@@ -191,9 +191,8 @@ def test_resume_goes_on_with_a_cut_chain(folder, tmp_path, monkeypatch):
     options = ["--stokes", "QU", "--out", out]
     assert jaxsky(monkeypatch, "fit", path, *options) == 0
     whole = json.loads((out / "result.json").read_text())
-    (out / "chain.h5").unlink()
     short = write_settings(folder, "short", **{"nsteps = 2200": "nsteps = 700"})
-    assert jaxsky(monkeypatch, "fit", short, *options) == 0
+    assert jaxsky(monkeypatch, "fit", short, *options, "--overwrite") == 0
     with h5py.File(out / "chain.h5") as file:
         assert file["full_QU"].attrs["iteration"] == 700
     assert jaxsky(monkeypatch, "fit", path, *options, "--resume") == 0

@@ -33,7 +33,7 @@ def like(request):
 def test_the_three_methods_agree(like):
     """Best fits within 0.1 sigma, widths within 5 %."""
     gradient = best_fit(like, START, priors=PRIORS)
-    grid = grid_fit(like, START, PRIORS)
+    grid = grid_fit(like, START, priors=PRIORS)
     mcmc = sample(like, START, priors=PRIORS, nsteps=4000, progress=False)
     assert gradient.free == grid.free == mcmc.free == tuple(sorted(START))
     for name in START:
@@ -143,7 +143,7 @@ def test_an_optimum_at_the_edge_of_a_prior_is_reported(like):
     assert caught.value.result.best_fit["dust.beta_dust"] == pytest.approx(2.2, abs=1e-3)
     assert not best_fit(like, start, priors=narrow, throw=False).converged
     # The grid and the chain pile up at the same edge instead of failing.
-    grid = grid_fit(like, start, narrow)
+    grid = grid_fit(like, start, priors=narrow)
     assert grid.best_fit["dust.beta_dust"] == pytest.approx(2.2)
     assert grid.interval_68["dust.beta_dust"][0] >= 2.2
 
@@ -167,15 +167,15 @@ def test_too_few_steps_are_reported_by_the_solver():
 
 def test_a_grid_needs_one_or_two_parameters_with_ranges(like):
     with pytest.raises(ValueError, match=r"one or two free parameters, not 3"):
-        grid_fit(like, START | {"calibration.44": 1.0}, PRIORS)
+        grid_fit(like, START | {"calibration.44": 1.0}, priors=PRIORS)
     with pytest.raises(ValueError, match=r"uniform prior for 'synchrotron.beta_syn'"):
-        grid_fit(like, START, {"dust.beta_dust": Uniform(1, 2)})
+        grid_fit(like, START, priors={"dust.beta_dust": Uniform(1, 2)})
 
 
 def test_a_grid_of_one_parameter(like):
     start = {"dust.beta_dust": 1.6}
     priors = {"dust.beta_dust": PRIORS["dust.beta_dust"]}
-    grid, gradient = grid_fit(like, start, priors), best_fit(like, start, priors=priors)
+    grid, gradient = grid_fit(like, start, priors=priors), best_fit(like, start, priors=priors)
     assert grid.sigma("dust.beta_dust") == pytest.approx(gradient.sigma("dust.beta_dust"), rel=0.03)
 
 

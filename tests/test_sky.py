@@ -34,6 +34,28 @@ def test_nothing_is_special_at_the_reference_frequency():
     np.testing.assert_allclose(near, at, rtol=1e-8)
 
 
+def test_bands_by_name_are_seen_in_their_order():
+    sky, bands = systems.dust_and_synchrotron(), systems.bands()
+    named = dict(zip(("z", "a"), bands, strict=True))
+    np.testing.assert_array_equal(observe(sky, named), observe(sky, bands))
+
+
+def test_the_order_of_components_does_not_matter():
+    """JAX sorts dictionaries; node counts chosen for one component must not reach another."""
+    parts = {
+        "synchrotron": Synchrotron(systems.random_maps(1), systems.spread(3.0, 0.6)),
+        "dust": Dust(systems.random_maps(2), systems.spread(1.5, 0.05), systems.spread(20, 2)),
+    }
+    seen = [
+        observe(Sky(dict(order)), systems.bands())
+        for order in (parts.items(), reversed(parts.items()))
+    ]
+    np.testing.assert_array_equal(*seen)
+    direct = observe(Sky(parts), systems.bands(), tolerance=0)
+    np.testing.assert_allclose(seen[0], direct, rtol=1e-8, atol=1e-9)
+    assert observe(Sky({k: parts[k] for k in ("synchrotron", "dust")}), systems.bands()).shape
+
+
 def test_names_follow_the_tree():
     sky = Sky({"a": systems.components()["two_body_dust"], "b": Synchrotron(np.ones((2, 48)))})
     names = parameter_names(sky)

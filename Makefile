@@ -15,8 +15,9 @@ lint: .venv/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# Huge pages for all that is allocated: numpy asks for them itself, XLA and numba do not.
 bench: .venv/.dev
-	$(BIN)/python -m benchmarks
+	GLIBC_TUNABLES=glibc.malloc.hugetlb=1 $(BIN)/python -m benchmarks --write
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv

@@ -64,6 +64,7 @@ def gram(
     return jax.lax.scan(add, total, jnp.arange(0, whole, chunk))[0]
 
 
+@jax.jit
 def square_root(matrix: Float[Array, "... row row"]) -> Float[Array, "... row row"]:
     """R with R^T R = G for symmetric positive semi-definite G, singular ones included.
 

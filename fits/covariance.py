@@ -36,6 +36,7 @@ class Fluctuations(eqx.Module):
     cmb_spectra: Float[Array, "stokes ell"] | None
     cmb_factors: Float[Array, " band"]
 
+    @eqx.filter_jit
     def covariance(
         self, rows: Float[Array, "band row stokes pix"]
     ) -> Float[Array, "bandrow bandrow"]:

@@ -17,11 +17,14 @@ the model in a band, and "offset.<band>.<stokes>", a constant added to it [uK_RJ
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
 from jaxtyping import Array, Float
 
 from fits.compress import gram, square_root
@@ -254,20 +257,34 @@ def likelihood(
 
     templates = jnp.stack([c.amplitude for c in sky.components.values()])
     products = gram(data, templates, weights)[:, keep]
-    size = products.shape[-1]
     if covariance_of is None:
-        blocks = square_root(products).reshape(-1, size, size)
-        matrix = jax.scipy.linalg.block_diag(*blocks)
-    else:
-        rows = weights[:, None, :, :] * jnp.where(weights[:, None] > 0, templates, 0)
-        whitening = _whitening(covariance_of(_one_stokes_each(rows, keep)))
-        blocks = products[:, :, 1:-1].reshape(-1, size - 2, size)
-        matrix = whitening @ jax.scipy.linalg.block_diag(*blocks)
-    full = jnp.zeros((len(matrix), len(bands), len(labels), size))
-    matrix = full.at[:, :, keep].set(matrix.reshape(len(matrix), len(bands), len(keep), size))
-    return TemplateLikelihood(_unit_sky(sky), own, matrix.reshape(len(matrix), -1))
+        root = square_root(products)
+        return TemplateLikelihood(_unit_sky(sky), own, _matrix(None, root, keep, len(labels)))
+    rows = _one_stokes_each(_weighted_templates(templates, weights), keep)
+    whitening = _whitening(covariance_of(rows))
+    matrix = _matrix(whitening, products[:, :, 1:-1], keep, len(labels))
+    return TemplateLikelihood(_unit_sky(sky), own, matrix)
 
 
+@jax.jit
+def _weighted_templates(templates, weights):
+    """Rows W T of each band and template, zero where masked."""
+    return weights[:, None] * jnp.where(weights[:, None] > 0, templates, 0)
+
+
+@partial(jax.jit, static_argnames="stokes")
+def _matrix(whitening, blocks, keep, stokes):
+    """Blocks (band, kept stokes, row, vector) on the diagonal of a matrix for all Stokes rows."""
+    bands, kept, rows, size = blocks.shape
+    matrix = jax.scipy.linalg.block_diag(*blocks.reshape(-1, rows, size))
+    if whitening is not None:
+        matrix = whitening @ matrix
+    full = jnp.zeros((len(matrix), bands, stokes, size))
+    full = full.at[:, :, keep].set(matrix.reshape(-1, bands, kept, size))
+    return full.reshape(len(matrix), -1)
+
+
+@jax.jit
 def _one_stokes_each(rows: Array, keep: Array) -> Float[Array, "band row stokes pix"]:
     """Rows (band, template, stokes, pix) split so that each holds one Stokes parameter."""
     bands, templates, stokes, npix = rows.shape
@@ -283,17 +300,19 @@ def _whitening(covariance: Float[Array, "row row"]) -> Float[Array, "row row"]:
     ValueError
         If the covariance is not positive definite: two templates are the same up to a factor.
     """
-    scale = jnp.sqrt(jnp.diagonal(covariance))
-    correlation = covariance / scale[:, None] / scale[None, :]
-    if not bool(jnp.all(scale > 0)) or float(jnp.linalg.eigvalsh(correlation)[0]) < 1e-12:
+    values = np.asarray(covariance)
+    scale = np.sqrt(np.diagonal(values))
+    usable = np.all(scale > 0)
+    if usable:
+        correlation = values / scale[:, None] / scale[None, :]
+        usable = np.linalg.eigvalsh(correlation)[0] > 1e-12
+    if not usable:
         raise ValueError(
             "The templates cannot be told apart in this region: the covariance of their "
             "amplitudes is not positive definite."
         )
-    inverse = jax.scipy.linalg.solve_triangular(
-        jnp.linalg.cholesky(correlation), jnp.eye(len(scale)), lower=True
-    )
-    return inverse / scale[None, :]
+    root = np.linalg.cholesky(correlation)
+    return jnp.asarray(scipy.linalg.solve_triangular(root, np.diag(1 / scale), lower=True))
 
 
 def _pixel_likelihood(at_start, sky, bands, data, weights, keep, covariance_of):

@@ -241,7 +241,11 @@ def plot_posterior(
         markers={n: v for n, v in (truth or {}).items() if n in free},
         marker_args={"color": TRUTH["color"], "lw": TRUTH["linewidth"], "ls": "-"},
     )
-    plotter.fig.suptitle(title, fontsize=8, y=1.03)
+    for i, name in enumerate(free):
+        for fit, color in zip(shown, REGION_COLORS, strict=False):
+            interval = fit.results["mcmc"].interval_68[name]
+            plotter.subplots[i, i].axvspan(*interval, color=color, alpha=0.15, linewidth=0)
+    plotter.fig.suptitle(f"{title}; 68 % shaded", fontsize=8, y=1.03)
     with mpl.rc_context(STYLE | {"savefig.dpi": 200}):
         _save(plotter.fig, path)
     return True

@@ -1,5 +1,6 @@
 """Bringing maps to a common resolution: one linear operator a map, with its exact transpose."""
 
+import ducc0
 import equinox as eqx
 import healpy
 import jax
@@ -62,6 +63,7 @@ class Preparation(eqx.Module):
             return resample(maps, self.window, self.nside)
         return average_pixels(maps, self.nside)
 
+    @eqx.filter_jit
     def transpose(self, maps: Float[Array, "stokes pix"]) -> Float[Array, "stokes pix"]:
         """The transposed operator, from the common resolution to that of the maps."""
         shape = (len(maps), healpy.nside2npix(self.nside_in))
@@ -89,7 +91,9 @@ def _check_nside(nside_in: int, nside: int, what: str) -> None:
 def _squared_window(window: np.ndarray, highest: int) -> np.ndarray:
     """Window of the square of the kernel that has the given window."""
     lmax = min(2 * (len(window) - 1), highest)
-    x, weights = np.polynomial.legendre.leggauss(2 * len(window) + lmax)
+    order = 2 * len(window) + lmax
+    x = np.cos(ducc0.misc.GL_thetas(order))
+    weights = ducc0.misc.GL_weights(order, 1) / (2 * np.pi)
     ell = np.arange(len(window))
     kernel = np.polynomial.legendre.legval(x, (2 * ell + 1) / (4 * np.pi) * window)
     return 2 * np.pi * (weights * kernel**2) @ np.polynomial.legendre.legvander(x, lmax)

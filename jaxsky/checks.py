@@ -41,14 +41,14 @@ def as_array(name: str, value: object) -> Array:
 
 def check_finite(name: str, value: Array) -> None:
     """Raise ValueError if a concrete array has NaN or infinite values; says how many."""
-    if is_concrete(value) and (bad := int(jnp.sum(~jnp.isfinite(value)))):
+    if is_concrete(value) and (bad := int(np.sum(~np.isfinite(value)))):
         raise ValueError(f"Argument `{name}` has {bad} of {value.size} values that are not finite.")
 
 
 def check_positive(name: str, value: Array) -> None:
     """Raise ValueError if a concrete array has values that are not finite and positive."""
     check_finite(name, value)
-    if is_concrete(value) and not bool(jnp.all(value > 0)):
+    if is_concrete(value) and not np.all(np.asarray(value) > 0):
         raise ValueError(
             f"Argument `{name}` must be positive, but its smallest value is {float(value.min()):g}."
         )

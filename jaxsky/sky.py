@@ -92,20 +92,26 @@ def _check_bands(bands: object) -> tuple[Bandpass, ...]:
     return tuple(bands)
 
 
-def _stack(rows: list[list[Array]]) -> Float[Array, "band stokes pix"]:
-    """Rows of pixels as one array; written row by row, XLA fuses each into one pass."""
-    return jnp.stack([row for band in rows for row in band]).reshape(len(rows), len(rows[0]), -1)
-
-
-def _emission(component: Component, bands: tuple[Bandpass, ...], nodes: Nodes) -> list[list[Array]]:
-    seds = [band_sed(component, band, nodes) for band in bands]
-    return [[row * sed for row in component.template] for sed in seds]
+def _emission(
+    component: Component, bands: tuple[Bandpass, ...], nodes: Nodes
+) -> list[Float[Array, "stokes pix"]]:
+    """What a component shows in each band."""
+    maps = []
+    for band in bands:
+        sed = band_sed(component, band, nodes)
+        if nodes and len(nodes) > 1:
+            # Costly laws are evaluated once for all Stokes parameters, ...
+            maps.append(component.template * sed)
+        else:
+            # ... cheap ones once a row: XLA fuses each row into one pass over memory.
+            maps.append(jnp.stack([row * sed for row in component.template]))
+    return maps
 
 
 @partial(jax.jit, static_argnames="plan")
 def _observe_components(sky, bands, plan):
     return {
-        name: _stack(_emission(component, bands, nodes))
+        name: jnp.stack(_emission(component, bands, nodes))
         for (name, component), nodes in zip(sky.components.items(), plan, strict=True)
     }
 
@@ -116,9 +122,7 @@ def _observe(sky, bands, plan):
         _emission(component, bands, nodes)
         for component, nodes in zip(sky.components.values(), plan, strict=True)
     ]
-    return _stack(
-        [[sum(rows) for rows in zip(*e, strict=True)] for e in zip(*emissions, strict=True)]
-    )
+    return jnp.stack([sum(maps) for maps in zip(*emissions, strict=True)])
 
 
 def observe(

@@ -25,8 +25,8 @@ class Fluctuations(eqx.Module):
     noise : for each band, covariance of Q and U in each pixel before that [uK_RJ^2]
     correlated : for each band, C_l of noise that is correlated between pixels, the same for E and
         B, in the prepared maps [uK_RJ^2], shape (ell,); None where there is none
-    cmb_spectra : C_l of EE and BB times the window of the prepared maps squared [uK_CMB^2],
-        shape (2, ell); None without CMB
+    cmb_spectra : C_l of EE and BB [uK_CMB^2], shape (2, ell); None without CMB
+    cmb_windows : beam and pixel window of the prepared maps of each band, shape (band, ell)
     cmb_factors : uK_RJ per uK_CMB in each band, shape (band,)
     """
 
@@ -34,6 +34,7 @@ class Fluctuations(eqx.Module):
     noise: tuple[Float[Array, "stokes stokes pix"], ...]
     correlated: tuple[Float[Array, " ell"] | None, ...]
     cmb_spectra: Float[Array, "stokes ell"] | None
+    cmb_windows: Float[Array, "band ell"] | None
     cmb_factors: Float[Array, " band"]
 
     @eqx.filter_jit
@@ -51,18 +52,24 @@ class Fluctuations(eqx.Module):
                 block = block + modes @ modes.T
             total = total.at[b, :, b, :].add(block)
         total = total.reshape(bands * count, bands * count)
-        if self.cmb_spectra is not None:
+        if self.cmb_spectra is not None and self.cmb_windows is not None:
             modes = jnp.concatenate(
                 [
-                    factor * _modes(band, self.cmb_spectra)
-                    for factor, band in zip(self.cmb_factors, rows, strict=True)
+                    factor * _modes(band, self.cmb_spectra * window**2)
+                    for factor, window, band in zip(
+                        self.cmb_factors, self.cmb_windows, rows, strict=True
+                    )
                 ]
             )
             total = total + modes @ modes.T
         return total
 
     def sigma(self) -> Float[Array, "band stokes pix"]:
-        """Standard deviation of the noise in each pixel of the prepared maps [uK_RJ]."""
+        """Standard deviation of the noise in each pixel of the prepared maps [uK_RJ].
+
+        NaN where it cannot be had: next to steps of the noise by more than a factor of some
+        hundred, where the smoothed map of variances rings below zero.
+        """
         variances = []
         for preparation, noise, spectrum in zip(
             self.preparations, self.noise, self.correlated, strict=True
@@ -72,7 +79,8 @@ class Fluctuations(eqx.Module):
                 modes = 2 * jnp.arange(spectrum.size) + 1
                 variance = variance + jnp.sum(modes * spectrum) / (4 * jnp.pi)
             variances.append(variance)
-        return jnp.sqrt(jnp.stack(variances))
+        total = jnp.stack(variances)
+        return jnp.sqrt(jnp.where(total > 0, total, jnp.nan))
 
 
 def _modes(

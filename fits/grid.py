@@ -1,17 +1,18 @@
 """The posterior of one or two parameters on a grid."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from fits.likelihood import Likelihood, chi2
+from fits.likelihood import Likelihood, PixelLikelihood, chi2
 from fits.priors import Prior, bounds, check_priors, log_prior
 from fits.results import FitResult
 from jaxsky.types import Numeric
 
-__all__ = ["grid_fit"]
+__all__ = ["grid_fit", "grid_is_possible"]
 
 #: The grid is narrowed to where the posterior exceeds exp(-NARROW/2) of its maximum (6 sigma).
 NARROW = 36.0
@@ -32,6 +33,12 @@ def _log_posterior(like, axes, priors):
         value = chi2(like, params)
         return -value / 2 + log_prior(params, priors), value
 
+    if isinstance(like, PixelLikelihood):
+        # One point after the other: all at once would hold the maps once for each of them.
+        mesh = [axis.ravel() for axis in jnp.meshgrid(*axes.values(), indexing="ij")]
+        shape = tuple(axis.size for axis in axes.values())
+        flat = jax.lax.map(lambda values: point(*values), tuple(mesh))
+        return jax.tree.map(lambda x: x.reshape(shape), flat)
     mapped = point
     for i in reversed(range(len(names))):
         mapped = jax.vmap(mapped, in_axes=tuple(0 if j == i else None for j in range(len(names))))
@@ -62,6 +69,12 @@ def _narrow(axis: np.ndarray, profile: np.ndarray) -> tuple[float, float]:
     """Range of an axis in which the profile matters, one step wider on either side."""
     inside = np.flatnonzero(profile > -NARROW / 2)
     return float(axis[max(inside[0] - 1, 0)]), float(axis[min(inside[-1] + 1, len(axis) - 1)])
+
+
+def grid_is_possible(free: Iterable[str], priors: Mapping[str, Prior]) -> bool:
+    """True for one or two parameters that each have a uniform prior."""
+    names = list(free)
+    return len(names) <= 2 and all(np.isfinite(bounds(name, priors)).all() for name in names)
 
 
 def grid_fit(
@@ -105,6 +118,7 @@ def grid_fit(
     for name, (low, high) in ranges.items():
         if not np.isfinite([low, high]).all():
             raise ValueError(f"A grid needs a uniform prior for {name!r}, to know its range.")
+    limits = dict(ranges)
     for _ in range(6):
         axes = {name: np.linspace(low, high, points) for name, (low, high) in ranges.items()}
         log_posterior, chi2s = (np.asarray(a) for a in _log_posterior(like, axes, priors))
@@ -118,15 +132,15 @@ def grid_fit(
         if min(shrunk) > 0.8:
             break
         ranges = narrowed
-    return _summary(like, free, axes, log_posterior, chi2s)
+    return _summary(free, axes, log_posterior, chi2s, limits)
 
 
 def _summary(
-    like: Likelihood,
     free: tuple[str, ...],
     axes: dict[str, np.ndarray],
     log_posterior: np.ndarray,
     chi2s: np.ndarray,
+    limits: dict[str, tuple[float, float]],
 ) -> FitResult:
     values = list(axes.values())
     density = np.exp(log_posterior)
@@ -146,14 +160,20 @@ def _summary(
         "log_posterior": log_posterior,
         "marginals": marginals,
     }
+    values_at_best = {name: float(mesh[i, best]) for i, name in enumerate(free)}
+    edges = [name for name, value in values_at_best.items() if value in limits[name]]
     return FitResult(
         method="grid",
         free=free,
-        best_fit={name: float(mesh[i, best]) for i, name in enumerate(free)},
+        best_fit=values_at_best,
         interval_68=intervals,
         covariance=np.atleast_2d(np.cov(mesh, aweights=weights / weights.sum(), ddof=0)),
         chi2=float(chi2s.ravel()[best]),
-        converged=True,
-        message="integrated",
+        converged=not edges,
+        message=(
+            f"The highest point lies at the edge of the uniform prior of {', '.join(edges)}."
+            if edges
+            else "integrated"
+        ),
         details=details,
     )

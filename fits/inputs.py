@@ -1,5 +1,6 @@
 """What a spectral-index fit starts from: templates and observed maps, from files or embedded."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ from jaxsky.galaxy import embedded_sky
 from jaxsky.harmonics import gaussian_beam, resample, synthesis
 from jaxsky.instrument import load_instrument
 from jaxsky.io import Maps, read_bandpass, read_maps, unit_factor
+from jaxsky.io.tables import stokes
 from jaxsky.noise import (
     draw,
     estimate_variance,
@@ -93,13 +95,13 @@ def embedded_inputs(settings: Settings) -> Inputs:
     sky = set_parameters(galaxy.sky("QU"), settings.fixed)
     instrument = load_instrument(embedded.instrument).select(embedded.channels)
     lmax = 2 * embedded.nside  # what the pixels resolve without aliasing
-    spectra = camb_spectra(lmax, settings.cmb.r) if settings.cmb.include else None
+    spectra = camb_spectra(2 * lmax, settings.cmb.r) if settings.cmb.include else None
     cmb_key, *noise_keys = jax.random.split(jax.random.key(seed), 1 + len(embedded.channels))
     components = dict(sky.components)
     if spectra is not None:
-        alm = realisation(cmb_key, jnp.asarray(spectra))
+        alm = realisation(cmb_key, jnp.asarray(spectra)[:, : lmax + 1])
         components["cmb"] = CMB(synthesis(alm, embedded.nside))
-    seen = observe(Sky(components), instrument.bands())
+    seen = observe(Sky(components), list(instrument.bands().values()))
 
     bands = {}
     used = np.ones(healpy.nside2npix(embedded.nside), bool)
@@ -134,7 +136,7 @@ def read_inputs(settings: Settings) -> Inputs:
     sky = set_parameters_of(templates, settings.fixed)
     bands = {spec.name: _read_band(folder, spec) for spec in settings.bands}
     nside = max(healpy.npix2nside(band.maps.shape[-1]) for band in bands.values())
-    spectra = camb_spectra(3 * nside - 1, settings.cmb.r) if settings.cmb.include else None
+    spectra = camb_spectra(4 * nside, settings.cmb.r) if settings.cmb.include else None
     return Inputs(sky, bands, spectra, None, settings.title)
 
 
@@ -172,6 +174,7 @@ def _read_template(
     folder: Path, name: str, spec: TemplateSettings, others: dict[str, Template]
 ) -> Template:
     read = _read(folder, spec)
+    _check_stokes(f"templates.{name}", read.names, "I" if spec.angles else "QU")
     maps = jnp.asarray(read.maps) * conversion(read.unit, "uK_RJ", spec.nu_ref)
     used = np.asarray(read.mask)
     parameters: dict[str, Any] = {"nu_ref": spec.nu_ref}
@@ -195,6 +198,15 @@ def _read_template(
     return Template(component, spec.fwhm, used)
 
 
+def _check_stokes(where: str, names: Sequence[str], wanted: str) -> None:
+    """Refuse columns whose names say that they are other Stokes parameters than is wanted."""
+    said = [stokes(name) for name in names[-len(wanted) :]]
+    if any(s and s != w for s, w in zip(said, wanted, strict=False)):
+        raise SettingsError(
+            f"{where}.fields: {', '.join(names)} are not {' and '.join(wanted)} by their names."
+        )
+
+
 def _bandpass(folder: Path, spec: BandpassSpec) -> Bandpass:
     if spec.file is not None:
         return read_bandpass(
@@ -210,6 +222,7 @@ def _read_band(folder: Path, spec: BandSettings) -> Band:
     read = _read(folder, spec)
     if len(read.maps) < 2:
         raise SettingsError(f"bands.{spec.name}: fields must name Q and U.")
+    _check_stokes(f"bands.{spec.name}", read.names, "QU")
     bandpass = _bandpass(folder, spec.bandpass)
     factor = bandpass.conversion(read.unit, "uK_RJ")
     maps, used = jnp.asarray(read.maps[-2:]) * factor, np.asarray(read.mask)
@@ -230,19 +243,25 @@ def _estimated_noise(noise, maps, used):
         return jnp.eye(2)[..., None] * variance[:, None, None] * jnp.ones(npix), None
     white, knee, slope = fit_knee(maps, quiet, 2 * nside)
     covariance = jnp.eye(2)[..., None] * jnp.full(npix, white / healpy.nside2pixarea(nside))
-    excess = knee_spectrum(white, knee, slope, 3 * nside - 1) - white
+    excess = knee_spectrum(white, knee, slope, 4 * nside) - white
     return covariance, excess.at[:2].set(0.0)
 
 
 def _given_noise(folder, spec, maps, factor, bandpass):
     """Covariance of Q and U in each pixel [uK_RJ^2], and where it is known."""
     npix = maps.shape[-1]
+    read_nside = healpy.npix2nside(npix)
     noise, eye = spec.noise, jnp.eye(2)[..., None]
     if noise.rms is not None:
         return eye * jnp.full(npix, (noise.rms * factor) ** 2), np.ones(npix, bool)
     if noise.map is not None:
         rms = _read(folder, noise.map)
         known = np.asarray(rms.mask)
+        if rms.nside != read_nside:
+            raise SettingsError(
+                f"bands.{spec.name}.noise: the map of the noise has nside {rms.nside}, "
+                f"that of the band {read_nside}."
+            )
         to_RJ = bandpass.conversion(rms.unit, "uK_RJ")
         rows = jnp.asarray(rms.maps) * to_RJ
         _check_noise(spec, rows, known)

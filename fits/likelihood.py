@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 from fits.compress import gram, square_root
 from jaxsky import Bandpass, Sky, observe_components, parameter_names, set_parameters
 from jaxsky.checks import as_array, check_double
-from jaxsky.interpolation import Nodes
+from jaxsky.interpolation import NodeCounts, Nodes
 from jaxsky.parameters import OFFSET, unknown_parameter
 from jaxsky.sky import interpolation_nodes
 from jaxsky.types import Numeric
@@ -92,8 +92,11 @@ class Likelihood(eqx.Module):
         known = (*parameter_names(self.sky), *self.bands.parameter_names())
         if not params:
             raise ValueError("Argument `start` must name at least one free parameter.")
+        own = self.bands.parameter_names()
         for name, value in params.items():
-            if name.removesuffix(OFFSET) not in known or name.endswith(".amplitude"):
+            target = name.removesuffix(OFFSET)
+            shifted_band = target != name and target in own
+            if target not in known or shifted_band or name.endswith(".amplitude"):
                 raise unknown_parameter(name, [k for k in known if not k.endswith(".amplitude")])
             if jnp.shape(value) != ():
                 raise ValueError(f"Free parameter {name!r} must be a number, not a map.")
@@ -247,22 +250,31 @@ def likelihood(
     keep = jnp.array([labels.index(s) for s in stokes])
     own = Bands(tuple(bands.values()), tuple(bands), labels)
     params = Likelihood(sky, own).check(start)
+    offsets = [name for name in params if name.startswith("offset.")]
+    for name in offsets:
+        if name[-1] not in stokes:
+            raise ValueError(f"Parameter {name!r} has no effect on Stokes {stokes}.")
     sky_params = own.sky_parameters(params)
     shifts = {name: value for name, value in sky_params.items() if name.endswith(OFFSET)}
     sky = set_parameters(sky, {n: v for n, v in sky_params.items() if n not in shifts})
     weights = jnp.broadcast_to(1 / sigma**2, data.shape)
     if not is_uniform(sky) or pixelwise:
         at_start = set_parameters(sky, shifts)
-        return _pixel_likelihood(at_start, sky, own, data, weights, keep, covariance_of)
+        return _pixel_likelihood(
+            at_start, sky, own, data, weights, keep, covariance_of, bool(offsets)
+        )
 
     templates = jnp.stack([c.amplitude for c in sky.components.values()])
     products = gram(data, templates, weights)[:, keep]
     if covariance_of is None:
         root = square_root(products)
         return TemplateLikelihood(_unit_sky(sky), own, _matrix(None, root, keep, len(labels)))
+    used = slice(1, None if offsets else -1)  # a constant row tells offsets from templates
+    if offsets:
+        templates = jnp.concatenate([templates, jnp.ones_like(templates[:1])])
     rows = _one_stokes_each(_weighted_templates(templates, weights), keep)
     whitening = _whitening(covariance_of(rows))
-    matrix = _matrix(whitening, products[:, :, 1:-1], keep, len(labels))
+    matrix = _matrix(whitening, products[:, :, used], keep, len(labels))
     return TemplateLikelihood(_unit_sky(sky), own, matrix)
 
 
@@ -315,16 +327,16 @@ def _whitening(covariance: Float[Array, "row row"]) -> Float[Array, "row row"]:
     return jnp.asarray(scipy.linalg.solve_triangular(root, np.diag(1 / scale), lower=True))
 
 
-def _pixel_likelihood(at_start, sky, bands, data, weights, keep, covariance_of):
+def _pixel_likelihood(at_start, sky, bands, data, weights, keep, covariance_of, constant):
     weights = jnp.zeros_like(weights).at[:, keep].set(weights[:, keep])
     data = jnp.where(weights > 0, data, 0)
     # Two spare nodes: a shift of a map moves its range, hardly its width.
     plan = interpolation_nodes(at_start, bands.bandpasses, 1e-10)
-    nodes = tuple(n and tuple(min(k + 2, 33) for k in n) for n in plan)
+    nodes = tuple(n and NodeCounts(tuple(k + 2 for k in n.counts)) for n in plan)
     rows = whitening = None
     if covariance_of is not None:
         seen = observe_components(at_start, bands.bandpasses, nodes=nodes)
-        rows = weights[:, None] * jnp.stack(list(seen.values()), axis=1)
-        rows = _one_stokes_each(rows, keep)
+        maps = [*seen.values(), *([jnp.ones_like(data)] if constant else [])]
+        rows = _one_stokes_each(weights[:, None] * jnp.stack(maps, axis=1), keep)
         whitening = _whitening(covariance_of(rows))
     return PixelLikelihood(sky, bands, data, jnp.sqrt(weights), nodes, rows, whitening)

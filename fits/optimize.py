@@ -83,11 +83,20 @@ def best_fit(
     # first steps do not depend on units.
     scale = {name: jnp.maximum(jnp.abs(value), 1e-3) for name, value in unbounded.items()}
     scaled = {name: value / scale[name] for name, value in unbounded.items()}
-    solution: optx.Solution = optx.least_squares(
-        _residuals, solver, scaled, args=(like, priors, scale), max_steps=500, throw=False
-    )
-    found = from_unbounded({k: v * scale[k] for k, v in solution.value.items()}, priors)
-    values = {name: float(found[name]) for name in free}
+
+    def solve(start):
+        args = (like, priors, scale)
+        solution: optx.Solution = optx.least_squares(
+            _residuals, solver, start, args=args, max_steps=500, throw=False
+        )
+        found = from_unbounded({k: v * scale[k] for k, v in solution.value.items()}, priors)
+        return solution, found, {name: float(found[name]) for name in free}
+
+    solution, found, values = solve(scaled)
+    if edges := _at_edge(values, priors):
+        # The range is flat at its edge, so a step that reached it too early has stuck there.
+        middle = solution.value | {name: jnp.zeros(()) for name in edges}
+        solution, found, values = solve(middle)
 
     hessian = np.asarray(_half_hessian(like, found, priors))
     positive = bool(np.isfinite(hessian).all()) and np.linalg.eigvalsh(hessian)[0] > 0

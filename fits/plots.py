@@ -10,7 +10,7 @@ import numpy as np
 from getdist import MCSamples, chains, plots
 
 from fits.results import FitResult
-from fits.spectral_index import Fit
+from fits.spectral_index import Fit, all_free
 
 __all__ = ["label", "plot_grids", "plot_marginals", "plot_posterior"]
 
@@ -94,6 +94,7 @@ def plot_grids(
     if not with_grid:
         return False
     regions = _by_region(with_grid)
+    x, y = with_grid[0].results["grid"].free
     columns = max(len(r) for r in regions.values())
     with mpl.rc_context(STYLE):
         figure, axes = plt.subplots(
@@ -104,13 +105,13 @@ def plot_grids(
             layout="constrained",
         )
         x, y = with_grid[0].results["grid"].free
-        limits = {"xlim": _limits(with_grid, x), "ylim": _limits(with_grid, y)}
         for row, (region, members) in zip(axes, regions.items(), strict=True):
             for axis in row[len(members) :]:
                 axis.set_visible(False)
             for axis, fit in zip(row, members, strict=False):
                 _grid_panel(axis, fit.results["grid"], truth)
-                axis.set(**limits)
+                alike = [f for f in with_grid if f.stokes == fit.stokes]
+                axis.set(xlim=_limits(alike, x), ylim=_limits(alike, y))
                 axis.set_title(f"{region}, {' + '.join(fit.stokes)}")
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
@@ -119,9 +120,17 @@ def plot_grids(
     return True
 
 
-def _limits(fits: Sequence[Fit], name: str) -> tuple[float, float]:
+def _drawable(fits: Sequence[Fit], name: str) -> list[Fit]:
+    """Fits that have a parameter, with a finite error."""
+    firsts = [(fit, next(iter(fit.results.values()))) for fit in fits]
+    return [fit for fit, r in firsts if name in r.free and np.isfinite(r.sigma(name))]
+
+
+def _limits(fits: Sequence[Fit], name: str) -> tuple[float, float] | None:
     """Range of a parameter that shows all fits to four standard deviations."""
-    results = [next(iter(fit.results.values())) for fit in fits]
+    results = [next(iter(fit.results.values())) for fit in _drawable(fits, name)]
+    if not results:
+        return None
     low = min(r.best_fit[name] - 4 * r.sigma(name) for r in results)
     high = max(r.best_fit[name] + 4 * r.sigma(name) for r in results)
     return low, high
@@ -175,7 +184,7 @@ def plot_marginals(
     path: Path, fits: Sequence[Fit], truth: Mapping[str, float] | None, title: str
 ) -> bool:
     """Marginal probability of each parameter, for Q, U and both, with 68 % intervals."""
-    free = next(iter(fits[0].results.values())).free
+    free = all_free(fits)
     regions = _by_region(fits)
     with mpl.rc_context(STYLE):
         figure, axes = plt.subplots(
@@ -188,7 +197,7 @@ def plot_marginals(
         )
         for row, (region, members) in zip(axes, regions.items(), strict=True):
             for axis, name in zip(row, free, strict=True):
-                for fit in members:
+                for fit in _drawable(members, name):
                     _marginal_curve(axis, fit, name)
                 if truth and name in truth:
                     axis.axvline(truth[name], **TRUTH, label="truth")

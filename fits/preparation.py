@@ -6,8 +6,9 @@ import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from jaxsky.components import Component
 from jaxsky.harmonics import average_pixels, gaussian_beam, resample
 
 __all__ = ["Preparation", "prepare_component"]
@@ -99,12 +100,20 @@ def _squared_window(window: np.ndarray, highest: int) -> np.ndarray:
     return 2 * np.pi * (weights * kernel**2) @ np.polynomial.legendre.legvander(x, lmax)
 
 
-def prepare_component(component, preparation: Preparation):
-    """A component with its amplitude, and parameters that are maps, at the common resolution."""
+def prepare_component(
+    component: Component, preparation: Preparation, kept: Bool[np.ndarray, " pix"] | None = None
+) -> Component:
+    """A component with its amplitude, and parameters that are maps, at the common resolution.
+
+    Parameters
+    ----------
+    component, preparation : what is prepared, and how
+    kept : pixels of the amplitude that are not set to zero; default all
+    """
 
     def prepare(leaf):
         if leaf.ndim == 2:
-            return preparation(leaf)
+            return preparation(leaf if kept is None else leaf * kept)
         return preparation(leaf[None])[0] if leaf.ndim == 1 else leaf
 
     return jax.tree.map(prepare, component)

@@ -34,8 +34,8 @@ class Uniform(Prior):
     0.0
     """
 
-    low: float = eqx.field(static=True)
-    high: float = eqx.field(static=True)
+    low: float
+    high: float
 
     def __init__(self, low: float, high: float) -> None:
         self.low, self.high = float(low), float(high)
@@ -60,8 +60,8 @@ class Gaussian(Prior):
     -2.0
     """
 
-    mean: float = eqx.field(static=True)
-    sigma: float = eqx.field(static=True)
+    mean: float
+    sigma: float
 
     def __init__(self, mean: float, sigma: float) -> None:
         self.mean, self.sigma = float(mean), float(sigma)

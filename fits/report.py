@@ -15,7 +15,7 @@ from rich.table import Table
 from fits import plots
 from fits.inputs import Inputs
 from fits.settings import Settings
-from fits.spectral_index import Fit
+from fits.spectral_index import Fit, all_free
 
 __all__ = ["result_table", "warnings", "write_report"]
 
@@ -29,6 +29,15 @@ def write_text(path: Path, text: str) -> None:
     partial = path.with_name(f".{path.name}")
     partial.write_text(text)
     partial.replace(path)
+
+
+def _finite(value: Any) -> Any:
+    """Numbers that are not finite as None, which JSON has."""
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _result(fit: Fit, method: str) -> dict[str, Any]:
@@ -85,7 +94,7 @@ def _short_names(names: Sequence[str]) -> list[str]:
 
 def result_table(fits: Sequence[Fit]) -> Table:
     """The best fits and 68 % intervals for the terminal."""
-    free = next(iter(fits[0].results.values())).free
+    free = all_free(fits)
     table = Table(caption="best fit and central 68 % interval; chi2 is the sum over pixels")
     for column in ("region", "Stokes", "method"):
         table.add_column(column)
@@ -93,7 +102,10 @@ def result_table(fits: Sequence[Fit]) -> Table:
         table.add_column(column, justify="right", overflow="fold")
     for fit in fits:
         for method, result in fit.results.items():
-            cells = [_with_errors(result.best_fit[n], *result.interval_68[n]) for n in free]
+            cells = [
+                _with_errors(result.best_fit[n], *result.interval_68[n]) if n in result.free else ""
+                for n in free
+            ]
             mark = "" if result.converged else " (!)"
             chi2 = f"{fit.chi2[method] / fit.dof:.3f}"
             table.add_row(fit.region, fit.stokes, method + mark, *cells, chi2)
@@ -101,9 +113,13 @@ def result_table(fits: Sequence[Fit]) -> Table:
     return table
 
 
-def warnings(fits: Sequence[Fit]) -> list[str]:
+def warnings(fits: Sequence[Fit], methods: Sequence[str]) -> list[str]:
     """What a user should know before using the numbers, a sentence each."""
     sentences = []
+    if "grid" in methods and not any("grid" in fit.results for fit in fits):
+        sentences.append(
+            "The grid was left out: it takes one or two free parameters with uniform priors."
+        )
     for fit in fits:
         where = f"{fit.region}, {fit.stokes}"
         for method, result in fit.results.items():
@@ -115,7 +131,7 @@ def warnings(fits: Sequence[Fit]) -> list[str]:
             sentences.append(
                 f"{where}: the model does not fit the amplitudes of the templates (chi2 "
                 f"{result.chi2:.1f} for {fit.dof_amplitudes} degrees of freedom, probability "
-                f"{probability:.1g}); its errors are too small."
+                f"{probability:.1g}); by chance, or its errors are too small."
             )
     return sentences
 
@@ -128,7 +144,8 @@ def write_report(
     Pictures that the fits do not allow (a grid of more than two parameters) are left out.
     """
     written = [out / "result.json", out / "log.json"]
-    write_text(written[0], json.dumps(result_json(inputs, settings, fits), indent=2) + "\n")
+    results = _finite(result_json(inputs, settings, fits))
+    write_text(written[0], json.dumps(results, indent=2, allow_nan=False) + "\n")
     for name, plot in {
         "grid.png": plots.plot_grids,
         "marginals.png": plots.plot_marginals,

@@ -148,6 +148,8 @@ def sample(
         vectorize=True,
         backend=backend,
     )
+    # emcee's own wrapper prints a traceback when it is interrupted.
+    sampler.log_prob_fn = sampler.log_prob_fn.f
     done = sampler.iteration
     initial = None
     if not done:

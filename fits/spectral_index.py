@@ -5,7 +5,7 @@ region, to Q, to U and to both, on a grid, by gradient and by MCMC.
 """
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ import scipy.stats
 from jaxtyping import Array, Bool, Float
 
 from fits.covariance import Fluctuations
-from fits.grid import grid_fit
+from fits.grid import grid_fit, grid_is_possible
 from fits.inputs import Inputs
 from fits.likelihood import Likelihood, chi2, likelihood
 from fits.optimize import best_fit
@@ -104,6 +104,11 @@ class Fit(NamedTuple):
         return float(scipy.stats.chi2.sf(self.results[method].chi2, self.dof_amplitudes))
 
 
+def all_free(fits: Sequence[Fit]) -> tuple[str, ...]:
+    """Names of the parameters that are free in any of the fits."""
+    return tuple(sorted({name for f in fits for r in f.results.values() for name in r.free}))
+
+
 def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
     """Bring templates and maps to a common nside and, if fwhm > 0, a common beam.
 
@@ -132,6 +137,7 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
             operator = Preparation.averaging(nsides[name], nside, name)
         operators[name] = operator
 
+    holes = _common_holes([own_used for own_used, _ in maps.values()]) if fwhm else {}
     used = np.ones(healpy.nside2npix(nside), bool)
     for name, (own_used, _) in maps.items():
         if not own_used.all():
@@ -139,35 +145,68 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
             if fwhm:  # the whole beam, without the ringing that the cut at lmax causes
                 window = gaussian_beam(fwhm, 2 * nsides[name])
                 spread = Preparation(window, nsides[name], nside)
+                own_used = holes[nsides[name]]
             kept = spread(jnp.asarray(own_used[None], float))[0]
             used &= np.asarray(kept) > 1 - MISSING
     sky = Sky(
         {
-            name: prepare_component(template.component, operators[f"template {name!r}"])
+            name: prepare_component(
+                template.component,
+                operators[f"template {name!r}"],
+                holes.get(nsides[f"template {name!r}"]),
+            )
             for name, template in inputs.templates.items()
         }
     )
     preparations = tuple(operators[f"band {name!r}"] for name in inputs.bands)
+    whole = [holes.get(op.nside_in, np.ones(1, bool)) for op in preparations]
     data = jnp.stack(
-        [op(band.maps) for op, band in zip(preparations, inputs.bands.values(), strict=True)]
+        [
+            op(band.maps * kept)
+            for op, band, kept in zip(preparations, inputs.bands.values(), whole, strict=True)
+        ]
     )
     bandpasses = {name: band.bandpass for name, band in inputs.bands.items()}
     factors = jnp.stack([b.conversion("uK_CMB", "uK_RJ") for b in bandpasses.values()])
-    spectra = None
+    spectra = windows = None
+    if not fwhm:  # averaged pixels hold multipoles beyond those they resolve
+        lmax = 4 * nside
     if inputs.cmb is not None:
-        # Without a common beam the coarsest stands for all; pixels act as a beam of their size.
-        beams = [fwhm] if fwhm else [b.fwhm for b in inputs.bands.values()]
-        window = gaussian_beam(max(beams), lmax)
+        beams = [fwhm or band.fwhm for band in inputs.bands.values()]
+        windows = jnp.stack([gaussian_beam(beam, lmax) for beam in beams])
         if not fwhm:
-            window = window * pixel_window(nside, lmax)
-        spectra = jnp.asarray(inputs.cmb)[1:3, : lmax + 1] * window**2
-    noise = tuple(band.noise for band in inputs.bands.values())
+            windows = windows * pixel_window(nside, lmax)
+        spectra = jnp.asarray(inputs.cmb)[1:3, : lmax + 1]
+    noise = tuple(
+        band.noise * kept for band, kept in zip(inputs.bands.values(), whole, strict=True)
+    )
     correlated = tuple(
         _prepared_spectrum(band.correlated, op, lmax)
         for op, band in zip(preparations, inputs.bands.values(), strict=True)
     )
-    fluctuations = Fluctuations(preparations, noise, correlated, spectra, factors)
-    return Prepared(sky, bandpasses, data, fluctuations.sigma(), used, fluctuations)
+    fluctuations = Fluctuations(preparations, noise, correlated, spectra, windows, factors)
+    sigma = fluctuations.sigma()
+    known = np.asarray(jnp.isfinite(sigma).all(axis=(0, 1)))
+    return Prepared(
+        sky, bandpasses, data, jnp.where(known, sigma, jnp.inf), used & known, fluctuations
+    )
+
+
+def _common_holes(maps: Sequence[Bool[np.ndarray, " pix"]]) -> dict[int, np.ndarray]:
+    """Pixels that no map misses, at each nside of the maps; empty if none misses any.
+
+    Smoothing spreads what surrounds a hole into it and the hole into what surrounds it, so all
+    maps, templates and data, get the same holes.
+    """
+    if all(used.all() for used in maps):
+        return {}
+    nsides = {healpy.npix2nside(used.size) for used in maps}
+    return {
+        nside: np.logical_and.reduce(
+            [healpy.ud_grade(u.astype(float), nside) > 0.999 for u in maps]
+        )
+        for nside in nsides
+    }
 
 
 def _prepared_spectrum(
@@ -214,7 +253,10 @@ def region_masks(settings: Settings) -> dict[str, Bool[np.ndarray, " pix"]]:
                 f"analysis.regions: {name!r} is neither {', '.join(known_regions())} nor a file "
                 f"in {folder}."
             )
-        regions[Path(name).stem] = np.asarray(region & common)
+        label = name if name in known_regions() else Path(name).stem
+        if label in regions:
+            raise SettingsError(f"analysis.regions: two regions are called {label!r}.")
+        regions[label] = np.asarray(region & common)
     return regions
 
 
@@ -226,10 +268,14 @@ def _fingerprint(like: Likelihood) -> str:
     return digest.hexdigest()
 
 
-def _chain(path: Path, name: str, like: Likelihood, settings: Settings) -> ChainFile:
+def _chain(path: Path, name: str, like: Likelihood, settings: Settings, free: int) -> ChainFile:
     """The chain's place in its file; a chain of other data or settings is refused."""
     backend = ChainFile(path, name)
-    size = (settings.mcmc.nwalkers, len(settings.free))
+    try:
+        _ = backend.initialized
+    except OSError:
+        raise SettingsError(f"{path}: is damaged; start again with --overwrite.") from None
+    size = (settings.mcmc.nwalkers, free)
     mark = f"{_fingerprint(like)} {settings.free} {settings.analysis.seed} {size}"
     if not backend.initialized:
         backend.reset(*size)
@@ -256,7 +302,14 @@ def fit_pixels(
     progress: bool = False,
 ) -> Fit:
     """The fits of one region and choice of Stokes parameters; see `run`."""
-    start, priors = settings.start(), settings.priors()
+    # An offset of a Stokes parameter that is not looked at has no effect.
+    other = tuple(s for s in "QU" if s not in stokes)
+    start = {
+        name: value
+        for name, value in settings.start().items()
+        if not (name.startswith("offset.") and name.endswith(other))
+    }
+    priors = {name: prior for name, prior in settings.priors().items() if name in start}
     report(f"{region}, {stokes}: inner products")
     diagonal = prepared.likelihood(start, stokes=stokes, region=used, kind="diagonal")
     like, dof_amplitudes = diagonal, None
@@ -266,6 +319,8 @@ def fit_pixels(
     results: dict[str, FitResult] = {}
     for method in settings.analysis.methods:
         report(f"{region}, {stokes}: {method}")
+        if method == "grid" and not grid_is_possible(start, priors):
+            continue
         if method == "grid":
             results[method] = grid_fit(like, start, priors=priors, points=settings.grid.points)
         elif method == "gradient":
@@ -273,7 +328,7 @@ def fit_pixels(
         else:
             chain = None
             if chains is not None:
-                chain = _chain(chains, f"{region}_{stokes}", like, settings)
+                chain = _chain(chains, f"{region}_{stokes}", like, settings, len(start))
             results[method] = sample(
                 like,
                 start,
@@ -285,6 +340,10 @@ def fit_pixels(
                 progress=progress,
                 throw=False,
             )
+    if not results:
+        raise SettingsError(
+            "analysis.methods: a grid alone takes one or two free parameters with uniform priors."
+        )
     values = {method: float(chi2(diagonal, r.best_fit)) for method, r in results.items()}
     dof = int(used.sum()) * len(prepared.bands) * len(stokes) - len(start)
     return Fit(region, stokes, results, values, dof, dof_amplitudes)

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxsky.checks import as_array, check_finite, check_positive, is_concrete
 from jaxsky.sed import cmb_derivative
 from jaxsky.types import Numeric
-from jaxsky.units import band_conversion
+from jaxsky.units import band_conversion, parse_unit
 
 __all__ = ["CONVENTIONS", "Bandpass", "average"]
 
@@ -20,6 +20,10 @@ CONVENTIONS: dict[str, Callable[[Array], Array]] = {
     "power": lambda nu: (nu / nu[0]) ** 2,
     "CMB": lambda nu: 1 / cmb_derivative(nu),
 }
+
+
+#: Higher frequencies [GHz] are taken for a mistake of unit.
+MAX_NU = 1e6
 
 
 class Bandpass(eqx.Module):
@@ -69,6 +73,10 @@ class Bandpass(eqx.Module):
             )
         check_positive("nu", self.nu)
         check_finite("weights", self.weights)
+        if is_concrete(self.nu) and float(self.nu.max()) > MAX_NU:
+            raise ValueError(
+                f"Argument `nu` reaches {float(self.nu.max()):g} GHz; it has to be in GHz, not Hz."
+            )
         if is_concrete(self.nu) and not bool(jnp.all(jnp.diff(self.nu) > 0)):
             raise ValueError("Argument `nu` must increase strictly from sample to sample.")
         if is_concrete(self._integrand) and not float(self._integrand.sum()) > 0:
@@ -87,6 +95,8 @@ class Bandpass(eqx.Module):
         """A band of constant weight over center +- width/2 [GHz], differentiable in both."""
         center, width = as_array("center", center), as_array("width", width)
         check_positive("width", width)
+        if samples < 2:
+            raise ValueError(f"Argument `samples` must be at least 2, but is {samples}.")
         nu = center + width * jnp.linspace(-0.5, 0.5, samples)
         return cls(nu, jnp.ones_like(nu), convention)
 
@@ -126,9 +136,17 @@ class Bandpass(eqx.Module):
         Parameters
         ----------
         source, target : names of units
-        nu_ref : frequency at which MJy/sr is quoted [GHz], default the band's center
+        nu_ref : frequency at which MJy/sr is quoted [GHz], needed for that unit: the published
+            factors are for nominal frequencies, and the center differs by percents
+
+        Raises
+        ------
+        ValueError
+            If a unit is unknown, or nu_ref is missing.
         """
-        nu_ref = self.center if nu_ref is None else nu_ref
+        if nu_ref is None and "MJy/sr" in (parse_unit(source)[1], parse_unit(target)[1]):
+            raise ValueError("Over a band MJy/sr needs `nu_ref`, the frequency it is quoted at.")
+        nu_ref = 1.0 if nu_ref is None else nu_ref
         return band_conversion(source, target, self.nu, self.quadrature, nu_ref)
 
 

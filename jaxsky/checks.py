@@ -39,10 +39,19 @@ def as_array(name: str, value: object) -> Array:
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
 
 
+#: Values below this are HEALPix's mark for missing pixels, -1.6375e30.
+UNSEEN = -1.6e30
+
+
 def check_finite(name: str, value: Array) -> None:
-    """Raise ValueError if a concrete array has NaN or infinite values; says how many."""
-    if is_concrete(value) and (bad := int(np.sum(~np.isfinite(value)))):
-        raise ValueError(f"Argument `{name}` has {bad} of {value.size} values that are not finite.")
+    """Raise ValueError if a concrete array has NaN, infinite or UNSEEN values; says how many."""
+    if not is_concrete(value):
+        return
+    numbers = np.asarray(value)
+    if bad := int(np.sum(~np.isfinite(numbers) | (numbers < UNSEEN))):
+        raise ValueError(
+            f"Argument `{name}` has {bad} of {value.size} values that are not finite (or UNSEEN)."
+        )
 
 
 def check_positive(name: str, value: Array) -> None:

@@ -76,9 +76,17 @@ def fit(
     if init:
         _write_example(settings_file or Path("analysis.toml"), fit_settings.EXAMPLE)
         return
-    overrides = {"seed": seed, "regions": region, "stokes": stokes, "nside": nside}
+    if resume and overwrite:
+        raise ValueError("--resume and --overwrite exclude each other.")
+    # Files on the command line are relative to the folder one is in, not to the settings.
+    files = [str(Path(r).resolve()) if Path(r).is_file() else r for r in region or []]
+    overrides = {"seed": seed, "regions": files or None, "stokes": stokes, "nside": nside}
     settings = fit_settings.load_settings(settings_file or fit_settings.EMBEDDED, overrides)
-    chains = _claim(out, resume, overwrite)
+    if not (resume or overwrite) and any((out / name).exists() for name in RESULTS):
+        raise ValueError(
+            f"{out}: holds results already; go on with --resume, replace them with --overwrite, "
+            "or choose another --out."
+        )
 
     with console.status("starting") as status:
         import matplotlib as mpl
@@ -95,15 +103,31 @@ def fit(
             else fit_inputs.read_inputs(settings)
         )
         prepared = spectral_index.prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
-        fits = spectral_index.run(settings, prepared, regions, chains, status.update)
+        chains = _claim(out, overwrite)
+
+        def report_step(message: str) -> None:
+            # emcee's progress bar takes the place of the status line.
+            (status.stop if message.endswith("mcmc") else status.start)()
+            status.update(message)
+
+        try:
+            fits = spectral_index.run(
+                settings, prepared, regions, chains, report_step, progress=True
+            )
+        except KeyboardInterrupt:
+            status.stop()
+            console.print("Stopped; go on with --resume.")
+            raise typer.Exit(130) from None
+        status.start()
         status.update("drawing")
         seconds = time.perf_counter() - started
         written = report.write_report(out, inputs, settings, fits, seconds)
     console.print(inputs.description, highlight=False)
     Console().print(report.result_table(fits))
-    for sentence in report.warnings(fits):
+    for sentence in report.warnings(fits, settings.analysis.methods):
         console.print(f"[yellow](!)[/] {sentence}", highlight=False)
-    console.print("Written: " + ", ".join(map(str, [*written, chains])), highlight=False)
+    written += [chains] if chains.exists() else []
+    console.print("Written: " + ", ".join(map(str, written)), highlight=False)
 
 
 def _write_example(path: Path, example: Path) -> None:
@@ -113,19 +137,15 @@ def _write_example(path: Path, example: Path) -> None:
     console.print(f"Written: {path}")
 
 
-def _claim(out: Path, resume: bool, overwrite: bool) -> Path:
-    """The place of the chains in a folder that may be written to."""
-    chains = out / "chain.h5"
-    if any((out / name).exists() for name in RESULTS) and not (resume or overwrite):
-        raise ValueError(
-            f"{out}: holds results already; go on with --resume, replace them with --overwrite, "
-            "or choose another --out."
-        )
+def _claim(out: Path, overwrite: bool) -> Path:
+    """The place of the chains in the folder of the results, made, and emptied if wanted."""
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out}: is not a folder; choose another --out.")
     out.mkdir(parents=True, exist_ok=True)
     if overwrite:
         for name in RESULTS:
             (out / name).unlink(missing_ok=True)
-    return chains
+    return out / "chain.h5"
 
 
 def main() -> None:
@@ -139,6 +159,3 @@ def main() -> None:
         message = error.args[0] if isinstance(error, KeyError) else error
         console.print(f"[red]jaxsky:[/] {message}", highlight=False, soft_wrap=True)
         sys.exit(2)
-    except KeyboardInterrupt:
-        console.print("Stopped; go on with --resume.")
-        sys.exit(130)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky import sed
-from jaxsky.checks import as_array, check_finite, check_positive
+from jaxsky.checks import as_array, check_finite, check_positive, is_concrete
 from jaxsky.constants import T_CMB
 from jaxsky.types import Parameter
 
@@ -114,6 +114,12 @@ def _check(name: str, value: object, npix: int, metadata: Any) -> None:
     if "positive" not in metadata:
         raise TypeError(f"Field `{name}` must be declared with jaxsky.components.parameter.")
     (check_positive if metadata["positive"] else check_finite)(name, array)
+
+
+def is_positive(component: type[Component], field: str) -> bool:
+    """True if a field of a component is declared to be positive."""
+    declared = {f.name: f.metadata for f in dataclasses.fields(component)}
+    return bool(declared[field].get("positive"))
 
 
 class Synchrotron(Component):
@@ -220,6 +226,11 @@ class AME(Component):
     m60: Parameter = parameter(4.0)
     nu_max: Parameter = parameter(19.0, positive=True)
     nu_ref: Parameter = parameter(23.0, positive=True)
+
+    def __check_init__(self) -> None:
+        nu_max = as_array("nu_max", self.nu_max)
+        if is_concrete(nu_max) and not bool(jnp.all(nu_max < 60)):
+            raise ValueError(f"Argument `nu_max` must be below 60 GHz, but is {nu_max.max():g}.")
 
     @classmethod
     def from_dust_angles(

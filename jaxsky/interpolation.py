@@ -8,7 +8,7 @@ of nodes is read off the decay of the Chebyshev coefficients over the range of t
 
 import itertools
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -23,12 +23,23 @@ from jaxsky.components import Component
 
 __all__ = ["Nodes", "band_sed", "choose_nodes"]
 
-#: Node counts, one for each parameter of a component that is a map; None for the direct sum.
-Nodes: TypeAlias = tuple[int, ...] | None
+
+class NodeCounts(NamedTuple):
+    """Counts, one for each parameter of a component that is a map, and the error to check.
+
+    `tolerance` is None where the counts are known to do.
+    """
+
+    counts: tuple[int, ...]
+    tolerance: float | None = None
+
+
+#: How a component is averaged; None for the direct sum.
+Nodes: TypeAlias = NodeCounts | None
 
 #: Nodes tried; a law that is not resolved by them is summed directly.
 MAX_NODES = 33
-#: Nodes when the range of a map is not known because it is being traced by JAX: 1e-10 for
+#: Nodes tried when the range of a map is not known because it is being traced by JAX: 1e-10 for
 #: indices within +-0.7 and temperatures within 15-30 K, over any band from 20 to 900 GHz.
 TRACED_NODES = 16
 #: With more maps than this in one component, a tensor of nodes would cost more than the sum.
@@ -57,7 +68,9 @@ def _range(values: Array) -> tuple[Array, Array]:
     """Middle and half-width of the values; a constant map gets a small width of its own."""
     low, high = jax.lax.stop_gradient((values.min(), values.max()))
     middle = (low + high) / 2
-    return middle, jnp.maximum((high - low) / 2, 1e-6 * (1 + jnp.abs(middle)))
+    # Wide enough that the slope of the series is not lost in the rounding of its values.
+    least = float(jnp.finfo(values.dtype).eps) ** (1 / 3)
+    return middle, jnp.maximum((high - low) / 2, least * (1 + jnp.abs(middle)))
 
 
 @jax.jit
@@ -96,22 +109,20 @@ def choose_nodes(component: Component, bands: tuple[Bandpass, ...], tolerance: f
 
     Returns
     -------
-    One count for each map; () if there is none; None where the direct sum is the better way.
+    Node counts; None where the direct sum is the better way, or there is no map.
     """
     maps, _ = _split(component)
-    if not maps:
-        return ()
-    if len(maps) > MAX_DIMENSIONS or tolerance <= 0:
+    if not maps or len(maps) > MAX_DIMENSIONS or tolerance <= 0:
         return None
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((component, bands))):
-        return (TRACED_NODES,) * len(maps)
+        return NodeCounts((TRACED_NODES,) * len(maps), tolerance)
     tails = np.asarray(_tails(component, bands))
     # A series of n terms leaves out the tail from n on; what rounding leaves there is noise.
-    floor = 100 * np.finfo(tails.dtype).eps
+    floor = 8 * np.finfo(tails.dtype).eps
     resolved = tails <= max(tolerance / (2 * len(maps)), floor)
     if not resolved.any(axis=1).all():
         return None
-    return tuple(int(max(first, 2)) for first in resolved.argmax(axis=1))
+    return NodeCounts(tuple(int(max(first, 2)) for first in resolved.argmax(axis=1)))
 
 
 def band_sed(
@@ -124,16 +135,27 @@ def band_sed(
     component, band : what is observed, and with what
     nodes : from `choose_nodes`; None sums directly over the band in every pixel
     """
-    if not nodes:
+    if nodes is None:
         return average(component.sed, band)
     maps, rebuild = _split(component)
     ranges = [_range(m) for m in maps]
     axes = [
         mid + half * jnp.asarray(chebyshev.nodes(n), mid.dtype)
-        for (mid, half), n in zip(ranges, nodes, strict=True)
+        for (mid, half), n in zip(ranges, nodes.counts, strict=True)
     ]
     mesh = [axis.ravel() for axis in jnp.meshgrid(*axes, indexing="ij")]
     values = jax.vmap(lambda *v: average(rebuild(v).sed, band))(*mesh)
-    coefs = chebyshev.coefficients(values.reshape(nodes))
+    values = values.reshape(nodes.counts)
+    coefs = chebyshev.coefficients(values)
     points = [(m - mid) / half for m, (mid, half) in zip(maps, ranges, strict=True)]
-    return chebyshev.evaluate(coefs, *points)
+    if nodes.tolerance is None:
+        return chebyshev.evaluate(coefs, *points)
+    # What the last two orders along each axis add bounds what the orders left out would.
+    size = jnp.abs(coefs)
+    tail = sum(jnp.moveaxis(size, axis, 0)[-2:].sum() for axis in range(size.ndim))
+    limit = max(nodes.tolerance, 8 * float(jnp.finfo(values.dtype).eps))
+    return jax.lax.cond(
+        tail <= limit * jnp.abs(values).min(),
+        lambda: chebyshev.evaluate(coefs, *points),
+        lambda: average(component.sed, band),
+    )

@@ -98,6 +98,14 @@ def knee_spectrum(
     return jnp.concatenate([jnp.zeros(2), white * (1 + (ell / ell_knee) ** -slope)])
 
 
+def _deviance(theta, args):
+    """-2 ln L of white level, knee and slope (logarithms) for a measured spectrum from l = 2."""
+    measured, modes = args
+    white, knee, slope = jnp.exp(theta)
+    spectrum = knee_spectrum(white, knee, slope, measured.size + 1)[2:]
+    return jnp.sum(modes * (jnp.log(spectrum) + measured / spectrum))
+
+
 def fit_knee(
     maps: Float[Array, "stokes pix"], used: Bool[Array, " pix"], lmax: int
 ) -> tuple[float, float, float]:
@@ -128,14 +136,11 @@ def fit_knee(
     modes = 2 * (2 * jnp.arange(2, lmax + 1) + 1) * fraction
     level = jnp.median(measured[-lmax // 4 :])
 
-    def deviance(theta, _):
-        white, knee, slope = jnp.exp(theta)
-        spectrum = knee_spectrum(level * white, knee, slope, lmax)[2:]
-        return jnp.sum(modes * (jnp.log(spectrum / level) + measured / spectrum))
-
     start = jnp.log(jnp.array([1.0, 10.0, 1.5]))
+    solver: optx.AbstractMinimiser = optx.BFGS(1e-6, 1e-6)
+    args = (measured / level, modes)
     solution: optx.Solution = optx.minimise(
-        deviance, optx.BFGS(1e-6, 1e-6), start, max_steps=500, throw=False
+        _deviance, solver, start, args=args, max_steps=500, throw=False
     )
     if solution.result != optx.RESULTS.successful:
         raise ValueError("The spectrum of the noise could not be fitted.")

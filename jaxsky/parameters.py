@@ -10,7 +10,8 @@ from collections.abc import Iterable, Mapping
 import jax
 from jaxtyping import Array, ArrayLike
 
-from jaxsky.checks import as_array
+from jaxsky.checks import as_array, check_finite, check_positive
+from jaxsky.components import is_positive
 from jaxsky.sky import Sky
 
 __all__ = ["OFFSET", "get_parameters", "parameter_names", "set_parameters"]
@@ -68,7 +69,8 @@ def set_parameters(sky: Sky, params: Mapping[str, ArrayLike]) -> Sky:
     KeyError
         If a name is unknown; the message lists the known ones.
     ValueError
-        If a value is neither a number nor a map of the sky's pixels (amplitudes: of their shape).
+        If a value is neither a number nor a map of the sky's pixels (amplitudes: of their shape),
+        is not finite, or not positive where it has to be.
 
     Examples
     --------
@@ -81,7 +83,8 @@ def set_parameters(sky: Sky, params: Mapping[str, ArrayLike]) -> Sky:
     """
     leaves, structure = _flatten(sky)
     stokes, npix = sky.shape
-    for name, value in params.items():
+    # Values first, then shifts, whatever the order of the dictionary.
+    for name, value in sorted(params.items(), key=lambda item: item[0].endswith(OFFSET)):
         target = name.removesuffix(OFFSET)
         if target not in leaves:
             raise unknown_parameter(name, leaves)
@@ -91,4 +94,8 @@ def set_parameters(sky: Sky, params: Mapping[str, ArrayLike]) -> Sky:
             wanted = f"shape {(stokes, npix)}" if amplitude else f"a number or of shape ({npix},)"
             raise ValueError(f"Parameter {name!r} must be {wanted}, but has shape {value.shape}.")
         leaves[target] = leaves[target] + value if name.endswith(OFFSET) else value
+        check_finite(name, leaves[target])
+        component, field = target.split(".")[:2]
+        if is_positive(type(sky[component]), field):
+            check_positive(name, leaves[target])
     return jax.tree.unflatten(structure, list(leaves.values()))

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -12,9 +11,6 @@ from jaxtyping import Array, Float
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import Component
 from jaxsky.interpolation import Nodes, band_sed, choose_nodes
-
-#: Several bands: a list, or by name.
-Bands: TypeAlias = Sequence[Bandpass] | Mapping[str, Bandpass]
 
 __all__ = ["Sky", "interpolation_nodes", "observe", "observe_band", "observe_components"]
 
@@ -80,10 +76,12 @@ def interpolation_nodes(sky: Sky, bands: Sequence[Bandpass], tolerance: float) -
 
 
 def _check_bands(bands: object) -> tuple[Bandpass, ...]:
-    if isinstance(bands, Mapping):
-        bands = list(bands.values())
+    # A dictionary would lose its order under jit, and with it the order of the result.
     if isinstance(bands, Bandpass) or not isinstance(bands, Sequence):
-        raise TypeError("Argument `bands` must be a list of Bandpass; for one, use observe_band.")
+        raise TypeError(
+            "Argument `bands` must be a list of Bandpass; for one, use observe_band, "
+            "for a dictionary list(bands.values())."
+        )
     for i, band in enumerate(bands):
         if not isinstance(band, Bandpass):
             raise TypeError(f"Entry {i} of `bands` must be a Bandpass, not {type(band).__name__}.")
@@ -99,7 +97,7 @@ def _emission(
     maps = []
     for band in bands:
         sed = band_sed(component, band, nodes)
-        if nodes and len(nodes) > 1:
+        if nodes and len(nodes.counts) > 1:
             # Costly laws are evaluated once for all Stokes parameters, ...
             maps.append(component.template * sed)
         else:
@@ -127,7 +125,7 @@ def _observe(sky, bands, plan):
 
 def observe(
     sky: Sky,
-    bands: Bands,
+    bands: Sequence[Bandpass],
     *,
     tolerance: float = 1e-10,
     nodes: tuple[Nodes, ...] | None = None,
@@ -137,12 +135,12 @@ def observe(
     Parameters
     ----------
     sky : the sky
-    bands : list of bands, or a dictionary of them by name
+    bands : list of bands
     tolerance : relative error of the band-averaged laws where parameters are maps; 0 sums
-        directly over the bands in every pixel
-    nodes : from `interpolation_nodes`, instead of a tolerance. Inside jit, where the range of
-        the maps is not known, a fixed number is used unless given here
-        (`jaxsky.interpolation.TRACED_NODES`).
+        directly over the bands in every pixel. Inside jit, where the range of the maps is not
+        known beforehand, a fixed number of nodes is tried and checked as the program runs; if
+        it does not reach the tolerance, the direct sum is made.
+    nodes : from `interpolation_nodes`, instead of a tolerance: not checked again
 
     Returns
     -------
@@ -166,7 +164,7 @@ def observe_band(
 
 def observe_components(
     sky: Sky,
-    bands: Bands,
+    bands: Sequence[Bandpass],
     *,
     tolerance: float = 1e-10,
     nodes: tuple[Nodes, ...] | None = None,

@@ -15,6 +15,7 @@ import systems
 from fits.compress import gram, square_root
 from fits.covariance import Fluctuations
 from fits.likelihood import chi2, likelihood
+from fits.optimize import best_fit
 from fits.preparation import Preparation
 from jaxsky import AME, Bandpass, Dust, Sky, Synchrotron, observe, parameter_names, set_parameters
 from jaxsky.cmb import camb_spectra
@@ -57,10 +58,11 @@ def fluctuations(cmb: bool = True) -> Fluctuations:
         noise[0].at[0, 1].set(0.3 * noise[0][0, 0]).at[1, 0].set(0.3 * noise[0][0, 0]),
         noise[1],
     )
-    spectra = jnp.asarray(camb_spectra(lmax))[1:3] * 1e4 * gaussian_beam(1500.0, lmax) ** 2
+    spectra = jnp.asarray(camb_spectra(lmax))[1:3] * 1e4
+    windows = jnp.stack([gaussian_beam(fwhm, lmax) for fwhm in (1500.0, 1200.0)])
     correlated = (None, jnp.zeros(lmax + 1).at[2:].set(3.0 / jnp.arange(2, lmax + 1) ** 2))
     return Fluctuations(
-        preparations, noise, correlated, spectra if cmb else None, jnp.array([0.95, 0.9])
+        preparations, noise, correlated, spectra if cmb else None, windows, jnp.array([0.95, 0.9])
     )
 
 
@@ -85,9 +87,11 @@ def dense_covariance(model: Fluctuations) -> np.ndarray:
         total[b, :, b, :] = blocks[b]
     if model.cmb_spectra is not None:
         Y = synthesis_matrix(8)
-        cmb = Y @ np.diag(np.asarray(model.cmb_spectra)[:, alm_ell(8)].ravel()) @ Y.T
-        f = np.asarray(model.cmb_factors)
-        total += np.einsum("a,b,ij->aibj", f, f, cmb)
+        f, windows = np.asarray(model.cmb_factors), np.asarray(model.cmb_windows)
+        for a in range(2):
+            for b in range(2):
+                spectra = np.asarray(model.cmb_spectra) * windows[a] * windows[b]
+                total[a, :, b, :] += f[a] * f[b] * Y @ np.diag(spectra[:, alm_ell(8)].ravel()) @ Y.T
     return total.reshape(2 * blocks[0].shape[0], -1)
 
 
@@ -188,6 +192,36 @@ def test_exact_likelihood_is_that_of_the_amplitudes():
         y = P @ (np.asarray(data) - seen).ravel()
         expected = y @ np.linalg.solve(P @ dense @ P.T, y)
         assert float(chi2(like, params)) == pytest.approx(expected, rel=1e-8)
+
+
+def white_covariance(sigma):
+    """Covariance of inner products with data of independent pixels."""
+
+    def covariance_of(rows):
+        spread = np.asarray(rows) * np.asarray(sigma)[:, None]
+        bands, count = spread.shape[:2]
+        total = np.zeros((bands, count, bands, count))
+        for b in range(bands):
+            flat = spread[b].reshape(count, -1)
+            total[b, :, b, :] = flat @ flat.T
+        return jnp.asarray(total.reshape(bands * count, -1))
+
+    return covariance_of
+
+
+@pytest.mark.parametrize("pixelwise", [False, True])
+@pytest.mark.parametrize("free", [START, {**START, "offset.44.Q": 0.0, "offset.70.U": 0.0}])
+def test_with_white_noise_the_two_likelihoods_agree(free, pixelwise):
+    sky, data, sigma = problem()
+    exact, diagonal = (
+        best_fit(
+            likelihood(sky, BANDS, data, sigma, free, covariance_of=c, pixelwise=pixelwise), free
+        )
+        for c in (white_covariance(sigma), None)
+    )
+    np.testing.assert_allclose(exact.covariance, diagonal.covariance, rtol=1e-6, atol=1e-12)
+    for name in free:
+        assert exact.best_fit[name] == pytest.approx(diagonal.best_fit[name], abs=1e-6)
 
 
 @pytest.mark.parametrize("exact", [False, True])
@@ -315,6 +349,16 @@ def same_templates():
             "`data` has 768 values that are not",
         ),
         ({"stokes": "V"}, ValueError, "`stokes` must be among 'QU', not 'V'"),
+        (
+            {"stokes": "Q", "start": {"offset.44.U": 0.0}},
+            ValueError,
+            "'offset.44.U' has no effect on Stokes Q",
+        ),
+        (
+            {"start": {"calibration.44.offset": 0.0}},
+            KeyError,
+            "parameter 'calibration.44.off",
+        ),
         ({"stokes": ""}, ValueError, "`stokes` must be among 'QU', not ''"),
         (
             {"sky": same_templates(), "covariance_of": fluctuations().covariance},

@@ -145,6 +145,7 @@ def test_an_optimum_at_the_edge_of_a_prior_is_reported(like):
     # The grid and the chain pile up at the same edge instead of failing.
     grid = grid_fit(like, start, priors=narrow)
     assert grid.best_fit["dust.beta_dust"] == pytest.approx(2.2)
+    assert not grid.converged
     assert grid.interval_68["dust.beta_dust"][0] >= 2.2
 
 

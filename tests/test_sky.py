@@ -34,12 +34,6 @@ def test_nothing_is_special_at_the_reference_frequency():
     np.testing.assert_allclose(near, at, rtol=1e-8)
 
 
-def test_bands_by_name_are_seen_in_their_order():
-    sky, bands = systems.dust_and_synchrotron(), systems.bands()
-    named = dict(zip(("z", "a"), bands, strict=True))
-    np.testing.assert_array_equal(observe(sky, named), observe(sky, bands))
-
-
 def test_the_order_of_components_does_not_matter():
     """JAX sorts dictionaries; node counts chosen for one component must not reach another."""
     parts = {

@@ -50,7 +50,7 @@ def test_single_precision_is_finite_to_terahertz():
 def test_a_narrow_band_is_its_centre():
     band = Bandpass.top_hat(143.0, 1e-4)
     for source, target in (("uK_CMB", "uK_RJ"), ("K_CMB", "MJy/sr"), ("MJy/sr", "uK_RJ")):
-        assert float(band.conversion(source, target)) == pytest.approx(
+        assert float(band.conversion(source, target, 143.0)) == pytest.approx(
             float(conversion(source, target, 143.0)), rel=1e-9
         )
 
@@ -77,3 +77,8 @@ def test_gradients_against_finite_differences():
 def test_unknown_unit_is_named():
     with pytest.raises(ValueError, match=r"Unknown unit 'K'; known units are .*K_CMB"):
         parse_unit("K")
+
+
+def test_a_brightness_over_a_band_needs_its_frequency():
+    with pytest.raises(ValueError, match=r"MJy/sr needs `nu_ref`"):
+        Bandpass.top_hat(143.0, 40.0).conversion("K_CMB", "MJy/sr")

@@ -88,7 +88,7 @@ def unit_factor(
         covariances) convert with the square of the factor
     at : frequency [GHz] or band, needed between K_RJ, K_CMB and MJy/sr; in a band the factor is
         that of `Bandpass.conversion`
-    nu_ref : frequency at which a band's MJy/sr is quoted [GHz], default its center
+    nu_ref : frequency at which a band's MJy/sr is quoted [GHz], needed for that unit
 
     Raises
     ------

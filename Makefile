@@ -36,7 +36,7 @@ bench: .venv/.dev
 pin:
 	rm -rf .venv
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet hatchling .
+	$(BIN)/python -m pip install --quiet hatchling editables .
 	( sed -n 1p requirements.txt; $(BIN)/python -m pip freeze | grep -v '^jaxsky' ) > .venv/run.txt
 	$(BIN)/python -m pip install --quiet '.[dev]'
 	( sed -n 1p requirements-dev.txt; $(BIN)/python -m pip freeze | grep -v '^jaxsky' \

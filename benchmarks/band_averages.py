@@ -96,7 +96,7 @@ def _beside_pysm(nside: int, temperature: bool, target: float, rounds: int) -> R
         f"{time_text(times[best])} ({best}) / {time_text(times['ours'])}",
         f"PySM computes I, Q, U: with 2/3 of its time {ratio * 2 / 3:.0f}x",
         f"its first call {time_text(first)}",
-        f"{nodes} nodes, error {error:.0e} against the direct sum (<= {TOLERANCE:.0e})",
+        f"{nodes.counts} nodes, error {error:.0e} against the direct sum (<= {TOLERANCE:.0e})",
         f"{agreement:.0e} against PySM",
     ]
     return Row(

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import h5py
 import healpy
 import jax
 import jax.numpy as jnp
@@ -270,11 +271,9 @@ def _fingerprint(like: Likelihood) -> str:
 
 def _chain(path: Path, name: str, like: Likelihood, settings: Settings, free: int) -> ChainFile:
     """The chain's place in its file; a chain of other data or settings is refused."""
+    if path.exists() and not h5py.is_hdf5(path):
+        raise SettingsError(f"{path}: is damaged; start again with --overwrite.")
     backend = ChainFile(path, name)
-    try:
-        _ = backend.initialized
-    except OSError:
-        raise SettingsError(f"{path}: is damaged; start again with --overwrite.") from None
     size = (settings.mcmc.nwalkers, free)
     mark = f"{_fingerprint(like)} {settings.free} {settings.analysis.seed} {size}"
     if not backend.initialized:

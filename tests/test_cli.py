@@ -350,3 +350,34 @@ def test_absent_settings_are_one_sentence(tmp_path, monkeypatch, capsys):
 def test_version(monkeypatch, capsys):
     assert jaxsky(monkeypatch, "--version") == 0
     assert capsys.readouterr().out.startswith("jaxsky 0.")
+
+
+def test_swapped_columns_are_refused(folder, tmp_path, monkeypatch, capsys):
+    swap = {'["Q_STOKES", "U_STOKES"]': '["U_STOKES", "Q_STOKES"]'}
+    path = write_settings(folder, "swapped", **swap)
+    assert jaxsky(monkeypatch, "fit", path, "--out", tmp_path / "out") == 2
+    assert "are not Q and U by their names" in one_sentence(capsys)
+
+
+def test_a_file_in_place_of_the_folder_is_left_alone(folder, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    out.write_text("mine")
+    assert jaxsky(monkeypatch, "fit", write_settings(folder, "file"), "--out", out) == 2
+    assert "is not a folder" in one_sentence(capsys)
+    assert out.read_text() == "mine"
+
+
+def test_a_damaged_chain_is_named_and_kept(folder, tmp_path, monkeypatch, capsys):
+    (tmp_path / "chain.h5").write_text("no HDF5")
+    options = ["--out", tmp_path, "--stokes", "QU", "--resume"]
+    assert jaxsky(monkeypatch, "fit", write_settings(folder, "damaged"), *options) == 2
+    assert "chain.h5: is damaged; start again with --overwrite" in one_sentence(capsys)
+    assert (tmp_path / "chain.h5").read_text() == "no HDF5"
+
+
+def test_a_mistake_does_not_cost_the_old_results(folder, tmp_path, monkeypatch, capsys):
+    (tmp_path / "result.json").write_text("old")
+    path = write_settings(folder, "typo", **{'"dust.fits"': '"dsut.fits"'})
+    assert jaxsky(monkeypatch, "fit", path, "--out", tmp_path, "--overwrite") == 2
+    assert "dsut.fits" in one_sentence(capsys)
+    assert (tmp_path / "result.json").read_text() == "old"

@@ -1,4 +1,4 @@
-"""Transforms against healpy, transposes and gradients; CMB and noise on top of them."""
+"""Transforms against healpy, transposes and gradients; the CMB on top of them."""
 
 import healpy
 import jax
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxsky import cmb, noise
+from jaxsky import cmb
 from jaxsky.harmonics import (
     adjoint_synthesis,
     alm_ell,
@@ -130,31 +130,3 @@ def test_cmb_refuses_nonsense():
         cmb.camb_spectra(10, r=-1)
     with pytest.raises(ValueError, match="`stokes` must be 'QU' or 'IQU', not 'Q'"):
         cmb.realisation(jax.random.key(0), jnp.ones((4, 5)), "Q")
-
-
-def test_noise_has_the_covariance_that_was_asked_for():
-    root = np.array([[2.0, 0, 0], [0.7, 1.5, 0], [-0.4, 0.9, 1.1]])
-    covariance = jnp.asarray(root @ root.T)[..., None] * jnp.ones(200_000)
-    np.testing.assert_allclose(noise.cholesky(covariance)[..., 0], root, rtol=1e-12)
-    draws = noise.draw(jax.random.key(1), covariance)
-    # Sampling errors of a covariance over 2e5 pixels are below 1 % of these variances.
-    np.testing.assert_allclose(np.cov(draws), root @ root.T, atol=0.06)
-
-
-def test_uniform_noise_does_not_depend_on_nside():
-    for nside in (16, 32):
-        covariance = noise.uniform_covariance(60.0, nside)
-        density = covariance[0, 0, 0] * healpy.nside2pixarea(nside, degrees=True) * 3600
-        assert float(density) == pytest.approx(60.0**2)
-
-
-def test_noise_is_estimated_from_a_smooth_sky():
-    nside = 32
-    sky = 10 * healpy.pix2vec(nside, np.arange(healpy.nside2npix(nside)))[0]
-    maps = sky + noise.draw(jax.random.key(3), noise.uniform_covariance(300.0, nside))
-    variance = noise.estimate_variance(maps, np.ones(sky.size, bool))
-    expected = noise.uniform_covariance(300.0, nside)[0, 0, 0]
-    # 9,216 degrees of freedom (sampling error 1.5 %) and a little of the dipole's gradient.
-    np.testing.assert_allclose(variance, expected, rtol=0.06)
-    with pytest.raises(ValueError, match="groups of four pixels"):
-        noise.estimate_variance(maps, np.zeros(sky.size, bool))

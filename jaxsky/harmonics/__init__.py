@@ -1,0 +1,44 @@
+"""Spherical harmonics of HEALPix maps: synthesis, analysis, rotation, smoothing, resolution.
+
+The transforms are ducc0's through jaxbind, so they can be jitted and differentiated and their
+transposes are exact; healpy supplies the bookkeeping (ring weights, sizes) and, as
+`engine="healpy"`, the reference. Coefficients are packed as real numbers (`packing`). Q and U are
+one spin-2 field with coefficients E and B. Smoothing Q and U as two scalars would be wrong by
+several percent.
+"""
+
+from jaxsky.harmonics.beams import beam_ratio, gaussian_beam, needed_lmax, pixel_window
+from jaxsky.harmonics.packing import (
+    alm_ell,
+    alm_from_healpy,
+    alm_to_healpy,
+    expand,
+    lmax_of,
+    power_spectrum,
+    resize,
+)
+from jaxsky.harmonics.resolution import average_pixels, children, resample, smooth
+from jaxsky.harmonics.transforms import ENGINES, adjoint_synthesis, analysis, rotate, synthesis
+
+__all__ = [
+    "ENGINES",
+    "adjoint_synthesis",
+    "alm_ell",
+    "alm_from_healpy",
+    "alm_to_healpy",
+    "analysis",
+    "average_pixels",
+    "beam_ratio",
+    "children",
+    "expand",
+    "gaussian_beam",
+    "lmax_of",
+    "needed_lmax",
+    "pixel_window",
+    "power_spectrum",
+    "resample",
+    "resize",
+    "rotate",
+    "smooth",
+    "synthesis",
+]

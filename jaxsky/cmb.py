@@ -3,12 +3,11 @@
 from functools import cache
 
 import camb
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsky.harmonics import alm_ell
+from jaxsky import correlated
 
 __all__ = ["PLANCK_2018", "camb_spectra", "realisation"]
 
@@ -69,11 +68,8 @@ def realisation(
     if stokes not in ("QU", "IQU"):
         raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")
     TT, EE, BB, TE = jnp.asarray(spectra)
-    ell = alm_ell(TT.size - 1)
-    white = jax.random.normal(key, (3, ell.size), TT.dtype)
-    correlated = TE / jnp.sqrt(jnp.where(TT > 0, TT, 1.0))
-    rest = jnp.sqrt(jnp.maximum(EE - correlated**2, 0.0))
-    temperature = jnp.sqrt(TT)[ell] * white[0]
-    E = correlated[ell] * white[0] + rest[ell] * white[1]
-    B = jnp.sqrt(BB)[ell] * white[2]
-    return jnp.stack([temperature, E, B] if stokes == "IQU" else [E, B])
+    zero = jnp.zeros_like(TT)
+    fields = jnp.stack(
+        [jnp.stack(row) for row in ([TT, TE, zero], [TE, EE, zero], [zero, zero, BB])]
+    )
+    return correlated.realisation(key, fields)[3 - len(stokes) :]

@@ -1,4 +1,4 @@
-"""The border: maps, masks and bandpasses in files, and quantities with units.
+"""The border: maps, masks, bandpasses, beams and spectra in files, and quantities with units.
 
 Inside the package there are only bare arrays (GHz, uK_RJ, K, arcmin; Galactic, RING, COSMO).
 Everything else is converted and checked here, once. A file that cannot be used raises
@@ -6,9 +6,11 @@ Everything else is converted and checked here, once. A file that cannot be used 
 """
 
 from jaxsky.io.bandpasses import read_bandpass
+from jaxsky.io.beams import read_beam
 from jaxsky.io.maps import Maps, read_maps, write_maps
 from jaxsky.io.masks import degrade_mask, read_mask
 from jaxsky.io.quantities import from_quantity, unit_factor, unit_name
+from jaxsky.io.spectra import read_spectra
 from jaxsky.io.tables import InputError
 
 __all__ = [
@@ -17,8 +19,10 @@ __all__ = [
     "degrade_mask",
     "from_quantity",
     "read_bandpass",
+    "read_beam",
     "read_maps",
     "read_mask",
+    "read_spectra",
     "unit_factor",
     "unit_name",
     "write_maps",

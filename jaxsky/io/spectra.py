@@ -1,0 +1,288 @@
+"""Power spectra in files: Planck's theory, CAMB's output and HEALPix FITS tables."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits as pyfits
+from jaxtyping import Float
+
+from jaxsky.io.quantities import unit_factor, unit_name
+from jaxsky.io.tables import InputError, open_fits
+
+__all__ = ["fits_table", "is_fits", "multipole_range", "read_spectra", "text_table"]
+
+SPECTRA = ("TT", "EE", "BB", "TE")
+#: First columns of text files, by format.
+_ORDERS = {"planck": ("L", "TT", "TE", "EE", "BB"), "camb": ("L", "TT", "EE", "BB", "TE")}
+#: Names of columns, upper case -> the package's: HEALPix (IDL, Fortran, healpy), HEALPix C++.
+_NAMES = {
+    **dict.fromkeys(("ELL", "INDEX", "MULTIPOLE"), "L"),
+    **dict.fromkeys(("TEMPERATURE", "TEMPERATURE C_L"), "TT"),
+    **dict.fromkeys(("GRADIENT", "E-MODE C_L"), "EE"),
+    **dict.fromkeys(("CURL", "B-MODE C_L"), "BB"),
+    **dict.fromkeys(("G-T", "T-E CROSS C_L"), "TE"),
+}
+_D_ELL = re.compile(r"(?<![a-z0-9])D_?(L|ELL)(?![a-z])|\bL\s*\*?\s*\(L\s*\+\s*1\)", re.I)
+_COMMENTS = ("#", ";", "%", "!", "\\", "|")
+#: |TE| may exceed sqrt(TT EE) by this factor, the rounding of text with six digits.
+_ROUNDING = 1 + 1e-5
+
+
+def is_fits(path: Path) -> bool:
+    """True for a FITS file, compressed or not; raises InputError if there is no file."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file.")
+    with path.open("rb") as stream:
+        start = stream.read(6)
+    return start == b"SIMPLE" or start.startswith(b"\x1f\x8b")
+
+
+def text_table(path: Path) -> tuple[list[list[str]], Float[np.ndarray, "row column"]]:
+    """Lines before the numbers of a text table, split into words, and the numbers."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: neither a FITS file nor a text table.") from None
+    header: list[list[str]] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, start=1):
+        text = line.strip()
+        if text.startswith(_COMMENTS):
+            header.append(text.strip("".join(_COMMENTS)).replace("|", " ").split())
+        if not text or text.startswith(_COMMENTS):
+            continue
+        try:
+            row = [float(cell) for cell in text.replace(",", " ").split()]
+        except ValueError:
+            if not rows:  # names of the columns
+                header.append(text.replace(",", " ").split())
+                continue
+            raise InputError(f"{path}, line {number}: not a row of numbers: {text!r}.") from None
+        if rows and len(row) != len(rows[0]):
+            raise InputError(
+                f"{path}, line {number}: {len(row)} numbers, but {len(rows[0])} in the lines above."
+            )
+        rows.append(row)
+    if not rows:
+        raise InputError(f"{path}: no line has numbers.")
+    return header, np.array(rows)
+
+
+def fits_table(
+    path: Path, hdus: pyfits.HDUList, hdu: int | str
+) -> pyfits.BinTableHDU | pyfits.TableHDU:
+    """The table `hdu` (number or name), binary or ASCII, of an open file."""
+    try:
+        found = hdus[hdu]
+    except (IndexError, KeyError):
+        names = ", ".join(f"{i} ({h.name})" for i, h in enumerate(hdus))
+        raise InputError(f"{path}: no HDU {hdu!r}; it has {names}.") from None
+    if not isinstance(found, pyfits.BinTableHDU | pyfits.TableHDU):
+        raise InputError(f"{path}: HDU {hdu!r} holds no table.")
+    return found
+
+
+def multipole_range(
+    path: Path, ell: Float[np.ndarray, " row"], lmax: int, start: int
+) -> tuple[int, int]:
+    """First multipole of a table, and number of its rows up to lmax.
+
+    Parameters
+    ----------
+    path : the file, for the messages
+    ell : multipole of each row
+    lmax : multipole that has to be reached
+    start : largest multipole with which the table may begin
+
+    Raises
+    ------
+    InputError
+        If the rows are no complete sequence of multipoles from `start` to `lmax`.
+    ValueError
+        If lmax is negative.
+    """
+    if lmax < 0:
+        raise ValueError(f"Argument `lmax` must not be negative, but is {lmax}.")
+    if odd := int(np.sum(~(ell == np.round(ell)) | (ell < 0))):
+        raise InputError(f"{path}: {odd} of {ell.size} rows do not begin with a multipole.")
+    if ell[0] > start:
+        raise InputError(f"{path}: begins at l = {ell[0]:.0f}, but l = {start} is needed.")
+    if np.any(jumps := np.diff(ell) != 1):
+        at = int(np.argmax(jumps))
+        raise InputError(f"{path}: l = {ell[at]:.0f} is followed by l = {ell[at + 1]:.0f}.")
+    if ell[-1] < lmax:
+        raise InputError(f"{path}: ends at l = {ell[-1]:.0f}, but lmax is {lmax}.")
+    return int(ell[0]), max(0, lmax + 1 - int(ell[0]))
+
+
+def _name(word: str) -> str:
+    """The package's name of a column."""
+    return _NAMES.get(word.upper(), word.upper())
+
+
+def _located(path: Path, names: Sequence[str], wanted: Sequence[str]) -> list[int]:
+    """Numbers of the columns that are wanted."""
+    known = [_name(name) for name in names]
+    if missing := [name for name in wanted if name not in known]:
+        hint = ""
+        if missing == ["BB"]:
+            hint = "; CAMB writes it with lensed and total spectra (_lensedCls.dat, _totCls.dat)"
+        raise InputError(
+            f"{path}: no column {', '.join(missing)}; it has {', '.join(names)}{hint}."
+        )
+    return [known.index(name) for name in wanted]
+
+
+def _text_order(
+    path: Path, header: list[list[str]], columns: int, format: str | None
+) -> Sequence[str]:
+    """Names of the columns of a text file, from its header, `format` or its own name."""
+    named = [names for words in header if "TT" in (names := [_name(word) for word in words])]
+    if named:
+        words = named[-1]
+        if len(words) != columns:
+            raise InputError(
+                f"{path}: the header names {len(words)} columns ({' '.join(words)}), "
+                f"but there are {columns}."
+            )
+        if format is not None and tuple(words[:5]) != _ORDERS[format]:
+            raise InputError(
+                f"{path}: argument `format` is {format!r}, but the columns are {' '.join(words)}."
+            )
+        return words
+    if path.name.endswith("scalCls.dat"):
+        raise InputError(
+            f"{path}: CAMB's scalar spectra have no BB; read the lensed or total ones "
+            "(_lensedCls.dat, _totCls.dat)."
+        )
+    if format is None and path.name.endswith(("lensedCls.dat", "totCls.dat")):
+        format = "camb"
+    if format is None:
+        choices = " or ".join(f"{k!r} for {' '.join(v)}" for k, v in _ORDERS.items())
+        raise InputError(f"{path}: no header names the columns; give `format`, {choices}.")
+    if columns < 5:
+        raise InputError(
+            f"{path}: {columns} columns, but format {format!r} has {' '.join(_ORDERS[format])}."
+        )
+    return _ORDERS[format]
+
+
+def _read_text(path: Path, lmax: int, format: str | None) -> Float[np.ndarray, "4 ell"]:
+    header, table = text_table(path)
+    names = _text_order(path, header, table.shape[1], format)
+    at, *columns = _located(path, names, ("L", *SPECTRA))
+    start, rows = multipole_range(path, table[:, at], lmax, 2)
+    ell = np.arange(start, start + rows)
+    factor = np.where(ell > 0, 2 * np.pi / np.maximum(ell * (ell + 1), 1), 0)
+    spectra = np.zeros((4, lmax + 1))
+    spectra[:, start:] = table[:rows, columns].T * factor
+    return spectra
+
+
+def _fits_factor(path: Path, name: str, found: str | None, given: str | None) -> float:
+    """Factor to uK_CMB^2 from the unit of a column or the argument that stands in for it."""
+    stated = None if (found or "").lower() in ("", "unknown") else found
+    text = stated if given is None else given
+    if text is None:
+        raise InputError(f'{path}: column {name} has no unit; give `unit`, such as "uK_CMB^2".')
+    factors = []
+    for value in (text, stated or text):
+        try:
+            # A spectrum of the CMB in bare kelvins is one of thermodynamic temperature.
+            definite = re.sub(r"K\^2$", "K_CMB^2", unit_name(value))
+            factors.append(unit_factor(definite, "uK_CMB^2"))
+        except ValueError:
+            raise InputError(
+                f"{path}: column {name} has the unit {value!r}, which is no square of K_CMB."
+            ) from None
+    if factors[0] != factors[1]:
+        raise InputError(f"{path}: argument `unit` is {given}, but column {name} is in {stated}.")
+    return factors[0]
+
+
+def _read_fits(path: Path, lmax: int, unit: str | None) -> Float[np.ndarray, "4 ell"]:
+    with open_fits(path) as hdus:
+        table = fits_table(path, hdus, 1)
+        if stated := _D_ELL.search(repr(table.header)):
+            raise InputError(
+                f"{path}: the header says {stated[0]!r}; spectra in FITS files must be C_l."
+            )
+        names = table.columns.names
+        columns = _located(path, names, SPECTRA)
+        multipoles = [table.data.field(n) for n in names if _name(n) == "L"]
+        factors = [
+            _fits_factor(path, names[c], table.header.get(f"TUNIT{c + 1}"), unit) for c in columns
+        ]
+        values = np.array([np.ravel(table.data.field(c)) for c in columns], np.float64)
+        ell = np.array(multipoles[0] if multipoles else np.arange(values.shape[1]), float).ravel()
+    start, rows = multipole_range(path, ell, lmax, 2)
+    spectra = np.zeros((4, lmax + 1))
+    spectra[:, start:] = values[:, :rows] * np.array(factors)[:, None]
+    return spectra
+
+
+def _check(path: Path, spectra: Float[np.ndarray, "4 ell"]) -> None:
+    """Raise InputError if the spectra are not those of a Gaussian field."""
+    for name, values in zip(SPECTRA, spectra, strict=True):
+        bad = ~np.isfinite(values) | ((values < 0) & (name != "TE"))
+        if bad.any():
+            kind = "finite" if name == "TE" else "finite and not negative"
+            raise InputError(
+                f"{path}: {name} must be {kind}, but is not at {bad.sum()} multipoles, "
+                f"the first l = {np.argmax(bad)}."
+            )
+    TT, EE, _, TE = spectra
+    if np.any(bad := np.abs(TE) > np.sqrt(TT * EE) * _ROUNDING):
+        raise InputError(
+            f"{path}: |TE| exceeds sqrt(TT EE) at {bad.sum()} multipoles, "
+            f"the first l = {np.argmax(bad)}."
+        )
+
+
+def read_spectra(
+    path: str | Path, lmax: int, *, format: str | None = None, unit: str | None = None
+) -> Float[np.ndarray, "4 ell"]:
+    """Power spectra C_l of TT, EE, BB, TE from a file [uK_CMB^2], l = 0 ... lmax.
+
+    * Text with l and D_l = l (l+1) C_l / 2 pi [uK^2]: the theory spectra of the Planck Legacy
+      Archive (L TT TE EE BB PP), and what CAMB writes (L TT EE BB TE). The header says which
+      column is which. Without one, CAMB's order is assumed for names that end in totCls.dat or
+      lensedCls.dat, and has to be given as `format` for others.
+    * FITS tables as HEALPix and healpy write them, with C_l, from l = 0 unless a column says
+      otherwise. Units are read from the header, the bare K^2 being one of K_CMB.
+
+    Multipoles 0 and 1 are zero where the file does not have them.
+
+    Parameters
+    ----------
+    path : text or FITS file
+    lmax : largest multipole
+    format : "planck" or "camb", the order of columns of a text file without header
+    unit : unit of a FITS table without one, for example "uK_CMB^2" (`healpy.write_cl` writes
+        none unless asked to)
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, lacks a spectrum, has gaps in l or ends below lmax;
+        says neither by itself nor by an argument what its columns and units are, or different
+        things by both; holds D_l in FITS; or has values that are not finite, negative TT, EE or
+        BB, or |TE| > sqrt(TT EE).
+    ValueError
+        If `format` is unknown or lmax is negative.
+    """
+    path = Path(path)
+    if format is not None and format not in _ORDERS:
+        raise ValueError(f"Argument `format` must be one of {', '.join(_ORDERS)}, not {format!r}.")
+    if is_fits(path):
+        if format is not None:
+            raise InputError(f"{path}: argument `format` is for text files, this is FITS.")
+        spectra = _read_fits(path, lmax, unit)
+    else:
+        if unit is not None:
+            raise InputError(f"{path}: argument `unit` is for FITS files, text is in uK^2.")
+        spectra = _read_text(path, lmax, format)
+    _check(path, spectra)
+    return spectra

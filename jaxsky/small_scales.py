@@ -1,0 +1,387 @@
+"""Small scales added to templates: the paper's extrapolation of their spectra, as a pure function.
+
+A template knows the sky up to the join, the upper end of the range over which a power law is
+fitted to its spectrum. Beyond, the sky is taken to follow the power law. The template is taken
+from its own beam to the target's up to the join; further on it keeps the beam it has, and is
+brought down where it exceeds the power law (there it is noise). What is missing is filled with a
+Gaussian realisation times a modulation, the normalised polarized intensity, so that the mean
+spectrum of the sum is the power law: at each multipole the injected power is the extrapolation
+less that of the template, never negative.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import healpy
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from jaxsky import correlated
+from jaxsky.checks import as_array, check_finite, check_positive, is_concrete
+from jaxsky.harmonics import (
+    analysis,
+    expand,
+    gaussian_beam,
+    lmax_of,
+    needed_lmax,
+    power_spectrum,
+    resample,
+    resize,
+    synthesis,
+)
+
+__all__ = [
+    "DUST",
+    "SYNCHROTRON",
+    "Extrapolation",
+    "PowerLaw",
+    "SmallScales",
+    "add_small_scales",
+    "continue_templates",
+    "extrapolate",
+    "fit_power_law",
+    "modulation",
+]
+
+
+class PowerLaw(NamedTuple):
+    """C_l = exp(log_amplitude) (l / pivot)^slope, with the covariance of the two numbers."""
+
+    log_amplitude: Float[Array, ""]
+    slope: Float[Array, ""]
+    covariance: Float[Array, "2 2"]
+    pivot: int
+
+    def __call__(self, lmax: int) -> Float[Array, " ell"]:
+        """C_l of l = 0 ... lmax, zero below l = 2."""
+        ell = jnp.arange(lmax + 1)
+        log = jnp.log(jnp.maximum(ell, 1) / self.pivot)
+        return jnp.where(ell < 2, 0.0, jnp.exp(self.log_amplitude + self.slope * log))
+
+
+def fit_power_law(spectrum: Float[Array, " ell"], lmin: int, lmax: int) -> PowerLaw:
+    """Straight line through log C_l against log l by least squares, every l counting alike.
+
+    The paper's fit; its errors come from the scatter about the line.
+
+    Parameters
+    ----------
+    spectrum : C_l, l = 0 ...
+    lmin, lmax : range of the fit, both included; lmax is the pivot of the result
+
+    Raises
+    ------
+    ValueError
+        If the range has fewer than four multipoles, is not within 2 ... of the spectrum, or the
+        spectrum is not positive there.
+    """
+    if not 2 <= lmin <= lmax - 3 or lmax >= len(spectrum):
+        raise ValueError(
+            f"A power law cannot be fitted from l = {lmin} to {lmax} to a spectrum that ends at "
+            f"{len(spectrum) - 1}; it needs four multipoles from l = 2 on."
+        )
+    part = spectrum[lmin : lmax + 1]
+    check_positive("spectrum", part)
+    log = jnp.log(jnp.arange(lmin, lmax + 1) / lmax)
+    (slope, log_amplitude), covariance = jnp.polyfit(log, jnp.log(part), 1, cov=True)
+    return PowerLaw(log_amplitude, slope, covariance[::-1, ::-1], lmax)
+
+
+class SmallScales(eqx.Module):
+    """How small scales continue a template.
+
+    Parameters
+    ----------
+    EE, BB : ranges of l over which the power laws are fitted; their upper ends are the joins
+    slope : of the laws of E and B, instead of those fitted; a number serves both
+    tilt : added to the slopes; negative is steeper. The pivot is the join.
+    amplitude : of the injected map, relative to that which makes the mean spectrum continuous
+    modulation_fwhm : beam by which the polarized intensity is smoothed to modulate [arcmin]
+
+    Raises
+    ------
+    TypeError, ValueError
+        For numbers that are not finite, a negative amplitude or a modulation_fwhm that is not
+        positive.
+    """
+
+    EE: tuple[int, int] = eqx.field(static=True)
+    BB: tuple[int, int] = eqx.field(static=True)
+    slope: Float[Array, "2"] | None
+    tilt: Float[Array, ""]
+    amplitude: Float[Array, ""]
+    modulation_fwhm: Float[Array, ""]
+
+    def __init__(
+        self,
+        EE: tuple[int, int],
+        BB: tuple[int, int],
+        slope: ArrayLike | None = None,
+        tilt: ArrayLike = 0.0,
+        amplitude: ArrayLike = 1.0,
+        modulation_fwhm: ArrayLike = 180.0,
+    ) -> None:
+        self.EE, self.BB = (EE[0], EE[1]), (BB[0], BB[1])
+        self.slope = None if slope is None else jnp.broadcast_to(as_array("slope", slope), (2,))
+        self.tilt = as_array("tilt", tilt)
+        self.amplitude = as_array("amplitude", amplitude)
+        self.modulation_fwhm = as_array("modulation_fwhm", modulation_fwhm)
+        for name in ("slope", "tilt", "amplitude"):
+            if getattr(self, name) is not None:
+                check_finite(name, getattr(self, name))
+        check_positive("modulation_fwhm", self.modulation_fwhm)
+        if is_concrete(self.amplitude) and self.amplitude < 0:
+            raise ValueError(
+                f"Argument `amplitude` must not be negative, but is {self.amplitude:g}."
+            )
+
+
+#: The paper's ranges for its templates.
+SYNCHROTRON = SmallScales(EE=(10, 120), BB=(4, 40))
+DUST = SmallScales(EE=(60, 600), BB=(60, 600))
+
+
+class Extrapolation(NamedTuple):
+    """The spectra E, B of a template and of what continues it, without the target's beam.
+
+    Parameters
+    ----------
+    measured : spectra of the template divided by those of its beam, up to its own lmax
+    laws : the fitted power laws
+    target : power laws with the slope asked for
+    transfer : factors of the template's coefficients, its own beam taken out
+    injected : spectra of what is added
+    """
+
+    measured: Float[Array, "2 ell_in"]
+    laws: tuple[PowerLaw, PowerLaw]
+    target: Float[Array, "2 ell"]
+    transfer: Float[Array, "2 ell_in"]
+    injected: Float[Array, "2 ell"]
+
+
+def extrapolate(
+    alm: Float[Array, "2 alm"], own: ArrayLike, small: SmallScales, lmax: int
+) -> Extrapolation:
+    """Spectra of a template and of the small scales that continue it.
+
+    Parameters
+    ----------
+    alm : packed coefficients E, B of the template, as far as they are known
+    own : beam of the template [arcmin]
+    small : how it is continued
+    lmax : largest multipole of the small scales
+
+    Raises
+    ------
+    ValueError
+        If a range does not lie within the template's multipoles.
+    """
+    known = lmax_of(alm)
+    beam = gaussian_beam(own, known)
+    measured = power_spectrum(alm) / beam**2
+    ell, laws, target, transfer = jnp.arange(known + 1), [], [], []
+    for i, (lmin, join) in enumerate((small.EE, small.BB)):
+        law = fit_power_law(measured[i], lmin, join)
+        slope = law.slope if small.slope is None else small.slope[i]
+        laws.append(law)
+        target.append(law._replace(slope=slope + small.tilt)(lmax))
+        allowed = jnp.pad(target[i], (0, max(0, known - lmax)))[: known + 1]
+        excess = measured[i] * (beam / beam[join]) ** 2 / jnp.where(allowed > 0, allowed, 1.0)
+        kept = beam / beam[join] / jnp.sqrt(jnp.maximum(excess, 1.0))
+        transfer.append(jnp.where(ell <= join, 1.0, kept))
+    there = jnp.stack(transfer) ** 2 * measured
+    both = min(known, lmax) + 1
+    missing = jnp.stack(target).at[:, :both].add(-there[:, :both])
+    joins = jnp.array([[small.EE[1]], [small.BB[1]]])
+    beyond = jnp.arange(lmax + 1) > joins
+    injected = jnp.where(beyond, jnp.maximum(missing, 0.0), 0.0)
+    return Extrapolation(
+        measured, (laws[0], laws[1]), jnp.stack(target), jnp.stack(transfer), injected
+    )
+
+
+def modulation(maps: Float[Array, "2 pix"], fwhm: ArrayLike, nside: int) -> Float[Array, " pix"]:
+    """Polarized intensity of Q, U, smoothed by a beam [arcmin] and divided by its mean.
+
+    Unlike Q over its mean, the paper's "normalised version of the template", it does not change
+    sign.
+    """
+    squared = jnp.sum(maps**2, axis=0)
+    intensity = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+    own = healpy.npix2nside(maps.shape[-1])
+    window = gaussian_beam(fwhm, 2 * own)
+    if is_concrete(window):
+        window = window[: needed_lmax(window) + 1]
+    return resample(intensity[None], window, nside)[0] / intensity.mean()
+
+
+def _rise(joins: Sequence[int], lmax: int) -> Float[Array, "field ell"]:
+    """0 below half the join, 1 from the join on: below, the template stays as it is."""
+    at = jnp.arange(lmax + 1) / jnp.asarray(joins)[:, None]
+    return jnp.sin(jnp.pi / 2 * jnp.clip(2 * at - 1, 0, 1)) ** 2
+
+
+def _correlations(
+    alms: Float[Array, "field alm"], ranges: Sequence[tuple[int, int]]
+) -> Float[Array, "field field"]:
+    """Correlation coefficients of coefficients over the multipoles in all ranges."""
+    lmin, lmax = max(r[0] for r in ranges), min(r[1] for r in ranges)
+    if lmin > lmax:
+        raise ValueError(
+            f"Correlated small scales need ranges that overlap, but they are {list(ranges)}."
+        )
+    ell = jnp.arange(lmax_of(alms) + 1)
+    inside = expand(jnp.where((ell >= lmin) & (ell <= lmax), 1.0, 0.0))
+    products = (alms * inside) @ alms.T
+    scale = jnp.sqrt(jnp.diagonal(products))
+    return products / (scale[:, None] * scale)
+
+
+def _injected_matrix(
+    alms: Float[Array, "field alm"],
+    parts: Sequence[Extrapolation],
+    ranges: Sequence[tuple[int, int]],
+) -> Float[Array, "field field ell"]:
+    """Spectra of what is added to several templates that are to stay as correlated as they are.
+
+    Each cross-spectrum is extrapolated with the coefficient of correlation that it has over the
+    range of the fits. Off the diagonal there is the same difference as on it, where both fields
+    are injected.
+    """
+    target, injected, transfer = (
+        jnp.concatenate([getattr(part, name) for part in parts])
+        for name in ("target", "injected", "transfer")
+    )
+    # The coefficients are here without their beams.
+    known, lmax = lmax_of(alms), target.shape[-1] - 1
+    both = min(known, lmax) + 1
+    rho = _correlations(alms, ranges)
+    cross = jax.vmap(lambda one: jax.vmap(lambda other: power_spectrum(one, other))(alms))(alms)
+    there = cross * transfer[:, None] * transfer[None]
+    root = jnp.sqrt(target)
+    matrix = rho[..., None] * root[:, None] * root[None]
+    matrix = matrix.at[..., :both].add(-there[..., :both])
+    present = (injected[:, None] > 0) & (injected[None] > 0)
+    on_diagonal = jnp.eye(len(injected), dtype=bool)[..., None]
+    return jnp.where(on_diagonal, injected[:, None], jnp.where(present, matrix, 0.0))
+
+
+class Continued(NamedTuple):
+    """Templates with their small scales.
+
+    Parameters
+    ----------
+    alms : packed coefficients E, B of each, without any beam
+    parts : the spectra that they follow
+    repaired : number of multipoles at which the matrix of spectra had to be repaired
+    """
+
+    alms: list[Float[Array, "2 alm"]]
+    parts: list[Extrapolation]
+    repaired: Int[Array, ""]
+
+
+def continue_templates(
+    key: Array,
+    maps: Sequence[Float[Array, "2 pix"]],
+    own: Sequence[ArrayLike],
+    small: Sequence[SmallScales],
+    nside: int,
+    lmax: int | None = None,
+) -> Continued:
+    """Templates continued to small scales, correlated with each other if there are several.
+
+    With one key the result is differentiable in slopes, tilts, amplitudes, beams and maps. Of
+    a single template E and B are independent; several keep their coefficients of correlation,
+    E with B and template with template (the paper's dust and AME, after Brown & Battye 2011).
+    The spectra are divided by the means of the products of the modulations, so that those of
+    the modulated maps are the extrapolated ones.
+
+    Parameters
+    ----------
+    key : of jax.random
+    maps : Q, U of each template, RING
+    own : beam of each template [arcmin]
+    small : how each is continued
+    nside : resolution at which the small scales are modulated
+    lmax : largest multipole of the result, by default 2 nside
+
+    Raises
+    ------
+    ValueError
+        If a range of a fit does not lie within a template's multipoles, or ranges of correlated
+        templates do not overlap.
+    """
+    lmax = 2 * nside if lmax is None else lmax
+    known = [_known(each, beam) for each, beam in zip(maps, own, strict=True)]
+    alms = [analysis(each, k) for each, k in zip(maps, known, strict=True)]
+    parts = [
+        extrapolate(alm, beam, how, lmax) for alm, beam, how in zip(alms, own, small, strict=True)
+    ]
+    bare = [
+        alm / expand(gaussian_beam(beam, k)) for alm, beam, k in zip(alms, own, known, strict=True)
+    ]
+    if len(maps) == 1:
+        matrix = jnp.eye(2)[..., None] * parts[0].injected[:, None]
+    else:
+        ranges = [r for how in small for r in (how.EE, how.BB)]
+        common = max(known)
+        fields = jnp.concatenate([resize(alm, common) for alm in bare])
+        padded = [
+            part._replace(transfer=jnp.pad(part.transfer, ((0, 0), (0, common - k))))
+            for part, k in zip(parts, known, strict=True)
+        ]
+        matrix = _injected_matrix(fields, padded, ranges)
+    gains = jnp.stack(
+        [
+            modulation(each, how.modulation_fwhm, nside)
+            for each, how in zip(maps, small, strict=True)
+        ]
+    )
+    power = jnp.repeat(jnp.repeat(gains @ gains.T / gains.shape[-1], 2, 0), 2, 1)
+    matrix, repaired = correlated.repair(matrix / power[..., None])
+    drawn = correlated.realisation(key, matrix)
+    result = []
+    for i, (alm, how, part, gain) in enumerate(zip(bare, small, parts, gains, strict=True)):
+        added = analysis(gain * synthesis(drawn[2 * i : 2 * i + 2], nside), lmax)
+        rise = _rise((how.EE[1], how.BB[1]), lmax)
+        template = resize(alm * expand(part.transfer), lmax)
+        result.append(template + how.amplitude * expand(rise) * added)
+    return Continued(result, parts, repaired)
+
+
+def _known(maps: Float[Array, "2 pix"], own: ArrayLike) -> int:
+    """Largest multipole of a template that its pixels and its beam let through."""
+    lmax = 2 * healpy.npix2nside(maps.shape[-1])
+    beam = gaussian_beam(own, lmax)
+    return needed_lmax(beam) if is_concrete(beam) else lmax
+
+
+def add_small_scales(
+    key: Array,
+    maps: Float[Array, "2 pix"],
+    own: ArrayLike,
+    fwhm: ArrayLike,
+    nside: int,
+    small: SmallScales,
+) -> Float[Array, "2 pix"]:
+    """A template with small scales, at a beam that may be finer than its own.
+
+    Parameters
+    ----------
+    key : of jax.random; another one gives other small scales
+    maps : Q, U, RING
+    own, fwhm : beam of the template, and of the result [arcmin]
+    nside : resolution of the result
+    small : how the template is continued
+
+    Raises
+    ------
+    ValueError
+        If a range of a fit does not lie within the template's multipoles.
+    """
+    (alm,) = continue_templates(key, [maps], [own], [small], nside).alms
+    return synthesis(alm * expand(gaussian_beam(fwhm, lmax_of(alm))), nside)

@@ -21,7 +21,15 @@ from jaxsky.bandpass import Bandpass, average
 from jaxsky.checks import is_concrete
 from jaxsky.components import Component
 
-__all__ = ["Nodes", "band_sed", "choose_nodes"]
+__all__ = [
+    "Nodes",
+    "Terms",
+    "band_sed",
+    "choose_nodes",
+    "choose_terms",
+    "term",
+    "term_weights",
+]
 
 
 class NodeCounts(NamedTuple):
@@ -125,6 +133,94 @@ def choose_nodes(component: Component, bands: tuple[Bandpass, ...], tolerance: f
     return NodeCounts(tuple(int(max(first, 2)) for first in resolved.argmax(axis=1)))
 
 
+def _series(
+    component: Component, band: Bandpass, counts: tuple[int, ...]
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Chebyshev coefficients of the band average in the parameters that are maps, and its values.
+
+    The axes are the maps, as long as their node counts.
+    """
+    maps, rebuild = _split(component)
+    if not maps:
+        value = average(component.sed, band)
+        return value, value
+    axes = [
+        mid + half * jnp.asarray(chebyshev.nodes(n), mid.dtype)
+        for (mid, half), n in zip(map(_range, maps), counts, strict=True)
+    ]
+    mesh = [axis.ravel() for axis in jnp.meshgrid(*axes, indexing="ij")]
+    values = jax.vmap(lambda *v: average(rebuild(v).sed, band))(*mesh).reshape(counts)
+    return chebyshev.coefficients(values), values
+
+
+def _points(component: Component) -> list[Float[Array, " pix"]]:
+    """The maps, scaled to [-1, 1]."""
+    maps, _ = _split(component)
+    return [(m - mid) / half for m, (mid, half) in zip(maps, map(_range, maps), strict=True)]
+
+
+class Terms(NamedTuple):
+    """Combinations of Chebyshev polynomials that the band averages of a component are made of.
+
+    Parameters
+    ----------
+    vectors : orthonormal combinations, shape (term, node); no node where no parameter is a map
+    counts : node counts
+    sizes : what each adds to the maps at most, relative to the maps
+    """
+
+    vectors: Float[Array, "term node"]
+    counts: tuple[int, ...]
+    sizes: tuple[float, ...]
+
+
+def choose_terms(
+    component: Component,
+    bands: tuple[Bandpass, ...],
+    importance: Float[Array, " band"],
+    tolerance: float,
+) -> Terms | None:
+    """The fewest maps from which a component's emission in all bands can be summed up.
+
+    The law's matrix (band, node) has singular values that fall fast, so a few combinations of
+    polynomials serve all bands, and what is linear (a transform) is done to these only.
+
+    Parameters
+    ----------
+    component, bands : concrete, not being traced
+    importance : what the template, times its law, is multiplied by to be relative to the maps
+    tolerance : error relative to the maps
+
+    Returns
+    -------
+    The terms, one and constant if no parameter is a map; None where bands are better averaged
+    one by one.
+    """
+    if not _split(component)[0]:
+        return Terms(jnp.ones((1, 1)), (), (1.0,))
+    nodes = choose_nodes(component, bands, tolerance)
+    if nodes is None or nodes.tolerance is not None:
+        return None
+    series = jnp.stack([_series(component, band, nodes.counts)[0].ravel() for band in bands])
+    _, sizes, vectors = np.linalg.svd(np.asarray(importance[:, None] * series), full_matrices=False)
+    kept = max(1, int(np.sum(sizes > tolerance)))
+    return Terms(jnp.asarray(vectors[:kept]), nodes.counts, tuple(map(float, sizes[:kept])))
+
+
+def term_weights(
+    component: Component, bands: tuple[Bandpass, ...], terms: Terms
+) -> Float[Array, "band term"]:
+    """How much of each term a component shows in each band."""
+    series = [_series(component, band, terms.counts)[0].ravel() for band in bands]
+    return jnp.stack(series) @ terms.vectors.T
+
+
+def term(component: Component, terms: Terms, index: int) -> Float[Array, " pix"]:
+    """A term in each pixel; a number if no parameter is a map."""
+    coefs = terms.vectors[index].reshape(terms.counts)
+    return chebyshev.evaluate(coefs, *_points(component))
+
+
 def band_sed(
     component: Component, band: Bandpass, nodes: Nodes
 ) -> Float[Array, ""] | Float[Array, " pix"]:
@@ -137,17 +233,8 @@ def band_sed(
     """
     if nodes is None:
         return average(component.sed, band)
-    maps, rebuild = _split(component)
-    ranges = [_range(m) for m in maps]
-    axes = [
-        mid + half * jnp.asarray(chebyshev.nodes(n), mid.dtype)
-        for (mid, half), n in zip(ranges, nodes.counts, strict=True)
-    ]
-    mesh = [axis.ravel() for axis in jnp.meshgrid(*axes, indexing="ij")]
-    values = jax.vmap(lambda *v: average(rebuild(v).sed, band))(*mesh)
-    values = values.reshape(nodes.counts)
-    coefs = chebyshev.coefficients(values)
-    points = [(m - mid) / half for m, (mid, half) in zip(maps, ranges, strict=True)]
+    coefs, values = _series(component, band, nodes.counts)
+    points = _points(component)
     if nodes.tolerance is None:
         return chebyshev.evaluate(coefs, *points)
     # What the last two orders along each axis add bounds what the orders left out would.

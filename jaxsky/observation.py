@@ -1,0 +1,93 @@
+"""What is observed, and how: components with their beams, bands with theirs, pixels."""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from jaxsky.bandpass import Bandpass
+from jaxsky.components import Component
+from jaxsky.small_scales import SmallScales
+
+__all__ = ["Observation", "ObservedBand", "Source"]
+
+
+class Source(eqx.Module):
+    """A component of the sky at the resolution of its template.
+
+    Parameters
+    ----------
+    component : template and law; Q, U, or I, Q, U
+    fwhm : own beam of the template [arcmin]
+    small_scales : how the template is continued below its beam; None leaves it as it is
+    correlated_with : name of a source whose small scales are drawn together with these
+    """
+
+    component: Component
+    fwhm: Float[Array, ""] | float = 0.0
+    small_scales: SmallScales | None = None
+    correlated_with: str | None = eqx.field(static=True, default=None)
+
+
+class ObservedBand(eqx.Module):
+    """How a band is observed.
+
+    Parameters
+    ----------
+    band : the bandpass
+    beam : FWHM of a Gaussian [arcmin], or a table b_l
+    target : beam to which the observed map is smoothed; None leaves it as observed
+    noise : uniform level [uK_RJ arcmin], covariance of each pixel [uK_RJ^2], shape
+        (stokes, stokes, pix), or None
+    diagonal : noise with the diagonal of the Cholesky factor only (`noise.draw`)
+    """
+
+    band: Bandpass
+    beam: Float[Array, ""] | Float[Array, " ell"] | float
+    target: Float[Array, ""] | float | None = None
+    noise: Float[Array, ""] | Float[Array, "stokes stokes pix"] | float | None = None
+    diagonal: bool = eqx.field(static=True, default=False)
+
+
+class Observation(eqx.Module):
+    """An experiment: channels by name, and the pixels of the maps.
+
+    Parameters
+    ----------
+    channels : by name, in order
+    nside : resolution of the maps
+    stokes : "QU" or "IQU"
+    finest : beam to which small scales are made [arcmin], at most the finest one observed
+    """
+
+    channels: dict[str, ObservedBand]
+    nside: int = eqx.field(static=True)
+    stokes: str = eqx.field(static=True, default="QU")
+    finest: Float[Array, ""] | float = 0.0
+    names: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def __init__(
+        self,
+        channels: Mapping[str, ObservedBand],
+        nside: int,
+        stokes: str = "QU",
+        finest: Float[Array, ""] | float = 0.0,
+    ) -> None:
+        self.channels, self.nside, self.stokes = dict(channels), nside, stokes
+        self.finest = finest
+        # JAX sorts dictionaries when it takes them apart.
+        self.names = tuple(channels)
+        if not self.channels:
+            raise ValueError("Argument `channels` must have at least one channel.")
+        if stokes not in ("QU", "IQU"):
+            raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")
+
+    @property
+    def lmax(self) -> int:
+        """Largest multipole of the sky in the maps."""
+        return 2 * self.nside
+
+    @property
+    def bands(self) -> tuple[Bandpass, ...]:
+        """The bandpasses in order."""
+        return tuple(self.channels[name].band for name in self.names)

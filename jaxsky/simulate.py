@@ -1,0 +1,373 @@
+"""Observing the sky with an experiment: the paper's procedure as a function of its parameters.
+
+Templates get their small scales, every component is scaled to a band, all are brought to the
+band's beam and added up, and noise is added. What is linear is done once: a component whose law
+is the same everywhere is transformed once for all bands, one whose parameters are maps a few
+times (`interpolation.choose_terms`), and bands are put together in harmonic space, one by one.
+With fixed keys the maps are differentiable in all numbers: spectral parameters, slopes and
+amplitudes of small scales, beams, band centres.
+"""
+
+import zlib
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import healpy
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxsky.cmb import realisation
+from jaxsky.components import Component
+from jaxsky.harmonics import (
+    analysis,
+    beam_ratio,
+    expand,
+    gaussian_beam,
+    resample,
+    resize,
+    synthesis,
+)
+from jaxsky.interpolation import Terms, band_sed, choose_terms, term, term_weights
+from jaxsky.noise import draw, uniform_alm, uniform_covariance
+from jaxsky.observation import Observation, ObservedBand, Source
+from jaxsky.small_scales import continue_templates
+
+__all__ = [
+    "Prepared",
+    "observe_bands",
+    "plan",
+    "prepare",
+    "simulate",
+    "stream",
+]
+
+#: Error of the varying laws, relative to the maps of a band.
+TOLERANCE = 1e-7
+
+
+def stream(key: Array, kind: str, name: str = "") -> Array:
+    """The key of one kind of random numbers: the same whatever else is drawn, and in any order."""
+    return jax.random.fold_in(key, zlib.crc32(f"{kind} {name}".encode()))
+
+
+class Prepared(NamedTuple):
+    """A component in harmonic space.
+
+    Parameters
+    ----------
+    component : its law, with parameters at the resolution of the observation
+    terms : what the law is made of; None where bands are averaged one by one
+    alms : coefficients of the template times each term, with the beam that it has
+    template : the template where bands are averaged one by one, else None
+    fwhm : beam [arcmin]
+    repaired : multipoles whose matrix of correlated small scales was repaired
+    """
+
+    component: Component
+    terms: Terms | None
+    alms: tuple[Float[Array, "stokes alm"], ...]
+    template: Float[Array, "stokes pix"] | None
+    fwhm: Float[Array, ""] | float
+    repaired: Int[Array, ""] | int = 0
+
+
+def _continued(
+    key: Array, sources: Mapping[str, Source], observation: Observation
+) -> dict[str, tuple[Float[Array, "2 alm"], Int[Array, ""] | int, Array | float]]:
+    """Coefficients of the sources that have small scales, how many repaired, and their beam: 0."""
+    leaders = {
+        name: source.correlated_with or name
+        for name, source in sources.items()
+        if source.small_scales is not None
+    }
+    result: dict[str, tuple[Array, Array | int, Array | float]] = {}
+    for leader in sorted(set(leaders.values())):
+        group = [leader, *sorted(n for n, first in leaders.items() if first == leader != n)]
+        members = [sources[name] for name in group]
+        continued = continue_templates(
+            stream(key, "small scales", leader),
+            [source.component.template for source in members],
+            [source.fwhm for source in members],
+            [source.small_scales for source in members if source.small_scales is not None],
+            observation.nside,
+        )
+        for name, alm in zip(group, continued.alms, strict=True):
+            result[name] = alm, continued.repaired, 0.0
+    return result
+
+
+def _template_alm(source: Source, lmax: int) -> Float[Array, "stokes alm"]:
+    """Coefficients of a template with its own beam, as far as its pixels resolve them."""
+    template = source.component.template
+    known = min(lmax, 2 * healpy.npix2nside(template.shape[-1]))
+    return resize(analysis(template, known), lmax)
+
+
+def _at(component: Component, nside: int) -> Component:
+    """A component whose parameters that are maps have the resolution of the observation."""
+
+    def bring(leaf):
+        if leaf.ndim != 1 or leaf.shape[-1] == healpy.nside2npix(nside):
+            return leaf
+        lmax = 2 * min(nside, healpy.npix2nside(leaf.shape[-1]))
+        return resample(leaf[None], jnp.ones(lmax + 1, leaf.dtype), nside)[0]
+
+    return jax.tree.map(bring, component)
+
+
+def plan(
+    sources: Mapping[str, Source], observation: Observation, tolerance: float = TOLERANCE
+) -> dict[str, Terms | None]:
+    """Terms of each source for `prepare`, chosen from values that are not being traced.
+
+    Parameters
+    ----------
+    sources, observation : what is observed, and how
+    tolerance : error of varying laws relative to the maps of a band
+    """
+    levels = {}
+    for name, source in sources.items():
+        middle = jax.tree.map(lambda x: x.mean() if x.ndim == 1 else x, source.component)
+        law = jnp.stack([band_sed(middle, band, None) for band in observation.bands])
+        levels[name] = jnp.sqrt(jnp.mean(source.component.template**2)), law
+    total = jnp.sqrt(sum((rms * law) ** 2 for rms, law in levels.values()))
+    return {
+        name: choose_terms(source.component, observation.bands, levels[name][0] / total, tolerance)
+        for name, source in sources.items()
+    }
+
+
+def _iterations(size: float) -> int:
+    """Jacobi steps for a term that adds so much: each gains at least a factor of 20."""
+    return 2 if size > 0.02 else 1 if size > 1e-3 else 0
+
+
+def prepare(
+    key: Array,
+    sources: Mapping[str, Source],
+    observation: Observation,
+    terms: Mapping[str, Terms | None] | None = None,
+) -> dict[str, Prepared]:
+    """Sources with their small scales, in harmonic space.
+
+    Parameters
+    ----------
+    key : of jax.random, for the small scales
+    sources : by name
+    observation : how they are observed
+    terms : from `plan`, by default made here; None for a source averages its bands one by one,
+        as is necessary where its parameters that are maps are being traced
+
+    Raises
+    ------
+    ValueError
+        If a range of a fit of small scales does not lie within a template's multipoles.
+    """
+    _check_sources(sources, observation)
+    terms = plan(sources, observation) if terms is None else terms
+    lmax, nside = observation.lmax, observation.nside
+    continued = _continued(key, sources, observation)
+    result = {}
+    for name, source in sources.items():
+        chosen, component = terms[name], _at(source.component, nside)
+        alm, repaired, fwhm = continued.get(name) or (
+            _template_alm(source, lmax),
+            0,
+            source.fwhm,
+        )
+        if chosen is not None and not chosen.counts:
+            result[name] = Prepared(component, chosen, (alm,), None, fwhm, repaired)
+            continue
+        if name in continued:
+            fwhm = observation.finest
+            alm = alm * expand(gaussian_beam(fwhm, lmax))
+        template = synthesis(alm, nside)
+        if chosen is None:
+            result[name] = Prepared(component, None, (), template, fwhm, repaired)
+            continue
+        alms = tuple(
+            analysis(template * term(component, chosen, i), lmax, _iterations(size))
+            for i, size in enumerate(chosen.sizes)
+        )
+        result[name] = Prepared(component, chosen, alms, None, fwhm, repaired)
+    return result
+
+
+def _check_sources(sources: Mapping[str, Source], observation: Observation) -> None:
+    for name, source in sources.items():
+        rows, wanted = len(source.component.template), observation.stokes
+        if rows != len(wanted):
+            raise ValueError(
+                f"Component {name!r} has {rows} Stokes parameters, but {wanted} are observed."
+            )
+        if source.small_scales is not None and rows != 2:
+            raise ValueError(
+                f"Component {name!r} has small scales, which are added to Q and U only; observe "
+                "stokes 'QU'."
+            )
+        leader = source.correlated_with
+        if leader is not None and (
+            leader not in sources
+            or leader == name
+            or sources[leader].small_scales is None
+            or source.small_scales is None
+        ):
+            raise ValueError(
+                f"The small scales of {name!r} are to be correlated with those of {leader!r}: "
+                "both need to be components with small scales."
+            )
+
+
+class _Part(NamedTuple):
+    """What one component adds to a band: coefficients, their weights, and a window for all."""
+
+    alms: tuple[Float[Array, "stokes alm"], ...]
+    weights: Float[Array, " term"]
+    window: Float[Array, " ell"]
+
+
+@jax.jit
+def _summed(parts: tuple[_Part, ...]) -> Float[Array, "stokes alm"]:
+    """The sum of the parts, in one pass."""
+    return sum(
+        expand(part.window) * sum(w * a for w, a in zip(part.weights, part.alms, strict=True))
+        for part in parts
+    )
+
+
+def _noise(
+    key: Array, channel: ObservedBand, observation: Observation
+) -> _Part | Float[Array, "stokes pix"] | None:
+    """Noise of a channel in harmonic space or as a map, whichever it is simpler in."""
+    if channel.noise is None:
+        return None
+    noise, stokes, nside = jnp.asarray(channel.noise), len(observation.stokes), observation.nside
+    if not noise.ndim and channel.target is not None:
+        # Uniform noise stays isotropic when it is smoothed.
+        alm = uniform_alm(key, noise, observation.lmax, stokes)
+        window = beam_ratio(channel.target, channel.beam, observation.lmax, "the channel")
+        return _Part((alm,), jnp.ones(1), window)
+    covariance = noise if noise.ndim else uniform_covariance(noise, nside, stokes)
+    white = draw(key, covariance, diagonal=channel.diagonal)
+    if channel.target is None:
+        return white
+    window = beam_ratio(channel.target, channel.beam, observation.lmax, "the channel")
+    return resample(white, window, nside)
+
+
+def observe_bands(
+    key: Array,
+    prepared: Mapping[str, Prepared],
+    observation: Observation,
+    cmb: Float[Array, "4 ell"] | None = None,
+    *,
+    components: bool = False,
+) -> Iterator[tuple[str, dict[str, Float[Array, "stokes pix"]]]]:
+    """The maps of each channel in turn, so that only one is in memory.
+
+    Parameters
+    ----------
+    key : of jax.random, for CMB and noise
+    prepared : from `prepare`; may be empty
+    observation : the experiment
+    cmb : spectra TT, EE, BB, TE [uK_CMB^2] up to 2 nside at least, or None for no CMB
+    components : give the map of each component, of "cmb" and "noise" as well as the "total"
+
+    Returns
+    -------
+    Name of the channel, and maps [uK_RJ] by name, shape (stokes, pix); each in turn.
+
+    Raises
+    ------
+    ValueError
+        If the beam of a channel is finer than that of a component, or the CMB's spectra end
+        below 2 nside.
+    """
+    nside, lmax, stokes = observation.nside, observation.lmax, observation.stokes
+    weights = {
+        name: term_weights(source.component, observation.bands, source.terms)
+        for name, source in prepared.items()
+        if source.terms is not None
+    }
+    if cmb is not None:
+        if cmb.shape[-1] <= lmax:
+            raise ValueError(
+                f"The spectra of the CMB end at l = {cmb.shape[-1] - 1}, but nside {nside} "
+                f"needs {lmax}."
+            )
+        cmb_alm = realisation(stream(key, "cmb"), jnp.asarray(cmb)[:, : lmax + 1], stokes)
+    for i, name in enumerate(observation.names):
+        channel = observation.channels[name]
+        beam = channel.beam if channel.target is None else channel.target
+        parts = {
+            which: _seen(source, channel, weights.get(which), i, beam, lmax, which)
+            for which, source in prepared.items()
+        }
+        if cmb is not None:
+            factor = channel.band.conversion("uK_CMB", "uK_RJ")
+            parts["cmb"] = _Part((cmb_alm,), factor[None], beam_ratio(beam, 0.0, lmax))
+        noise = _noise(stream(key, "noise", name), channel, observation)
+        if isinstance(noise, _Part):
+            parts["noise"] = noise
+        maps = {}
+        if components:
+            maps = {which: synthesis(_summed((part,)), nside) for which, part in parts.items()}
+            total = sum(maps.values())
+        elif parts:
+            total = synthesis(_summed(tuple(parts.values())), nside)
+        else:
+            total = 0.0
+        if noise is not None and not isinstance(noise, _Part):
+            total = total + noise
+            maps = {**maps, "noise": noise} if components else maps
+        elif not parts:
+            raise ValueError("Nothing is left to be observed: no component, no CMB, no noise.")
+        yield name, {**maps, "total": jnp.asarray(total)}
+
+
+def _seen(
+    source: Prepared,
+    channel: ObservedBand,
+    weights: Float[Array, "band term"] | None,
+    index: int,
+    beam: Array | float,
+    lmax: int,
+    name: str,
+) -> _Part:
+    """A component in a band."""
+    window = beam_ratio(beam, source.fwhm, lmax, f"component {name!r}")
+    if weights is not None:
+        return _Part(source.alms, weights[index], window)
+    assert source.template is not None  # kept where there are no terms
+    law = band_sed(source.component, channel.band, None)
+    return _Part((analysis(source.template * law, lmax),), jnp.ones(1), window)
+
+
+def simulate(
+    key: Array,
+    sources: Mapping[str, Source],
+    observation: Observation,
+    cmb: Float[Array, "4 ell"] | None = None,
+    *,
+    terms: Mapping[str, Terms | None] | None = None,
+) -> Float[Array, "band stokes pix"]:
+    """Simulated maps of all channels [uK_RJ]: `prepare` and `observe_bands` in one.
+
+    Differentiable in sources and observation with a fixed key.
+
+    Parameters
+    ----------
+    key : of jax.random
+    sources, observation : what is observed, and how
+    cmb : spectra TT, EE, BB, TE [uK_CMB^2], or None
+    terms : see `prepare`
+
+    Raises
+    ------
+    ValueError
+        If a beam is finer than that of a component without small scales.
+    """
+    prepared = prepare(key, sources, observation, terms)
+    seen = observe_bands(key, prepared, observation, cmb)
+    return jnp.stack([maps["total"] for _, maps in seen])

@@ -1,23 +1,36 @@
 """White noise of maps: draws from the covariance of each pixel, and estimates from the maps."""
 
+import math
+from collections.abc import Sequence
+from functools import partial
+
 import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
+from jaxsky.checks import as_array, check_finite, is_concrete
 from jaxsky.harmonics import alm_ell, analysis, children
 from jaxsky.types import Numeric
 
 __all__ = [
+    "check_covariance",
     "cholesky",
+    "covariance_from_columns",
     "draw",
     "estimate_variance",
     "fit_knee",
+    "hits_covariance",
     "knee_spectrum",
+    "rms_covariance",
+    "uniform_alm",
     "uniform_covariance",
 ]
+
+#: Columns of a covariance by their number, in the order of Planck's maps.
+_COLUMNS = {3: ("QQ", "QU", "UU"), 6: ("II", "IQ", "IU", "QQ", "QU", "UU")}
 
 
 def uniform_covariance(
@@ -35,6 +48,135 @@ def uniform_covariance(
     return jnp.eye(stokes)[..., None] * jnp.full(healpy.nside2npix(nside), sigma**2)
 
 
+def uniform_alm(
+    key: Array, noise: ArrayLike, lmax: int, stokes: int = 2
+) -> Float[Array, "stokes alm"]:
+    """Packed coefficients of white noise, N_l = noise^2 (in u rad) at all multipoles.
+
+    The harmonic counterpart of a draw from `uniform_covariance`, without pixels.
+
+    Parameters
+    ----------
+    key : of jax.random
+    noise : noise [u arcmin], u being the unit of the maps
+    lmax : largest multipole
+    stokes : rows: 1 for I, 2 for E, B, 3 for I, E, B; E and B have no modes at l < 2
+
+    Raises
+    ------
+    ValueError
+        If `stokes` is none of these.
+    """
+    if stokes not in (1, 2, 3):
+        raise ValueError(f"Argument `stokes` must be 1, 2 or 3, not {stokes!r}.")
+    level = as_array("noise", noise) * (math.pi / 180 / 60)
+    degree = alm_ell(lmax)
+    spins = np.array({1: [0], 2: [2, 2], 3: [0, 2, 2]}[stokes])
+    white = jax.random.normal(key, (stokes, degree.size), level.dtype)
+    return jnp.where(degree >= spins[:, None], level * white, 0)
+
+
+def _diagonal(variance: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:
+    return jnp.eye(len(variance), dtype=variance.dtype)[..., None] * variance
+
+
+def rms_covariance(rms: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:
+    """Covariance of each pixel from maps of the rms, without correlations.
+
+    Parameters
+    ----------
+    rms : standard deviation of each Stokes parameter in each pixel, shape (stokes, pix)
+
+    Raises
+    ------
+    TypeError
+        If the maps carry a unit.
+    ValueError
+        For a wrong shape, and values that are not finite or negative.
+    """
+    rms = as_array("rms", rms)
+    if rms.ndim != 2:
+        raise ValueError(
+            f"Argument `rms` must have shape (stokes, pix), but has shape {rms.shape}."
+        )
+    check_finite("rms", rms)
+    if is_concrete(rms) and (bad := int(jnp.sum(rms < 0))):
+        raise ValueError(f"Argument `rms` has {bad} of {rms.size} values that are negative.")
+    return _diagonal(rms**2)
+
+
+def hits_covariance(
+    sigma0: ArrayLike, hits: Float[Array, " pix"], stokes: int = 2
+) -> Float[Array, "stokes stokes pix"]:
+    """Covariance of each pixel from the number of observations, sigma_0^2 / hits.
+
+    Parameters
+    ----------
+    sigma0 : noise of one observation, a number or one for each Stokes parameter; those of WMAP's
+        polarization differ a little from those of its intensity
+    hits : number of observations of each pixel
+    stokes : number of Stokes parameters
+
+    Raises
+    ------
+    TypeError
+        If an argument carries a unit.
+    ValueError
+        For wrong shapes, values that are not finite, and pixels without hits.
+    """
+    sigma0, hits = as_array("sigma0", sigma0), as_array("hits", hits)
+    if sigma0.shape not in ((), (stokes,)):
+        raise ValueError(
+            f"Argument `sigma0` must be a number or have shape ({stokes},), "
+            f"but has shape {sigma0.shape}."
+        )
+    if hits.ndim != 1:
+        raise ValueError(f"Argument `hits` must have shape (pix,), but has shape {hits.shape}.")
+    check_finite("sigma0", sigma0)
+    check_finite("hits", hits)
+    if is_concrete(hits) and (bad := int(jnp.sum(hits <= 0))):
+        raise ValueError(f"Argument `hits` is not positive in {bad} of {hits.size} pixels.")
+    return _diagonal(jnp.broadcast_to(sigma0, (stokes,))[:, None] ** 2 / hits)
+
+
+def covariance_from_columns(
+    columns: Float[Array, "column pix"], names: Sequence[str] | None = None
+) -> Float[Array, "stokes stokes pix"]:
+    """Covariance of each pixel from its elements, as Planck's maps have them.
+
+    Parameters
+    ----------
+    columns : three maps for Q, U or six for I, Q, U
+    names : what they are, "QQ_COV" or "QQ" and so on, I or T; by default in Planck's order, QQ,
+        QU, UU or II, IQ, IU, QQ, QU, UU
+
+    Raises
+    ------
+    TypeError
+        If the maps carry a unit.
+    ValueError
+        For another number of columns, or names that are not these.
+    """
+    columns = as_array("columns", columns)
+    if columns.ndim != 2 or len(columns) not in _COLUMNS:
+        raise ValueError(
+            "Argument `columns` must have shape (3, pix) or (6, pix), "
+            f"but has shape {columns.shape}."
+        )
+    expected = _COLUMNS[len(columns)]
+    given = list(expected if names is None else names)
+    pairs = ["".join(sorted(name[:2].upper().replace("T", "I"))) for name in given]
+    if sorted(pairs) != sorted(expected):
+        raise ValueError(
+            f"Argument `names` must be {', '.join(expected)} in any order, "
+            f"but is {', '.join(given)}."
+        )
+    rows = dict(zip(pairs, columns, strict=True))
+    stokes = "QU" if len(columns) == 3 else "IQU"
+    return jnp.stack([jnp.stack([rows[min(a + b, b + a)] for b in stokes]) for a in stokes])
+
+
+@jax.jit
 def cholesky(covariance: Float[Array, "stokes stokes pix"]) -> Float[Array, "stokes stokes pix"]:
     """Lower Cholesky factor of the covariance of each pixel, written out element by element."""
     n = len(covariance)
@@ -43,24 +185,66 @@ def cholesky(covariance: Float[Array, "stokes stokes pix"]) -> Float[Array, "sto
         for j in range(i + 1):
             rest = covariance[i, j] - sum(lower[i][k] * lower[j][k] for k in range(j))
             if i == j:
-                # At zero, where the derivative of the root is not finite, it is not taken.
-                lower[i][j] = jnp.where(rest == 0, 0.0, jnp.sqrt(jnp.where(rest == 0, 1.0, rest)))
+                lower[i][j] = jnp.sqrt(rest)
             else:
                 lower[i][j] = rest / jnp.where(lower[j][j] > 0, lower[j][j], 1.0)
     return jnp.stack([jnp.stack(row) for row in lower])
 
 
-@jax.jit
-def draw(key: Array, covariance: Float[Array, "stokes stokes pix"]) -> Float[Array, "stokes pix"]:
+def check_covariance(name: str, covariance: Float[Array, "stokes stokes pix"]) -> None:
+    """Raise ValueError if the covariance of a pixel is not positive definite; says of how many.
+
+    Only the lower triangle is looked at, as in `draw`. Traced arrays pass.
+
+    Parameters
+    ----------
+    name : of the argument, for the message
+    covariance : of the Stokes parameters in each pixel
+    """
+    if covariance.ndim != 3 or covariance.shape[0] != covariance.shape[1]:
+        raise ValueError(
+            f"Argument `{name}` must have shape (stokes, stokes, pix), "
+            f"but has shape {covariance.shape}."
+        )
+    if not is_concrete(covariance):
+        return
+    # A root of a negative number is NaN, and NaN is not positive.
+    pivots = jnp.einsum("ssp->sp", cholesky(covariance))
+    good = jnp.all((pivots > 0) & jnp.isfinite(pivots), axis=0)
+    if bad := int(jnp.sum(~good)):
+        raise ValueError(
+            f"Argument `{name}` is not positive definite in {bad} of {good.size} pixels."
+        )
+
+
+@partial(jax.jit, static_argnames="diagonal")
+def _correlated(covariance, white, diagonal):
+    """White noise times the Cholesky factor of each pixel, or its diagonal."""
+    lower = cholesky(covariance)
+    terms = [[i] if diagonal else range(i + 1) for i in range(len(white))]
+    return jnp.stack([sum(lower[i, j] * white[j] for j in js) for i, js in enumerate(terms)])
+
+
+def draw(
+    key: Array, covariance: Float[Array, "stokes stokes pix"], *, diagonal: bool = False
+) -> Float[Array, "stokes pix"]:
     """A realisation L n of noise with a covariance in each pixel, independent between pixels.
+
+    L is the lower Cholesky factor, n white. The paper (Hervias-Caimapo, Bonaldi & Brown 2016)
+    takes the diagonal of L alone, as standard deviations. Those are what remains of each Stokes
+    parameter when the ones before it are known: the draws have no correlations, and where the
+    covariance has some, U is too quiet by the factor 1 - R^2 in variance, R being its multiple
+    correlation with I and Q; Q by that with I, and I not at all.
 
     Parameters
     ----------
     key : of jax.random
     covariance : of the Stokes parameters in each pixel, positive semi-definite
+    diagonal : independent draws with the diagonal of L as standard deviations, as in the paper
     """
+    # Apart from the products: in one program XLA evaluates the normals anew in each of its rows.
     white = jax.random.normal(key, covariance.shape[1:], covariance.dtype)
-    return jnp.einsum("stp,tp->sp", cholesky(covariance), white)
+    return _correlated(covariance, white, diagonal)
 
 
 def estimate_variance(

@@ -1,8 +1,7 @@
 """What a spectral-index fit starts from: templates and observed maps, from files or embedded."""
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import healpy
 import jax
@@ -11,16 +10,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fits.settings import Band as BandSettings
-from fits.settings import BandpassSpec, MapFile, Settings, SettingsError
-from fits.settings import Template as TemplateSettings
+from fits.settings import Settings
 from jaxsky import (
-    AME,
     CMB,
     Bandpass,
-    Component,
-    Dust,
     Sky,
-    Synchrotron,
     get_parameters,
     observe,
     parameter_names,
@@ -29,9 +23,9 @@ from jaxsky import (
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.galaxy import embedded_sky
 from jaxsky.harmonics import gaussian_beam, resample, synthesis
+from jaxsky.inputs import Template, check_stokes, read, read_bandpass_spec, read_templates
 from jaxsky.instrument import load_instrument
-from jaxsky.io import Maps, read_bandpass, read_maps, unit_factor
-from jaxsky.io.tables import stokes
+from jaxsky.io import unit_factor
 from jaxsky.noise import (
     draw,
     estimate_variance,
@@ -39,19 +33,9 @@ from jaxsky.noise import (
     knee_spectrum,
     uniform_covariance,
 )
-from jaxsky.units import conversion
+from jaxsky.settings import SettingsError
 
-__all__ = ["Band", "Inputs", "Template", "embedded_inputs", "read_inputs"]
-
-LAWS: dict[str, type[Component]] = {"dust": Dust, "synchrotron": Synchrotron, "ame": AME}
-
-
-class Template(NamedTuple):
-    """A component at the resolution of its map."""
-
-    component: Component
-    fwhm: float
-    used: Bool[np.ndarray, " pix"]
+__all__ = ["Band", "Inputs", "embedded_inputs", "read_inputs"]
 
 
 class Band(NamedTuple):
@@ -130,10 +114,7 @@ def read_inputs(settings: Settings) -> Inputs:
         For files that cannot be read as what they should be.
     """
     folder = Path(settings.data_dir)
-    templates: dict[str, Template] = {}
-    for name, spec in sorted(settings.templates.items(), key=lambda item: item[1].law == "ame"):
-        templates[name] = _read_template(folder, name, spec, templates)
-    sky = set_parameters_of(templates, settings.fixed)
+    sky = set_parameters_of(read_templates(folder, settings.templates), settings.fixed)
     bands = {spec.name: _read_band(folder, spec) for spec in settings.bands}
     nside = max(healpy.npix2nside(band.maps.shape[-1]) for band in bands.values())
     spectra = camb_spectra(4 * nside, settings.cmb.r) if settings.cmb.include else None
@@ -158,74 +139,14 @@ def set_parameters_of(
     return templates
 
 
-def _read(folder: Path, spec: MapFile) -> Maps:
-    return read_maps(
-        folder / spec.file,
-        fields=spec.fields,
-        hdu=spec.hdu,
-        unit=spec.unit,
-        ordering=spec.ordering,
-        coordinates=spec.coordinates,
-        polarization=spec.polarization,
-    )
-
-
-def _read_template(
-    folder: Path, name: str, spec: TemplateSettings, others: dict[str, Template]
-) -> Template:
-    read = _read(folder, spec)
-    _check_stokes(f"templates.{name}", read.names, "I" if spec.angles else "QU")
-    maps = jnp.asarray(read.maps) * conversion(read.unit, "uK_RJ", spec.nu_ref)
-    used = np.asarray(read.mask)
-    parameters: dict[str, Any] = {"nu_ref": spec.nu_ref}
-    for key, value in spec.parameters.items():
-        if isinstance(value, MapFile):
-            column = _read(folder, value)
-            parameters[key], used = jnp.asarray(column.maps)[0], used & np.asarray(column.mask)
-        else:
-            parameters[key] = tuple(value) if isinstance(value, list) else value
-    try:
-        if spec.angles:
-            if len(maps) != 1:
-                raise ValueError(f"fields must name one intensity map, not {len(maps)} maps")
-            component: Component = AME.from_dust_angles(
-                maps[0], others[spec.angles].component.amplitude, **parameters
-            )
-        else:
-            component = LAWS[spec.law](maps[-2:], **parameters)
-    except (TypeError, ValueError) as error:
-        raise SettingsError(f"templates.{name}: {error}") from None
-    return Template(component, spec.fwhm, used)
-
-
-def _check_stokes(where: str, names: Sequence[str], wanted: str) -> None:
-    """Refuse columns whose names say that they are other Stokes parameters than is wanted."""
-    said = [stokes(name) for name in names[-len(wanted) :]]
-    if any(s and s != w for s, w in zip(said, wanted, strict=False)):
-        raise SettingsError(
-            f"{where}.fields: {', '.join(names)} are not {' and '.join(wanted)} by their names."
-        )
-
-
-def _bandpass(folder: Path, spec: BandpassSpec) -> Bandpass:
-    if spec.file is not None:
-        return read_bandpass(
-            folder / spec.file, spec.band, detectors=spec.detectors, convention=spec.convention
-        )
-    assert spec.center is not None  # one of file and center is given
-    if not spec.width:
-        return Bandpass.delta(spec.center)
-    return Bandpass.top_hat(spec.center, spec.width, spec.convention or "RJ")
-
-
 def _read_band(folder: Path, spec: BandSettings) -> Band:
-    read = _read(folder, spec)
-    if len(read.maps) < 2:
+    found = read(folder, spec)
+    if len(found.maps) < 2:
         raise SettingsError(f"bands.{spec.name}: fields must name Q and U.")
-    _check_stokes(f"bands.{spec.name}", read.names, "QU")
-    bandpass = _bandpass(folder, spec.bandpass)
-    factor = bandpass.conversion(read.unit, "uK_RJ")
-    maps, used = jnp.asarray(read.maps[-2:]) * factor, np.asarray(read.mask)
+    check_stokes(f"bands.{spec.name}", found.names, "QU")
+    bandpass = read_bandpass_spec(folder, spec.bandpass)
+    factor = bandpass.conversion(found.unit, "uK_RJ")
+    maps, used = jnp.asarray(found.maps[-2:]) * factor, np.asarray(found.mask)
     if spec.noise.estimate_above is not None:
         noise, correlated = _estimated_noise(spec.noise, maps, used)
         return Band(maps, used, bandpass, spec.fwhm, noise, correlated)
@@ -255,7 +176,7 @@ def _given_noise(folder, spec, maps, factor, bandpass):
     if noise.rms is not None:
         return eye * jnp.full(npix, (noise.rms * factor) ** 2), np.ones(npix, bool)
     if noise.map is not None:
-        rms = _read(folder, noise.map)
+        rms = read(folder, noise.map)
         known = np.asarray(rms.mask)
         if rms.nside != read_nside:
             raise SettingsError(
@@ -267,9 +188,9 @@ def _given_noise(folder, spec, maps, factor, bandpass):
         _check_noise(spec, rows, known)
         return eye * jnp.broadcast_to(rows[-2:], maps.shape) ** 2, known
     columns = spec.model_copy(update={"fields": list(noise.covariance), "unit": None})
-    read = _read(folder, columns)
-    known = np.asarray(read.mask)
-    QQ, QU, UU = jnp.asarray(read.maps) * unit_factor(read.unit, "uK_RJ^2", bandpass)
+    found = read(folder, columns)
+    known = np.asarray(found.mask)
+    QQ, QU, UU = jnp.asarray(found.maps) * unit_factor(found.unit, "uK_RJ^2", bandpass)
     _check_noise(spec, jnp.stack([QQ, UU, QQ * UU - QU**2]), known)
     return jnp.stack([jnp.stack([QQ, QU]), jnp.stack([QU, UU])]), known
 

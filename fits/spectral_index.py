@@ -25,10 +25,11 @@ from fits.optimize import best_fit
 from fits.preparation import Preparation, prepare_component
 from fits.results import FitResult
 from fits.sample import ChainFile, sample
-from fits.settings import Settings, SettingsError, known_regions
+from fits.settings import Settings, known_regions
 from jaxsky import Bandpass, Sky
 from jaxsky.harmonics import gaussian_beam, pixel_window
 from jaxsky.io import degrade_mask, read_mask
+from jaxsky.settings import SettingsError
 from jaxsky.types import Numeric
 
 __all__ = ["Fit", "Prepared", "prepare", "region_masks", "run"]

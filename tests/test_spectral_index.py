@@ -8,7 +8,7 @@ import pytest
 
 from fits import settings as fit_settings
 from fits.covariance import Fluctuations
-from fits.inputs import Band, Inputs, Template, embedded_inputs
+from fits.inputs import Band, Inputs, embedded_inputs
 from fits.likelihood import likelihood
 from fits.optimize import best_fit
 from fits.preparation import Preparation, prepare_component
@@ -17,6 +17,7 @@ from jaxsky import Bandpass, Dust, Sky, observe
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.galaxy import embedded_sky
 from jaxsky.harmonics import alm_ell, gaussian_beam, resample, synthesis
+from jaxsky.inputs import Template
 from jaxsky.instrument import load_instrument
 from jaxsky.noise import draw, fit_knee, knee_spectrum, uniform_covariance
 

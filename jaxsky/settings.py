@@ -1,0 +1,186 @@
+"""Settings in TOML files: what commands share, validated with a sentence for each mistake."""
+
+import os
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
+
+__all__ = [
+    "BandpassSpec",
+    "MapFile",
+    "MaskFile",
+    "Nside",
+    "SettingsError",
+    "SettingsFile",
+    "Table",
+    "TemplateFile",
+    "check_angles",
+    "load",
+]
+
+
+class SettingsError(ValueError):
+    """Settings that cannot work, as one sentence that names the file and the key."""
+
+
+class Table(BaseModel):
+    """A table of settings: its fields are the keys, and no others."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+def _power_of_two(value: int) -> int:
+    if value & (value - 1):
+        raise ValueError(f"nside must be a power of two, not {value}")
+    return value
+
+
+Nside = Annotated[int, Field(gt=0), AfterValidator(_power_of_two)]
+
+
+class MapFile(Table):
+    """Columns of a FITS map; what its header says need not be given."""
+
+    file: str
+    fields: list[str | int] | None = None
+    hdu: int = Field(1, ge=1)
+    unit: str | None = None
+    ordering: Literal["RING", "NESTED"] | None = None
+    coordinates: Literal["G", "C", "E"] | None = None
+    polarization: Literal["COSMO", "IAU"] | None = None
+
+
+class MaskFile(Table):
+    """A mask, 1 where a pixel is used: FITS, or one entry of an .npz file."""
+
+    file: str
+    key: str | None = None
+    ordering: Literal["RING", "NESTED"] | None = None
+
+
+class TemplateFile(MapFile):
+    """A component: its map at a reference frequency, its law, parameters that are not default."""
+
+    law: Literal["dust", "synchrotron", "ame"]
+    nu_ref: float = Field(gt=0)
+    fwhm: float = Field(0.0, ge=0)
+    angles: str | None = None
+    parameters: dict[str, float | list[float] | MapFile] = {}
+
+    @model_validator(mode="after")
+    def _angles(self) -> "TemplateFile":
+        if self.angles and self.law != "ame":
+            raise ValueError("angles are for the law 'ame' only")
+        return self
+
+
+class BandpassSpec(Table):
+    """A bandpass: a table in a file, or a top-hat."""
+
+    file: str | None = None
+    band: str | None = None
+    detectors: list[str] | None = None
+    convention: Literal["RJ", "power", "CMB"] | None = None
+    center: float | None = Field(None, gt=0)
+    width: float | None = Field(None, ge=0)
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "BandpassSpec":
+        if (self.file is None) == (self.center is None):
+            raise ValueError("give a bandpass either as file or as center and width")
+        return self
+
+
+class SettingsFile(Table):
+    """What any file of settings has; a command's settings derive from it."""
+
+    title: str = ""
+    data_dir: str = "."
+
+
+def check_angles(templates: Mapping[str, TemplateFile]) -> None:
+    """Raise ValueError if a template takes its angles from one that does not exist."""
+    for name, template in templates.items():
+        if template.angles and template.angles not in templates:
+            raise ValueError(f"templates.{name}.angles: there is no template {template.angles}")
+
+
+def _expand(text: str) -> str:
+    """Environment variables in a path: $NAME, or ${NAME:-default}."""
+
+    def value(match: re.Match[str]) -> str:
+        name, default = match["braced"] or match["plain"], match["default"]
+        found = os.environ.get(name) or default
+        if found is None:
+            raise ValueError(f"the environment variable {name} is not set")
+        return found
+
+    pattern = r"\$(?:\{(?P<braced>\w+)(?::-(?P<default>[^}]*))?\}|(?P<plain>\w+))"
+    return re.sub(pattern, value, text)
+
+
+def _sentence(path: Path, error: ValidationError) -> str:
+    parts = []
+    for item in error.errors():
+        where = ".".join(str(key) for key in item["loc"])
+        what = item["msg"].removeprefix("Value error, ")
+        if item["type"] == "extra_forbidden":
+            what = "unknown key"
+        elif item["type"] == "missing":
+            what = "is missing"
+        elif not item["msg"].startswith("Value error"):
+            what = f"{what[0].lower()}{what[1:]}, not {item['input']!r}"
+        parts.append(f"{where}: {what}" if where else what)
+    return f"{path}: {'; '.join(parts)}."
+
+
+T = TypeVar("T", bound=SettingsFile)
+
+
+def load(path: Path, model: type[T], overrides: Mapping[str, Mapping[str, Any]] | None = None) -> T:
+    """Settings from a TOML file.
+
+    Parameters
+    ----------
+    path : the file; relative paths in it are relative to its `data_dir`, and that to its folder
+    model : what the settings are
+    overrides : by table, values that replace those of the file; None is ignored
+
+    Returns
+    -------
+    The settings, with `data_dir` as an absolute path.
+
+    Raises
+    ------
+    SettingsError
+        If the file is absent, is not TOML, or has a mistake; the message names file and key.
+    """
+    try:
+        raw = tomllib.loads(path.read_text())
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read ({error.strerror}).") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: is not valid TOML ({error}).") from None
+    for table, values in (overrides or {}).items():
+        given = {key: value for key, value in values.items() if value is not None}
+        if given and isinstance(raw.get(table, {}), dict):
+            raw[table] = raw.get(table, {}) | given
+    try:
+        settings = model.model_validate(raw)
+        folder = path.resolve().parent / _expand(settings.data_dir)
+    except ValidationError as error:
+        raise SettingsError(_sentence(path, error)) from None
+    except ValueError as error:
+        raise SettingsError(f"{path}: data_dir: {error}.") from None
+    return settings.model_copy(update={"data_dir": str(folder.resolve())})

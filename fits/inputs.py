@@ -23,9 +23,16 @@ from jaxsky import (
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.galaxy import embedded_sky
 from jaxsky.harmonics import gaussian_beam, resample, synthesis
-from jaxsky.inputs import Template, check_stokes, read, read_bandpass_spec, read_templates
+from jaxsky.inputs import (
+    Template,
+    check_stokes,
+    read,
+    read_bandpass_spec,
+    read_noise,
+    read_templates,
+    set_parameters_of,
+)
 from jaxsky.instrument import load_instrument
-from jaxsky.io import unit_factor
 from jaxsky.noise import (
     draw,
     estimate_variance,
@@ -33,7 +40,6 @@ from jaxsky.noise import (
     knee_spectrum,
     uniform_covariance,
 )
-from jaxsky.settings import SettingsError
 
 __all__ = ["Band", "Inputs", "embedded_inputs", "read_inputs"]
 
@@ -121,28 +127,8 @@ def read_inputs(settings: Settings) -> Inputs:
     return Inputs(sky, bands, spectra, None, settings.title)
 
 
-def set_parameters_of(
-    templates: dict[str, Template], fixed: dict[str, float]
-) -> dict[str, Template]:
-    """Templates with some of their parameters set, by dotted name."""
-    by_template: dict[str, dict[str, float]] = {}
-    for name, value in fixed.items():
-        by_template.setdefault(name.split(".")[0], {})[name] = value
-    for name, values in by_template.items():
-        if name not in templates:
-            raise SettingsError(
-                f"fixed: there is no template {name!r}; templates are {', '.join(templates)}."
-            )
-        alone = Sky({name: templates[name].component})
-        component = set_parameters(alone, values)[name]
-        templates[name] = templates[name]._replace(component=component)
-    return templates
-
-
 def _read_band(folder: Path, spec: BandSettings) -> Band:
     found = read(folder, spec)
-    if len(found.maps) < 2:
-        raise SettingsError(f"bands.{spec.name}: fields must name Q and U.")
     check_stokes(f"bands.{spec.name}", found.names, "QU")
     bandpass = read_bandpass_spec(folder, spec.bandpass)
     factor = bandpass.conversion(found.unit, "uK_RJ")
@@ -150,7 +136,15 @@ def _read_band(folder: Path, spec: BandSettings) -> Band:
     if spec.noise.estimate_above is not None:
         noise, correlated = _estimated_noise(spec.noise, maps, used)
         return Band(maps, used, bandpass, spec.fwhm, noise, correlated)
-    noise, known = _given_noise(folder, spec, maps, factor, bandpass)
+    noise, known = read_noise(
+        folder,
+        spec.noise,
+        bandpass,
+        found.nside,
+        where=f"bands.{spec.name}.noise",
+        unit=found.unit,
+        own=spec,
+    )
     return Band(jnp.where(known, maps, 0), used & known, bandpass, spec.fwhm, noise)
 
 
@@ -166,37 +160,3 @@ def _estimated_noise(noise, maps, used):
     covariance = jnp.eye(2)[..., None] * jnp.full(npix, white / healpy.nside2pixarea(nside))
     excess = knee_spectrum(white, knee, slope, 4 * nside) - white
     return covariance, excess.at[:2].set(0.0)
-
-
-def _given_noise(folder, spec, maps, factor, bandpass):
-    """Covariance of Q and U in each pixel [uK_RJ^2], and where it is known."""
-    npix = maps.shape[-1]
-    read_nside = healpy.npix2nside(npix)
-    noise, eye = spec.noise, jnp.eye(2)[..., None]
-    if noise.rms is not None:
-        return eye * jnp.full(npix, (noise.rms * factor) ** 2), np.ones(npix, bool)
-    if noise.map is not None:
-        rms = read(folder, noise.map)
-        known = np.asarray(rms.mask)
-        if rms.nside != read_nside:
-            raise SettingsError(
-                f"bands.{spec.name}.noise: the map of the noise has nside {rms.nside}, "
-                f"that of the band {read_nside}."
-            )
-        to_RJ = bandpass.conversion(rms.unit, "uK_RJ")
-        rows = jnp.asarray(rms.maps) * to_RJ
-        _check_noise(spec, rows, known)
-        return eye * jnp.broadcast_to(rows[-2:], maps.shape) ** 2, known
-    columns = spec.model_copy(update={"fields": list(noise.covariance), "unit": None})
-    found = read(folder, columns)
-    known = np.asarray(found.mask)
-    QQ, QU, UU = jnp.asarray(found.maps) * unit_factor(found.unit, "uK_RJ^2", bandpass)
-    _check_noise(spec, jnp.stack([QQ, UU, QQ * UU - QU**2]), known)
-    return jnp.stack([jnp.stack([QQ, QU]), jnp.stack([QU, UU])]), known
-
-
-def _check_noise(spec: BandSettings, rows: Array, known: np.ndarray) -> None:
-    if bad := int(jnp.sum((rows <= 0).any(axis=0) & known)):
-        raise SettingsError(
-            f"bands.{spec.name}.noise: {bad} pixels have a noise that is not positive definite."
-        )

@@ -11,6 +11,7 @@ from jaxsky.settings import (
     BandpassSpec,
     MapFile,
     MaskFile,
+    NoiseFile,
     Nside,
     SettingsFile,
     Table,
@@ -64,27 +65,16 @@ class Parameter(Table):
         return Gaussian(*self.gaussian) if self.gaussian else None
 
 
-class Noise(Table):
-    """Noise of a map: exactly one of these; per pixel of the map as it is in the file."""
+class Noise(NoiseFile):
+    """Noise of a band: from files, or at latitudes above one estimated from its own map."""
 
-    rms: float | None = Field(None, gt=0)
-    map: MapFile | None = None
-    covariance: tuple[str, str, str] | None = None
+    KINDS = (*NoiseFile.KINDS, "estimate_above")
+
     estimate_above: float | None = Field(None, ge=0, lt=90)
     correlated: bool = False
 
     @model_validator(mode="after")
-    def _one_kind(self) -> "Noise":
-        given = [
-            k
-            for k in ("rms", "map", "covariance", "estimate_above")
-            if getattr(self, k) is not None
-        ]
-        if len(given) != 1:
-            raise ValueError(
-                "give the noise as exactly one of rms, map, covariance (columns QQ, QU, UU) or "
-                f"estimate_above (a latitude), not {', '.join(given) or 'none'}"
-            )
+    def _not_given(self) -> "Noise":
         if self.correlated and self.estimate_above is None:
             raise ValueError("correlated goes with estimate_above only")
         return self

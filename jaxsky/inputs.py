@@ -1,4 +1,4 @@
-"""What settings name, read: maps, templates with their laws, bandpasses."""
+"""What settings name, read: maps, templates with their laws, bandpasses, noise."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -6,16 +6,41 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Array, Bool, Float
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import AME, Component, Dust, Synchrotron
-from jaxsky.io import Maps, read_bandpass, read_maps
-from jaxsky.io.tables import stokes
-from jaxsky.settings import BandpassSpec, MapFile, SettingsError, TemplateFile
+from jaxsky.io import InputError, Maps, read_bandpass, read_maps, unit_factor
+from jaxsky.io.tables import stokes as stokes_of
+from jaxsky.noise import (
+    check_covariance,
+    covariance_from_columns,
+    hits_covariance,
+    rms_covariance,
+)
+from jaxsky.parameters import set_parameters
+from jaxsky.settings import (
+    BandpassSpec,
+    Hits,
+    MapFile,
+    NoiseColumns,
+    NoiseFile,
+    SettingsError,
+    TemplateFile,
+)
+from jaxsky.sky import Sky
 from jaxsky.units import conversion
 
-__all__ = ["LAWS", "Template", "check_stokes", "read", "read_bandpass_spec", "read_templates"]
+__all__ = [
+    "LAWS",
+    "Template",
+    "check_stokes",
+    "read",
+    "read_bandpass_spec",
+    "read_noise",
+    "read_templates",
+    "set_parameters_of",
+]
 
 LAWS: dict[str, type[Component]] = {"dust": Dust, "synchrotron": Synchrotron, "ame": AME}
 
@@ -41,8 +66,16 @@ def read(folder: Path, spec: MapFile) -> Maps:
     )
 
 
-def read_templates(folder: Path, specs: Mapping[str, TemplateFile]) -> dict[str, Template]:
-    """Templates with their laws, Q and U [uK_RJ], by name.
+def read_templates(
+    folder: Path, specs: Mapping[str, TemplateFile], stokes: str = "QU"
+) -> dict[str, Template]:
+    """Templates with their laws [uK_RJ], by name; those with angles of others come last.
+
+    Parameters
+    ----------
+    folder : of the files
+    specs : by name; their angles are those of each other (`jaxsky.settings.check_angles`)
+    stokes : "QU" for the last two columns of each file, "IQU" for the last three
 
     Raises
     ------
@@ -50,16 +83,16 @@ def read_templates(folder: Path, specs: Mapping[str, TemplateFile]) -> dict[str,
         For files that cannot be read as what they should be.
     """
     templates: dict[str, Template] = {}
-    for name, spec in sorted(specs.items(), key=lambda item: item[1].law == "ame"):
-        templates[name] = _read_template(folder, name, spec, templates)
+    for name, spec in sorted(specs.items(), key=lambda item: item[1].angles is not None):
+        templates[name] = _read_template(folder, name, spec, templates, stokes)
     return templates
 
 
 def _read_template(
-    folder: Path, name: str, spec: TemplateFile, others: dict[str, Template]
+    folder: Path, name: str, spec: TemplateFile, others: dict[str, Template], stokes: str
 ) -> Template:
     found = read(folder, spec)
-    check_stokes(f"templates.{name}", found.names, "I" if spec.angles else "QU")
+    check_stokes(f"templates.{name}", found.names, "I" if spec.angles else stokes)
     maps = jnp.asarray(found.maps) * conversion(found.unit, "uK_RJ", spec.nu_ref)
     used = np.asarray(found.mask)
     parameters: dict[str, Any] = {"nu_ref": spec.nu_ref}
@@ -77,19 +110,44 @@ def _read_template(
                 maps[0], others[spec.angles].component.amplitude, **parameters
             )
         else:
-            component = LAWS[spec.law](maps[-2:], **parameters)
+            component = LAWS[spec.law](maps[-len(stokes) :], **parameters)
     except (TypeError, ValueError) as error:
         raise SettingsError(f"templates.{name}: {error}") from None
     return Template(component, spec.fwhm, used)
 
 
+def set_parameters_of(
+    templates: Mapping[str, Template], fixed: Mapping[str, float]
+) -> dict[str, Template]:
+    """Templates with some of their parameters set, by dotted name.
+
+    Raises
+    ------
+    SettingsError, KeyError
+        For a template or a parameter that does not exist.
+    """
+    by_template: dict[str, dict[str, float]] = {}
+    for name, value in fixed.items():
+        by_template.setdefault(name.split(".")[0], {})[name] = value
+    changed = dict(templates)
+    for name, values in by_template.items():
+        if name not in templates:
+            raise SettingsError(
+                f"fixed: there is no template {name!r}; templates are {', '.join(templates)}."
+            )
+        component = set_parameters(Sky({name: templates[name].component}), values)[name]
+        changed[name] = templates[name]._replace(component=component)
+    return changed
+
+
 def check_stokes(where: str, names: Sequence[str], wanted: str) -> None:
-    """Refuse columns whose names say that they are other Stokes parameters than is wanted."""
-    said = [stokes(name) for name in names[-len(wanted) :]]
-    if any(s and s != w for s, w in zip(said, wanted, strict=False)):
-        raise SettingsError(
-            f"{where}.fields: {', '.join(names)} are not {' and '.join(wanted)} by their names."
-        )
+    """Refuse columns that are too few, or by their names other Stokes parameters than wanted."""
+    listed = " and ".join(filter(None, (", ".join(wanted[:-1]), wanted[-1])))
+    if len(names) < len(wanted):
+        raise SettingsError(f"{where}: fields must name {listed}, not {', '.join(names)}.")
+    said = [stokes_of(name) for name in names[-len(wanted) :]]
+    if any(s and s != w for s, w in zip(said, wanted, strict=True)):
+        raise SettingsError(f"{where}.fields: {', '.join(names)} are not {listed} by their names.")
 
 
 def read_bandpass_spec(folder: Path, spec: BandpassSpec) -> Bandpass:
@@ -102,3 +160,92 @@ def read_bandpass_spec(folder: Path, spec: BandpassSpec) -> Bandpass:
     if not spec.width:
         return Bandpass.delta(spec.center)
     return Bandpass.top_hat(spec.center, spec.width, spec.convention or "RJ")
+
+
+def read_noise(
+    folder: Path,
+    noise: NoiseFile,
+    bandpass: Bandpass,
+    nside: int,
+    stokes: str = "QU",
+    *,
+    where: str,
+    unit: str,
+    own: MapFile | None = None,
+) -> tuple[Float[Array, "stokes stokes pix"], Bool[np.ndarray, " pix"]]:
+    """Covariance of each pixel [uK_RJ^2], and where it is known; 0 elsewhere.
+
+    Parameters
+    ----------
+    folder : of the files
+    noise : what the settings say; pixels without hits are not known
+    bandpass : of the map
+    nside : resolution of the map
+    stokes : "QU" or "IQU"
+    where : key of the noise in the settings, for the messages
+    unit : unit of the map, and so of rms and sigma0
+    own : the map that has the noise, if its columns are in the same file
+
+    Raises
+    ------
+    jaxsky.io.InputError, SettingsError
+        For files that cannot be read as what they should be, another nside, and noise that is
+        not positive definite.
+    """
+    try:
+        covariance, known = _covariance(folder, noise, bandpass, nside, stokes, where, unit, own)
+        check_covariance("noise", covariance[..., known])
+    except (InputError, SettingsError):
+        raise
+    except ValueError as error:
+        raise SettingsError(f"{where}: {error}") from None
+    return jnp.where(known, covariance, 0.0), known
+
+
+def _covariance(folder, noise, bandpass, nside, stokes, where, unit, own):
+    """See `read_noise`; with any values where the covariance is not known."""
+    n, npix = len(stokes), 12 * nside**2
+    if noise.rms is not None:
+        rms = noise.rms * unit_factor(unit, "uK_RJ", bandpass)
+        return rms_covariance(jnp.full((n, npix), rms)), np.ones(npix, bool)
+    kind = next(k for k in ("map", "covariance", "hits") if getattr(noise, k) is not None)
+    spec, where = getattr(noise, kind), f"{where}.{kind}"
+    found = read(folder, _file(spec, own, where))
+    if found.nside != nside:
+        raise SettingsError(f"{where}: nside is {found.nside}, but that of the map is {nside}.")
+    maps, known = jnp.asarray(found.maps), np.asarray(found.mask)
+    if kind == "map":
+        _check_number(f"{where}.fields", len(maps), stokes)
+        rms = maps[-n:] * unit_factor(found.unit, "uK_RJ", bandpass)
+        return rms_covariance(jnp.broadcast_to(rms, (n, npix))), known
+    if kind == "covariance":
+        if len(maps) == 3 and n == 3:
+            raise SettingsError(f"{where}: I, Q and U need six columns, II, IQ, IU, QQ, QU, UU.")
+        columns = maps * unit_factor(found.unit, "uK_RJ^2", bandpass)
+        return covariance_from_columns(columns)[-n:, -n:], known
+    if len(maps) != 1:
+        raise SettingsError(f"{where}.fields: one column is needed, not {', '.join(found.names)}.")
+    _check_number(f"{where}.sigma0", len(spec.sigma0), stokes)
+    sigma0 = jnp.array(spec.sigma0)[-n:] * unit_factor(spec.sigma0_unit or unit, "uK_RJ", bandpass)
+    known = known & (found.maps[0] != 0)
+    hits = jnp.where(known, maps[0], 1.0)
+    return hits_covariance(jnp.broadcast_to(sigma0, (n,)), hits, n), known
+
+
+def _file(spec: MapFile | NoiseColumns, own: MapFile | None, where: str) -> MapFile:
+    """The columns to read; those without a file are in that of the map."""
+    said = spec.model_dump(include=set(MapFile.model_fields), exclude_none=True)
+    if isinstance(spec, Hits):
+        said.setdefault("unit", "")  # a number, whatever the header calls it
+    if "file" not in said:
+        if own is None:
+            raise SettingsError(f"{where}: file is missing.")
+        taken = set(MapFile.model_fields) - {"fields", "unit"}
+        said = own.model_dump(include=taken, exclude_none=True) | said
+    return MapFile(**said)
+
+
+def _check_number(where: str, number: int, stokes: str) -> None:
+    """Refuse other numbers than one for all, one for each, or one for I, too."""
+    if number not in (1, len(stokes), 3):
+        raise SettingsError(f"{where}: one or {len(stokes)} are needed, not {number}.")

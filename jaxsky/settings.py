@@ -5,7 +5,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -13,13 +13,18 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    field_validator,
     model_validator,
 )
 
 __all__ = [
     "BandpassSpec",
+    "CovarianceColumns",
+    "Hits",
     "MapFile",
     "MaskFile",
+    "NoiseColumns",
+    "NoiseFile",
     "Nside",
     "SettingsError",
     "SettingsFile",
@@ -49,16 +54,19 @@ def _power_of_two(value: int) -> int:
 Nside = Annotated[int, Field(gt=0), AfterValidator(_power_of_two)]
 
 
-class MapFile(Table):
-    """Columns of a FITS map; what its header says need not be given."""
-
-    file: str
+class _Columns(Table):
     fields: list[str | int] | None = None
-    hdu: int = Field(1, ge=1)
     unit: str | None = None
     ordering: Literal["RING", "NESTED"] | None = None
     coordinates: Literal["G", "C", "E"] | None = None
     polarization: Literal["COSMO", "IAU"] | None = None
+
+
+class MapFile(_Columns):
+    """Columns of a FITS map; what its header says need not be given."""
+
+    file: str
+    hdu: int = Field(1, ge=1)
 
 
 class MaskFile(Table):
@@ -102,6 +110,70 @@ class BandpassSpec(Table):
         return self
 
 
+class NoiseColumns(_Columns):
+    """Columns about the noise; what is not given is as in the map that has it, file included."""
+
+    file: str | None = None
+    hdu: int | None = Field(None, ge=1)
+
+
+class CovarianceColumns(NoiseColumns):
+    """Columns QQ, QU, UU or II, IQ, IU, QQ, QU, UU, in this order; a list alone names them."""
+
+    fields: list[str | int]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _list(cls, value: Any) -> Any:
+        return {"fields": list(value)} if isinstance(value, list | tuple) else value
+
+    @field_validator("fields")
+    @classmethod
+    def _three_or_six(cls, value: list[str | int]) -> list[str | int]:
+        if len(value) not in (3, 6):
+            raise ValueError(
+                "name the columns QQ, QU, UU or II, IQ, IU, QQ, QU, UU, "
+                f"not {', '.join(map(str, value)) or 'none'}"
+            )
+        return value
+
+
+class Hits(NoiseColumns):
+    """Number of observations of a pixel, and the noise of one of them.
+
+    `sigma0` is a number or one for each Stokes parameter, in `sigma0_unit` or that of the map.
+    """
+
+    sigma0: list[Annotated[float, Field(gt=0)]] = Field(min_length=1, max_length=3)
+    sigma0_unit: str | None = None
+
+    @field_validator("sigma0", mode="before")
+    @classmethod
+    def _list(cls, value: Any) -> Any:
+        return value if isinstance(value, list | tuple) else [value]
+
+
+class NoiseFile(Table):
+    """Noise of a map: exactly one of these; per pixel of the map as it is in the file."""
+
+    KINDS: ClassVar[tuple[str, ...]] = ("rms", "map", "covariance", "hits")
+
+    rms: float | None = Field(None, gt=0)
+    map: MapFile | None = None
+    covariance: CovarianceColumns | None = None
+    hits: Hits | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "NoiseFile":
+        given = [kind for kind in self.KINDS if getattr(self, kind) is not None]
+        if len(given) != 1:
+            raise ValueError(
+                f"give the noise as exactly one of {', '.join(self.KINDS)}, "
+                f"not {', '.join(given) or 'none'}"
+            )
+        return self
+
+
 class SettingsFile(Table):
     """What any file of settings has; a command's settings derive from it."""
 
@@ -110,10 +182,16 @@ class SettingsFile(Table):
 
 
 def check_angles(templates: Mapping[str, TemplateFile]) -> None:
-    """Raise ValueError if a template takes its angles from one that does not exist."""
+    """Raise ValueError if a template takes its angles from one that has none of its own."""
     for name, template in templates.items():
-        if template.angles and template.angles not in templates:
+        if not template.angles:
+            continue
+        if template.angles not in templates:
             raise ValueError(f"templates.{name}.angles: there is no template {template.angles}")
+        if templates[template.angles].angles:
+            raise ValueError(
+                f"templates.{name}.angles: template {template.angles} has none of its own"
+            )
 
 
 def _expand(text: str) -> str:

@@ -11,6 +11,7 @@ from getdist import MCSamples, chains, plots
 
 from fits.results import FitResult
 from fits.spectral_index import Fit, all_free
+from jaxsky.io import whole
 
 __all__ = ["label", "plot_grids", "plot_marginals", "plot_posterior"]
 
@@ -63,10 +64,9 @@ def _tex(name: str) -> str:
 
 
 def _save(figure: plt.Figure, path: Path) -> None:
-    partial = path.with_name(f".{path.name}")
-    figure.savefig(partial, format="png")
+    with whole(path) as beside:
+        figure.savefig(beside, format="png")
     plt.close(figure)
-    partial.replace(path)
 
 
 def _levels(log_posterior: np.ndarray) -> list[float]:

@@ -16,19 +16,13 @@ from fits import plots
 from fits.inputs import Inputs
 from fits.settings import Settings
 from fits.spectral_index import Fit, all_free
+from jaxsky.io import write_text
 
 __all__ = ["result_table", "warnings", "write_report"]
 
 #: A fit with a smaller probability to exceed its chi^2 is pointed out.
 UNLIKELY = 0.01
 PACKAGES = ("jaxsky", "jax", "numpy", "healpy", "optimistix", "emcee", "getdist", "camb", "ducc0")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file beside its place and move it there, so that it is never half written."""
-    partial = path.with_name(f".{path.name}")
-    partial.write_text(text)
-    partial.replace(path)
 
 
 def _finite(value: Any) -> Any:

@@ -13,6 +13,35 @@ __all__ = ["realisation", "repair"]
 LEAST = 1e-10
 
 
+@jax.custom_jvp
+def _positive(
+    matrix: Float[Array, "ell field field"],
+) -> tuple[Float[Array, "ell field field"], Float[Array, " ell"]]:
+    """Symmetric matrices with eigenvalues of at least `LEAST`, and the smallest that they had."""
+    values, vectors = jnp.linalg.eigh(matrix)
+    kept = jnp.maximum(values, LEAST)
+    return (vectors * kept[:, None]) @ vectors.mT, values[:, 0]
+
+
+@_positive.defjvp
+def _positive_jvp(primals, tangents):
+    """Derivative of a function of a matrix (Daleckii & Krein): no eigenvectors to differentiate.
+
+    Those have no derivative where eigenvalues coincide, as without correlations they all do.
+    """
+    values, vectors = jnp.linalg.eigh(primals[0])
+    kept = jnp.maximum(values, LEAST)
+    above = values > LEAST
+    both, one = above[:, :, None] & above[:, None], above[:, :, None] != above[:, None]
+    gap = jnp.where(one, values[:, :, None] - values[:, None], 1.0)
+    slope = jnp.where(one, (kept[:, :, None] - kept[:, None]) / gap, both)
+    turned = vectors.mT @ tangents[0] @ vectors
+    return (
+        ((vectors * kept[:, None]) @ vectors.mT, values[:, 0]),
+        (vectors @ (slope * turned) @ vectors.mT, turned[:, 0, 0]),
+    )
+
+
 @jax.jit
 def repair(
     spectra: Float[Array, "field field ell"],
@@ -21,8 +50,7 @@ def repair(
 
     Extrapolated cross-spectra may exceed what the auto-spectra allow. Such a matrix keeps its
     auto-spectra; of its correlation coefficients the negative eigenvalues are set to zero and
-    the diagonal is scaled back to one. No multipole is left out. Gradients pass through as if
-    nothing had been repaired.
+    the diagonal is scaled back to one. No multipole is left out. Differentiable in the spectra.
 
     Parameters
     ----------
@@ -38,16 +66,13 @@ def repair(
     there = (power[:, None] > 0) & (power[None] > 0)
     ones = jnp.eye(n, dtype=spectra.dtype)[..., None]
     matrix = jnp.where(there, spectra / (scale[:, None] * scale[None]), ones)
-    values, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(matrix.transpose(2, 0, 1)))
-    indefinite = values[:, 0] < LEAST
-    kept = jnp.maximum(values, LEAST)
-    mended = jnp.einsum("lij,lj,lkj->ikl", vectors, kept, vectors)
-    norm = jnp.sqrt(jnp.diagonal(mended).T)
-    mended = mended / (norm[:, None] * norm[None])
-    matrix = matrix + jnp.where(indefinite, mended - jax.lax.stop_gradient(matrix), 0.0)
+    mended, least = _positive(matrix.transpose(2, 0, 1))
+    norm = jnp.sqrt(jnp.einsum("lii->li", mended))
+    mended = (mended / (norm[:, :, None] * norm[:, None])).transpose(1, 2, 0)
+    matrix = jnp.where(least < LEAST, mended, matrix)
     # A field without power has no correlations.
     matrix = jnp.where(there, matrix, 0.0)
-    return matrix * scale[:, None] * scale[None], jnp.sum(values[:, 0] < -LEAST)
+    return matrix * scale[:, None] * scale[None], jnp.sum(least < -LEAST)
 
 
 @jax.jit

@@ -223,8 +223,6 @@ def _covariance(folder, noise, bandpass, nside, stokes, where, unit, own):
             raise SettingsError(f"{where}: I, Q and U need six columns, II, IQ, IU, QQ, QU, UU.")
         columns = maps * unit_factor(found.unit, "uK_RJ^2", bandpass)
         return covariance_from_columns(columns)[-n:, -n:], known
-    if len(maps) != 1:
-        raise SettingsError(f"{where}.fields: one column is needed, not {', '.join(found.names)}.")
     _check_number(f"{where}.sigma0", len(spec.sigma0), stokes)
     sigma0 = jnp.array(spec.sigma0)[-n:] * unit_factor(spec.sigma0_unit or unit, "uK_RJ", bandpass)
     known = known & (found.maps[0] != 0)

@@ -58,6 +58,12 @@ class Observation(eqx.Module):
     nside : resolution of the maps
     stokes : "QU" or "IQU"
     finest : beam to which small scales are made [arcmin], at most the finest one observed
+    lmax : largest multipole of the sky in the maps, by default 2 nside
+
+    Raises
+    ------
+    ValueError
+        If there is no channel, or `stokes` is neither.
     """
 
     channels: dict[str, ObservedBand]
@@ -65,6 +71,7 @@ class Observation(eqx.Module):
     stokes: str = eqx.field(static=True, default="QU")
     finest: Float[Array, ""] | float = 0.0
     names: tuple[str, ...] = eqx.field(static=True, default=())
+    lmax: int = eqx.field(static=True, default=0)
 
     def __init__(
         self,
@@ -72,20 +79,17 @@ class Observation(eqx.Module):
         nside: int,
         stokes: str = "QU",
         finest: Float[Array, ""] | float = 0.0,
+        lmax: int | None = None,
     ) -> None:
         self.channels, self.nside, self.stokes = dict(channels), nside, stokes
         self.finest = finest
+        self.lmax = 2 * nside if lmax is None else lmax
         # JAX sorts dictionaries when it takes them apart.
         self.names = tuple(channels)
         if not self.channels:
             raise ValueError("Argument `channels` must have at least one channel.")
         if stokes not in ("QU", "IQU"):
             raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")
-
-    @property
-    def lmax(self) -> int:
-        """Largest multipole of the sky in the maps."""
-        return 2 * self.nside
 
     @property
     def bands(self) -> tuple[Bandpass, ...]:

@@ -144,6 +144,7 @@ class Hits(NoiseColumns):
     `sigma0` is a number or one for each Stokes parameter, in `sigma0_unit` or that of the map.
     """
 
+    fields: list[str | int] = Field(min_length=1, max_length=1)
     sigma0: list[Annotated[float, Field(gt=0)]] = Field(min_length=1, max_length=3)
     sigma0_unit: str | None = None
 

@@ -9,7 +9,7 @@ amplitudes of small scales, beams, band centres.
 """
 
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import healpy
@@ -24,8 +24,8 @@ from jaxsky.harmonics import (
     beam_ratio,
     expand,
     gaussian_beam,
+    low_multipoles,
     resample,
-    resize,
     synthesis,
 )
 from jaxsky.interpolation import Terms, band_sed, choose_terms, term, term_weights
@@ -91,17 +91,11 @@ def _continued(
             [source.fwhm for source in members],
             [source.small_scales for source in members if source.small_scales is not None],
             observation.nside,
+            observation.lmax,
         )
         for name, alm in zip(group, continued.alms, strict=True):
             result[name] = alm, continued.repaired, 0.0
     return result
-
-
-def _template_alm(source: Source, lmax: int) -> Float[Array, "stokes alm"]:
-    """Coefficients of a template with its own beam, as far as its pixels resolve them."""
-    template = source.component.template
-    known = min(lmax, 2 * healpy.npix2nside(template.shape[-1]))
-    return resize(analysis(template, known), lmax)
 
 
 def _at(component: Component, nside: int) -> Component:
@@ -172,7 +166,7 @@ def prepare(
     for name, source in sources.items():
         chosen, component = terms[name], _at(source.component, nside)
         alm, repaired, fwhm = continued.get(name) or (
-            _template_alm(source, lmax),
+            low_multipoles(source.component.template, lmax),
             0,
             source.fwhm,
         )
@@ -263,6 +257,7 @@ def observe_bands(
     cmb: Float[Array, "4 ell"] | None = None,
     *,
     components: bool = False,
+    names: Sequence[str] | None = None,
 ) -> Iterator[tuple[str, dict[str, Float[Array, "stokes pix"]]]]:
     """The maps of each channel in turn, so that only one is in memory.
 
@@ -273,6 +268,7 @@ def observe_bands(
     observation : the experiment
     cmb : spectra TT, EE, BB, TE [uK_CMB^2] up to 2 nside at least, or None for no CMB
     components : give the map of each component, of "cmb" and "noise" as well as the "total"
+    names : channels to give, by default all; what they show does not depend on it
 
     Returns
     -------
@@ -298,6 +294,8 @@ def observe_bands(
             )
         cmb_alm = realisation(stream(key, "cmb"), jnp.asarray(cmb)[:, : lmax + 1], stokes)
     for i, name in enumerate(observation.names):
+        if names is not None and name not in names:
+            continue
         channel = observation.channels[name]
         beam = channel.beam if channel.target is None else channel.target
         parts = {

@@ -17,7 +17,13 @@ from jaxsky.harmonics.packing import (
     power_spectrum,
     resize,
 )
-from jaxsky.harmonics.resolution import average_pixels, children, resample, smooth
+from jaxsky.harmonics.resolution import (
+    average_pixels,
+    children,
+    low_multipoles,
+    resample,
+    smooth,
+)
 from jaxsky.harmonics.transforms import ENGINES, adjoint_synthesis, analysis, rotate, synthesis
 
 __all__ = [
@@ -33,6 +39,7 @@ __all__ = [
     "expand",
     "gaussian_beam",
     "lmax_of",
+    "low_multipoles",
     "needed_lmax",
     "pixel_window",
     "power_spectrum",

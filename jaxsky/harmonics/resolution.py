@@ -12,10 +12,24 @@ from jaxsky.harmonics.beams import beam_ratio, needed_lmax
 from jaxsky.harmonics.packing import expand, resize
 from jaxsky.harmonics.transforms import analysis, synthesis
 
-__all__ = ["average_pixels", "children", "resample", "smooth"]
+__all__ = ["average_pixels", "children", "low_multipoles", "resample", "smooth"]
 
-#: Multipoles analysed by `resample`, in units of those kept, as far as the map resolves them.
+#: Multipoles analysed by `low_multipoles`, in units of those kept, as far as the map resolves them.
 MARGIN = 3
+
+
+def low_multipoles(maps: Float[Array, "stokes pix"], lmax: int) -> Float[Array, "stokes alm"]:
+    """Packed coefficients up to lmax of maps that have higher multipoles, too.
+
+    Multipoles beyond those that are analysed leak into them, so more are than are kept.
+
+    Parameters
+    ----------
+    maps : shape (stokes, pix), RING; one row is I, two are Q, U, three are I, Q, U
+    lmax : largest multipole kept; above 2 nside of the maps coefficients are zero
+    """
+    resolved = 2 * healpy.npix2nside(maps.shape[-1])
+    return resize(analysis(maps, min(resolved, MARGIN * lmax)), lmax)
 
 
 @partial(jax.jit, static_argnames="nside")
@@ -33,10 +47,7 @@ def resample(
     window : factor for each multipole 0 ... lmax; lmax at most 3 nside - 1 of the input
     nside : resolution of the result
     """
-    lmax = len(window) - 1
-    # Multipoles beyond those that are analysed leak into them, so more are than are kept.
-    wide = max(lmax, min(2 * healpy.npix2nside(maps.shape[-1]), MARGIN * lmax))
-    return synthesis(resize(analysis(maps, wide), lmax) * expand(window), nside)
+    return synthesis(low_multipoles(maps, len(window) - 1) * expand(window), nside)
 
 
 def smooth(

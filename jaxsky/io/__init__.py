@@ -7,6 +7,7 @@ Everything else is converted and checked here, once. A file that cannot be used 
 
 from jaxsky.io.bandpasses import read_bandpass
 from jaxsky.io.beams import read_beam
+from jaxsky.io.files import whole, write_text
 from jaxsky.io.maps import Maps, read_maps, write_maps
 from jaxsky.io.masks import degrade_mask, read_mask
 from jaxsky.io.quantities import from_quantity, unit_factor, unit_name
@@ -25,5 +26,7 @@ __all__ = [
     "read_spectra",
     "unit_factor",
     "unit_name",
+    "whole",
     "write_maps",
+    "write_text",
 ]

@@ -1,10 +1,10 @@
 """HEALPix maps in FITS files: read into the package's conventions, written in full."""
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import healpy
 import numpy as np
@@ -12,6 +12,7 @@ from astropy.io import fits as pyfits
 from jaxtyping import Bool, Float
 
 from jaxsky.bandpass import Bandpass
+from jaxsky.io.files import whole
 from jaxsky.io.quantities import is_ambiguous, unit_factor, unit_name
 from jaxsky.io.tables import COORDINATES, ORDERINGS, HealpixTable, InputError, open_fits, stokes
 from jaxsky.types import Numeric
@@ -287,9 +288,10 @@ def write_maps(
     unit: str | Sequence[str],
     mask: Bool[np.ndarray, " pix"] | None = None,
     overwrite: bool = False,
-    extra_header: Mapping[str, str | float] | None = None,
+    extra_header: Mapping[str, Any] | None = None,
+    single: bool = False,
 ) -> None:
-    """Maps as a HEALPix table in a FITS file, float64, with a header that leaves nothing open.
+    """Maps as a HEALPix table in a FITS file, with a header that leaves nothing open.
 
     The file is written beside its place and moved there when it is complete.
 
@@ -301,7 +303,8 @@ def write_maps(
     unit : unit of all maps or of each, as `unit_name` takes them; "" for pure numbers
     mask : True in used pixels, shape (pix,); the others are written as UNSEEN
     overwrite : replace a file that is there
-    extra_header : further header keywords and their values
+    extra_header : further header keywords and their values, or values and comments
+    single : write single precision instead of double
 
     Raises
     ------
@@ -327,7 +330,7 @@ def write_maps(
         maps = np.where(mask, maps, healpy.UNSEEN)
     # A blank TUNIT cannot be told from a missing one, so a pure number is written as "1".
     columns = [
-        pyfits.Column(name=name, format="D", array=values, unit=text or "1")
+        pyfits.Column(name=name, format="E" if single else "D", array=values, unit=text or "1")
         for name, values, text in zip(names, maps, units, strict=True)
     ]
     table = pyfits.BinTableHDU.from_columns(columns, name="MAPS")
@@ -350,9 +353,5 @@ def write_maps(
             )
         table.header[key] = value
     table.header.update(required)
-    beside = path.with_name(f".partial-{os.getpid()}-{path.name}")
-    try:
+    with whole(path) as beside:
         pyfits.HDUList([pyfits.PrimaryHDU(), table]).writeto(beside, overwrite=True)
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)

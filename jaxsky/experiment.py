@@ -1,0 +1,385 @@
+"""The settings of a simulation, what they name brought together, and refusals with the numbers."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import healpy
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+
+from jaxsky.cmb import camb_spectra
+from jaxsky.galaxy import GalaxyModel, embedded_sky
+from jaxsky.inputs import (
+    Template,
+    read_bandpass_spec,
+    read_noise,
+    read_templates,
+    set_parameters_of,
+)
+from jaxsky.instrument import load_instrument
+from jaxsky.io import read_beam, read_spectra
+from jaxsky.observation import Observation, ObservedBand, Source
+from jaxsky.settings import (
+    BandpassSpec,
+    NoiseFile,
+    Nside,
+    SettingsError,
+    SettingsFile,
+    Table,
+    TemplateFile,
+    check_angles,
+    load,
+)
+from jaxsky.small_scales import SmallScales
+from jaxsky.units import parse_unit
+
+__all__ = ["DEFAULT", "EXAMPLE", "Experiment", "Setup", "build", "load_experiment"]
+
+DEFAULT = Path(__file__).with_name("core.toml")
+EXAMPLE = Path(__file__).with_name("experiment.toml")
+
+#: A map resolves beams of so many pixels: there b_l is down to 0.43 at l = 2 nside.
+PIXELS = 1.5
+#: A beam below this lets nothing through that would be seen.
+UNSEEN_WINDOW = 1e-8
+
+
+class Main(Table):
+    """What is observed, and what is written."""
+
+    instrument: str | None = None
+    channels: list[str] | None = Field(None, min_length=1)
+    samples: int = Field(51, ge=2)
+    nside: Nside = 256
+    fwhm: float | Literal["own"] = "own"
+    stokes: Literal["QU", "IQU"] = "QU"
+    unit: Literal["uK_RJ", "uK_CMB"] = "uK_RJ"
+    include: list[str] | None = Field(None, min_length=1)
+    outputs: tuple[Literal["total", "components"], ...] = ("total",)
+    diagonal_noise: bool = False
+    seed: int = Field(0, ge=0, lt=2**32)
+    small_scales_seed: int | None = Field(None, ge=0, lt=2**32)
+
+    @field_validator("fwhm")
+    @classmethod
+    def _positive(cls, value: float | str) -> float | str:
+        if not isinstance(value, str) and value <= 0:
+            raise ValueError(f"fwhm must be positive, or 'own', not {value:g}")
+        return value
+
+
+class Embedded(Table):
+    """The embedded model of the Galaxy."""
+
+    nside: Nside = 256
+    seed: int = Field(0, ge=0, lt=2**32)
+    model: dict[str, float] = Field(default={})
+
+
+class SmallScalesTable(Table):
+    """Small scales of a component; see `jaxsky.small_scales.SmallScales`."""
+
+    EE: tuple[int, int]
+    BB: tuple[int, int]
+    slope: float | tuple[float, float] | None = None
+    tilt: float = 0.0
+    amplitude: float = Field(1.0, ge=0)
+    modulation_fwhm: float = Field(180.0, gt=0)
+    correlated_with: str | None = None
+
+
+class CMBTable(Table):
+    """The CMB: from CAMB, or from a file of spectra."""
+
+    r: float = Field(0.0, ge=0)
+    cosmology: dict[str, float] = Field(default={})
+    spectra: str | None = None
+    format: Literal["camb", "planck"] | None = None
+    unit: str | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> "CMBTable":
+        if self.spectra is not None and (self.r or self.cosmology):
+            raise ValueError("r and cosmology are for CAMB; leave them out with spectra")
+        return self
+
+
+class NoiseTable(NoiseFile):
+    """Noise of a band: a uniform level [unit arcmin], or that of each pixel.
+
+    `unit` is also that of rms, map, covariance (squared) and sigma0 where a file does not say it.
+    """
+
+    KINDS = ("level", *NoiseFile.KINDS)
+
+    level: float | None = Field(None, gt=0)
+    unit: str = "uK_CMB"
+
+    @field_validator("unit")
+    @classmethod
+    def _known(cls, value: str, info: ValidationInfo) -> str:
+        parse_unit(value)
+        return value
+
+
+class BandTable(Table):
+    """A band of an experiment of one's own."""
+
+    name: str = Field(min_length=1, pattern=r"^[\w.+-]+$")
+    bandpass: BandpassSpec
+    fwhm: float | None = Field(None, ge=0)
+    beam: str | None = None
+    noise: NoiseTable | None = None
+
+    @model_validator(mode="after")
+    def _one_beam(self) -> "BandTable":
+        if (self.fwhm is None) == (self.beam is None):
+            raise ValueError("give the beam either as fwhm or as the file of a window, beam")
+        return self
+
+
+class Experiment(SettingsFile):
+    """All settings of a simulation."""
+
+    experiment: Main = Main()
+    embedded: Embedded | None = None
+    templates: dict[str, TemplateFile] = Field(default={})
+    fixed: dict[str, float] = Field(default={})
+    small_scales: dict[str, SmallScalesTable] = Field(default={})
+    cmb: CMBTable = CMBTable()
+    bands: list[BandTable] = Field(default=[])
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Experiment":
+        if (self.experiment.instrument is None) == (not self.bands):
+            raise ValueError("give either experiment.instrument or bands")
+        if self.bands and self.experiment.channels:
+            raise ValueError("experiment.channels chooses from an instrument, not from bands")
+        if self.embedded is not None and self.templates:
+            raise ValueError("give either templates or the table embedded")
+        names = [band.name for band in self.bands]
+        if len(set(names)) < len(names):
+            raise ValueError(f"the names of the bands must differ, but are {', '.join(names)}")
+        check_angles(self.templates)
+        known = [*self.foregrounds(), "cmb", "noise"]
+        for name in self.experiment.include or []:
+            if name not in known:
+                raise ValueError(f"experiment.include: {name!r} is none of {', '.join(known)}")
+        for name in self.small_scales:
+            if name not in self.foregrounds():
+                raise ValueError(f"small_scales.{name}: there is no such component")
+        return self
+
+    def foregrounds(self) -> list[str]:
+        """Names of the components that have templates."""
+        return ["dust", "synchrotron"] if self.embedded is not None else list(self.templates)
+
+    def included(self) -> list[str]:
+        """Names of all that is simulated, "cmb" and "noise" among them."""
+        everything = [*self.foregrounds(), "cmb", "noise"]
+        return [n for n in everything if n in (self.experiment.include or everything)]
+
+
+def load_experiment(
+    path: Path, overrides: Mapping[str, Mapping[str, object]] | None = None
+) -> Experiment:
+    """Settings from a TOML file; see `jaxsky.settings.load`."""
+    return load(path, Experiment, overrides)
+
+
+class Setup(NamedTuple):
+    """What is simulated, ready for `jaxsky.simulate`.
+
+    Parameters
+    ----------
+    sources : components by name
+    observation : the experiment
+    cmb : spectra TT, EE, BB, TE [uK_CMB^2], or None
+    description : what the templates are
+    """
+
+    sources: dict[str, Source]
+    observation: Observation
+    cmb: Float[np.ndarray, "4 ell"] | None
+    description: str
+
+
+def build(settings: Experiment) -> Setup:
+    """Read what the settings name, and check that it can work.
+
+    Raises
+    ------
+    jaxsky.io.InputError, SettingsError, KeyError
+        For files that are not what they should be, names that do not exist, pixels too wide for
+        a beam, a beam finer than a template without small scales, or one that is finer than the
+        beam of a band.
+    """
+    main, included = settings.experiment, settings.included()
+    channels = _channels(settings)
+    target = None if main.fwhm == "own" else float(main.fwhm)
+    seen = {
+        name: _width(channel.beam) if target is None else target
+        for name, channel in channels.items()
+    }
+    _check_pixels(main.nside, seen)
+    if target is not None:
+        for name, channel in channels.items():
+            if target < (own := _width(channel.beam)):
+                raise SettingsError(
+                    f"experiment.fwhm: {target:g} arcmin is finer than the beam of band {name!r}, "
+                    f"{own:g} arcmin."
+                )
+    templates, description = _templates(settings)
+    _check_templates(settings, templates, seen)
+    sources = {
+        name: _source(settings, name, templates[name]) for name in included if name in templates
+    }
+    lmax = _lmax(channels, target, main.nside)
+    observation = Observation(channels, main.nside, main.stokes, min(seen.values()), lmax)
+    cmb = _cmb(settings, lmax) if "cmb" in included else None
+    return Setup(sources, observation, cmb, description)
+
+
+def _width(beam: Array | float) -> float:
+    """FWHM [arcmin] of a Gaussian beam, or of the Gaussian that falls to 1/2 where a table does."""
+    table = np.asarray(beam)
+    if not table.ndim:
+        return float(table)
+    below = np.flatnonzero(table < 0.5)
+    ell = int(below[0]) if below.size else len(table)
+    return float(np.degrees(4 * np.log(2) / np.sqrt(ell * (ell + 1))) * 60)
+
+
+def _lmax(channels: Mapping[str, ObservedBand], target: float | None, nside: int) -> int:
+    """The last multipole that any of the maps shows, at most 2 nside."""
+    width = min(_width(c.beam) for c in channels.values()) if target is None else target
+    sigma = np.radians(width / 60) / np.sqrt(8 * np.log(2))
+    return int(min(2 * nside, max(2.0, np.sqrt(-2 * np.log(UNSEEN_WINDOW)) / max(sigma, 1e-9))))
+
+
+def _check_pixels(nside: int, beams: Mapping[str, float]) -> None:
+    name = min(beams, key=beams.__getitem__)
+    pixel, beam = healpy.nside2resol(nside, arcmin=True), beams[name]
+    if beam < PIXELS * pixel:
+        needed = nside
+        while beam < PIXELS * healpy.nside2resol(needed, arcmin=True) and needed < 2**20:
+            needed *= 2
+        raise SettingsError(
+            f"experiment.nside: pixels of {pixel:.3g} arcmin (nside {nside}) are too wide for the "
+            f"beam of {beam:g} arcmin of band {name!r}; that takes nside {needed}, or a common "
+            f"fwhm of at least {PIXELS * pixel:.3g} arcmin."
+        )
+
+
+def _templates(settings: Experiment) -> tuple[dict[str, Template], str]:
+    stokes = settings.experiment.stokes
+    if settings.embedded is None:
+        templates = read_templates(Path(settings.data_dir), settings.templates, stokes)
+        description = settings.title or "Templates from files."
+    else:
+        embedded = settings.embedded
+        numbers: dict[str, Any] = embedded.model
+        try:
+            model = GalaxyModel(**numbers)
+        except (TypeError, ValueError) as error:
+            raise SettingsError(f"embedded.model: {error}") from None
+        galaxy = embedded_sky(embedded.nside, embedded.seed, model)
+        sky = galaxy.sky(stokes)
+        used = np.ones(sky.shape[1], bool)
+        templates = {name: Template(sky[name], 0.0, used) for name in sky}
+        description = galaxy.description
+    return set_parameters_of(templates, settings.fixed), description
+
+
+def _check_templates(
+    settings: Experiment, templates: Mapping[str, Template], beams: Mapping[str, float]
+) -> None:
+    band = min(beams, key=beams.__getitem__)
+    for name, template in templates.items():
+        if missing := int(np.sum(~template.used)):
+            raise SettingsError(
+                f"templates.{name}: {missing} pixels have no value; a simulation takes maps of "
+                "the full sky."
+            )
+        nside = healpy.npix2nside(template.used.size)
+        pixel = healpy.nside2resol(nside, arcmin=True)
+        own = max(template.fwhm, PIXELS * pixel)
+        if name not in settings.small_scales and beams[band] < own:
+            why = (
+                f"{template.fwhm:g} arcmin"
+                if template.fwhm == own
+                else (f"{own:.3g} arcmin, {PIXELS:g} pixels of nside {nside}")
+            )
+            raise SettingsError(
+                f"templates.{name}: its resolution, {why}, is coarser than the {beams[band]:g} "
+                f"arcmin of band {band!r}; add small scales, [small_scales.{name}], or bring the "
+                f"maps to a common fwhm of at least {own:.3g} arcmin."
+            )
+
+
+def _source(settings: Experiment, name: str, template: Template) -> Source:
+    spec = settings.small_scales.get(name)
+    if spec is None:
+        return Source(template.component, template.fwhm)
+    numbers = spec.model_dump(exclude={"correlated_with"})
+    try:
+        small = SmallScales(**numbers)
+    except ValueError as error:
+        raise SettingsError(f"small_scales.{name}: {error}") from None
+    return Source(template.component, template.fwhm, small, spec.correlated_with)
+
+
+def _channels(settings: Experiment) -> dict[str, ObservedBand]:
+    """The bands with their noise [uK_RJ], if that is included."""
+    main, folder = settings.experiment, Path(settings.data_dir)
+    target = None if main.fwhm == "own" else float(main.fwhm)
+    noisy = "noise" in settings.included()
+    channels = {}
+    if main.instrument is not None:
+        instrument = load_instrument(main.instrument)
+        if main.channels is not None:
+            instrument = instrument.select(main.channels)
+        for channel in instrument:
+            band = channel.band(main.samples)
+            level = channel.noise * band.conversion(channel.noise_unit, "uK_RJ") if noisy else None
+            channels[channel.name] = ObservedBand(
+                band, channel.fwhm, target, level, main.diagonal_noise
+            )
+        return channels
+    for spec in settings.bands:
+        band = read_bandpass_spec(folder, spec.bandpass)
+        noise = None
+        if noisy and spec.noise is not None:
+            if spec.noise.level is not None:
+                noise = spec.noise.level * band.conversion(spec.noise.unit, "uK_RJ")
+            else:
+                noise, known = read_noise(
+                    folder,
+                    spec.noise,
+                    band,
+                    main.nside,
+                    main.stokes,
+                    where=f"bands.{spec.name}.noise",
+                    unit=spec.noise.unit,
+                )
+                if missing := int(np.sum(~known)):
+                    raise SettingsError(
+                        f"bands.{spec.name}.noise: {missing} pixels have no noise; a simulation "
+                        "takes maps of the full sky."
+                    )
+        beam = spec.fwhm if spec.beam is None else read_beam(folder / spec.beam, 2 * main.nside)
+        channels[spec.name] = ObservedBand(
+            band, jnp.asarray(beam), target, noise, main.diagonal_noise
+        )
+    return channels
+
+
+def _cmb(settings: Experiment, lmax: int) -> Float[np.ndarray, "4 ell"]:
+    spec = settings.cmb
+    if spec.spectra is None:
+        return camb_spectra(lmax, spec.r, **spec.cosmology)
+    path = Path(settings.data_dir) / spec.spectra
+    return read_spectra(path, lmax, format=spec.format, unit=spec.unit)

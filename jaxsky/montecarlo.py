@@ -1,0 +1,203 @@
+"""Realisations of a simulation as files: in any order, in any number of processes, resumed."""
+
+import json
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+import jaxsky
+from jaxsky.experiment import Experiment, Setup
+from jaxsky.io import write_maps, write_text
+from jaxsky.simulate import Prepared, observe_bands, plan, prepare
+
+__all__ = ["LOG", "Written", "claim", "paths", "realisation_key", "run"]
+
+LOG = "simulation.json"
+PACKAGES = ("jaxsky", "jax", "numpy", "healpy", "ducc0", "jaxbind", "camb")
+#: Settings that do not change what a realisation is.
+LAYOUT = {"title", "data_dir"}
+
+
+class Written(NamedTuple):
+    """A file of a realisation: where, and the seconds since the one before it; None if skipped."""
+
+    sim: int
+    band: str
+    path: Path
+    seconds: float | None
+
+
+def realisation_key(seed: int, index: int) -> Array:
+    """The key of a realisation, from nothing but the seed and its number."""
+    return jax.random.fold_in(jax.random.key(seed), index)
+
+
+def paths(out: Path, names: tuple[str, ...], index: int) -> dict[str, Path]:
+    """The file of each band of a realisation."""
+    return {name: out / f"sim_{index:05d}" / f"{name}.fits" for name in names}
+
+
+def _content(settings: Experiment) -> dict[str, Any]:
+    return settings.model_dump(mode="json", exclude_none=True, exclude=LAYOUT)
+
+
+def claim(out: Path, settings: Experiment, resume: bool, overwrite: bool) -> None:
+    """Make the folder of the results and leave a log of what they are in it.
+
+    Raises
+    ------
+    ValueError
+        If there are results already and they are neither to be resumed nor replaced, or those to
+        be resumed are of other settings.
+    """
+    log = out / LOG
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out}: is not a folder; choose another --out.")
+    if log.exists() and not overwrite:
+        if not resume:
+            raise ValueError(
+                f"{out}: holds a simulation already; go on with --resume, replace it with "
+                "--overwrite, or choose another --out."
+            )
+        try:
+            there = json.loads(log.read_text())["settings"]
+        except (ValueError, KeyError, TypeError):
+            raise ValueError(f"{log}: is damaged; start again with --overwrite.") from None
+        if there != _content(settings):
+            raise ValueError(
+                f"{out}: holds a simulation with other settings; choose another --out, or start "
+                "again with --overwrite."
+            )
+        return
+    if overwrite:
+        for path in out.glob("sim_*/*.fits"):
+            path.unlink()
+    out.mkdir(parents=True, exist_ok=True)
+    versions = {name: version(name) for name in PACKAGES}
+    content = {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "python": platform.python_version(),
+        "versions": versions,
+        "settings": _content(settings),
+    }
+    write_text(log, json.dumps(content, indent=2) + "\n")
+
+
+def _header(settings: Experiment, setup: Setup, name: str, index: int) -> dict[str, Any]:
+    channel = setup.observation.channels[name]
+    main = settings.experiment
+    nu = np.asarray(channel.band.nu)
+    header: dict[str, Any] = {
+        "CREATOR": (f"jaxsky {jaxsky.__version__}", "software"),
+        "INSTRUME": (main.instrument or settings.title or "own bands", "instrument"),
+        "BAND": (name, "name of the band"),
+        "FREQ": (float(channel.band.center), "[GHz] mean frequency of the band"),
+        "FREQMIN": (float(nu.min()), "[GHz] lower end of the band"),
+        "FREQMAX": (float(nu.max()), "[GHz] upper end of the band"),
+        "LMAX": (setup.observation.lmax, "largest multipole of the sky"),
+        "SEED": (main.seed, "seed of all realisations"),
+        "SIM": (index, "number of the realisation"),
+        "CONTENT": (", ".join(settings.included()), "what the total is made of"),
+    }
+    beam = channel.beam if channel.target is None else channel.target
+    if np.ndim(beam):
+        header["BEAM"] = ("table", "beam, as in the settings")
+    else:
+        header["FWHM"] = (float(beam), "[arcmin] beam of the maps")
+    noise = channel.noise
+    if noise is not None and not np.ndim(noise):
+        header["NOISE"] = (float(noise), "[uK_RJ arcmin] noise before smoothing")
+    to_CMB = float(channel.band.conversion("uK_RJ", "uK_CMB"))
+    header["RJ2CMB"] = (to_CMB, "uK_CMB per uK_RJ in this band")
+    header["COMMENT"] = setup.description
+    return header
+
+
+def _write(
+    path: Path,
+    maps: Mapping[str, Array],
+    settings: Experiment,
+    header: Mapping[str, Any],
+    factor: float,
+) -> None:
+    stokes = settings.experiment.stokes
+    wanted = ["total", *(n for n in maps if n != "total")]
+    columns = [np.asarray(maps[name]) * factor for name in wanted]
+    names = [s if name == "total" else f"{s}_{name}" for name in wanted for s in stokes]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_maps(
+        path,
+        np.concatenate(columns),
+        names=names,
+        unit=settings.experiment.unit,
+        overwrite=True,
+        extra_header=header,
+        single=True,
+    )
+
+
+def run(
+    settings: Experiment,
+    setup: Setup,
+    out: Path,
+    indices: range,
+    report: Callable[[str], None] = lambda message: None,
+) -> Iterator[Written]:
+    """Simulate realisations into files, one for each band; files that are there are kept.
+
+    A realisation depends on the seed and its number only.
+
+    Parameters
+    ----------
+    settings, setup : from `jaxsky.experiment`
+    out : folder, from `claim`
+    indices : numbers of the realisations
+    report : called with a line before each step of the work
+
+    Returns
+    -------
+    The files, as they are written.
+    """
+    main, observation = settings.experiment, setup.observation
+    terms = None
+    prepared: dict[str, Prepared] | None = None
+    # Templates without random small scales, or with the same for all, are prepared once.
+    random = main.small_scales_seed is None and any(
+        source.small_scales is not None for source in setup.sources.values()
+    )
+    cmb = None if setup.cmb is None else jnp.asarray(setup.cmb)
+    for index in indices:
+        files = paths(out, observation.names, index)
+        missing = [name for name, path in files.items() if not path.exists()]
+        yield from (Written(index, n, files[n], None) for n in files if n not in missing)
+        if not missing:
+            continue
+        key = realisation_key(main.seed, index)
+        if prepared is None or random:
+            report("templates")
+            terms = plan(setup.sources, observation) if terms is None else terms
+            small = key if random else jax.random.key(main.small_scales_seed or 0)
+            prepared = prepare(small, setup.sources, observation, terms)
+            for name, source in prepared.items():
+                if repaired := int(source.repaired):
+                    report(f"{name}: correlations repaired at {repaired} multipoles")
+        start = time.perf_counter()
+        components = "components" in main.outputs
+        seen = observe_bands(key, prepared, observation, cmb, components=components, names=missing)
+        for name, maps in seen:
+            report(f"band {name}")
+            factor = float(observation.channels[name].band.conversion("uK_RJ", main.unit))
+            header = _header(settings, setup, name, index)
+            _write(files[name], maps, settings, header, factor)
+            now = time.perf_counter()
+            yield Written(index, name, files[name], now - start)
+            start = now

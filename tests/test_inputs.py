@@ -1,0 +1,440 @@
+"""What settings name, read: noise in all its forms, templates with and without intensity."""
+
+import healpy
+import numpy as np
+import pytest
+from astropy.io import fits as pyfits
+
+from fits import settings as fit_settings
+from fits.inputs import read_inputs
+from jaxsky.bandpass import Bandpass
+from jaxsky.inputs import (
+    read,
+    read_bandpass_spec,
+    read_noise,
+    read_templates,
+    set_parameters_of,
+)
+from jaxsky.io import InputError
+from jaxsky.settings import (
+    BandpassSpec,
+    MapFile,
+    NoiseFile,
+    Nside,
+    SettingsError,
+    SettingsFile,
+    Table,
+    TemplateFile,
+    check_angles,
+    load,
+)
+
+NSIDE = 4
+NPIX = 12 * NSIDE**2
+BAND = Bandpass.top_hat(44.0, 8.0)
+#: uK_RJ in a K_CMB.
+FACTOR = float(BAND.conversion("K_CMB", "uK_RJ"))
+SIX = ["II_COV", "IQ_COV", "IU_COV", "QQ_COV", "QU_COV", "UU_COV"]
+HOLE = 7
+
+
+def write(path, columns, units, nest=False, coordinates="G", nside=NSIDE):
+    """A FITS map in RING or NESTED from columns in RING."""
+    nested = [healpy.reorder(c, r2n=True) if nest else c for c in columns.values()]
+    cols = [
+        pyfits.Column(name=n, format="D", array=c, unit=u)
+        for n, c, u in zip(columns, nested, units, strict=True)
+    ]
+    table = pyfits.BinTableHDU.from_columns(cols)
+    table.header.update(PIXTYPE="HEALPIX", ORDERING="NESTED" if nest else "RING", NSIDE=nside)
+    if coordinates:
+        table.header["COORDSYS"] = coordinates
+    table.writeto(path)
+
+
+@pytest.fixture(scope="module")
+def matrices():
+    """Covariances of I, Q, U [K_CMB^2], all elements different."""
+    roots = np.random.default_rng(3).normal(size=(NPIX, 3, 3))
+    return 1e-12 * (np.einsum("pik,pjk->ijp", roots, roots) + np.eye(3)[..., None])
+
+
+@pytest.fixture(scope="module")
+def hits():
+    found = np.random.default_rng(4).integers(1, 900, NPIX).astype(float)
+    found[HOLE] = 0
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, matrices, hits):
+    folder = tmp_path_factory.mktemp("inputs")
+    rng = np.random.default_rng(5)
+    maps = {f"{s}_STOKES": rng.normal(size=NPIX) for s in "IQU"}
+    # As Planck's: NESTED, K_CMB, a pixel without a value.
+    rows, columns = np.triu_indices(3)
+    covariance = dict(zip(SIX, matrices[rows, columns].copy(), strict=True))
+    covariance["UU_COV"][HOLE] = healpy.UNSEEN
+    units = ["K_CMB"] * 3 + ["K_CMB^2"] * 6
+    write(folder / "planck.fits", maps | covariance, units, nest=True)
+    # As WMAP's: mK that may be anything, "counts", no coordinates.
+    wmap = {"TEMPERATURE": maps["I_STOKES"], "Q_POLARISATION": maps["Q_STOKES"]}
+    wmap |= {"U_POLARISATION": maps["U_STOKES"], "N_OBS": hits, "MINUS": -hits}
+    units = ["mK", *["mK,thermodynamic"] * 2, "counts", "counts"]
+    write(folder / "wmap.fits", wmap, units, nest=True, coordinates=None)
+    rms = {f"{s}_RMS": 1e-6 * (1 + rng.random(NPIX)) for s in "IQU"}
+    rms["Q_RMS"][HOLE] = np.nan
+    rms["MINUS"] = -rms["I_RMS"]
+    write(folder / "rms.fits", rms, ["K_CMB"] * 4)
+    write(folder / "wide.fits", {"RMS": np.ones(12 * 2**2)}, ["uK_RJ"], nside=2)
+    write(folder / "iqu.fits", maps, ["uK_RJ"] * 3)
+    polarized = {k: v for k, v in maps.items() if k != "I_STOKES"}
+    write(folder / "qu.fits", polarized, ["uK_RJ"] * 2)
+    write(folder / "beta.fits", {"BETA_D": 1.5 + 0.1 * rng.random(NPIX)}, ["1"])
+    write(folder / "ame.fits", {"I": 1 + rng.random(NPIX)}, ["K_RJ"])
+    return folder
+
+
+PLANCK = MapFile(file="planck.fits", fields=["Q_STOKES", "U_STOKES"])
+WMAP = MapFile(
+    file="wmap.fits",
+    fields=["Q_POLARISATION", "U_POLARISATION"],
+    unit="mK_CMB",
+    coordinates="G",
+)
+
+
+def noise_of(folder, spec, stokes="QU", unit="K_CMB", own=None):
+    noise = NoiseFile.model_validate(spec)
+    return read_noise(folder, noise, BAND, NSIDE, stokes, where="noise", unit=unit, own=own)
+
+
+def others():
+    return np.arange(NPIX) != HOLE
+
+
+@pytest.mark.parametrize("stokes", ["QU", "IQU"])
+def test_rms_is_in_the_unit_of_the_map(folder, stokes):
+    covariance, known = noise_of(folder, {"rms": 2e-6}, stokes)
+    assert known.all()
+    assert known.shape == (NPIX,)
+    expected = np.eye(len(stokes))[..., None] * np.full(NPIX, (2e-6 * FACTOR) ** 2)
+    np.testing.assert_allclose(covariance, expected, rtol=1e-12)
+    other, _ = noise_of(folder, {"rms": 2.0}, stokes, unit="uK_RJ")
+    np.testing.assert_allclose(other, np.eye(len(stokes))[..., None] * np.full(NPIX, 4.0))
+
+
+@pytest.mark.parametrize(
+    ("fields", "stokes", "used"),
+    [
+        (["I_RMS"], "QU", ["I_RMS"] * 2),
+        (["I_RMS"], "IQU", ["I_RMS"] * 3),
+        (["Q_RMS", "U_RMS"], "QU", ["Q_RMS", "U_RMS"]),
+        (["I_RMS", "Q_RMS", "U_RMS"], "QU", ["Q_RMS", "U_RMS"]),
+        (["I_RMS", "Q_RMS", "U_RMS"], "IQU", ["I_RMS", "Q_RMS", "U_RMS"]),
+    ],
+)
+def test_rms_maps(folder, fields, stokes, used):
+    spec = {"map": {"file": "rms.fits", "fields": fields}}
+    covariance, known = noise_of(folder, spec, stokes)
+    np.testing.assert_array_equal(known, others() if "Q_RMS" in fields else np.ones(NPIX, bool))
+    table = pyfits.getdata(folder / "rms.fits")
+    rms = np.stack([table[name] for name in used]) * FACTOR
+    expected = np.where(known, np.eye(len(used))[..., None] * rms**2, 0)
+    np.testing.assert_allclose(covariance, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("names", "stokes"), [(SIX, "IQU"), (SIX, "QU"), (SIX[3:], "QU")], ids=["6", "6QU", "3QU"]
+)
+@pytest.mark.parametrize("inside", [True, False])
+def test_covariance_columns(folder, matrices, names, stokes, inside):
+    """In the file of the map, or in another one: the same matrices, in uK_RJ^2."""
+    if inside:
+        covariance, known = noise_of(folder, {"covariance": names}, stokes, own=PLANCK)
+    else:
+        spec = {"covariance": {"file": "planck.fits", "fields": names}}
+        covariance, known = noise_of(folder, spec, stokes, unit="uK_RJ")
+    np.testing.assert_array_equal(known, others())
+    n = len(stokes)
+    expected = np.where(known, matrices[-n:, -n:] * FACTOR**2, 0)
+    np.testing.assert_allclose(covariance, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("sigma0", "stokes", "each"),
+    [
+        (1.4, "QU", [1.4, 1.4]),
+        (1.4, "IQU", [1.4, 1.4, 1.4]),
+        ([1.5, 1.6], "QU", [1.5, 1.6]),
+        ([1.4, 1.5, 1.6], "QU", [1.5, 1.6]),
+        ([1.4, 1.5, 1.6], "IQU", [1.4, 1.5, 1.6]),
+    ],
+)
+def test_hits_are_wmaps_numbers_of_observations(folder, hits, sigma0, stokes, each):
+    """The variance is sigma_0^2 / N_obs; ordering and coordinates are those of the map."""
+    spec = {"hits": {"fields": ["N_OBS"], "sigma0": sigma0}}
+    covariance, known = noise_of(folder, spec, stokes, unit="mK_CMB", own=WMAP)
+    np.testing.assert_array_equal(known, others())
+    variance = (np.array(each)[:, None] * 1e-3 * FACTOR) ** 2 / np.where(known, hits, np.inf)
+    np.testing.assert_allclose(covariance, np.eye(len(each))[..., None] * variance, rtol=1e-12)
+
+
+def test_hits_in_another_file_with_a_unit_of_sigma0(folder):
+    own = {"hits": {"fields": ["N_OBS"], "sigma0": 1.4}}
+    expected, _ = noise_of(folder, own, unit="mK_CMB", own=WMAP)
+    table = {"file": "wmap.fits", "fields": ["N_OBS"], "coordinates": "G"}
+    spec = {"hits": table | {"sigma0": 1400.0, "sigma0_unit": "uK_CMB"}}
+    found, _ = noise_of(folder, spec, unit="K_RJ")
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("spec", "stokes", "own", "words"),
+    [
+        (
+            {"map": {"file": "wide.fits"}},
+            "QU",
+            None,
+            r"noise.map: nside is 2, but that of the map is 4\.",
+        ),
+        (
+            {"map": {"file": "rms.fits", "fields": ["Q_RMS", "U_RMS"]}},
+            "IQU",
+            None,
+            r"noise.map.fields: one or 3 are needed, not 2\.",
+        ),
+        (
+            {"map": {"file": "rms.fits", "fields": ["MINUS"]}},
+            "QU",
+            None,
+            r"noise: Argument `rms` has 384 of 384 values that are negative",
+        ),
+        (
+            {"map": {"file": "planck.fits", "fields": ["QQ_COV"]}},
+            "QU",
+            None,
+            r"noise: Unit 'K_CMB\^2' does not convert to 'uK_RJ'",
+        ),
+        ({"covariance": SIX[3:]}, "IQU", PLANCK, r"noise.covariance: I, Q and U need six columns"),
+        ({"covariance": SIX[3:]}, "QU", None, r"noise.covariance: file is missing\."),
+        (
+            {"covariance": [*SIX[:3], "QU_COV", "QQ_COV", "UU_COV"]},
+            "QU",
+            PLANCK,
+            r"noise: Argument `noise` is not positive definite in \d+ of 191 pixels",
+        ),
+        ({"hits": {"fields": ["N_OBS"], "sigma0": 1.0}}, "QU", None, "hits: file is missing"),
+        (
+            {"hits": {"fields": ["N_OBS"], "sigma0": [1.0, 2.0]}},
+            "IQU",
+            WMAP,
+            r"noise.hits.sigma0: one or 3 are needed, not 2\.",
+        ),
+        (
+            {"hits": {"fields": ["MINUS"], "sigma0": 1.0}},
+            "QU",
+            WMAP,
+            r"noise: Argument `hits` is not positive in 191 of 192 pixels",
+        ),
+        (
+            {"hits": {"fields": ["N_OBS"], "sigma0": 1.0, "sigma0_unit": "mk"}},
+            "QU",
+            WMAP,
+            r"noise: Unit 'mk' does not convert to 'uK_RJ'",
+        ),
+    ],
+)
+def test_mistakes_in_noise_are_one_sentence(folder, spec, stokes, own, words):
+    with pytest.raises(SettingsError, match=words):
+        noise_of(folder, spec, stokes, own=own)
+
+
+def test_files_that_cannot_be_read_are_named_once(folder):
+    with pytest.raises(InputError, match=r"^[^:]*none.fits: no such file\.$"):
+        noise_of(folder, {"map": {"file": "none.fits"}})
+    with pytest.raises(InputError, match=r"no column 'XX'"):
+        noise_of(folder, {"covariance": ["XX", *SIX[4:]]}, own=PLANCK)
+
+
+class Analysis(Table):
+    nside: Nside = 8
+    seed: int = 0
+
+
+class Example(SettingsFile):
+    analysis: Analysis = Analysis()
+    noise: NoiseFile = NoiseFile(rms=1.0)
+
+
+@pytest.mark.parametrize(
+    ("noise", "words"),
+    [
+        ("{ }", "noise: give the noise as exactly one of rms, map, covariance, hits, not none."),
+        ("{ rms = 1.0, covariance = ['a', 'b', 'c'] }", "not rms, covariance."),
+        ("{ level = 1.0 }", "noise.level: unknown key"),
+        ("{ covariance = ['a', 'b', 'c', 'd'] }", "noise.covariance.fields: name the columns QQ, "),
+        ("{ covariance = [] }", "not none."),
+        ("{ covariance = 'QQ' }", "noise.covariance: input should be a valid dictionary"),
+        ("{ hits = { fields = ['N_OBS'] } }", "noise.hits.sigma0: is missing."),
+        ("{ hits = { sigma0 = 1.0 } }", "noise.hits.fields: is missing."),
+        ("{ hits = { fields = ['a', 'b'], sigma0 = 1 } }", "noise.hits.fields: list should have"),
+        ("{ hits = { sigma0 = -1.0 } }", "noise.hits.sigma0.0: input should be greater than 0"),
+        ("{ hits = { sigma0 = [1, 2, 3, 4] } }", "noise.hits.sigma0: list should have at most 3"),
+        ("{ hits = { sigma0 = 1.0, hdu = 0 } }", "noise.hits.hdu: input should be greater than"),
+    ],
+)
+def test_mistakes_in_the_table_of_noise_are_one_sentence(tmp_path, noise, words):
+    path = tmp_path / "settings.toml"
+    path.write_text(f"noise = {noise}")
+    with pytest.raises(SettingsError) as mistake:
+        load(path, Example)
+    assert str(mistake.value).startswith(f"{path}: ")
+    assert words in str(mistake.value)
+
+
+def test_settings_of_any_model_with_values_replaced(tmp_path, monkeypatch):
+    path = tmp_path / "settings.toml"
+    path.write_text("data_dir = '$SKY_MAPS'\n[analysis]\nnside = 16\nseed = 3\n")
+    monkeypatch.setenv("SKY_MAPS", "maps")
+    settings = load(path, Example, {"analysis": {"nside": None, "seed": 5}, "noise": {}})
+    assert isinstance(settings, Example)
+    assert (settings.analysis.nside, settings.analysis.seed) == (16, 5)
+    assert settings.noise.rms == 1.0
+    assert settings.data_dir == str((tmp_path / "maps").resolve())
+    # A table that the file does not have; one that is none is a mistake, as without.
+    path.write_text("")
+    assert load(path, Example, {"analysis": {"nside": 2}}).analysis.nside == 2
+    path.write_text("analysis = 3")
+    with pytest.raises(SettingsError, match=r"analysis: input should be a valid dictionary"):
+        load(path, Example, {"analysis": {"nside": 2}})
+    path.write_text("analysis.nside = 6")
+    with pytest.raises(SettingsError, match=r"analysis.nside: nside must be a power of two, not 6"):
+        load(path, Example)
+
+
+def test_a_model_of_noise_with_more_kinds(tmp_path):
+    class Levels(NoiseFile):
+        KINDS = (*NoiseFile.KINDS, "level")
+        level: float | None = None
+
+    assert Levels(level=2.0).level == 2.0
+    with pytest.raises(ValueError, match=r"one of rms, map, covariance, hits, level, not rms, lev"):
+        Levels(level=2.0, rms=1.0)
+
+
+def specs(file, **more):
+    """Dust from a file, with a map of its index, and AME along it that is named before it."""
+    dust = {"law": "dust", "file": file, "nu_ref": 353.0, "fwhm": 10.0}
+    dust["parameters"] = {"beta_dust": {"file": "beta.fits"}, "T_dust": 20.0}
+    ame = {"law": "ame", "file": "ame.fits", "nu_ref": 22.8, "angles": "dust"}
+    return {name: TemplateFile(**spec) for name, spec in {"ame": ame, "dust": dust | more}.items()}
+
+
+def test_templates_with_intensity(folder):
+    templates = read_templates(folder, specs("iqu.fits"), "IQU")
+    maps = read(folder, MapFile(file="iqu.fits")).maps
+    dust, ame = templates["dust"], templates["ame"].component
+    np.testing.assert_array_equal(dust.component.amplitude, maps)
+    assert (float(dust.component.T_dust), dust.fwhm) == (20.0, 10.0)
+    np.testing.assert_array_equal(
+        dust.component.beta_dust, pyfits.getdata(folder / "beta.fits")["BETA_D"]
+    )
+    # AME: its own intensity, the angles of the dust, a polarization of 1 %.
+    intensity = 1e6 * pyfits.getdata(folder / "ame.fits")["I"]
+    np.testing.assert_allclose(ame.template[0], intensity, rtol=1e-12)
+    np.testing.assert_allclose(
+        np.arctan2(ame.template[2], ame.template[1]), np.arctan2(maps[2], maps[1]), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        np.hypot(ame.template[1], ame.template[2]), 0.01 * intensity, rtol=1e-12
+    )
+
+
+def test_polarization_is_the_same_with_and_without_intensity(folder):
+    whole = read_templates(folder, specs("iqu.fits"), "IQU")
+    for file in ("iqu.fits", "qu.fits"):
+        polarized = read_templates(folder, specs(file))
+        assert list(polarized) == list(whole) == ["dust", "ame"]
+        for name, template in polarized.items():
+            assert template.component.amplitude.shape == (2, NPIX)
+            expected = whole[name].component.amplitude[1:]
+            np.testing.assert_array_equal(template.component.amplitude, expected)
+
+
+@pytest.mark.parametrize(
+    ("file", "more", "words"),
+    [
+        ("qu.fits", {}, r"templates.dust: fields must name I, Q and U, not Q_STOKES, U_STOKES\."),
+        ("iqu.fits", {"fields": ["Q_STOKES", "U_STOKES", "I_STOKES"]}, "are not I, Q and U by"),
+    ],
+)
+def test_templates_without_intensity_are_refused(folder, file, more, words):
+    with pytest.raises(SettingsError, match=words):
+        read_templates(folder, specs(file, **more), "IQU")
+
+
+def test_one_column_is_no_polarization(folder):
+    words = r"templates.dust: fields must name Q and U, not Q_STOKES\."
+    with pytest.raises(SettingsError, match=words):
+        read_templates(folder, specs("qu.fits", fields=["Q_STOKES"]))
+
+
+def test_angles_come_from_a_template_with_some():
+    spec = {"law": "ame", "file": "ame.fits", "nu_ref": 22.8}
+    first, second = TemplateFile(**spec, angles="b"), TemplateFile(**spec, angles="a")
+    check_angles({"a": first, "b": TemplateFile(**spec)})
+    with pytest.raises(ValueError, match=r"templates.a.angles: there is no template b"):
+        check_angles({"a": first})
+    with pytest.raises(ValueError, match=r"templates.a.angles: template b has none of its own"):
+        check_angles({"a": first, "b": second})
+
+
+def test_parameters_are_set_in_a_copy(folder):
+    templates = read_templates(folder, specs("qu.fits"))
+    changed = set_parameters_of(templates, {"dust.T_dust": 25.0})
+    assert float(changed["dust"].component.T_dust) == 25.0
+    assert float(templates["dust"].component.T_dust) == 20.0
+    assert changed["ame"] is templates["ame"]
+    with pytest.raises(SettingsError, match=r"no template 'cmb'; templates are dust, ame\."):
+        set_parameters_of(templates, {"cmb.T_cmb": 3.0})
+    with pytest.raises(KeyError, match=r"Unknown parameter 'dust.T'"):
+        set_parameters_of(templates, {"dust.T": 3.0})
+
+
+def test_bandpasses_of_settings(folder):
+    assert read_bandpass_spec(folder, BandpassSpec(center=70.0)).nu.tolist() == [70.0]
+    top_hat = read_bandpass_spec(folder, BandpassSpec(center=70.0, width=14.0, convention="power"))
+    assert (float(top_hat.nu[0]), float(top_hat.nu[-1])) == (63.0, 77.0)
+    assert top_hat.convention == "power"
+    table = np.array([[60.0, 0.0], [70.0, 1.0], [80.0, 0.0]])
+    np.savetxt(folder / "band.txt", table)
+    read_in = read_bandpass_spec(folder, BandpassSpec(file="band.txt", convention="RJ"))
+    np.testing.assert_array_equal(read_in.nu, table[:, 0])
+
+
+def test_fits_take_hits_and_six_columns(folder, matrices, hits):
+    """Both as noise of Q and U; pixels without either are not used."""
+    dust = specs("qu.fits")["dust"].model_dump(exclude_none=True)
+    common = {"bandpass": {"center": 44.0, "width": 8.0}, "fwhm": 30.0}
+    wmap = WMAP.model_dump() | {"noise": {"hits": {"fields": ["N_OBS"], "sigma0": 1.4}}}
+    planck = PLANCK.model_dump() | {"noise": {"covariance": SIX}}
+    settings = fit_settings.Settings.model_validate(
+        {
+            "data_dir": str(folder),
+            "free": {"dust.T_dust": {"start": 21.0}},
+            "templates": {"dust": dust},
+            "bands": [common | wmap | {"name": "W"}, common | planck | {"name": "P"}],
+            "cmb": {"include": False},
+        }
+    )
+    # What was written into a log is read again.
+    bands = read_inputs(fit_settings.Settings.model_validate(settings.model_dump())).bands
+    for band in bands.values():
+        np.testing.assert_array_equal(band.used, others())
+        assert not band.maps[:, HOLE].any()
+    variance = (1.4e-3 * FACTOR) ** 2 / hits[others()]
+    expected = np.eye(2)[..., None] * variance
+    np.testing.assert_allclose(bands["W"].noise[..., others()], expected, rtol=1e-12)
+    expected = matrices[1:, 1:, others()] * FACTOR**2
+    np.testing.assert_allclose(bands["P"].noise[..., others()], expected, rtol=1e-12)

@@ -31,6 +31,7 @@ from jaxsky.harmonics import (
     resize,
     synthesis,
 )
+from jaxsky.harmonics.beams import NEGLIGIBLE
 
 __all__ = [
     "DUST",
@@ -89,6 +90,16 @@ def fit_power_law(spectrum: Float[Array, " ell"], lmin: int, lmax: int) -> Power
     return PowerLaw(log_amplitude, slope, covariance[::-1, ::-1], lmax)
 
 
+def _numbers(name: str, value: ArrayLike, count: int = 1) -> Array:
+    """A finite number, or `count` of them."""
+    array = as_array(name, value)
+    if array.shape not in ((), (count,))[:count]:
+        known = "a number" if count == 1 else f"a number or {count} numbers"
+        raise ValueError(f"Argument `{name}` must be {known}, but has shape {array.shape}.")
+    check_finite(name, array)
+    return array
+
+
 class SmallScales(eqx.Module):
     """How small scales continue a template.
 
@@ -103,8 +114,8 @@ class SmallScales(eqx.Module):
     Raises
     ------
     TypeError, ValueError
-        For numbers that are not finite, a negative amplitude or a modulation_fwhm that is not
-        positive.
+        For ranges that are not two integers, wrong shapes, numbers that are not finite, a
+        negative amplitude or a modulation_fwhm that is not positive.
     """
 
     EE: tuple[int, int] = eqx.field(static=True)
@@ -123,14 +134,14 @@ class SmallScales(eqx.Module):
         amplitude: ArrayLike = 1.0,
         modulation_fwhm: ArrayLike = 180.0,
     ) -> None:
+        for name, ends in {"EE": EE, "BB": BB}.items():
+            if [type(end) for end in ends] != [int, int]:
+                raise TypeError(f"Argument `{name}` must be two integers, but is {ends!r}.")
         self.EE, self.BB = (EE[0], EE[1]), (BB[0], BB[1])
-        self.slope = None if slope is None else jnp.broadcast_to(as_array("slope", slope), (2,))
-        self.tilt = as_array("tilt", tilt)
-        self.amplitude = as_array("amplitude", amplitude)
-        self.modulation_fwhm = as_array("modulation_fwhm", modulation_fwhm)
-        for name in ("slope", "tilt", "amplitude"):
-            if getattr(self, name) is not None:
-                check_finite(name, getattr(self, name))
+        self.slope = None if slope is None else jnp.broadcast_to(_numbers("slope", slope, 2), 2)
+        self.tilt = _numbers("tilt", tilt)
+        self.amplitude = _numbers("amplitude", amplitude)
+        self.modulation_fwhm = _numbers("modulation_fwhm", modulation_fwhm)
         check_positive("modulation_fwhm", self.modulation_fwhm)
         if is_concrete(self.amplitude) and self.amplitude < 0:
             raise ValueError(
@@ -151,7 +162,7 @@ class Extrapolation(NamedTuple):
     measured : spectra of the template divided by those of its beam, up to its own lmax
     laws : the fitted power laws
     target : power laws with the slope asked for
-    transfer : factors of the template's coefficients, its own beam taken out
+    transfer : factors of the template's coefficients, by which its own beam is taken out
     injected : spectra of what is added
     """
 
@@ -181,7 +192,9 @@ def extrapolate(
     """
     known = lmax_of(alm)
     beam = gaussian_beam(own, known)
-    measured = power_spectrum(alm) / beam**2
+    # Beyond the joins its own beam is not taken out: there may be nothing left of it.
+    seen, power = beam > NEGLIGIBLE, power_spectrum(alm)
+    measured = jnp.where(seen, power / jnp.where(seen, beam, 1.0) ** 2, 0.0)
     ell = jnp.arange(known + 1)
     laws, target, transfer, there = [], [], [], []
     for i, (lmin, join) in enumerate((small.EE, small.BB)):
@@ -190,16 +203,16 @@ def extrapolate(
         laws.append(law)
         target.append(law._replace(slope=slope + small.tilt)(lmax))
         allowed = jnp.pad(target[i], (0, max(0, known - lmax)))[: known + 1]
-        excess = measured[i] * (beam / beam[join]) ** 2 / jnp.where(allowed > 0, allowed, 1.0)
-        kept = beam / beam[join] / jnp.sqrt(jnp.maximum(excess, 1.0))
-        transfer.append(jnp.where(ell <= join, 1.0, kept))
+        kept = power[i] / beam[join] ** 2
+        excess = kept / jnp.where(allowed > 0, allowed, 1.0)
+        beyond = 1 / beam[join] / jnp.sqrt(jnp.maximum(excess, 1.0))
+        transfer.append(jnp.where(ell <= join, 1 / jnp.where(ell <= join, beam, 1.0), beyond))
         # Where the template is brought down to the law, nothing is missing: exactly, not nearly.
-        there.append(jnp.where(excess >= 1, allowed, kept**2 * measured[i]))
+        there.append(jnp.where(excess >= 1, allowed, kept))
     both = min(known, lmax) + 1
     missing = jnp.stack(target).at[:, :both].add(-jnp.stack(there)[:, :both])
     joins = jnp.array([[small.EE[1]], [small.BB[1]]])
-    beyond = jnp.arange(lmax + 1) > joins
-    injected = jnp.where(beyond, jnp.maximum(missing, 0.0), 0.0)
+    injected = jnp.where(jnp.arange(lmax + 1) > joins, jnp.maximum(missing, 0.0), 0.0)
     return Extrapolation(
         measured, (laws[0], laws[1]), jnp.stack(target), jnp.stack(transfer), injected
     )
@@ -251,21 +264,15 @@ def _injected_matrix(
 
     Each cross-spectrum is extrapolated with the coefficient of correlation that it has over the
     range of the fits. Off the diagonal there is the same difference as on it, where both fields
-    are injected.
+    are injected. The coefficients are those that stay, without their beams.
     """
-    target, injected, transfer = (
-        jnp.concatenate([getattr(part, name) for part in parts])
-        for name in ("target", "injected", "transfer")
+    target, injected = (
+        jnp.concatenate([getattr(part, name) for part in parts]) for name in ("target", "injected")
     )
-    # The coefficients are here without their beams.
-    known, lmax = lmax_of(alms), target.shape[-1] - 1
-    both = min(known, lmax) + 1
     rho = _correlations(alms, ranges)
-    cross = jax.vmap(lambda one: jax.vmap(lambda other: power_spectrum(one, other))(alms))(alms)
-    there = cross * transfer[:, None] * transfer[None]
+    there = jax.vmap(lambda one: jax.vmap(lambda other: power_spectrum(one, other))(alms))(alms)
     root = jnp.sqrt(target)
-    matrix = rho[..., None] * root[:, None] * root[None]
-    matrix = matrix.at[..., :both].add(-there[..., :both])
+    matrix = rho[..., None] * root[:, None] * root[None] - there[..., : root.shape[-1]]
     present = (injected[:, None] > 0) & (injected[None] > 0)
     on_diagonal = jnp.eye(len(injected), dtype=bool)[..., None]
     return jnp.where(on_diagonal, injected[:, None], jnp.where(present, matrix, 0.0))
@@ -314,29 +321,30 @@ def continue_templates(
     Raises
     ------
     ValueError
-        If a range of a fit does not lie within a template's multipoles, or ranges of correlated
-        templates do not overlap.
+        If maps are not Q, U, a range of a fit does not lie within a template's multipoles, or
+        ranges of correlated templates do not overlap.
     """
+    for each in maps:
+        if jnp.ndim(each) != 2 or len(each) != 2:
+            raise ValueError(
+                "Small scales are added to maps of shape (2, pix), Q and U, not of shape "
+                f"{jnp.shape(each)}."
+            )
     lmax = 2 * nside if lmax is None else lmax
     known = [_known(each, beam) for each, beam in zip(maps, own, strict=True)]
     alms = [analysis(each, k) for each, k in zip(maps, known, strict=True)]
     parts = [
         extrapolate(alm, beam, how, lmax) for alm, beam, how in zip(alms, own, small, strict=True)
     ]
-    bare = [
-        alm / expand(gaussian_beam(beam, k)) for alm, beam, k in zip(alms, own, known, strict=True)
+    wide = max(lmax, *known)
+    stay = [
+        resize(alm * expand(part.transfer), wide) for alm, part in zip(alms, parts, strict=True)
     ]
     if len(maps) == 1:
         matrix = jnp.eye(2)[..., None] * parts[0].injected[:, None]
     else:
         ranges = [r for how in small for r in (how.EE, how.BB)]
-        common = max(known)
-        fields = jnp.concatenate([resize(alm, common) for alm in bare])
-        padded = [
-            part._replace(transfer=jnp.pad(part.transfer, ((0, 0), (0, common - k))))
-            for part, k in zip(parts, known, strict=True)
-        ]
-        matrix = _injected_matrix(fields, padded, ranges)
+        matrix = _injected_matrix(jnp.concatenate(stay), parts, ranges)
     gains = jnp.stack(
         [
             modulation(each, how.modulation_fwhm, nside)
@@ -347,10 +355,9 @@ def continue_templates(
     matrix, repaired = correlated.repair(matrix / power[..., None])
     drawn = correlated.realisation(key, matrix)
     result = []
-    for i, (alm, how, part, gain) in enumerate(zip(bare, small, parts, gains, strict=True)):
+    for i, (template, how, gain) in enumerate(zip(stay, small, gains, strict=True)):
         added = analysis(gain * synthesis(drawn[2 * i : 2 * i + 2], nside), lmax)
         rise = _rise((how.EE[1], how.BB[1]), lmax)
-        template = resize(alm * expand(part.transfer), lmax)
         result.append(template + how.amplitude * expand(rise) * added)
     return Continued(result, parts, repaired)
 
@@ -383,7 +390,8 @@ def add_small_scales(
     Raises
     ------
     ValueError
-        If a range of a fit does not lie within the template's multipoles.
+        If the maps are not Q, U, or a range of a fit does not lie within the template's
+        multipoles.
     """
     (alm,) = continue_templates(key, [maps], [own], [small], nside).alms
     return synthesis(alm * expand(gaussian_beam(fwhm, lmax_of(alm))), nside)

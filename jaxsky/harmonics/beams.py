@@ -64,11 +64,11 @@ def beam_ratio(
                 f"{float(own):g} arcmin."
             )
         return _gaussian(target**2 - own**2, lmax)
-    over, under = (_window(beam, lmax, what) for beam in (target, own))
+    over, under = _window(target, lmax, "the target"), _window(own, lmax, what)
     empty = jnp.abs(under) < NEGLIGIBLE
     ratio = jnp.where(empty, 0.0, over / jnp.where(empty, 1.0, under))
-    if is_concrete(ratio) and float(ratio.max()) > 1 + FINER:
-        at = int(ratio.argmax())
+    if is_concrete(ratio) and float(jnp.abs(ratio).max()) > 1 + FINER:
+        at = int(jnp.abs(ratio).argmax())
         raise ValueError(
             f"The target beam is finer than that of {what}: at l = {at} their windows are "
             f"{float(over[at]):.3g} and {float(under[at]):.3g}."

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -11,7 +10,7 @@ from getdist import MCSamples, chains, plots
 
 from fits.results import FitResult
 from fits.spectral_index import Fit, all_free
-from jaxsky.io import whole
+from jaxsky.plots import STYLE, save
 
 __all__ = ["label", "plot_grids", "plot_marginals", "plot_posterior"]
 
@@ -21,16 +20,6 @@ chains.print_load_details = False  # getdist otherwise prints about burn-in
 COLORS = {"Q": "#0072B2", "U": "#D55E00", "QU": "#222222"}
 REGION_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 TRUTH = {"color": "#CC79A7", "linewidth": 1.6}
-STYLE: Any = {
-    "font.size": 9,
-    "axes.titlesize": 9,
-    "axes.labelsize": 10,
-    "legend.fontsize": 8,
-    "figure.dpi": 150,
-    "savefig.bbox": "tight",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-}
 #: What the fields of components are called in the literature.
 SYMBOLS = {
     "beta_dust": r"\beta_{\rm dust}",
@@ -61,12 +50,6 @@ def label(name: str) -> str:
 
 def _tex(name: str) -> str:
     return f"${label(name)}$"
-
-
-def _save(figure: plt.Figure, path: Path) -> None:
-    with whole(path) as beside:
-        figure.savefig(beside, format="png")
-    plt.close(figure)
 
 
 def _levels(log_posterior: np.ndarray) -> list[float]:
@@ -116,7 +99,7 @@ def plot_grids(
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
         figure.suptitle(title, fontsize=9)
-        _save(figure, path)
+        save(figure, path)
     return True
 
 
@@ -208,7 +191,7 @@ def plot_marginals(
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
         figure.suptitle(title, fontsize=9)
-        _save(figure, path)
+        save(figure, path)
     return True
 
 
@@ -256,5 +239,5 @@ def plot_posterior(
             plotter.subplots[i, i].axvspan(*interval, color=color, alpha=0.15, linewidth=0)
     plotter.fig.suptitle(f"{title}; 68 % shaded", fontsize=8, y=1.03)
     with mpl.rc_context(STYLE | {"savefig.dpi": 200}):
-        _save(plotter.fig, path)
+        save(plotter.fig, path)
     return True

@@ -227,13 +227,14 @@ def simulate(
             progress.stop()
             console.print("Stopped; go on with --resume.")
             raise typer.Exit(130) from None
-        report("drawing")
-        picture = out / f"sim_{first:05d}.png"
-        if not picture.exists() or seconds:
+        written = [out / "sim_*"]
+        if settings.experiment.sheet:
             from jaxsky import plots
 
+            report("drawing")
+            written.append(out / f"sim_{first:05d}.png")
             plots.contact_sheet(
-                picture,
+                written[-1],
                 montecarlo.paths(out, names, first),
                 lambda path: read_maps(path, fields=["Q", "U"]).maps,
                 setup.observation.lmax,
@@ -244,7 +245,7 @@ def simulate(
     kept = nsims * len(names) - len(seconds)
     rate = f"{statistics.median(seconds.values()):.2g} s a band, " if seconds else ""
     console.print(
-        f"Written: {len(seconds)} maps in {out / 'sim_*'} and {picture}"
+        f"Written: {len(seconds)} maps in {' and '.join(map(str, written))}"
         + (f"; {kept} maps were there already" if kept else "")
         + f" ({rate}{time.perf_counter() - started:.1f} s in all).",
         highlight=False,

@@ -2,7 +2,6 @@
 
 from functools import cache
 
-import camb
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -41,6 +40,8 @@ def camb_spectra(lmax: int, r: float = 0.0, **cosmology: float) -> Float[np.ndar
     """
     if r < 0:
         raise ValueError(f"Argument `r` must not be negative, but is {r}.")
+    import camb  # takes as long to import as a small simulation takes
+
     # The lensing of l = lmax needs higher multipoles, and CAMB some for its interpolation.
     params = camb.set_params(
         **(cosmology or PLANCK_2018), r=r, WantTensors=r > 0, lmax=max(lmax + 500, 1000)

@@ -59,6 +59,7 @@ class Main(Table):
     unit: Literal["uK_RJ", "uK_CMB"] = "uK_RJ"
     include: list[str] | None = Field(None, min_length=1)
     outputs: tuple[Literal["total", "components"], ...] = ("total",)
+    sheet: bool = True
     diagonal_noise: bool = False
     seed: int = Field(0, ge=0, lt=2**32)
     small_scales_seed: int | None = Field(None, ge=0, lt=2**32)

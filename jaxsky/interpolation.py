@@ -8,6 +8,7 @@ of nodes is read off the decay of the Chebyshev coefficients over the range of t
 
 import itertools
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -133,6 +134,7 @@ def choose_nodes(component: Component, bands: tuple[Bandpass, ...], tolerance: f
     return NodeCounts(tuple(int(max(first, 2)) for first in resolved.argmax(axis=1)))
 
 
+@partial(jax.jit, static_argnames="counts")
 def _series(
     component: Component, band: Bandpass, counts: tuple[int, ...]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
@@ -217,7 +219,12 @@ def term_weights(
 
 def term(component: Component, terms: Terms, index: int) -> Float[Array, " pix"]:
     """A term in each pixel; a number if no parameter is a map."""
-    coefs = terms.vectors[index].reshape(terms.counts)
+    return _combination(component, terms.vectors[index].reshape(terms.counts))
+
+
+@jax.jit
+def _combination(component: Component, coefs: Float[Array, "..."]) -> Float[Array, " pix"]:
+    """A series in the scaled parameters that are maps."""
     return chebyshev.evaluate(coefs, *_points(component))
 
 

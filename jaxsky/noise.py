@@ -12,7 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxsky.checks import as_array, check_finite, is_concrete
-from jaxsky.harmonics import alm_ell, analysis, children
+from jaxsky.harmonics import alm_ell, analysis, children, expand
 from jaxsky.types import Numeric
 
 __all__ = [
@@ -70,10 +70,15 @@ def uniform_alm(
     if stokes not in (1, 2, 3):
         raise ValueError(f"Argument `stokes` must be 1, 2 or 3, not {stokes!r}.")
     level = as_array("noise", noise) * (math.pi / 180 / 60)
-    degree = alm_ell(lmax)
     spins = np.array({1: [0], 2: [2, 2], 3: [0, 2, 2]}[stokes])
-    white = jax.random.normal(key, (stokes, degree.size), level.dtype)
-    return jnp.where(degree >= spins[:, None], level * white, 0)
+    there = np.arange(lmax + 1) >= spins[:, None]
+    white = jax.random.normal(key, (stokes, (lmax + 1) ** 2), level.dtype)
+    return _scaled(white, jnp.where(there, level, 0))
+
+
+@jax.jit
+def _scaled(alm: Float[Array, "stokes alm"], levels: Float[Array, "stokes ell"]):
+    return alm * expand(levels)
 
 
 def _diagonal(variance: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:

@@ -120,16 +120,25 @@ def plan(
     sources, observation : what is observed, and how
     tolerance : error of varying laws relative to the maps of a band
     """
-    levels = {}
-    for name, source in sources.items():
-        middle = jax.tree.map(lambda x: x.mean() if x.ndim == 1 else x, source.component)
-        law = jnp.stack([band_sed(middle, band, None) for band in observation.bands])
-        levels[name] = jnp.sqrt(jnp.mean(source.component.template**2)), law
+    levels = _levels({name: source.component for name, source in sources.items()}, observation)
     total = jnp.sqrt(sum((rms * law) ** 2 for rms, law in levels.values()))
     return {
         name: choose_terms(source.component, observation.bands, levels[name][0] / total, tolerance)
         for name, source in sources.items()
     }
+
+
+@jax.jit
+def _levels(
+    components: dict[str, Component], observation: Observation
+) -> dict[str, tuple[Float[Array, ""], Float[Array, " band"]]]:
+    """The rms of each template, and its law in each band at the mean of its parameters."""
+    levels = {}
+    for name, component in components.items():
+        middle = jax.tree.map(lambda x: x.mean() if x.ndim == 1 else x, component)
+        law = jnp.stack([band_sed(middle, band, None) for band in observation.bands])
+        levels[name] = jnp.sqrt(jnp.mean(component.template**2)), law
+    return levels
 
 
 def _iterations(size: float) -> int:

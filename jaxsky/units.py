@@ -4,6 +4,9 @@ Units are named by strings such as "uK_CMB", "mK_RJ", "MJy/sr". The factors are 
 arrays; the names are static. Inside the package everything is uK_RJ.
 """
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -79,6 +82,7 @@ def conversion(source: str, target: str, nu: Numeric) -> Float[Array, "..."]:
     )
 
 
+@partial(jax.jit, static_argnames=("source", "target"))
 def band_conversion(
     source: str,
     target: str,

@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 from rich.console import Console
 
-from benchmarks import band_averages, command, likelihoods
+from benchmarks import band_averages, command, likelihoods, simulations
 from benchmarks.table import Row, conditions, markdown, rich_table
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
@@ -20,7 +20,17 @@ BENCHMARKS = {
     "compile": band_averages.compilation,
     "grid": likelihoods.grid,
     "chain": likelihoods.chain,
+    "simulate-beta-maps": simulations.beta_maps,
+    "simulate-constant": simulations.constant,
+    "monte-carlo": simulations.monte_carlo,
+    "nside-2048": simulations.nside_2048,
+    "smoothing": simulations.smoothing,
+    "analysis": simulations.transform,
+    "smoothing-nside": simulations.growth,
+    "correlated": simulations.correlated_alm,
 }
+#: These take minutes: they are run by name, and when the table is kept.
+LONG = ("nside-2048",)
 
 
 def _arguments() -> argparse.Namespace:
@@ -51,7 +61,9 @@ def main() -> None:
         console.print("\n".join(BENCHMARKS), highlight=False)
         return
     jax.config.update("jax_enable_x64", True)
-    rows = _measure([arguments.only] if arguments.only else list(BENCHMARKS), arguments.quick)
+    every = arguments.write or arguments.quick
+    names = [name for name in BENCHMARKS if every or name not in LONG]
+    rows = _measure([arguments.only] if arguments.only else names, arguments.quick)
     lines = conditions(arguments.quick)
     console.print(rich_table(rows))
     console.print("\n".join(lines), highlight=False)

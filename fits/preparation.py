@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsky.components import Component
-from jaxsky.harmonics import average_pixels, gaussian_beam, resample
+from jaxsky.harmonics import average_pixels, beam_ratio, resample
 
 __all__ = ["Preparation", "prepare_component"]
 
@@ -39,12 +39,7 @@ class Preparation(eqx.Module):
             If the target is finer than `what` is, in beam or pixels.
         """
         _check_nside(nside_in, nside, what)
-        if fwhm < own_fwhm:
-            raise ValueError(
-                f"The common resolution of {fwhm:g} arcmin is finer than that of {what}, "
-                f"{own_fwhm:g} arcmin."
-            )
-        return cls(gaussian_beam(np.sqrt(fwhm**2 - own_fwhm**2), lmax), nside_in, nside)
+        return cls(beam_ratio(fwhm, own_fwhm, lmax, what), nside_in, nside)
 
     @classmethod
     def averaging(cls, nside_in: int, nside: int, what: str = "map") -> "Preparation":

@@ -27,6 +27,7 @@ __all__ = [
     "rms_covariance",
     "uniform_alm",
     "uniform_covariance",
+    "uniform_map",
 ]
 
 #: Columns of a covariance by their number, in the order of Planck's maps.
@@ -46,6 +47,22 @@ def uniform_covariance(
     """
     sigma = noise / (healpy.nside2resol(nside, arcmin=True))
     return jnp.eye(stokes)[..., None] * jnp.full(healpy.nside2npix(nside), sigma**2)
+
+
+def uniform_map(
+    key: Array, noise: ArrayLike, nside: int, stokes: int = 2
+) -> Float[Array, "stokes pix"]:
+    """White noise of a uniform level: a draw from `uniform_covariance`, without that in memory.
+
+    Parameters
+    ----------
+    key : of jax.random
+    noise : noise [u arcmin], u being the unit of the maps
+    nside : resolution
+    stokes : number of Stokes parameters, all with this noise
+    """
+    sigma = as_array("noise", noise) / healpy.nside2resol(nside, arcmin=True)
+    return sigma * jax.random.normal(key, (stokes, healpy.nside2npix(nside)), sigma.dtype)
 
 
 def uniform_alm(

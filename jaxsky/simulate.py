@@ -29,7 +29,7 @@ from jaxsky.harmonics import (
     synthesis,
 )
 from jaxsky.interpolation import Terms, band_sed, choose_terms, term, term_weights
-from jaxsky.noise import draw, uniform_alm, uniform_covariance
+from jaxsky.noise import draw, uniform_alm, uniform_map
 from jaxsky.observation import Observation, ObservedBand, Source
 from jaxsky.small_scales import continue_templates
 
@@ -251,8 +251,9 @@ def _noise(
         alm = uniform_alm(key, noise, observation.lmax, stokes)
         window = beam_ratio(channel.target, channel.beam, observation.lmax, "the channel")
         return _Part((alm,), jnp.ones(1), window)
-    covariance = noise if noise.ndim else uniform_covariance(noise, nside, stokes)
-    white = draw(key, covariance, diagonal=channel.diagonal)
+    if not noise.ndim:
+        return uniform_map(key, noise, nside, stokes)
+    white = draw(key, noise, diagonal=channel.diagonal)
     if channel.target is None:
         return white
     window = beam_ratio(channel.target, channel.beam, observation.lmax, "the channel")

@@ -217,9 +217,12 @@ def simulate(
         montecarlo.claim(out, settings, resume, overwrite)
         names = setup.observation.names
         progress.update(task, total=nsims * len(names))
-        seconds = {}
+        seconds, notes = {}, dict[str, None]()  # a set that keeps its order
+        indices = range(first, first + nsims)
         try:
-            for file in montecarlo.run(settings, setup, out, range(first, first + nsims), report):
+            for file in montecarlo.run(
+                settings, setup, out, indices, report, lambda note: notes.setdefault(note)
+            ):
                 progress.advance(task)
                 if file.seconds is not None:
                     seconds[file.path] = file.seconds
@@ -242,6 +245,8 @@ def simulate(
                 settings.title,
             )
     console.print(setup.description, highlight=False)
+    for sentence in notes:
+        console.print(f"[yellow](!)[/] {sentence}", highlight=False)
     kept = nsims * len(names) - len(seconds)
     rate = f"{statistics.median(seconds.values()):.2g} s a band, " if seconds else ""
     console.print(

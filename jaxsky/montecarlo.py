@@ -151,6 +151,7 @@ def run(
     out: Path,
     indices: range,
     report: Callable[[str], None] = lambda message: None,
+    note: Callable[[str], None] = lambda message: None,
 ) -> Iterator[Written]:
     """Simulate realisations into files, one for each band; files that are there are kept.
 
@@ -162,6 +163,7 @@ def run(
     out : folder, from `claim`
     indices : numbers of the realisations
     report : called with a line before each step of the work
+    note : called with sentences that a user should know
 
     Returns
     -------
@@ -189,7 +191,10 @@ def run(
             prepared = prepare(small, setup.sources, observation, terms)
             for name, source in prepared.items():
                 if repaired := int(source.repaired):
-                    report(f"{name}: correlations repaired at {repaired} multipoles")
+                    note(
+                        f"{name}: the extrapolated cross-spectra exceed what the auto-spectra "
+                        f"allow at {repaired} multipoles; correlations were reduced there."
+                    )
         start = time.perf_counter()
         components = "components" in main.outputs
         seen = observe_bands(key, prepared, observation, cmb, components=components, names=missing)

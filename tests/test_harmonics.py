@@ -1,4 +1,4 @@
-"""Transforms against healpy, transposes and gradients; the CMB on top of them."""
+"""Transforms against healpy, transposes, gradients; beams, packing and resolution."""
 
 import healpy
 import jax
@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxsky import cmb
 from jaxsky.harmonics import (
     adjoint_synthesis,
     alm_ell,
@@ -15,27 +14,48 @@ from jaxsky.harmonics import (
     alm_to_healpy,
     analysis,
     average_pixels,
+    beam_ratio,
+    children,
+    expand,
     gaussian_beam,
+    lmax_of,
+    low_multipoles,
+    needed_lmax,
+    pixel_window,
+    power_spectrum,
     resample,
+    resize,
+    rotate,
+    smooth,
     synthesis,
 )
 
 NSIDE, LMAX = 32, 64
+ROWS = pytest.mark.parametrize(
+    "rows", [slice(0, 1), slice(1, 3), slice(0, 3)], ids=["I", "QU", "IQU"]
+)
+TURNS = pytest.mark.parametrize(("source", "target"), ["GE", "EC", "CG", "GC"])
+
+
+def drawn(lmax, stokes=3, seed=4):
+    """Packed coefficients of a falling spectrum; E and B have none at l < 2."""
+    ell = alm_ell(lmax)
+    white = np.random.default_rng(seed).normal(size=(stokes, ell.size))
+    spins = np.array([0, 2, 2])[3 - stokes :, None]
+    return jnp.asarray(white / (ell + 1.0) * (ell >= spins))
 
 
 @pytest.fixture(scope="module")
 def alm():
     """healpy's coefficients (I, E, B) of a map with a falling spectrum."""
-    ell = np.arange(LMAX + 1)
-    spectrum = 1 / (ell + 1.0) ** 2 * (ell > 1)
-    rng = np.random.default_rng(4)
-    shape = (3, healpy.Alm.getsize(LMAX))
-    draws = rng.normal(size=shape) + 1j * rng.normal(size=shape)
-    draws[:, : LMAX + 1].imag = 0
-    return np.stack([healpy.almxfl(a, np.sqrt(spectrum)) for a in draws])
+    return alm_to_healpy(drawn(LMAX).at[0, alm_ell(LMAX) < 2].set(0), LMAX)
 
 
-@pytest.mark.parametrize("rows", [slice(0, 1), slice(1, 3), slice(0, 3)], ids=["I", "QU", "IQU"])
+def rms(x):
+    return float(jnp.sqrt(jnp.mean(x**2)))
+
+
+@ROWS
 def test_synthesis_and_analysis_against_healpy(alm, rows):
     maps = healpy.alm2map(alm, NSIDE, lmax=LMAX)[rows]
     packed = jnp.asarray(alm_from_healpy(alm[rows], LMAX))
@@ -48,6 +68,52 @@ def test_synthesis_and_analysis_against_healpy(alm, rows):
     assert np.abs(back - packed).max() < 2 * np.abs(reference[rows] - packed).max()
 
 
+@ROWS
+def test_the_engines_agree(rows):
+    alm = drawn(LMAX)[rows]
+    maps = synthesis(alm, NSIDE)
+    np.testing.assert_allclose(
+        synthesis(alm, NSIDE, engine="healpy"), maps, atol=1e-10 * float(maps.std())
+    )
+    for iterations in (0, 2):
+        np.testing.assert_allclose(
+            analysis(maps, LMAX, iterations, engine="healpy"),
+            analysis(maps, LMAX, iterations),
+            atol=1e-10 * float(alm.std()),
+        )
+
+
+@pytest.mark.parametrize("lmax", [3 * NSIDE // 2, 2 * NSIDE])
+@pytest.mark.parametrize("stokes", [1, 2])
+def test_analysis_inverts_the_synthesis(lmax, stokes):
+    alm = drawn(lmax, stokes)
+    back = analysis(synthesis(alm, NSIDE), lmax)
+    assert rms(back - alm) < 1e-6 * rms(alm)
+
+
+@TURNS
+def test_rotation_against_healpy(source, target):
+    alm = drawn(LMAX)
+    turned = rotate(alm, source, target)
+    rotator = healpy.Rotator(coord=[source, target])
+    expected = [rotator.rotate_alm(row, lmax=LMAX) for row in alm_to_healpy(alm, LMAX)]
+    expected = alm_from_healpy(np.stack(expected), LMAX)
+    np.testing.assert_allclose(turned, expected, atol=1e-10 * float(alm.std()))
+    np.testing.assert_array_equal(rotate(alm, source, target, engine="healpy"), expected)
+    np.testing.assert_allclose(rotate(turned, target, source), alm, atol=1e-10)
+
+
+def test_the_galactic_pole_has_its_equatorial_coordinates():
+    # A dipole towards the pole, cos theta in Galactic coordinates; the pole is at right ascension
+    # 192.8595 and declination 27.1283 degrees (J2000).
+    alm = jnp.zeros((1, 9)).at[0, 1].set(np.sqrt(4 * np.pi / 3))
+    dipole = synthesis(rotate(alm, "G", "C"), 16)[0]
+    x, y, z = healpy.pix2vec(16, np.arange(healpy.nside2npix(16)))
+    pole = healpy.ang2vec(192.8595, 27.1283, lonlat=True)
+    # healpy's angles are good to about 1e-4 degrees.
+    np.testing.assert_allclose(dipole, pole @ [x, y, z], atol=1e-5)
+
+
 def test_packing_is_inverse_and_keeps_the_norm(alm):
     packed = alm_from_healpy(alm, LMAX)
     np.testing.assert_allclose(alm_to_healpy(packed, LMAX), alm, atol=1e-15)
@@ -56,13 +122,103 @@ def test_packing_is_inverse_and_keeps_the_norm(alm):
     np.testing.assert_allclose(power, healpy.alm2cl(alm[0]), rtol=1e-12, atol=1e-18)
 
 
-def test_transpose_of_synthesis():
-    rng = np.random.default_rng(0)
-    a = jnp.asarray(rng.normal(size=(2, (LMAX + 1) ** 2)))
-    a = a.at[:, alm_ell(LMAX) < 2].set(0)  # spin 2 has no such modes
-    m = jnp.asarray(rng.normal(size=(2, healpy.nside2npix(NSIDE))))
-    left, right = jnp.vdot(synthesis(a, NSIDE), m), jnp.vdot(a, adjoint_synthesis(m, LMAX))
-    assert float(left) == pytest.approx(float(right), rel=1e-11)
+@pytest.mark.parametrize("lmax", [0, 1, 5, 301, 1535])
+def test_expand_puts_a_function_of_l_in_the_order_of_the_coefficients(lmax):
+    assert lmax_of(expand(jnp.ones(lmax + 1))) == lmax
+    np.testing.assert_array_equal(expand(jnp.arange(lmax + 1)), alm_ell(lmax))
+
+
+@pytest.mark.parametrize("lmax", [0, 3, 40, LMAX, LMAX + 7])
+def test_resize_against_healpy(alm, lmax):
+    expected = np.stack([healpy.resize_alm(row, LMAX, LMAX, lmax, lmax) for row in alm])
+    resized = resize(jnp.asarray(alm_from_healpy(alm, LMAX)), lmax)
+    np.testing.assert_array_equal(resized, alm_from_healpy(expected, lmax))
+
+
+def test_spectra_against_healpy(alm):
+    packed = jnp.asarray(alm_from_healpy(alm, LMAX))
+    auto = np.stack([healpy.alm2cl(row) for row in alm])
+    np.testing.assert_allclose(power_spectrum(packed), auto, rtol=1e-12, atol=1e-18)
+    cross = np.stack([healpy.alm2cl(alm[i], alm[i - 1]) for i in range(3)])
+    crossed = power_spectrum(packed, packed[jnp.array([2, 0, 1])])
+    np.testing.assert_allclose(crossed, cross, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(power_spectrum(packed[1]), auto[1], rtol=1e-12, atol=1e-18)
+
+
+def assert_transpose(function, x, seed=0):
+    """The transpose of a linear function has the same inner products."""
+    y = function(x)
+    other = jnp.asarray(np.random.default_rng(seed).normal(size=y.shape))
+    (back,) = jax.linear_transpose(function, x)(other)
+    assert float(jnp.vdot(y, other)) == pytest.approx(float(jnp.vdot(x, back)), rel=1e-10)
+
+
+@ROWS
+def test_transposes(rows):
+    alm = drawn(LMAX)[rows]
+    maps = jnp.asarray(np.random.default_rng(1).normal(size=(len(alm), 12 * NSIDE**2)))
+    assert_transpose(lambda a: synthesis(a, NSIDE), alm)
+    assert_transpose(lambda m: adjoint_synthesis(m, LMAX), maps)
+    assert_transpose(lambda m: analysis(m, LMAX), maps)
+    assert_transpose(lambda a: rotate(a, "G", "C"), alm)
+    assert_transpose(lambda m: resample(m, gaussian_beam(300.0, 40), 16), maps)
+    np.testing.assert_allclose(
+        adjoint_synthesis(maps, LMAX),
+        jax.linear_transpose(lambda a: synthesis(a, NSIDE), alm)(maps)[0],
+        atol=1e-12,
+    )
+
+
+def test_vmap_is_a_loop():
+    alms = jnp.stack([drawn(16, seed=seed) for seed in range(3)])
+    maps = jax.vmap(lambda a: synthesis(a, 8))(alms)
+    np.testing.assert_allclose(maps, jnp.stack([synthesis(a, 8) for a in alms]), atol=1e-12)
+    back = jax.vmap(lambda m: analysis(m, 16))(maps)
+    np.testing.assert_allclose(back, jnp.stack([analysis(m, 16) for m in maps]), atol=1e-12)
+    turned = jax.vmap(lambda a: rotate(a, "G", "E"))(alms)
+    np.testing.assert_allclose(turned, jnp.stack([rotate(a, "G", "E") for a in alms]), atol=1e-12)
+
+
+def test_gradients_of_transforms():
+    alm = drawn(16)
+    check_grads(lambda a: synthesis(a, 8), (alm,), order=1)
+    check_grads(lambda m: analysis(m, 16), (synthesis(alm, 8),), order=1)
+    check_grads(lambda a: rotate(a, "G", "E"), (alm,), order=1)
+    check_grads(lambda a: power_spectrum(resize(a, 20)), (alm,), order=1)
+
+
+def test_gradients_in_maps_and_beams():
+    maps = jnp.asarray(np.random.default_rng(1).normal(size=(2, healpy.nside2npix(8))))
+    hundreds = jnp.asarray(6.0), jnp.asarray(3.0)
+
+    def smoothed(fwhm, own, m):
+        return smooth(m, 100 * fwhm, 100 * own, lmax=16)
+
+    check_grads(smoothed, (*hundreds, maps), order=1, rtol=1e-5)
+
+    def resampled(fwhm, m):
+        return resample(m, gaussian_beam(100 * fwhm, 16), 4)
+
+    check_grads(resampled, (hundreds[0], maps), order=1, rtol=1e-5)
+    # At equal widths the square root of their difference has no derivative; the window has one.
+    slope = jax.grad(lambda fwhm: beam_ratio(fwhm, 300.0, 16).sum())(300.0)
+    step = (beam_ratio(300.1, 300.0, 16) - 1).sum() / 0.1
+    # One-sided, as the target may not be finer; the error is half the second derivative's.
+    assert float(slope) == pytest.approx(float(step), rel=1e-3)
+
+
+def test_gradients_in_beams_and_tables():
+    table = gaussian_beam(200.0, 30) * (1 + 0.01 * jnp.cos(jnp.arange(31)))
+    check_grads(lambda t: beam_ratio(6 * t[:17] ** 0 * t[:17] ** 2, t, 16), (table,), order=1)
+    for arguments in [(jnp.asarray(6.0), table), (table**3, jnp.asarray(2.0))]:
+        check_grads(
+            lambda over, under: beam_ratio(
+                over if over.ndim else 100 * over, under if under.ndim else 100 * under, 16
+            ),
+            arguments,
+            order=1,
+            rtol=1e-5,
+        )
 
 
 def test_smoothing_against_healpy(alm):
@@ -76,6 +232,63 @@ def test_smoothing_against_healpy(alm):
     np.testing.assert_allclose(ours[1:] * ratio, theirs[1:], atol=1e-4 * theirs[1:].std())
 
 
+def test_smoothing_is_better_than_healpys():
+    alm = drawn(LMAX)
+    fwhm = np.radians(2.0)
+    exact = synthesis(alm * expand(gaussian_beam(120.0, LMAX)), NSIDE)
+    maps = synthesis(alm, NSIDE)
+    ours = smooth(maps, 120.0, lmax=LMAX)
+    theirs = healpy.smoothing(np.asarray(maps), fwhm=fwhm, lmax=LMAX, iter=3)
+    theirs[1:] /= np.exp(2 * (fwhm / np.sqrt(8 * np.log(2))) ** 2)
+    for rows in (slice(0, 1), slice(1, 3)):
+        error = rms(ours[rows] - exact[rows])
+        assert error < 1e-6 * rms(exact[rows])
+        assert error < rms(theirs[rows] - exact[rows])
+
+
+def test_smoothing_keeps_a_map_at_its_own_beam():
+    maps = synthesis(drawn(LMAX) * expand(gaussian_beam(200.0, LMAX)), NSIDE)
+    np.testing.assert_allclose(smooth(maps, 200.0, 200.0), maps, atol=1e-6)
+    twice = smooth(smooth(maps, 300.0, 200.0), 500.0, 300.0)
+    np.testing.assert_allclose(smooth(maps, 500.0, 200.0), twice, atol=1e-6)
+
+
+def test_windows_of_beams():
+    ell = np.arange(101)
+    # healpy's window of the same beam, in temperature.
+    np.testing.assert_allclose(
+        gaussian_beam(90.0, 100), healpy.gauss_beam(np.radians(1.5), 100), rtol=1e-12
+    )
+    ratio = beam_ratio(50.0, 30.0, 100)
+    np.testing.assert_allclose(ratio, gaussian_beam(40.0, 100), rtol=1e-12)
+    # A Gaussian as a table is the Gaussian, on either side.
+    wide, narrow = gaussian_beam(50.0, 100), gaussian_beam(30.0, 120)
+    for target, own in [(wide, 30.0), (50.0, narrow), (wide, narrow)]:
+        np.testing.assert_allclose(beam_ratio(target, own, 100), ratio, rtol=1e-12)
+    # What a beam has erased does not come back.
+    table = np.where(ell < 50, 0.5, 0.0)
+    assert np.all(beam_ratio(table, table, 100) == (ell < 50))
+
+
+def test_the_last_multipole_that_is_needed():
+    window = gaussian_beam(400.0, 500)
+    last = needed_lmax(window)
+    assert window[last] > 1e-12 >= window[last + 1]
+    assert needed_lmax(gaussian_beam(0.0, 500)) == 500
+    assert needed_lmax(np.zeros(5)) == 0
+
+
+def test_window_of_a_pixel_is_that_of_averaging():
+    # From samples to means over 16 x 16 of them; pixels differ in shape, so within 1 %.
+    fine = synthesis(drawn(2 * NSIDE, 1), 16 * NSIDE)
+    low = 3 * NSIDE // 2
+    means = analysis(average_pixels(fine, NSIDE), 2 * NSIDE)
+    factor = power_spectrum(means, drawn(2 * NSIDE, 1)) / power_spectrum(drawn(2 * NSIDE, 1))
+    smoothed = np.convolve(factor[0], np.ones(5) / 5, "same")
+    np.testing.assert_allclose(smoothed[8:low:8], pixel_window(NSIDE, low)[8:low:8], rtol=0.01)
+    assert pixel_window(NSIDE, low)[low - 1] < 0.9
+
+
 def test_degrading_by_coefficients_keeps_what_fits(alm):
     maps = jnp.asarray(healpy.alm2map(alm, NSIDE, lmax=LMAX))
     low = resample(maps, jnp.ones(17), 8)
@@ -85,18 +298,25 @@ def test_degrading_by_coefficients_keeps_what_fits(alm):
     np.testing.assert_allclose(low, expected, atol=2e-3 * float(maps.std()))
 
 
+def test_low_multipoles_are_free_of_those_above():
+    alm = drawn(LMAX)
+    maps = synthesis(alm, NSIDE)
+    kept = low_multipoles(maps, 24)
+    assert rms(kept - resize(alm, 24)) < 1e-6 * rms(alm)
+    # An analysis that ends there has what lies above in it.
+    assert rms(analysis(maps, 24) - resize(alm, 24)) > 100 * rms(kept - resize(alm, 24))
+    # Above 2 nside a map has nothing to be trusted.
+    assert np.all(low_multipoles(maps, 80)[:, alm_ell(80) > LMAX] == 0)
+
+
 def test_averaging_pixels_is_healpys(alm):
     maps = healpy.alm2map(alm, NSIDE, lmax=LMAX)
     np.testing.assert_allclose(average_pixels(maps, 8), healpy.ud_grade(maps, 8), atol=1e-12)
-
-
-def test_gradient_in_the_beam():
-    maps = jnp.asarray(np.random.default_rng(1).normal(size=(2, healpy.nside2npix(8))))
-
-    def smoothed(fwhm, m):
-        return resample(m, gaussian_beam(fwhm * 100, 16), 4)
-
-    check_grads(smoothed, (jnp.asarray(6.0), maps), order=1, rtol=1e-5)
+    pixels = children(jnp.arange(healpy.nside2npix(NSIDE)), 8)
+    theta, phi = healpy.pix2ang(NSIDE, np.asarray(pixels))
+    np.testing.assert_array_equal(
+        healpy.ang2pix(8, theta, phi), np.arange(healpy.nside2npix(8))[:, None] + 0 * pixels
+    )
 
 
 def test_single_precision():
@@ -104,29 +324,57 @@ def test_single_precision():
     assert resample(maps, gaussian_beam(jnp.float32(600.0), 16), 4).dtype == jnp.float32
 
 
-def test_cmb_spectra_and_realisation():
-    spectra = cmb.camb_spectra(LMAX, r=0.1)
-    TT, _, BB, _ = spectra
-    assert spectra.shape == (4, LMAX + 1)
-    # D_l of TT at l = 10 is about 850 uK^2; r = 0.1 lifts BB over that of lensing.
-    assert 700 < 110 / (2 * np.pi) * TT[10] < 1000
-    assert BB[10] > 3 * cmb.camb_spectra(LMAX)[2][10]
-    keys = jax.random.split(jax.random.key(0), 300)
-    alms = jax.vmap(lambda k: cmb.realisation(k, jnp.asarray(spectra), "IQU"))(keys)
-    ell = alm_ell(LMAX)
-    for degree in (2, 30, 64):
-        modes = np.asarray(alms[:, :, ell == degree]).swapaxes(0, 1).reshape(3, -1)
-        measured = modes @ modes.T / modes.shape[1]
-        tt, ee, bb, te = spectra[:, degree]
-        expected = np.array([[tt, te, 0], [te, ee, 0], [0, 0, bb]])
-        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-        np.testing.assert_allclose(
-            measured / scale, expected / scale, atol=6 / modes.shape[1] ** 0.5
-        )
+def test_refuses_beams_that_are_finer_than_the_maps_own():
+    maps = jnp.ones((1, 768))
+    with pytest.raises(
+        ValueError, match=r"target beam of 30 arcmin is finer than that of the map, 60 arcmin\."
+    ):
+        smooth(maps, 30.0, 60.0)
+    with pytest.raises(ValueError, match="finer than that of the dust, 60 arcmin"):
+        beam_ratio(30.0, 60.0, 10, what="the dust")
+    with pytest.raises(
+        ValueError, match=r"finer than that of the dust: at l = 80 their windows are .* and "
+    ):
+        beam_ratio(30.0, gaussian_beam(60.0, 100), 80, what="the dust")
+    # The tail of a measured table may be negative.
+    table = gaussian_beam(60.0, 100).at[90].set(-1e-3)
+    with pytest.raises(ValueError, match=r"at l = 90 their windows are 0\.8.* and -0\.001\."):
+        beam_ratio(60.0, table, 100)
+    # By as much as tables scatter, it may be finer.
+    assert float(beam_ratio(table[:80] * 1.005, table, 79).max()) == pytest.approx(1.005)
 
 
-def test_cmb_refuses_nonsense():
-    with pytest.raises(ValueError, match="`r` must not be negative, but is -1"):
-        cmb.camb_spectra(10, r=-1)
-    with pytest.raises(ValueError, match="`stokes` must be 'QU' or 'IQU', not 'Q'"):
-        cmb.realisation(jax.random.key(0), jnp.ones((4, 5)), "Q")
+def test_refuses_tables_that_are_too_short():
+    table = gaussian_beam(60.0, 50)
+    with pytest.raises(ValueError, match="beam table of the dust ends at l = 50, not at 51"):
+        beam_ratio(90.0, table, 51, what="the dust")
+    with pytest.raises(ValueError, match="beam table of the target ends at l = 50, not at 51"):
+        beam_ratio(table, 30.0, 51, what="the dust")
+
+
+def test_refuses_engines_and_coordinates_that_it_does_not_know():
+    alm, maps = drawn(4), jnp.ones((3, 48))
+    message = "`engine` must be one of ducc, healpy, not 's2fft'"
+    with pytest.raises(ValueError, match=message):
+        synthesis(alm, 2, engine="s2fft")
+    with pytest.raises(ValueError, match=message):
+        analysis(maps, 4, engine="s2fft")
+    with pytest.raises(ValueError, match=message):
+        rotate(alm, "G", "C", engine="s2fft")
+    with pytest.raises(ValueError, match="`source` must be one of G, E, C, not 'Q'"):
+        rotate(alm, "Q", "C")
+    with pytest.raises(ValueError, match="`target` must be one of G, E, C, not 'g'"):
+        rotate(alm, "G", "g")
+
+
+def test_refuses_single_precision_of_the_program():
+    alm = np.ones((1, 16))
+    jax.config.update("jax_enable_x64", False)
+    try:
+        # Of sizes that no other test uses: the check is made once for each.
+        with pytest.raises(RuntimeError, match="spherical harmonic transform needs double"):
+            synthesis(jnp.asarray(alm), 1)
+        with pytest.raises(RuntimeError, match="A rotation needs double precision"):
+            rotate(jnp.asarray(alm), "G", "C")
+    finally:
+        jax.config.update("jax_enable_x64", True)

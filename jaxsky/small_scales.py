@@ -272,7 +272,7 @@ def _injected_matrix(
     rho = _correlations(alms, ranges)
     there = jax.vmap(lambda one: jax.vmap(lambda other: power_spectrum(one, other))(alms))(alms)
     root = jnp.sqrt(target)
-    matrix = rho[..., None] * root[:, None] * root[None] - there[..., : root.shape[-1]]
+    matrix = rho[..., None] * root[:, None] * root[None] - there
     present = (injected[:, None] > 0) & (injected[None] > 0)
     on_diagonal = jnp.eye(len(injected), dtype=bool)[..., None]
     return jnp.where(on_diagonal, injected[:, None], jnp.where(present, matrix, 0.0))
@@ -336,9 +336,8 @@ def continue_templates(
     parts = [
         extrapolate(alm, beam, how, lmax) for alm, beam, how in zip(alms, own, small, strict=True)
     ]
-    wide = max(lmax, *known)
     stay = [
-        resize(alm * expand(part.transfer), wide) for alm, part in zip(alms, parts, strict=True)
+        resize(alm * expand(part.transfer), lmax) for alm, part in zip(alms, parts, strict=True)
     ]
     if len(maps) == 1:
         matrix = jnp.eye(2)[..., None] * parts[0].injected[:, None]

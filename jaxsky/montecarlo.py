@@ -190,10 +190,10 @@ def run(
             small = key if random else jax.random.key(main.small_scales_seed or 0)
             prepared = prepare(small, setup.sources, observation, terms)
             for name, source in prepared.items():
-                if repaired := int(source.repaired):
+                if setup.sources[name].correlated_with and int(source.repaired):
                     note(
-                        f"{name}: the extrapolated cross-spectra exceed what the auto-spectra "
-                        f"allow at {repaired} multipoles; correlations were reduced there."
+                        f"{name}: its extrapolated cross-spectra exceed what the auto-spectra "
+                        f"allow at {source.repaired} multipoles; correlations were reduced there."
                     )
         start = time.perf_counter()
         components = "components" in main.outputs

@@ -305,9 +305,9 @@ def continue_templates(
 
     With one key the result is differentiable in slopes, tilts, amplitudes, beams and maps. Of
     a single template E and B are independent; several keep their coefficients of correlation,
-    E with B and template with template (the paper's dust and AME, after Brown & Battye 2011).
-    The spectra are divided by the means of the products of the modulations, so that those of
-    the modulated maps are the extrapolated ones.
+    E with B and template with template (the paper's dust and AME, after Brown & Battye 2011),
+    and are modulated by the mean of their modulations. The spectra are divided by the mean
+    square of the modulation, so that those of the modulated maps are the extrapolated ones.
 
     Parameters
     ----------
@@ -344,17 +344,15 @@ def continue_templates(
     else:
         ranges = [r for how in small for r in (how.EE, how.BB)]
         matrix = _injected_matrix(jnp.concatenate(stay), parts, ranges)
-    gains = jnp.stack(
-        [
-            modulation(each, how.modulation_fwhm, nside)
-            for each, how in zip(maps, small, strict=True)
-        ]
-    )
-    power = jnp.repeat(jnp.repeat(gains @ gains.T / gains.shape[-1], 2, 0), 2, 1)
-    matrix, repaired = correlated.repair(matrix / power[..., None])
+    gains = [
+        modulation(each, how.modulation_fwhm, nside) for each, how in zip(maps, small, strict=True)
+    ]
+    # One for all: two that differ would make the maps less correlated than the fields.
+    gain = sum(gains) / len(gains)
+    matrix, repaired = correlated.repair(matrix / jnp.mean(gain**2))
     drawn = correlated.realisation(key, matrix)
     result = []
-    for i, (template, how, gain) in enumerate(zip(stay, small, gains, strict=True)):
+    for i, (template, how) in enumerate(zip(stay, small, strict=True)):
         added = analysis(gain * synthesis(drawn[2 * i : 2 * i + 2], nside), lmax)
         rise = _rise((how.EE[1], how.BB[1]), lmax)
         result.append(template + how.amplitude * expand(rise) * added)

@@ -61,7 +61,7 @@ def test_synthesis_and_analysis_against_healpy(alm, rows):
     packed = jnp.asarray(alm_from_healpy(alm[rows], LMAX))
     np.testing.assert_allclose(synthesis(packed, NSIDE), maps, atol=1e-10 * maps.std())
     back = np.asarray(analysis(jnp.asarray(maps), LMAX))
-    # Ring weights and two Jacobi steps; band-limited to 2 nside.
+    # Ring weights and three Jacobi steps; band-limited to 2 nside.
     np.testing.assert_allclose(back, packed, atol=1e-4 * float(packed.std()))
     # healpy's own error with iter=3 is as large.
     reference = alm_from_healpy(healpy.map2alm(healpy.alm2map(alm, NSIDE), LMAX, iter=3), LMAX)
@@ -189,17 +189,11 @@ def test_gradients_of_transforms():
 
 def test_gradients_in_maps_and_beams():
     maps = jnp.asarray(np.random.default_rng(1).normal(size=(2, healpy.nside2npix(8))))
-    hundreds = jnp.asarray(6.0), jnp.asarray(3.0)
 
     def smoothed(fwhm, own, m):
         return smooth(m, 100 * fwhm, 100 * own, lmax=16)
 
-    check_grads(smoothed, (*hundreds, maps), order=1, rtol=1e-5)
-
-    def resampled(fwhm, m):
-        return resample(m, gaussian_beam(100 * fwhm, 16), 4)
-
-    check_grads(resampled, (hundreds[0], maps), order=1, rtol=1e-5)
+    check_grads(smoothed, (jnp.asarray(6.0), jnp.asarray(3.0), maps), order=1, rtol=1e-5)
     # At equal widths the square root of their difference has no derivative; the window has one.
     slope = jax.grad(lambda fwhm: beam_ratio(fwhm, 300.0, 16).sum())(300.0)
     step = (beam_ratio(300.1, 300.0, 16) - 1).sum() / 0.1
@@ -208,9 +202,12 @@ def test_gradients_in_maps_and_beams():
 
 
 def test_gradients_in_beams_and_tables():
-    table = gaussian_beam(200.0, 30) * (1 + 0.01 * jnp.cos(jnp.arange(31)))
-    check_grads(lambda t: beam_ratio(6 * t[:17] ** 0 * t[:17] ** 2, t, 16), (table,), order=1)
-    for arguments in [(jnp.asarray(6.0), table), (table**3, jnp.asarray(2.0))]:
+    table = gaussian_beam(200.0, 30) * (1 - 0.01 * jnp.sin(jnp.arange(31)) ** 2)
+    for arguments in [
+        (jnp.asarray(6.0), table),
+        (table**3, jnp.asarray(1.0)),
+        (table**3, table),
+    ]:
         check_grads(
             lambda over, under: beam_ratio(
                 over if over.ndim else 100 * over, under if under.ndim else 100 * under, 16
@@ -246,11 +243,12 @@ def test_smoothing_is_better_than_healpys():
         assert error < rms(theirs[rows] - exact[rows])
 
 
-def test_smoothing_keeps_a_map_at_its_own_beam():
+def test_smoothing_starts_at_the_beam_of_the_map():
     maps = synthesis(drawn(LMAX) * expand(gaussian_beam(200.0, LMAX)), NSIDE)
-    np.testing.assert_allclose(smooth(maps, 200.0, 200.0), maps, atol=1e-6)
+    # The largest error of the analysis, near the poles.
+    np.testing.assert_allclose(smooth(maps, 200.0, 200.0), maps, atol=1e-5)
     twice = smooth(smooth(maps, 300.0, 200.0), 500.0, 300.0)
-    np.testing.assert_allclose(smooth(maps, 500.0, 200.0), twice, atol=1e-6)
+    np.testing.assert_allclose(smooth(maps, 500.0, 200.0), twice, atol=1e-5)
 
 
 def test_windows_of_beams():
@@ -286,7 +284,7 @@ def test_window_of_a_pixel_is_that_of_averaging():
     factor = power_spectrum(means, drawn(2 * NSIDE, 1)) / power_spectrum(drawn(2 * NSIDE, 1))
     smoothed = np.convolve(factor[0], np.ones(5) / 5, "same")
     np.testing.assert_allclose(smoothed[8:low:8], pixel_window(NSIDE, low)[8:low:8], rtol=0.01)
-    assert pixel_window(NSIDE, low)[low - 1] < 0.9
+    assert pixel_window(NSIDE, low)[low - 1] < 0.92
 
 
 def test_degrading_by_coefficients_keeps_what_fits(alm):
@@ -338,7 +336,7 @@ def test_refuses_beams_that_are_finer_than_the_maps_own():
         beam_ratio(30.0, gaussian_beam(60.0, 100), 80, what="the dust")
     # The tail of a measured table may be negative.
     table = gaussian_beam(60.0, 100).at[90].set(-1e-3)
-    with pytest.raises(ValueError, match=r"at l = 90 their windows are 0\.8.* and -0\.001\."):
+    with pytest.raises(ValueError, match=r"at l = 90 their windows are 0\.799 and -0\.001\."):
         beam_ratio(60.0, table, 100)
     # By as much as tables scatter, it may be finer.
     assert float(beam_ratio(table[:80] * 1.005, table, 79).max()) == pytest.approx(1.005)

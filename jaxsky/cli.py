@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -214,14 +215,20 @@ def simulate(
         from jaxsky.io import read_maps
 
         setup = experiment.build(settings)
-        montecarlo.claim(out, settings, resume, overwrite)
+        montecarlo.check_folder(out, settings, resume, overwrite)
         names = setup.observation.names
         progress.update(task, total=nsims * len(names))
         seconds, notes = {}, dict[str, None]()  # a set that keeps its order
         indices = range(first, first + nsims)
         try:
             for file in montecarlo.run(
-                settings, setup, out, indices, report, lambda note: notes.setdefault(note)
+                settings,
+                setup,
+                out,
+                indices,
+                overwrite,
+                report,
+                lambda note: notes.setdefault(note),
             ):
                 progress.advance(task)
                 if file.seconds is not None:
@@ -244,7 +251,7 @@ def simulate(
                 settings.experiment.unit,
                 settings.title,
             )
-    console.print(setup.description, highlight=False)
+    console.print(setup.description, highlight=False, markup=False)
     for sentence in notes:
         console.print(f"[yellow](!)[/] {sentence}", highlight=False)
     kept = nsims * len(names) - len(seconds)
@@ -284,5 +291,5 @@ def main() -> None:
         app()
     except (ValueError, KeyError, OSError) as error:
         message = error.args[0] if isinstance(error, KeyError) else error
-        console.print(f"[red]jaxsky:[/] {message}", highlight=False, soft_wrap=True)
+        console.print(f"[red]jaxsky:[/] {escape(str(message))}", highlight=False, soft_wrap=True)
         sys.exit(2)

@@ -8,8 +8,9 @@ import healpy
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from jaxsky.bandpass import Bandpass
 from jaxsky.cmb import camb_spectra
 from jaxsky.galaxy import GalaxyModel, embedded_sky
 from jaxsky.inputs import (
@@ -20,7 +21,7 @@ from jaxsky.inputs import (
     set_parameters_of,
 )
 from jaxsky.instrument import load_instrument
-from jaxsky.io import read_beam, read_spectra
+from jaxsky.io import InputError, read_beam, read_spectra
 from jaxsky.observation import Observation, ObservedBand, Source
 from jaxsky.settings import (
     BandpassSpec,
@@ -34,7 +35,7 @@ from jaxsky.settings import (
     load,
 )
 from jaxsky.small_scales import SmallScales
-from jaxsky.units import parse_unit
+from jaxsky.units import UNITS
 
 __all__ = ["DEFAULT", "EXAMPLE", "Experiment", "Setup", "build", "load_experiment"]
 
@@ -105,6 +106,8 @@ class CMBTable(Table):
     def _one_source(self) -> "CMBTable":
         if self.spectra is not None and (self.r or self.cosmology):
             raise ValueError("r and cosmology are for CAMB; leave them out with spectra")
+        if self.spectra is None and (self.format or self.unit):
+            raise ValueError("format and unit are those of spectra, a file")
         return self
 
 
@@ -121,15 +124,16 @@ class NoiseTable(NoiseFile):
 
     @field_validator("unit")
     @classmethod
-    def _known(cls, value: str, info: ValidationInfo) -> str:
-        parse_unit(value)
+    def _known(cls, value: str) -> str:
+        if UNITS.get(value, (1.0, ""))[1] not in ("K_RJ", "K_CMB"):
+            raise ValueError(f"must be a temperature such as uK_RJ or mK_CMB, not {value!r}")
         return value
 
 
 class BandTable(Table):
     """A band of an experiment of one's own."""
 
-    name: str = Field(min_length=1, pattern=r"^[\w.+-]+$")
+    name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_+-][A-Za-z0-9_.+-]*$")
     bandpass: BandpassSpec
     fwhm: float | None = Field(None, ge=0)
     beam: str | None = None
@@ -159,6 +163,8 @@ class Experiment(SettingsFile):
             raise ValueError("give either experiment.instrument or bands")
         if self.bands and self.experiment.channels:
             raise ValueError("experiment.channels chooses from an instrument, not from bands")
+        if self.bands and "samples" in self.experiment.model_fields_set:
+            raise ValueError("experiment.samples is of an instrument's bands, not of bands")
         if self.embedded is not None and self.templates:
             raise ValueError("give either templates or the table embedded")
         names = [band.name for band in self.bands]
@@ -283,6 +289,9 @@ def _templates(settings: Experiment) -> tuple[dict[str, Template], str]:
     else:
         embedded = settings.embedded
         numbers: dict[str, Any] = embedded.model
+        known = GalaxyModel.__dataclass_fields__
+        for name in set(numbers) - set(known):
+            raise SettingsError(f"embedded.model: {name!r} is none of {', '.join(known)}.")
         try:
             model = GalaxyModel(**numbers)
         except (TypeError, ValueError) as error:
@@ -351,7 +360,7 @@ def _channels(settings: Experiment) -> dict[str, ObservedBand]:
             )
         return channels
     for spec in settings.bands:
-        band = read_bandpass_spec(folder, spec.bandpass)
+        band = _band(folder, spec)
         noise = None
         if noisy and spec.noise is not None:
             if spec.noise.level is not None:
@@ -376,6 +385,15 @@ def _channels(settings: Experiment) -> dict[str, ObservedBand]:
             band, jnp.asarray(beam), target, noise, main.diagonal_noise
         )
     return channels
+
+
+def _band(folder: Path, spec: BandTable) -> Bandpass:
+    try:
+        return read_bandpass_spec(folder, spec.bandpass)
+    except InputError:
+        raise
+    except ValueError as error:
+        raise SettingsError(f"bands.{spec.name}.bandpass: {error}") from None
 
 
 def _cmb(settings: Experiment, lmax: int) -> Float[np.ndarray, "4 ell"]:

@@ -19,12 +19,12 @@ from jaxsky.experiment import Experiment, Setup
 from jaxsky.io import write_maps, write_text
 from jaxsky.simulate import Prepared, observe_bands, plan, prepare
 
-__all__ = ["LOG", "Written", "claim", "paths", "realisation_key", "run"]
+__all__ = ["LOG", "Written", "check_folder", "paths", "realisation_key", "run"]
 
 LOG = "simulation.json"
 PACKAGES = ("jaxsky", "jax", "numpy", "healpy", "ducc0", "jaxbind", "camb")
 #: Settings that do not change what a realisation is.
-LAYOUT = {"title", "data_dir"}
+LAYOUT: Any = {"title": True, "data_dir": True, "experiment": {"sheet"}}
 
 
 class Written(NamedTuple):
@@ -50,19 +50,21 @@ def _content(settings: Experiment) -> dict[str, Any]:
     return settings.model_dump(mode="json", exclude_none=True, exclude=LAYOUT)
 
 
-def claim(out: Path, settings: Experiment, resume: bool, overwrite: bool) -> None:
-    """Make the folder of the results and leave a log of what they are in it.
+def check_folder(out: Path, settings: Experiment, resume: bool, overwrite: bool) -> None:
+    """Whether realisations with these settings may be written to a folder.
 
     Raises
     ------
     ValueError
-        If there are results already and they are neither to be resumed nor replaced, or those to
-        be resumed are of other settings.
+        If there are results already and they are neither to be resumed nor replaced, or it is
+        not known that those to be resumed are of the same settings.
     """
     log = out / LOG
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is not a folder; choose another --out.")
-    if log.exists() and not overwrite:
+    if overwrite:
+        return
+    if log.exists():
         if not resume:
             raise ValueError(
                 f"{out}: holds a simulation already; go on with --resume, replace it with "
@@ -77,10 +79,24 @@ def claim(out: Path, settings: Experiment, resume: bool, overwrite: bool) -> Non
                 f"{out}: holds a simulation with other settings; choose another --out, or start "
                 "again with --overwrite."
             )
-        return
+    elif any(_maps(out)):
+        raise ValueError(
+            f"{out}: holds maps of unknown settings, for {LOG} is missing; choose another --out, "
+            "or start again with --overwrite."
+        )
+
+
+def _maps(out: Path) -> Iterator[Path]:
+    return out.glob("sim_*/*.fits")
+
+
+def _claim(out: Path, settings: Experiment, overwrite: bool) -> None:
+    """Make the folder and leave a log of what is in it, unless that is there."""
     if overwrite:
-        for path in out.glob("sim_*/*.fits"):
+        for path in _maps(out):
             path.unlink()
+    elif (out / LOG).exists():
+        return
     out.mkdir(parents=True, exist_ok=True)
     versions = {name: version(name) for name in PACKAGES}
     content = {
@@ -89,7 +105,7 @@ def claim(out: Path, settings: Experiment, resume: bool, overwrite: bool) -> Non
         "versions": versions,
         "settings": _content(settings),
     }
-    write_text(log, json.dumps(content, indent=2) + "\n")
+    write_text(out / LOG, json.dumps(content, indent=2) + "\n")
 
 
 def _header(settings: Experiment, setup: Setup, name: str, index: int) -> dict[str, Any]:
@@ -98,7 +114,7 @@ def _header(settings: Experiment, setup: Setup, name: str, index: int) -> dict[s
     nu = np.asarray(channel.band.nu)
     header: dict[str, Any] = {
         "CREATOR": (f"jaxsky {jaxsky.__version__}", "software"),
-        "INSTRUME": (main.instrument or settings.title or "own bands", "instrument"),
+        "INSTRUME": (main.instrument or _ascii(settings.title) or "own bands", "instrument"),
         "BAND": (name, "name of the band"),
         "FREQ": (float(channel.band.center), "[GHz] mean frequency of the band"),
         "FREQMIN": (float(nu.min()), "[GHz] lower end of the band"),
@@ -118,8 +134,13 @@ def _header(settings: Experiment, setup: Setup, name: str, index: int) -> dict[s
         header["NOISE"] = (float(noise), "[uK_RJ arcmin] noise before smoothing")
     to_CMB = float(channel.band.conversion("uK_RJ", "uK_CMB"))
     header["RJ2CMB"] = (to_CMB, "uK_CMB per uK_RJ in this band")
-    header["COMMENT"] = setup.description
+    header["COMMENT"] = _ascii(setup.description)
     return header
+
+
+def _ascii(text: str) -> str:
+    """Text as FITS headers take it: one line of ASCII."""
+    return " ".join(text.split()).encode("ascii", "replace").decode()
 
 
 def _write(
@@ -150,18 +171,21 @@ def run(
     setup: Setup,
     out: Path,
     indices: range,
+    overwrite: bool = False,
     report: Callable[[str], None] = lambda message: None,
     note: Callable[[str], None] = lambda message: None,
 ) -> Iterator[Written]:
     """Simulate realisations into files, one for each band; files that are there are kept.
 
-    A realisation depends on the seed and its number only.
+    A realisation depends on the seed and its number only. The folder is touched when the first
+    map is ready: what goes wrong before costs nothing.
 
     Parameters
     ----------
     settings, setup : from `jaxsky.experiment`
-    out : folder, from `claim`
+    out : folder, see `check_folder`
     indices : numbers of the realisations
+    overwrite : remove all maps that are in the folder
     report : called with a line before each step of the work
     note : called with sentences that a user should know
 
@@ -177,9 +201,11 @@ def run(
         source.small_scales is not None for source in setup.sources.values()
     )
     cmb = None if setup.cmb is None else jnp.asarray(setup.cmb)
+    claimed = False
     for index in indices:
         files = paths(out, observation.names, index)
-        missing = [name for name, path in files.items() if not path.exists()]
+        stale = overwrite and not claimed
+        missing = [name for name, path in files.items() if stale or not path.exists()]
         yield from (Written(index, n, files[n], None) for n in files if n not in missing)
         if not missing:
             continue
@@ -202,6 +228,9 @@ def run(
             report(f"band {name}")
             factor = float(observation.channels[name].band.conversion("uK_RJ", main.unit))
             header = _header(settings, setup, name, index)
+            if not claimed:
+                _claim(out, settings, overwrite)
+                claimed = True
             _write(files[name], maps, settings, header, factor)
             now = time.perf_counter()
             yield Written(index, name, files[name], now - start)

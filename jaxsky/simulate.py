@@ -85,14 +85,17 @@ def _continued(
     for leader in sorted(set(leaders.values())):
         group = [leader, *sorted(n for n, first in leaders.items() if first == leader != n)]
         members = [sources[name] for name in group]
-        continued = continue_templates(
-            stream(key, "small scales", leader),
-            [source.component.template for source in members],
-            [source.fwhm for source in members],
-            [source.small_scales for source in members if source.small_scales is not None],
-            observation.nside,
-            observation.lmax,
-        )
+        try:
+            continued = continue_templates(
+                stream(key, "small scales", leader),
+                [source.component.template for source in members],
+                [source.fwhm for source in members],
+                [source.small_scales for source in members if source.small_scales is not None],
+                observation.nside,
+                observation.lmax,
+            )
+        except ValueError as error:
+            raise ValueError(f"Small scales of {', '.join(group)}: {error}") from None
         for name, alm in zip(group, continued.alms, strict=True):
             result[name] = alm, continued.repaired, 0.0
     return result
@@ -214,11 +217,13 @@ def _check_sources(sources: Mapping[str, Source], observation: Observation) -> N
             leader not in sources
             or leader == name
             or sources[leader].small_scales is None
+            or sources[leader].correlated_with is not None
             or source.small_scales is None
         ):
             raise ValueError(
                 f"The small scales of {name!r} are to be correlated with those of {leader!r}: "
-                "both need to be components with small scales."
+                "both need to be components with small scales, and the second one must not be "
+                "correlated with yet another."
             )
 
 
@@ -287,10 +292,15 @@ def observe_bands(
     Raises
     ------
     ValueError
-        If the beam of a channel is finer than that of a component, or the CMB's spectra end
-        below 2 nside.
+        If the beam of a channel is finer than that of a component, the CMB's spectra end below
+        2 nside, or there is nothing to observe in a channel.
     """
     nside, lmax, stokes = observation.nside, observation.lmax, observation.stokes
+    for name, channel in observation.channels.items():
+        if not prepared and cmb is None and channel.noise is None:
+            raise ValueError(
+                f"Nothing is left to be observed in band {name!r}: no component, no CMB, no noise."
+            )
     weights = {
         name: term_weights(source.component, observation.bands, source.terms)
         for name, source in prepared.items()
@@ -329,8 +339,6 @@ def observe_bands(
         if noise is not None and not isinstance(noise, _Part):
             total = total + noise
             maps = {**maps, "noise": noise} if components else maps
-        elif not parts:
-            raise ValueError("Nothing is left to be observed: no component, no CMB, no noise.")
         yield name, {**maps, "total": jnp.asarray(total)}
 
 

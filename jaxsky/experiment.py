@@ -239,11 +239,11 @@ def build(settings: Experiment) -> Setup:
                     f"experiment.fwhm: {target:g} arcmin is finer than the beam of band {name!r}, "
                     f"{own:g} arcmin."
                 )
-    templates, description = _templates(settings)
+    used = [name for name in included if name in settings.foregrounds()]
+    templates, description = _templates(settings) if used else ({}, "No foregrounds.")
+    templates = {name: templates[name] for name in used}
     _check_templates(settings, templates, seen)
-    sources = {
-        name: _source(settings, name, templates[name]) for name in included if name in templates
-    }
+    sources = {name: _source(settings, name, template) for name, template in templates.items()}
     lmax = _lmax(channels, target, main.nside)
     observation = Observation(channels, main.nside, main.stokes, min(seen.values()), lmax)
     cmb = _cmb(settings, lmax) if "cmb" in included else None
@@ -262,9 +262,17 @@ def _width(beam: Array | float) -> float:
 
 def _lmax(channels: Mapping[str, ObservedBand], target: float | None, nside: int) -> int:
     """The last multipole that any of the maps shows, at most 2 nside."""
-    width = min(_width(c.beam) for c in channels.values()) if target is None else target
-    sigma = np.radians(width / 60) / np.sqrt(8 * np.log(2))
-    return int(min(2 * nside, max(2.0, np.sqrt(-2 * np.log(UNSEEN_WINDOW)) / max(sigma, 1e-9))))
+    beams = [c.beam for c in channels.values()] if target is None else [target]
+    return int(min(2 * nside, max(2.0, *map(_reach, beams))))
+
+
+def _reach(beam: Array | float) -> float:
+    """The last multipole that a beam lets through; a table may fall less fast than a Gaussian."""
+    table = np.asarray(beam)
+    if table.ndim:
+        return float(np.flatnonzero(np.abs(table) > UNSEEN_WINDOW).max())
+    sigma = np.radians(float(table) / 60) / np.sqrt(8 * np.log(2))
+    return float(np.sqrt(-2 * np.log(UNSEEN_WINDOW)) / max(sigma, 1e-9))
 
 
 def _check_pixels(nside: int, beams: Mapping[str, float]) -> None:

@@ -44,16 +44,23 @@ def save(figure: plt.Figure, path: Path) -> None:
     plt.close(figure)
 
 
-def _image(axes: Axes, pixels: np.ndarray, limit: float, label: str, **options: Any) -> None:
+def _image(
+    axes: Axes, pixels: np.ndarray, limit: float, label: str, linear: bool = False, **options: Any
+) -> None:
     """Values about zero with a bar of colours, linear up to a tenth of the limit, then logarithmic.
 
-    So the Galactic plane and high latitudes show in one picture.
+    So the Galactic plane and high latitudes show in one picture. Or linear throughout. The limit
+    is rounded to one digit.
     """
-    norm = mpl.colors.AsinhNorm(linear_width=limit / 10, vmin=-limit, vmax=limit)
+    limit = float(f"{limit:.1g}")
+    norm: mpl.colors.Normalize
+    if linear:
+        norm, between = mpl.colors.Normalize(-limit, limit), limit / 2
+    else:
+        norm, between = mpl.colors.AsinhNorm(limit / 10, -limit, limit), limit / 10
     image = axes.imshow(pixels, origin="lower", cmap="RdBu_r", norm=norm, **options)
     bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02, extend="both")
-    rounded = float(f"{limit:.1g}")
-    bar.set_ticks([-rounded, -rounded / 10, 0, rounded / 10, rounded])
+    bar.set_ticks([-limit, -between, 0, between, limit])
     bar.ax.yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
     bar.ax.minorticks_off()
     bar.set_label(label)
@@ -76,7 +83,10 @@ def draw_patch(
     limit: float,
     label: str,
 ) -> None:
-    """A square patch of the sky about (l, b), all in degrees; gnomonic, l growing to the left."""
+    """A square patch of the sky about (l, b), all in degrees; gnomonic, l growing to the left.
+
+    Unlike those of `draw_map`, its colours are linear.
+    """
     nside = healpy.npix2nside(values.size)
     xsize = 300
     projector = healpy.projector.GnomonicProj(
@@ -84,7 +94,7 @@ def draw_patch(
     )
     pixels = projector.projmap(np.asarray(values), lambda x, y, z: healpy.vec2pix(nside, x, y, z))
     half = size / 2
-    _image(axes, pixels, limit, label, extent=(half, -half, -half, half))
+    _image(axes, pixels, limit, label, linear=True, extent=(half, -half, -half, half))
     axes.set_xlabel(rf"$(l - {center[0]:g}^\circ)\,\cos b$ [deg]")
     axes.set_ylabel(rf"$b - {center[1]:g}^\circ$ [deg]")
 

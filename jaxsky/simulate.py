@@ -144,9 +144,9 @@ def _levels(
     return levels
 
 
-def _iterations(size: float) -> int:
+def _iterations(size: float, nside: int) -> int:
     """Jacobi steps for a term that adds so much: each gains at least a factor of 20."""
-    return 2 if size > 0.02 else 1 if size > 1e-3 else 0
+    return (2 if size > 0.02 else 1 if size > 1e-3 else 0) + (nside < 128)
 
 
 def prepare(
@@ -193,7 +193,7 @@ def prepare(
             result[name] = Prepared(component, None, (), template, fwhm, repaired)
             continue
         alms = tuple(
-            analysis(template * term(component, chosen, i), lmax, _iterations(size))
+            analysis(template * term(component, chosen, i), lmax, _iterations(size, nside))
             for i, size in enumerate(chosen.sizes)
         )
         result[name] = Prepared(component, chosen, alms, None, fwhm, repaired)

@@ -94,7 +94,8 @@ def _write_settings(folder: Path, experiment: str, varying: bool = False) -> Pat
     beta_syn = index("beta_syn", peer.BETA_SYN)
     path = folder / "experiment.toml"
     path.write_text(
-        f'[experiment]\ninstrument = "core"\nsamples = {peer.SAMPLES}\nsheet = false\n{experiment}\n'
+        '[experiment]\ninstrument = "core"\nsheet = false\n'
+        f"samples = {peer.SAMPLES}\n{experiment}\n"
         + _component("dust", "dust", peer.NU_DUST, T_dust=peer.T_DUST, beta_dust=beta_dust)
         + _component("synchrotron", "synchrotron", peer.NU_SYNCHROTRON, beta_syn=beta_syn)
         + '[cmb]\nspectra = "cmb.fits"\n'
@@ -128,13 +129,14 @@ class _Beside:
         line = [sys.executable, "-m", "benchmarks.pysm_healpy", str(self.folder), str(out)]
         return usage([*line, *self.options, *options]), out
 
-    def _maps(self, folder: Path) -> list[np.ndarray]:
+    def _maps(self, run: tuple[Usage, Path]) -> list[np.ndarray]:
+        folder = run[1]
         return [read_maps(folder / f"{name}.fits", fields=["Q", "U"]).maps for name in self.names]
 
     def agreement(self) -> tuple[float, float]:
         """Largest difference of foregrounds, and of the power of CMB and noise (other draws)."""
-        ours, total = (self._maps(self.ours(*o)[1]) for o in (["--only", "foregrounds"], []))
-        theirs, their_total = (self._maps(self.theirs(*o)[1]) for o in (["--foregrounds"], []))
+        ours, total = self._maps(self.ours("--only", "foregrounds")), self._maps(self.ours())
+        theirs, their_total = self._maps(self.theirs("--foregrounds")), self._maps(self.theirs())
         difference = max(np.std(y - x) / np.std(x) for x, y in zip(ours, theirs, strict=True))
         rest = [_power(b - a) for a, b in zip(ours, total, strict=True)]
         their_rest = [_power(b - a) for a, b in zip(theirs, their_total, strict=True)]
@@ -185,7 +187,7 @@ def _beside_pysm(quick: bool, varying: bool, target: float) -> list[Row]:
         f"mean power of CMB and noise (other draws) by {power:.1%}",
     ]
     which = "beta maps" if varying else "constant indices"
-    work = f"COrE, 15 bands at 60 arcmin, nside {nside}, {which}, cold process: PySM 3 with healpy"
+    work = f"COrE, 15 bands at 60 arcmin, {which}, nside {nside}, cold process: PySM 3, healpy"
     rows = [
         Row(
             f"{work} / `jaxsky simulate`",
@@ -298,7 +300,7 @@ def smoothing(quick: bool) -> list[Row]:
         "healpy": theirs,
         "equal": lambda: theirs(lmax),
     }
-    errors = {name: _error(calls[name](), exact) for name in ("ours",)}
+    errors = {"ours": _error(calls["ours"](), exact)}
     for name in ("healpy", "equal"):
         # healpy's polarized beam is larger by this at all multipoles.
         errors[name] = _error(calls[name]()[1:] / np.exp(2 * sigma**2), exact)

@@ -123,11 +123,13 @@ def plan(
     sources, observation : what is observed, and how
     tolerance : error of varying laws relative to the maps of a band
     """
-    levels = _levels({name: source.component for name, source in sources.items()}, observation)
+    # Terms are for the ranges of the maps as they are used.
+    components = {n: _at(source.component, observation.nside) for n, source in sources.items()}
+    levels = _levels(components, observation)
     total = jnp.sqrt(sum((rms * law) ** 2 for rms, law in levels.values()))
     return {
-        name: choose_terms(source.component, observation.bands, levels[name][0] / total, tolerance)
-        for name, source in sources.items()
+        name: choose_terms(component, observation.bands, levels[name][0] / total, tolerance)
+        for name, component in components.items()
     }
 
 

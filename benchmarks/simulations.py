@@ -169,9 +169,12 @@ def _beside_pysm(quick: bool, varying: bool, target: float) -> list[Row]:
         lmax = pyfits.getval(maps / f"{beside.names[0]}.fits", "LMAX", 1)
         theirs, _ = beside.theirs()
         second, _ = beside.ours()
-        variants = {f"lmax {lmax} as here": ["--lmax", str(lmax)]}
+        variants = {
+            f"lmax {lmax} as here": ["--lmax", str(lmax)],
+            "CMB and noise in harmonic space, without I": ["--lean"],
+        }
         if not varying:
-            variants["transforming the templates, then scaling"] = ["--scaled"]
+            variants["besides, templates transformed once, then scaled"] = ["--lean", "--scaled"]
         others = {name: beside.theirs(*options)[0] for name, options in variants.items()}
         runs = [first, second, beside.ours()[0]]
     wall, peak = median(run.seconds for run in runs), median(run.peak for run in runs)
@@ -180,7 +183,8 @@ def _beside_pysm(quick: bool, varying: bool, target: float) -> list[Row]:
         f"{time_text(theirs.seconds)} / {time_text(wall)} "
         f"(runs {', '.join(time_text(run.seconds) for run in runs)})",
         *(
-            f"with {name} {time_text(run.seconds)}, {run.seconds / wall:.1f}x"
+            f"with {name} {time_text(run.seconds)}, {run.seconds / wall:.1f}x, "
+            f"{run.peak / peak:.1f}x in memory"
             for name, run in others.items()
         ),
         f"at nside {small} foregrounds differ by {difference:.0e} of their rms in the worst band, "

@@ -152,7 +152,7 @@ def _write(
 ) -> None:
     stokes = settings.experiment.stokes
     wanted = ["total", *(n for n in maps if n != "total")]
-    columns = [np.asarray(maps[name]) * factor for name in wanted]
+    columns = [np.asarray(maps[name] * factor, np.float32) for name in wanted]
     names = [s if name == "total" else f"{s}_{name}" for name in wanted for s in stokes]
     path.parent.mkdir(parents=True, exist_ok=True)
     write_maps(
@@ -182,7 +182,7 @@ def run(
 
     Parameters
     ----------
-    settings, setup : from `jaxsky.experiment`
+    settings, setup : from `jaxsky.experiment`; sources are removed from it when they have served
     out : folder, see `check_folder`
     indices : numbers of the realisations
     overwrite : remove all maps that are in the folder
@@ -221,6 +221,8 @@ def run(
                         f"{name}: its extrapolated cross-spectra exceed what the auto-spectra "
                         f"allow at {source.repaired} multipoles; correlations were reduced there."
                     )
+            if not random:
+                setup.sources.clear()
         start = time.perf_counter()
         components = "components" in main.outputs
         seen = observe_bands(key, prepared, observation, cmb, components=components, names=missing)

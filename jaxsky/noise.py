@@ -207,8 +207,8 @@ def cholesky(covariance: Float[Array, "stokes stokes pix"]) -> Float[Array, "sto
         for j in range(i + 1):
             rest = covariance[i, j] - sum(lower[i][k] * lower[j][k] for k in range(j))
             if i == j:
-                # At zero, where the derivative of the root is not finite, it is not taken.
-                lower[i][j] = jnp.where(rest == 0, 0.0, jnp.sqrt(jnp.where(rest == 0, 1.0, rest)))
+                # Rounding may leave a zero negative; its root has no derivative.
+                lower[i][j] = jnp.where(rest > 0, jnp.sqrt(jnp.where(rest > 0, rest, 1.0)), 0.0)
             else:
                 lower[i][j] = rest / jnp.where(lower[j][j] > 0, lower[j][j], 1.0)
     return jnp.stack([jnp.stack(row) for row in lower])

@@ -113,6 +113,11 @@ def _at(component: Component, nside: int) -> Component:
     return jax.tree.map(bring, component)
 
 
+def _law(component: Component) -> Component:
+    """A component without the pixels of its template."""
+    return jax.tree.map(lambda leaf: leaf[:, :0] if leaf.ndim == 2 else leaf, component)
+
+
 def plan(
     sources: Mapping[str, Source], observation: Observation, tolerance: float = TOLERANCE
 ) -> dict[str, Terms | None]:
@@ -178,7 +183,7 @@ def prepare(
     continued = _continued(key, sources, observation)
     result = {}
     for name, source in sources.items():
-        chosen, component = terms[name], _at(source.component, nside)
+        chosen, component = terms[name], _law(_at(source.component, nside))
         alm, repaired, fwhm = continued.get(name) or (
             low_multipoles(source.component.template, lmax),
             0,

@@ -3,7 +3,8 @@
 A template knows the sky up to the join, the upper end of the range over which a power law is
 fitted to its spectrum. Beyond, the sky is taken to follow the power law. The template is taken
 from its own beam to the target's up to the join; further on it keeps the beam it has, and is
-brought down where it exceeds the power law (there it is noise). What is missing is filled with a
+brought down where it exceeds the power law: the paper's templates are noise there, and the law
+comes first also where a template is only curved. What is missing is filled with a
 Gaussian realisation times a modulation, the normalised polarized intensity, so that the mean
 spectrum of the sum is the power law: at each multipole the injected power is the extrapolation
 less that of the template, never negative.
@@ -32,62 +33,18 @@ from jaxsky.harmonics import (
     synthesis,
 )
 from jaxsky.harmonics.beams import NEGLIGIBLE
+from jaxsky.power_law import PowerLaw, fit_power_law
 
 __all__ = [
     "DUST",
     "SYNCHROTRON",
     "Extrapolation",
-    "PowerLaw",
     "SmallScales",
     "add_small_scales",
     "continue_templates",
     "extrapolate",
-    "fit_power_law",
     "modulation",
 ]
-
-
-class PowerLaw(NamedTuple):
-    """C_l = exp(log_amplitude) (l / pivot)^slope, with the covariance of the two numbers."""
-
-    log_amplitude: Float[Array, ""]
-    slope: Float[Array, ""]
-    covariance: Float[Array, "2 2"]
-    pivot: int
-
-    def __call__(self, lmax: int) -> Float[Array, " ell"]:
-        """C_l of l = 0 ... lmax, zero below l = 2."""
-        ell = jnp.arange(lmax + 1)
-        log = jnp.log(jnp.maximum(ell, 1) / self.pivot)
-        return jnp.where(ell < 2, 0.0, jnp.exp(self.log_amplitude + self.slope * log))
-
-
-def fit_power_law(spectrum: Float[Array, " ell"], lmin: int, lmax: int) -> PowerLaw:
-    """Straight line through log C_l against log l by least squares, every l counting alike.
-
-    The paper's fit; its errors come from the scatter about the line.
-
-    Parameters
-    ----------
-    spectrum : C_l, l = 0 ...
-    lmin, lmax : range of the fit, both included; lmax is the pivot of the result
-
-    Raises
-    ------
-    ValueError
-        If the range has fewer than four multipoles, is not within 2 ... of the spectrum, or the
-        spectrum is not positive there.
-    """
-    if not 2 <= lmin <= lmax - 3 or lmax >= len(spectrum):
-        raise ValueError(
-            f"A power law cannot be fitted from l = {lmin} to {lmax} to a spectrum that ends at "
-            f"{len(spectrum) - 1}; it needs four multipoles from l = 2 on."
-        )
-    part = spectrum[lmin : lmax + 1]
-    check_positive("spectrum", part)
-    log = jnp.log(jnp.arange(lmin, lmax + 1) / lmax)
-    (slope, log_amplitude), covariance = jnp.polyfit(log, jnp.log(part), 1, cov=True)
-    return PowerLaw(log_amplitude, slope, covariance[::-1, ::-1], lmax)
 
 
 def _numbers(name: str, value: ArrayLike, count: int = 1) -> Array:
@@ -255,27 +212,53 @@ def _correlations(
     return products / (scale[:, None] * scale)
 
 
-def _injected_matrix(
+def _root(values: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Square root of what is positive, else 0; there, its derivative is 0 as well."""
+    return jnp.where(values > 0, jnp.sqrt(jnp.where(values > 0, values, 1.0)), 0.0)
+
+
+def _correlated_parts(
     alms: Float[Array, "field alm"],
     parts: Sequence[Extrapolation],
     ranges: Sequence[tuple[int, int]],
-) -> Float[Array, "field field ell"]:
-    """Spectra of what is added to several templates that are to stay as correlated as they are.
+) -> tuple[Float[Array, "field alm"], Float[Array, "field field ell"]]:
+    """What is added to several templates that are to stay as correlated as they are.
 
     Each cross-spectrum is extrapolated with the coefficient of correlation that it has over the
-    range of the fits. Off the diagonal there is the same difference as on it, where both fields
-    are injected. The coefficients are those that stay, without their beams.
+    range of the fits. Where one template is still known and another is not, the other gets a
+    part proportional to the first: of T_ij / T_ii times its coefficients, T being the spectra
+    wanted, as much as is known of i (in power) and missing of j (in amplitude).
+
+    Parameters
+    ----------
+    alms : coefficients that stay, without their beams
+    parts : spectra of each template
+    ranges : of the fits, one a field
+
+    Returns
+    -------
+    Those parts, and the spectra of what is still missing, to be drawn.
     """
-    target, injected = (
-        jnp.concatenate([getattr(part, name) for part in parts]) for name in ("target", "injected")
-    )
-    rho = _correlations(alms, ranges)
-    there = jax.vmap(lambda one: jax.vmap(lambda other: power_spectrum(one, other))(alms))(alms)
-    root = jnp.sqrt(target)
-    matrix = rho[..., None] * root[:, None] * root[None] - there
-    present = (injected[:, None] > 0) & (injected[None] > 0)
-    on_diagonal = jnp.eye(len(injected), dtype=bool)[..., None]
-    return jnp.where(on_diagonal, injected[:, None], jnp.where(present, matrix, 0.0))
+    law = jnp.concatenate([part.target for part in parts])
+    n, ell = len(alms), jnp.arange(law.shape[-1])
+    beyond = ell > jnp.array([[join] for _, join in ranges])
+    rho = _correlations(alms, ranges)[..., None]
+    kept = jax.vmap(lambda one: jax.vmap(lambda other: power_spectrum(one, other))(alms))(alms)
+    power = jnp.einsum("iil->il", kept)
+    auto = jnp.where(beyond, law, power)
+    root, other = _root(auto), ~jnp.eye(n, dtype=bool)[..., None]
+    continued = other & (beyond[:, None] | beyond)
+    wanted = jnp.where(continued, rho * root[:, None] * root, kept)
+    wanted = jnp.where(other, wanted, auto[:, None])
+    known = power / jnp.where(auto > 0, auto, 1.0)
+    share = jnp.where(beyond, 1 - _root(jnp.minimum(known, 1.0)), 0.0)[:, None] * known
+    borrowed = jnp.where(other, share * wanted / jnp.where(auto > 0, auto, 1.0), 0.0)
+    added = jnp.stack([sum(expand(borrowed[j, i]) * alms[i] for i in range(n)) for j in range(n)])
+    mixing = borrowed + jnp.eye(n)[..., None]
+    missing = wanted - jnp.einsum("ijl,jkl,mkl->iml", mixing, kept, mixing)
+    # What rounding leaves where nothing is missing would have any correlation.
+    there = beyond & (jnp.einsum("iil->il", missing) > NEGLIGIBLE * auto)
+    return added, jnp.where(there[:, None] & there, missing, 0.0)
 
 
 class Continued(NamedTuple):
@@ -306,12 +289,13 @@ def continue_templates(
     With one key the result is differentiable in slopes, tilts, amplitudes, beams and maps. Of
     a single template E and B are independent; several keep their coefficients of correlation,
     E with B and template with template (the paper's dust and AME, after Brown & Battye 2011),
-    and are modulated by the mean of their modulations. The spectra are divided by the mean
+    and are modulated by the mean of their modulations; where one is known to higher multipoles
+    than another, it is correlated with what is known. The spectra are divided by the mean
     square of the modulation, so that those of the modulated maps are the extrapolated ones.
 
     Parameters
     ----------
-    key : of jax.random
+    key : of jax.random; at another nside or lmax it gives other small scales
     maps : Q, U of each template, RING
     own : beam of each template [arcmin]
     small : how each is continued
@@ -340,10 +324,10 @@ def continue_templates(
         resize(alm * expand(part.transfer), lmax) for alm, part in zip(alms, parts, strict=True)
     ]
     if len(maps) == 1:
-        matrix = jnp.eye(2)[..., None] * parts[0].injected[:, None]
+        borrowed, matrix = jnp.zeros(()), jnp.eye(2)[..., None] * parts[0].injected[:, None]
     else:
         ranges = [r for how in small for r in (how.EE, how.BB)]
-        matrix = _injected_matrix(jnp.concatenate(stay), parts, ranges)
+        borrowed, matrix = _correlated_parts(jnp.concatenate(stay), parts, ranges)
     gains = [
         modulation(each, how.modulation_fwhm, nside) for each, how in zip(maps, small, strict=True)
     ]
@@ -354,8 +338,10 @@ def continue_templates(
     result = []
     for i, (template, how) in enumerate(zip(stay, small, strict=True)):
         added = analysis(gain * synthesis(drawn[2 * i : 2 * i + 2], nside), lmax)
-        rise = _rise((how.EE[1], how.BB[1]), lmax)
-        result.append(template + how.amplitude * expand(rise) * added)
+        added = expand(_rise((how.EE[1], how.BB[1]), lmax)) * added
+        if len(maps) > 1:
+            added = added + borrowed[2 * i : 2 * i + 2]
+        result.append(template + how.amplitude * added)
     return Continued(result, parts, repaired)
 
 

@@ -44,7 +44,7 @@ def resample(
     Parameters
     ----------
     maps : shape (stokes, pix), RING; one row is I, two are Q, U, three are I, Q, U
-    window : factor for each multipole 0 ... lmax; lmax at most 3 nside - 1 of the input
+    window : factor for each multipole 0 ... lmax; above 2 nside of the input nothing is left
     nside : resolution of the result
     """
     return synthesis(low_multipoles(maps, len(window) - 1) * expand(window), nside)

@@ -317,7 +317,7 @@ def write_maps(
         contradicts what is written here.
     """
     path = Path(path)
-    maps = np.atleast_2d(np.asarray(maps, dtype=np.float64))
+    maps = np.atleast_2d(np.asarray(maps, dtype=np.float32 if single else np.float64))
     names = [names] if isinstance(names, str) else list(names)
     units = [unit_name(x) for x in ([unit] * len(maps) if isinstance(unit, str) else unit)]
     mask = None if mask is None else np.asarray(mask, dtype=bool)

@@ -8,7 +8,14 @@ import pytest
 import systems
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.chebyshev import coefficients, evaluate, nodes
-from jaxsky.interpolation import TRACED_NODES, choose_nodes
+from jaxsky.interpolation import (
+    TRACED_NODES,
+    band_sed,
+    choose_nodes,
+    choose_terms,
+    term,
+    term_weights,
+)
 
 MAPS = systems.random_maps(1)
 beta, T, beta_syn = systems.spread(1.54, 0.2), systems.spread(21, 4), systems.spread(3.0, 0.3)
@@ -108,3 +115,89 @@ def test_single_precision_reaches_its_own_rounding():
     direct = observe(sky, bands, tolerance=0)
     # Rounding of ln S and of the sum over the band: a few 1e-6.
     np.testing.assert_allclose(observe(sky, bands), direct, rtol=1e-5)
+
+
+#: More bands than terms, over a wide range.
+MANY = tuple(Bandpass.delta(nu) for nu in (30.0, 60.0, 100.0, 143.0, 217.0, 353.0, 545.0, 857.0))
+
+
+def summed(component, bands, terms):
+    """The law in each band and pixel as a sum of terms, shape (band, pix)."""
+    maps = jnp.stack([term(component, terms, i) for i in range(len(terms.vectors))])
+    return term_weights(component, bands, terms) @ maps
+
+
+def law(component, bands):
+    return jnp.stack([band_sed(component, band, None) for band in bands])
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9])
+@pytest.mark.parametrize("case", ["beta_dust", "beta_dust and T_dust", "beta_syn"])
+def test_terms_add_up_to_the_law(case, tolerance):
+    component = SKIES[case]
+    exact = law(component, MANY)
+    importance = 1 / jnp.sqrt(jnp.mean(exact**2, axis=1))
+    terms = choose_terms(component, MANY, importance, tolerance)
+    error = jnp.sqrt(jnp.mean((summed(component, MANY, terms) - exact) ** 2, axis=1)) * importance
+    # A term left out adds at most its size, `tolerance`; several may be.
+    assert float(error.max()) < 3 * tolerance
+    assert min(terms.sizes) > tolerance
+    assert list(terms.sizes) == sorted(terms.sizes, reverse=True)
+    np.testing.assert_allclose(
+        terms.vectors @ terms.vectors.T, np.eye(len(terms.sizes)), atol=1e-12
+    )
+
+
+def test_there_are_no_more_terms_than_needed():
+    def count(component, tolerance, bands=MANY):
+        importance = 1 / jnp.sqrt(jnp.mean(law(component, bands) ** 2, axis=1))
+        return len(choose_terms(component, bands, importance, tolerance).vectors)
+
+    narrow = Dust(MAPS, systems.spread(1.54, 0.02))
+    assert count(narrow, 1e-6) < count(SKIES["beta_dust"], 1e-6) < len(MANY)
+    assert count(narrow, 1e-2) < count(narrow, 1e-6)
+    assert count(SKIES["beta_dust"], 1e-12, MANY[:2]) == 2
+
+
+def test_a_component_of_less_importance_needs_fewer_terms():
+    component = SKIES["beta_dust"]
+    importance = 1 / jnp.sqrt(jnp.mean(law(component, MANY) ** 2, axis=1))
+    few, many = (
+        len(choose_terms(component, MANY, f * importance, 1e-7).vectors) for f in (1e-4, 1)
+    )
+    assert few < many
+
+
+def test_a_law_without_maps_is_one_exact_term():
+    component = Dust(MAPS)
+    terms = choose_terms(component, MANY, jnp.ones(len(MANY)), 1e-2)
+    assert terms.counts == ()
+    np.testing.assert_allclose(term_weights(component, MANY, terms)[:, 0], law(component, MANY))
+    # Weights are for whatever the numbers are; a term chosen before serves all.
+    other = Dust(MAPS, 1.7, 18.0)
+    np.testing.assert_allclose(term_weights(other, MANY, terms)[:, 0], law(other, MANY))
+    assert float(term(component, terms, 0)) == 1.0
+
+
+def test_no_terms_where_bands_are_better_averaged_one_by_one():
+    ones = jnp.ones(len(MANY))
+    three = Dust(MAPS, beta, T, nu_ref=systems.spread(353, 1))
+    assert choose_terms(three, MANY, ones, 1e-7) is None
+    unresolved = Dust(MAPS, systems.spread(1.5, 3.5), systems.spread(35, 25))
+    assert choose_terms(unresolved, MANY, ones, 1e-10) is None
+    found = []
+    jax.jit(lambda beta: found.append(choose_terms(Dust(MAPS, beta), MANY, ones, 1e-7)))(beta)
+    assert found == [None]
+
+
+def test_derivatives_of_weights_are_those_of_the_law():
+    """Of the frequency of a band, with terms that were chosen before."""
+    component = SKIES["beta_dust"]
+    terms = choose_terms(component, MANY, 1 / law(component, MANY).mean(axis=1), 1e-12)
+
+    def by_terms(nu):
+        return summed(component, (Bandpass.delta(nu),), terms)[0]
+
+    exact = jax.jacfwd(lambda nu: law(component, (Bandpass.delta(nu),))[0])(200.0)
+    # 200 GHz is none of the bands, between which the law goes smoothly.
+    np.testing.assert_allclose(jax.jacfwd(by_terms)(200.0), exact, rtol=1e-5)

@@ -1,0 +1,756 @@
+"""Simulations from settings: realisations as files, what each key does, and refusals."""
+
+import json
+import re
+import sys
+
+import healpy
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from astropy.io import fits as pyfits
+
+from jaxsky import cli, experiment, montecarlo
+from jaxsky.experiment import DEFAULT, EXAMPLE, build, load_experiment
+from jaxsky.galaxy import embedded_sky
+from jaxsky.harmonics import alm_ell, expand, gaussian_beam, synthesis
+from jaxsky.io import read_maps, write_maps
+from jaxsky.simulate import simulate
+
+NSIDE = 8
+NPIX = 12 * NSIDE**2
+SETTINGS = """
+title = "A small sky"
+[experiment]
+nside = 8
+fwhm = 1200.0
+sheet = false
+seed = 3
+[templates.dust]
+law = "dust"
+file = "dust.fits"
+nu_ref = 353.0
+fwhm = 900.0
+parameters = { beta_dust = { file = "beta.fits", unit = "" } }
+[templates.synchrotron]
+law = "synchrotron"
+file = "synchrotron.fits"
+nu_ref = 30.0
+fwhm = 900.0
+[cmb]
+spectra = "cmb.dat"
+format = "camb"
+[[bands]]
+name = "30"
+bandpass = { center = 30.0, width = 6.0 }
+fwhm = 800.0
+noise = { level = 300.0 }
+[[bands]]
+name = "143"
+bandpass = { center = 143.0, width = 30.0 }
+beam = "beam.txt"
+noise = { rms = 1.0, unit = "uK_RJ" }
+"""
+SMALL = "\n[small_scales.dust]\nEE = [4, 10]\nBB = [3, 8]\nmodulation_fwhm = 1500.0\n"
+BOTH = SMALL + SMALL.replace("dust", "synchrotron")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """What the settings name."""
+    folder = tmp_path_factory.mktemp("sky")
+    rng = np.random.default_rng(6)
+    ell = alm_ell(2 * NSIDE)
+    beam = np.asarray(expand(gaussian_beam(900.0, 2 * NSIDE)))
+    for name in ("dust", "synchrotron"):
+        alm = np.where(ell > 1, 100 * rng.normal(size=(3, ell.size)) / (1 + ell), 0) * beam
+        maps = np.asarray(synthesis(jnp.asarray(alm), NSIDE))
+        write_maps(folder / f"{name}.fits", maps[1:], names=["Q", "U"], unit="uK_RJ")
+        write_maps(folder / f"{name}_iqu.fits", maps, names=list("IQU"), unit="uK_RJ")
+        mask = np.arange(NPIX) > 4
+        write_maps(folder / f"{name}_cut.fits", maps[1:], names=["Q", "U"], unit="uK_RJ", mask=mask)
+    beta = 1.5 + 0.1 * np.cos(healpy.pix2ang(NSIDE, np.arange(NPIX))[0])
+    write_maps(folder / "beta.fits", beta, names="BETA_D", unit="")
+    covariance = np.stack([1 + rng.random(NPIX), rng.random(NPIX) - 0.5, 1 + rng.random(NPIX)])
+    names = ["QQ_COV", "QU_COV", "UU_COV"]
+    write_maps(folder / "covariance.fits", covariance, names=names, unit="uK_RJ^2")
+    hits = np.where(np.arange(NPIX) > 4, 9.0, 0.0)
+    write_maps(folder / "hits.fits", hits, names="HITS", unit="")
+    coarse = np.ones(NPIX // 4)
+    write_maps(folder / "coarse.fits", coarse, names="RMS", unit="uK_RJ")
+    multipoles = np.arange(2, 40)
+    powers = np.array([1e3, 20.0, 5.0, 50.0])[:, None] * np.ones(multipoles.size)
+    table = np.column_stack([multipoles, *powers])
+    np.savetxt(folder / "cmb.dat", table)
+    np.savetxt(folder / "short.dat", table[:8])
+    window = np.asarray(gaussian_beam(800.0, 20))
+    np.savetxt(folder / "beam.txt", np.column_stack([np.arange(21), window]))
+    return folder
+
+
+def write(folder, *changes, text=SETTINGS, name="experiment"):
+    """The settings with some text replaced, as a file."""
+    for old, new in changes:
+        assert text.count(old) >= 1, old
+        text = text.replace(old, new, 1)
+    path = folder / f"{name}.toml"
+    path.write_text(text)
+    return path
+
+
+def command(monkeypatch, *arguments) -> int:
+    monkeypatch.setattr(sys, "argv", ["jaxsky", "simulate", *map(str, arguments)])
+    try:
+        cli.main()
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    return 0
+
+
+def one_sentence(capsys) -> str:
+    """What was printed: one sentence, no traceback."""
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "Traceback" not in printed
+    assert printed.startswith("jaxsky:"), printed
+    return printed
+
+
+def content(out) -> dict[str, bytes]:
+    return {str(p.relative_to(out)): p.read_bytes() for p in sorted(out.rglob("sim_*/*"))}
+
+
+def columns(path) -> dict[str, np.ndarray]:
+    names = pyfits.getdata(path, 1).names
+    return dict(zip(names, read_maps(path, fields=names).maps, strict=True))
+
+
+COMPONENTS = ("sheet = false", 'sheet = false\noutputs = ["total", "components"]')
+
+
+# What is written.
+
+
+def test_files_are_the_simulation(folder, tmp_path, monkeypatch, capsys):
+    path, out = write(folder), tmp_path / "out"
+    assert command(monkeypatch, path, "--out", out) == 0
+    assert "Written: 2 maps" in " ".join(capsys.readouterr().err.split())
+    assert sorted(content(out)) == ["sim_00000/143.fits", "sim_00000/30.fits"]
+    setup = build(load_experiment(path))
+    key = montecarlo.realisation_key(3, 0)
+    expected = simulate(key, setup.sources, setup.observation, jnp.asarray(setup.cmb))
+    for name, maps in zip(setup.observation.names, expected, strict=True):
+        file = out / "sim_00000" / f"{name}.fits"
+        found = read_maps(file)
+        assert (found.names, found.unit, found.nside) == (("Q", "U"), "uK_RJ", NSIDE)
+        assert found.mask.all()
+        # Single precision.
+        np.testing.assert_allclose(found.maps, maps, atol=1e-6 * float(jnp.abs(maps).max()))
+        again, header = healpy.read_map(file, field=None, h=True, dtype=np.float64)
+        np.testing.assert_array_equal(again, found.maps)
+        header = dict(header)
+        wanted = {
+            "BAND": name,
+            "SEED": 3,
+            "SIM": 0,
+            "CONTENT": "dust, synchrotron, cmb, noise",
+            "INSTRUME": "A small sky",
+            "FWHM": 1200.0,
+            "LMAX": 16,
+            "NSIDE": NSIDE,
+            "ORDERING": "RING",
+            "COORDSYS": "G",
+            "POLCCONV": "COSMO",
+            "TTYPE1": "Q",
+            "TTYPE2": "U",
+            "TUNIT1": "uK_RJ",
+            "TUNIT2": "uK_RJ",
+        }
+        assert {k: header[k] for k in wanted} == wanted
+        assert header["CREATOR"].startswith("jaxsky ")
+        band = setup.observation.channels[name].band
+        assert header["FREQ"] == pytest.approx(float(band.center))
+        assert (header["FREQMIN"], header["FREQMAX"]) == (band.nu.min(), band.nu.max())
+        assert header["RJ2CMB"] == pytest.approx(float(band.conversion("uK_RJ", "uK_CMB")))
+        assert ("NOISE" in header) == (name == "30")
+        if name == "30":
+            level = 300.0 * float(band.conversion("uK_CMB", "uK_RJ"))
+            assert header["NOISE"] == pytest.approx(level)
+    log = json.loads((out / montecarlo.LOG).read_text())
+    assert {"jaxsky", "jax", "healpy", "ducc0"} <= set(log["versions"])
+    assert log["settings"]["experiment"]["seed"] == 3
+    assert log["settings"]["bands"][0]["noise"]["level"] == 300.0
+
+
+def test_units_and_components(folder, tmp_path, monkeypatch):
+    plain, thermodynamic = tmp_path / "RJ", tmp_path / "CMB"
+    assert command(monkeypatch, write(folder, COMPONENTS), "--out", plain) == 0
+    change = (COMPONENTS[0], COMPONENTS[1] + '\nunit = "uK_CMB"')
+    assert command(monkeypatch, write(folder, change), "--out", thermodynamic) == 0
+    for name in ("30", "143"):
+        one, other = (p / "sim_00000" / f"{name}.fits" for p in (plain, thermodynamic))
+        maps = columns(one)
+        parts = ("dust", "synchrotron", "cmb", "noise")
+        assert sorted(maps) == sorted([*"QU", *(f"{s}_{p}" for s in "QU" for p in parts)])
+        assert list(maps)[:2] == ["Q", "U"]
+        assert read_maps(other).unit == "uK_CMB"
+        factor = pyfits.getheader(one, 1)["RJ2CMB"]
+        for s in "QU":
+            total = sum(maps[f"{s}_{p}"] for p in parts)
+            np.testing.assert_allclose(maps[s], total, atol=1e-6 * np.abs(maps[s]).max())
+        for column, values in columns(other).items():
+            np.testing.assert_allclose(values, factor * maps[column], rtol=1e-6)
+
+
+def test_one_thing_only(folder, tmp_path, monkeypatch):
+    path = write(folder, COMPONENTS)
+    assert command(monkeypatch, path, "--out", tmp_path / "all") == 0
+    whole = columns(tmp_path / "all" / "sim_00000" / "143.fits")
+    expected = {
+        "noise": ["noise"],
+        "cmb": ["cmb"],
+        "foregrounds": ["dust", "synchrotron"],
+        "signal": ["dust", "synchrotron", "cmb"],
+    }
+    for only, parts in expected.items():
+        out = tmp_path / only
+        assert command(monkeypatch, path, "--out", out, "--only", only) == 0
+        file = out / "sim_00000" / "143.fits"
+        maps = columns(file)
+        assert pyfits.getheader(file, 1)["CONTENT"] == ", ".join(parts)
+        assert set(maps) == {"Q", "U", *(f"{s}_{p}" for s in "QU" for p in parts)}
+        for s in "QU":
+            total = sum(whole[f"{s}_{p}"] for p in parts)
+            np.testing.assert_allclose(maps[s], total, atol=1e-5 * np.abs(total).max())
+
+
+def test_only_needs_no_files_that_it_does_not_show(folder, tmp_path, monkeypatch):
+    path = write(folder, ("dust.fits", "absent.fits"), ("cmb.dat", "absent.dat"))
+    assert command(monkeypatch, path, "--out", tmp_path / "out", "--only", "noise") == 0
+    header = pyfits.getheader(tmp_path / "out" / "sim_00000" / "30.fits", 1)
+    assert str(header["COMMENT"]) == "No foregrounds."
+
+
+def test_beams_and_noise_of_all_kinds(folder):
+    rms, level = '{ rms = 1.0, unit = "uK_RJ" }', "{ level = 300.0 }"
+    path = write(
+        folder,
+        ("fwhm = 1200.0", 'fwhm = "own"'),
+        ("fwhm = 900.0", "fwhm = 700.0"),
+        ("fwhm = 900.0", "fwhm = 700.0"),
+        (level, '{ covariance = { file = "covariance.fits", '
+         'fields = ["QQ_COV", "QU_COV", "UU_COV"] } }'),
+        ("seed = 3", "diagonal_noise = true"),
+    )  # fmt: skip
+    channels = build(load_experiment(path)).observation.channels
+    fields = ["QQ_COV", "QU_COV", "UU_COV"]
+    columns = read_maps(folder / "covariance.fits", fields=fields).maps
+    np.testing.assert_allclose(channels["30"].noise[[0, 0, 1], [0, 1, 1]], columns)
+    assert channels["30"].diagonal
+    np.testing.assert_allclose(channels["143"].noise, jnp.eye(2)[..., None] * jnp.ones(NPIX))
+    assert channels["30"].target is None
+    np.testing.assert_allclose(channels["143"].beam, gaussian_beam(800.0, 16), rtol=1e-6)
+    assert channels["30"].beam == 800.0
+    none = write(folder, (f"noise = {rms}", ""))
+    assert build(load_experiment(none)).observation.channels["143"].noise is None
+
+
+def test_multipoles_that_no_map_shows_are_left_out(folder):
+    rough = write(
+        folder,
+        ("nside = 8", 'nside = 64\ninclude = ["noise"]'),
+        ('beam = "beam.txt"', "fwhm = 500.0"),
+        ('{ rms = 1.0, unit = "uK_RJ" }', "{ level = 1.0 }"),
+    )
+    lmax = build(load_experiment(rough)).observation.lmax
+    window = np.asarray(gaussian_beam(1200.0, 2 * lmax))
+    assert lmax < 128
+    assert window[lmax - 1] > 1e-8 > window[lmax + 1]
+    assert build(load_experiment(write(folder))).observation.lmax == 16
+
+
+# Realisations.
+
+
+@pytest.fixture(scope="module")
+def three(folder, tmp_path_factory):
+    """Three realisations with small scales, in one run."""
+    patch, out = pytest.MonkeyPatch(), tmp_path_factory.mktemp("three") / "out"
+    path = write(folder, ("[cmb]", SMALL + "[cmb]"), name="three")
+    assert command(patch, path, "--out", out, "--nsims", 3) == 0
+    patch.undo()
+    return path, content(out)
+
+
+def test_a_realisation_does_not_depend_on_the_order(three, tmp_path, monkeypatch, capsys):
+    path, expected = three
+    out = tmp_path / "out"
+    assert len(expected) == 6
+    assert len(set(expected.values())) == 6
+    assert command(monkeypatch, path, "--out", out, "--first", 2) == 0
+    assert sorted(content(out)) == ["sim_00002/143.fits", "sim_00002/30.fits"]
+    assert command(monkeypatch, path, "--out", out, "--nsims", 2, "--resume") == 0
+    assert content(out) == expected
+    # One is lost, one is made again; the others are left alone.
+    lost = out / "sim_00001" / "30.fits"
+    times = {p: p.stat().st_mtime_ns for p in out.rglob("*.fits")}
+    lost.unlink()
+    capsys.readouterr()
+    assert command(monkeypatch, path, "--out", out, "--nsims", 3, "--resume") == 0
+    assert "Written: 1 maps" in (said := " ".join(capsys.readouterr().err.split()))
+    assert "5 maps were there already" in said
+    assert content(out) == expected
+    assert [p for p, t in times.items() if p.stat().st_mtime_ns != t] == [lost]
+
+
+def test_a_stopped_run_goes_on(three, tmp_path, monkeypatch, capsys):
+    path, expected = three
+    out = tmp_path / "out"
+    write_file, count = montecarlo.write_maps, iter(range(100))
+
+    def stopped(*arguments, **options):
+        if next(count) == 3:
+            raise KeyboardInterrupt
+        write_file(*arguments, **options)
+
+    monkeypatch.setattr(montecarlo, "write_maps", stopped)
+    assert command(monkeypatch, path, "--out", out, "--nsims", 3) == 130
+    assert "Stopped; go on with --resume." in capsys.readouterr().err
+    assert len(content(out)) == 3
+    assert not list(out.rglob(".partial*"))
+    monkeypatch.setattr(montecarlo, "write_maps", write_file)
+    assert command(monkeypatch, path, "--out", out, "--nsims", 3, "--resume") == 0
+    assert content(out) == expected
+
+
+def test_another_seed_is_another_sky(three, tmp_path, monkeypatch):
+    path, expected = three
+    for seed in (3, 4):
+        out = tmp_path / str(seed)
+        assert command(monkeypatch, path, "--out", out, "--seed", seed) == 0
+        for name, data in content(out).items():
+            assert (data == expected[name]) == (seed == 3)
+
+
+def test_small_scales_can_be_the_same_for_all(folder, tmp_path, monkeypatch):
+    found = {}
+    for seed in ("", "small_scales_seed = 0", "small_scales_seed = 1"):
+        change = (COMPONENTS[0], f"{COMPONENTS[1]}\n{seed}")
+        path, out = write(folder, change, ("[cmb]", SMALL + "[cmb]")), tmp_path / f"_{seed[-1:]}"
+        assert command(monkeypatch, path, "--out", out, "--nsims", 2) == 0
+        found[seed[-1:]] = [columns(out / f"sim_0000{i}" / "30.fits") for i in (0, 1)]
+    for name in ("Q_cmb", "Q_noise"):
+        assert not np.array_equal(found["0"][0][name], found["0"][1][name])
+        for i in (0, 1):
+            np.testing.assert_array_equal(found[""][i][name], found["0"][i][name])
+    for fixed in "01":
+        np.testing.assert_array_equal(found[fixed][0]["Q_dust"], found[fixed][1]["Q_dust"])
+    different = [found[""][0], found[""][1], found["0"][0], found["1"][0]]
+    assert len({maps["Q_dust"].tobytes() for maps in different}) == 4
+    assert len({maps["Q_synchrotron"].tobytes() for maps in different}) == 1
+
+
+# Every key does something.
+
+
+def simulated(path):
+    settings = load_experiment(path)
+    setup = build(settings)
+    key = montecarlo.realisation_key(settings.experiment.seed, 0)
+    cmb = None if setup.cmb is None else jnp.asarray(setup.cmb)
+    return np.asarray(simulate(key, setup.sources, setup.observation, cmb))
+
+
+def small(line, table="dust"):
+    """A key more in the table of small scales."""
+    at = f"[small_scales.{table}]\n"
+    return (at, f"{at}{line}\n")
+
+
+@pytest.fixture(scope="module")
+def reference(folder):
+    return simulated(write(folder, ("[cmb]", BOTH + "[cmb]"), name="reference"))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ("seed = 3", "seed = 4"),
+        ("fwhm = 1200.0", "fwhm = 1250.0"),
+        ("nside = 8", 'nside = 8\ninclude = ["dust", "cmb", "noise"]'),
+        ("[cmb]", '[fixed]\n"synchrotron.beta_syn" = 3.0\n[cmb]'),
+        ("fwhm = 900.0", "fwhm = 880.0"),
+        ("nu_ref = 353.0", "nu_ref = 350.0"),
+        ("EE = [4, 10]", "EE = [4, 9]"),
+        ("BB = [3, 8]", "BB = [2, 8]"),
+        small("slope = -2.0"),
+        small("slope = [-2.0, -2.2]"),
+        small("tilt = 0.1"),
+        small("amplitude = 0.5"),
+        ("modulation_fwhm = 1500.0", "modulation_fwhm = 2000.0"),
+        small('correlated_with = "dust"', "synchrotron"),
+        ('format = "camb"', 'format = "planck"'),
+        ("center = 30.0", "center = 31.0"),
+        ("width = 6.0", "width = 16.0"),
+        ("width = 6.0", 'width = 6.0, convention = "power"'),
+        ("fwhm = 800.0", "fwhm = 700.0"),
+        ("level = 300.0", "level = 200.0"),
+        ("level = 300.0", 'level = 300.0, unit = "uK_RJ"'),
+        ("rms = 1.0", "rms = 2.0"),
+    ],
+    ids=lambda change: change[1].strip().splitlines()[-1],
+)
+def test_a_key_changes_the_maps(folder, reference, change):
+    path = write(folder, ("[cmb]", BOTH + "[cmb]"), change, name="changed")
+    maps = simulated(path)
+    assert maps.shape == reference.shape
+    assert np.abs(maps / reference - 1).max() > 1e-3
+
+
+def test_a_slope_for_both_is_one_for_each(folder):
+    one, two = (
+        simulated(write(folder, ("[cmb]", SMALL + "[cmb]"), small(f"slope = {slope}")))
+        for slope in ("-2.0", "[-2.0, -2.0]")
+    )
+    np.testing.assert_array_equal(one, two)
+
+
+def test_diagonal_noise(folder):
+    fields = 'fields = ["QQ_COV", "QU_COV", "UU_COV"]'
+    noise = ("{ level = 300.0 }", f'{{ covariance = {{ file = "covariance.fits", {fields} }} }}')
+    only = ("nside = 8", 'nside = 8\ninclude = ["noise"]')
+    own = ("fwhm = 1200.0", 'fwhm = "own"')
+    one = simulated(write(folder, noise, only, own))
+    other = simulated(
+        write(folder, noise, only, own, ("seed = 3", "seed = 3\ndiagonal_noise=true"))
+    )
+    np.testing.assert_array_equal(one[0, 0], other[0, 0])
+    assert not np.allclose(one[0, 1], other[0, 1])
+
+
+INSTRUMENT = """
+[experiment]
+instrument = "core"
+channels = ["45", "105"]
+nside = 8
+fwhm = 1200.0
+[embedded]
+nside = 8
+"""
+
+
+def test_keys_of_instruments_and_of_the_embedded_sky(folder, monkeypatch):
+    asked, sky = [], embedded_sky(4)
+
+    def recorded(*arguments):
+        asked.append(arguments)
+        return sky
+
+    monkeypatch.setattr(experiment, "embedded_sky", recorded)
+    monkeypatch.setattr(experiment, "camb_spectra", lambda lmax, r: np.zeros((4, lmax + 1)))
+
+    def made(*changes):
+        wide = ("fwhm = 1200.0", "fwhm = 1400.0")
+        path = write(folder, wide, *changes, text=INSTRUMENT, name="core")
+        return build(load_experiment(path)).observation
+
+    plain = made()
+    assert plain.names == ("45", "105")
+    assert plain.bands[0].nu.size == 51
+    assert made(("nside = 8", "nside = 8\nsamples = 7")).bands[0].nu.size == 7
+    assert made(("nside = 8", "nside = 8\nstokes = 'IQU'")).stokes == "IQU"
+    assert len(made(('channels = ["45", "105"]', "")).names) == 15
+    made(("[embedded]\nnside = 8", "[embedded]\nnside = 16\nseed = 2\nmodel = { p0 = 0.1 }"))
+    numbers = [(nside, seed, float(model.p0)) for nside, seed, model in asked]
+    assert numbers == [(8, 0, 0.2)] * 4 + [(16, 2, 0.1)]
+
+
+def test_keys_of_the_cmb_reach_camb(folder, monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        experiment, "camb_spectra", lambda *a, **k: asked.append((a, k)) or np.zeros((4, 17))
+    )
+    spectra = 'spectra = "cmb.dat"\nformat = "camb"\n'
+    for line in ("", "r = 0.05\n", "cosmology = { H0 = 70.0 }\n"):
+        build(load_experiment(write(folder, (spectra, line))))
+    assert asked == [((16, 0.0), {}), ((16, 0.05), {}), ((16, 0.0), {"H0": 70.0})]
+
+
+# Refusals.
+
+
+IQU = [("nside = 8", 'nside = 8\nstokes = "IQU"')] + [
+    (f'"{name}.fits"', f'"{name}_iqu.fits"') for name in ("dust", "synchrotron")
+]
+CMB = "[cmb]"
+RMS = '{ rms = 1.0, unit = "uK_RJ" }'
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            [("nside = 8", "nside = 4")],
+            "pixels of 879 arcmin (nside 4) are too wide for the beam of 1200 arcmin of band '30'; "
+            "that takes nside 8, or a common fwhm of at least 1.32e+03 arcmin",
+        ),
+        ([("nside = 8", "nside = 9")], "experiment.nside: nside must be a power of two, not 9"),
+        (
+            [("fwhm = 1200.0", "fwhm = 700.0")],
+            "experiment.fwhm: 700 arcmin is finer than the beam of band '30', 800 arcmin",
+        ),
+        ([("fwhm = 1200.0", "fwhm = 0")], "fwhm must be positive, or 'own', not 0"),
+        (
+            [("fwhm = 1200.0", "fwhm = 850.0")],
+            "templates.dust: its resolution, 900 arcmin, is coarser than the 850 arcmin of band "
+            "'30'; add small scales, [small_scales.dust], or bring the maps to a common fwhm of "
+            "at least 900 arcmin",
+        ),
+        (
+            [("nside = 8", 'nside = 8\ninclude = ["dst"]')],
+            "experiment.include: 'dst' is none of dust, synchrotron, cmb, noise",
+        ),
+        ([("nside = 8", "nside = 8\ninclude = []")], "experiment.include: list should have"),
+        (
+            [("nside = 8", 'nside = 8\ninclude = ["noise"]'), (f"noise = {RMS}", "")],
+            "Nothing is left to be observed in band '143': no component, no CMB, no noise",
+        ),
+        ([("nside = 8", 'nside = 8\ninstrument = "core"')],
+         "give either experiment.instrument or bands"),
+        ([("nside = 8", 'nside = 8\nchannels = ["30"]')],
+         "experiment.channels chooses from an instrument, not from bands"),
+        ([("nside = 8", "nside = 8\nsamples = 9")],
+         "experiment.samples is of an instrument's bands, not of bands"),
+        ([(CMB, "[embedded]\n" + CMB)], "give either templates or the table embedded"),
+        ([('name = "143"', 'name = "30"')], "the names of the bands must differ, but are 30, 30"),
+        ([('name = "143"', 'name = "a/b"')], "bands.1.name: string should match"),
+        ([('name = "143"', 'name = ".."')], "bands.1.name: string should match"),
+        ([("seed = 3", "seeds = 3")], "experiment.seeds: unknown key"),
+        ([("seed = 3", "seed = -3")], "experiment.seed: input should be greater than or equal"),
+        ([("sheet = false", 'outputs = ["parts"]')], "experiment.outputs.0: input should be"),
+        ([("sheet = false", 'unit = "mK"')], "experiment.unit: input should be 'uK_RJ' or"),
+        # Templates.
+        ([('"dust.fits"', '"dust_cut.fits"')],
+         "templates.dust: 5 pixels have no value; a simulation takes maps of the full sky"),
+        ([('"dust.fits"', '"absent.fits"')], "absent.fits"),
+        ([(CMB, '[fixed]\n"dust.beta" = 1.0\n' + CMB)],
+         "Unknown parameter 'dust.beta'; known parameters are dust.amplitude, dust.beta_dust"),
+        ([(CMB, '[fixed]\n"ame.m60" = 1.0\n' + CMB)],
+         "fixed: there is no template 'ame'; templates are dust, synchrotron"),
+        # Small scales.
+        ([(CMB, SMALL + CMB), *IQU], "'dust' has small scales, which are added to Q and U only"),
+        ([(CMB, SMALL.replace("dust", "ame") + CMB)],
+         "small_scales.ame: there is no such component"),
+        ([(CMB, SMALL + CMB), ("EE = [4, 10]", "EE = [4, 30]")],
+         "Small scales of dust: A power law cannot be fitted from l = 4 to 30 to a spectrum that "
+         "ends at 16"),
+        ([(CMB, SMALL + CMB), ("EE = [4, 10]", "EE = [9, 10]")], "it needs four multipoles"),
+        ([(CMB, SMALL + CMB), ("EE = [4, 10]", "EE = [4, 10, 11]")], "small_scales.dust.EE"),
+        ([(CMB, SMALL + CMB), small("amplitude = -1.0")], "small_scales.dust.amplitude"),
+        ([(CMB, SMALL + CMB), small("tilt = nan")], "small_scales.dust: Argument `tilt`"),
+        ([(CMB, SMALL + CMB), small('correlated_with = "synchrotron"')],
+         "The small scales of 'dust' are to be correlated with those of 'synchrotron'"),
+        ([(CMB, BOTH + CMB), small('correlated_with = "dust"')],
+         "The small scales of 'dust' are to be correlated with those of 'dust'"),
+        ([(CMB, BOTH + CMB), small('correlated_with = "nothing"')],
+         "The small scales of 'dust' are to be correlated with those of 'nothing'"),
+        ([(CMB, BOTH + CMB), small('correlated_with = "synchrotron"'),
+          small('correlated_with = "dust"', "synchrotron")],
+         "the second one must not be correlated with yet another"),
+        ([(CMB, BOTH + CMB), small('correlated_with = "synchrotron"'),
+          ("EE = [4, 10]", "EE = [2, 6]"), ("EE = [4, 10]", "EE = [8, 12]")],
+         "Correlated small scales need ranges that overlap"),
+        # The CMB.
+        ([('"cmb.dat"', '"short.dat"')], "short.dat: ends at l = 9, but lmax is 16"),
+        ([('"cmb.dat"', '"cmb.dat"\nr = 0.1')],
+         "cmb: r and cosmology are for CAMB; leave them out with spectra"),
+        ([('"cmb.dat"', '"cmb.dat"\nunit = "uK^2"')], "argument `unit` is for FITS files"),
+        ([('spectra = "cmb.dat"\n', "")], "cmb: format and unit are those of spectra, a file"),
+        # Bands.
+        ([("fwhm = 800.0", 'fwhm = 800.0\nbeam = "beam.txt"')], "give the beam either as fwhm"),
+        ([('"beam.txt"', '"cmb.dat"')], "cmb.dat"),
+        ([("width = 6.0", "width = 70.0")], "bands.30.bandpass: Argument `nu` must be positive"),
+        ([("level = 300.0", "level = 300.0, rms = 1.0")],
+         "bands.0.noise: give the noise as exactly one of level, rms, map, covariance, hits"),
+        ([("level = 300.0", "level = 0.0")], "bands.0.noise.level: input should be greater than 0"),
+        ([("level = 300.0", 'level = 300.0, unit = "MJy/sr"')],
+         "bands.0.noise.unit: must be a temperature such as uK_RJ or mK_CMB, not 'MJy/sr'"),
+        ([(RMS, '{ map = { file = "coarse.fits" } }')],
+         "bands.143.noise.map: nside is 4, but that of the map is 8"),
+        ([(RMS, '{ hits = { file = "hits.fits", fields = ["HITS"], sigma0 = 1.0 } }')],
+         "bands.143.noise: 5 pixels have no noise; a simulation takes maps of the full sky"),
+    ],
+    ids=lambda value: value[:40] if isinstance(value, str) else "",
+)  # fmt: skip
+def test_refusals(folder, tmp_path, monkeypatch, capsys, changes, words):
+    path, out = write(folder, *changes, name="mistake"), tmp_path / "a" / "out"
+    assert command(monkeypatch, path, "--out", out) == 2
+    assert words in one_sentence(capsys)
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (('"core"', '"cor"'), "Unknown instrument 'cor'; known are planck, wmap, core, litebird"),
+        (('"105"', '"106"'), "COrE has no channel '106'; it has 45, 75, 105"),
+        (("[embedded]", "[embedded]\nmodel = { height = 1.0 }"),
+         "embedded.model: 'height' is none of psi0, psi1"),
+        (("[embedded]", "[embedded]\nmodel = { dust_height = -1.0 }"),
+         "embedded.model: Argument `dust_height` must be positive"),
+        (("[embedded]\nnside = 8", "[embedded]\nnside = 4"),
+         "templates.dust: its resolution, 1.32e+03 arcmin, 1.5 pixels of nside 4, is coarser"),
+    ],
+)  # fmt: skip
+def test_refusals_of_instruments(folder, tmp_path, monkeypatch, capsys, change, words):
+    path = write(folder, change, text=INSTRUMENT, name="core")
+    assert command(monkeypatch, path, "--out", tmp_path / "out") == 2
+    assert words in one_sentence(capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_refusals_of_options(folder, tmp_path, monkeypatch, capsys):
+    path, out = write(folder), tmp_path / "out"
+    for options, words in {
+        ("--only", "dust"): "--only must be one of noise, signal, foregrounds, cmb, not 'dust'",
+        ("--resume", "--overwrite"): "--resume and --overwrite exclude each other",
+        ("--nside", "7"): "experiment.nside: nside must be a power of two, not 7",
+        ("--seed", "-1"): "experiment.seed: input should be greater than or equal to 0, not -1",
+    }.items():
+        assert command(monkeypatch, path, "--out", out, *options) == 2
+        assert words in one_sentence(capsys)
+    for options in (("--nsims", "0"), ("--first", "-1")):
+        assert command(monkeypatch, path, "--out", out, *options) == 2
+        assert "Traceback" not in capsys.readouterr().err
+    assert command(monkeypatch, tmp_path / "none.toml", "--out", out) == 2
+    assert "none.toml: cannot be read (No such file or directory)" in one_sentence(capsys)
+    assert not out.exists()
+
+
+def test_a_folder_with_results_is_left_alone(folder, tmp_path, monkeypatch, capsys):
+    path, out = write(folder, name="mine"), tmp_path / "out"
+    assert command(monkeypatch, path, "--out", out) == 0
+    before, log = content(out), out / montecarlo.LOG
+
+    def refused(path, *options):
+        capsys.readouterr()
+        assert command(monkeypatch, path, "--out", out, *options) == 2
+        assert content(out) == before
+        return one_sentence(capsys)
+
+    assert "holds a simulation already; go on with --resume, replace it" in refused(path)
+    for options in (("--seed", "4"), ("--only", "noise")):
+        said = refused(path, "--resume", *options)
+        assert "holds a simulation with other settings; choose another --out" in said
+    # A mistake that only the small scales notice does not cost the old results.
+    wrong = write(folder, (CMB, SMALL.replace("[4, 10]", "[4, 30]") + CMB), name="wrong")
+    assert "from l = 4 to 30" in refused(wrong, "--overwrite")
+    whole = log.read_bytes()
+    for damage in (b"{}", b"[1]", b"\xff\xfe", whole[:50]):
+        log.write_bytes(damage)
+        assert "simulation.json: is damaged; start again with --overwrite" in refused(
+            path, "--resume"
+        )
+    log.unlink()
+    for options in ((), ("--resume",)):
+        assert "holds maps of unknown settings" in refused(path, *options)
+    log.write_bytes(whole)
+    # Neither a title, where the files are nor a picture make it another simulation.
+    moved = write(folder, ('title = "A small sky"', 'data_dir = "."'), name="moved")
+    assert command(monkeypatch, moved, "--out", out, "--resume") == 0
+    assert content(out) == before
+    pictured = load_experiment(write(folder, ("sheet = false", "sheet = true"), name="sheet"))
+    montecarlo.check_folder(out, pictured, resume=True, overwrite=False)
+    assert command(monkeypatch, path, "--out", out, "--overwrite", "--seed", "4") == 0
+    assert content(out).keys() == before.keys()
+    assert all(content(out)[name] != before[name] for name in before)
+
+
+def test_a_file_in_place_of_the_folder_is_left_alone(folder, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    out.write_text("mine")
+    assert command(monkeypatch, write(folder), "--out", out) == 2
+    assert "is not a folder" in one_sentence(capsys)
+    assert out.read_text() == "mine"
+
+
+# Examples, titles and pictures.
+
+
+def test_init_writes_an_example_that_is_valid(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "mine.toml"
+    assert command(monkeypatch, path, "--init") == 0
+    assert path.read_text() == EXAMPLE.read_text()
+    settings = load_experiment(path)
+    assert settings.included() == ["dust", "synchrotron", "cmb", "noise"]
+    channels = experiment._channels(settings)
+    assert list(channels) == ["45", "105", "315"]
+    path.write_text("mine")
+    capsys.readouterr()
+    assert command(monkeypatch, path, "--init") == 2
+    assert "exists already" in one_sentence(capsys)
+    assert path.read_text() == "mine"
+
+
+def test_what_is_commented_out_in_the_example_is_valid(tmp_path):
+    text, path = EXAMPLE.read_text(), tmp_path / "example.toml"
+    lines = re.findall(r"^# (\w+ = .*)$", text.split("# ... or maps")[0], re.MULTILINE)
+    tail = text.split("[fixed]")[1].split("# Bands of one's own")[0]
+    lines += re.findall(r"^# (\w+ = .*)$", tail, re.MULTILINE)
+    assert len(lines) > 14
+    for line in lines:
+        changed = text.replace(f"# {line}", line, 1)
+        if line.startswith("spectra"):
+            changed = changed.replace("r = 0.01", "")
+        path.write_text(changed)
+        load_experiment(path)
+    # Tables: maps and bands of one's own.
+    own = text.split("# ... or maps of one's own")[1].split("[fixed]")[0].split("\n", 2)[2]
+    bands = text.split("instead of an instrument:\n")[1]
+    # Several ways to give the noise: the first one.
+    bands = re.sub(r"^# noise = \{ (rms|covariance|hits).*\n", "", bands, flags=re.MULTILINE)
+    tables = re.sub(r"^# ?", "", own + bands, flags=re.MULTILINE)
+    path.write_text(
+        "[experiment]\nnside = 512\n[small_scales.dust]\nEE=[60,300]\nBB=[60,300]\n" + tables
+    )
+    settings = load_experiment(path)
+    assert list(settings.templates) == ["dust", "ame"]
+    assert [band.name for band in settings.bands] == ["44"]
+
+
+def test_the_default_is_valid():
+    settings = load_experiment(DEFAULT)
+    channels = experiment._channels(settings)
+    assert len(channels) == 15
+    assert all(c.noise > 0 and c.target == 60.0 for c in channels.values())
+    experiment._check_pixels(settings.experiment.nside, dict.fromkeys(channels, 60.0))
+
+
+def test_titles_of_all_kinds(folder, tmp_path, monkeypatch, capsys):
+    title = "Herv\u00edas-Caimap\u00f3 [red] \u00b5K " + 30 * "long "
+    path, out = write(folder, ("A small sky", title)), tmp_path / "out"
+    assert command(monkeypatch, path, "--out", out, "--only", "noise") == 0
+    header = pyfits.getheader(out / "sim_00000" / "30.fits", 1)
+    assert header["INSTRUME"].startswith("Herv?as-Caimap? [red] ?K long")
+    assert command(monkeypatch, path, "--out", tmp_path / "fg", "--only", "foregrounds") == 0
+    assert "[red]" in capsys.readouterr().err
+
+
+def test_intensity_and_the_sheet(folder, tmp_path, monkeypatch):
+    path, out = write(folder, ("sheet = false", "sheet = true"), *IQU), tmp_path / "out"
+    assert command(monkeypatch, path, "--out", out, "--first", 7) == 0
+    (picture,) = out.glob("*.png")
+    assert picture.name == "sim_00007.png"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    setup = build(load_experiment(path))
+    key = montecarlo.realisation_key(3, 7)
+    expected = simulate(key, setup.sources, setup.observation, jnp.asarray(setup.cmb))
+    found = read_maps(out / "sim_00007" / "30.fits", fields=["I", "Q", "U"])
+    np.testing.assert_allclose(found.maps, expected[0], atol=1e-6 * float(jnp.abs(expected).max()))
+
+
+def test_a_folder_that_cannot_be_made(folder, tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").write_text("mine")
+    out = tmp_path / "file" / "out"
+    assert command(monkeypatch, write(folder), "--out", out) == 2
+    assert "Not a directory" in one_sentence(capsys)
+    assert not out.exists()

@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from types import SimpleNamespace
 
 import healpy
 import jax.numpy as jnp
@@ -10,9 +11,9 @@ import numpy as np
 import pytest
 from astropy.io import fits as pyfits
 
+import systems
 from jaxsky import cli, experiment, montecarlo
 from jaxsky.experiment import DEFAULT, EXAMPLE, build, load_experiment
-from jaxsky.galaxy import embedded_sky
 from jaxsky.harmonics import alm_ell, expand, gaussian_beam, synthesis
 from jaxsky.io import read_maps, write_maps
 from jaxsky.simulate import simulate
@@ -439,11 +440,13 @@ nside = 8
 
 
 def test_keys_of_instruments_and_of_the_embedded_sky(folder, monkeypatch):
-    asked, sky = [], embedded_sky(4)
+    sky = systems.dust_and_synchrotron(12 * 4**2)
+    galaxy = SimpleNamespace(sky=lambda stokes: sky, description="A model.")
+    asked = []
 
     def recorded(*arguments):
         asked.append(arguments)
-        return sky
+        return galaxy
 
     monkeypatch.setattr(experiment, "embedded_sky", recorded)
     monkeypatch.setattr(experiment, "camb_spectra", lambda lmax, r: np.zeros((4, lmax + 1)))

@@ -12,8 +12,8 @@ import pytest
 from astropy.io import fits as pyfits
 
 import systems
-from jaxsky import cli, experiment, montecarlo
-from jaxsky.experiment import DEFAULT, EXAMPLE, build, load_experiment
+from jaxsky import cli, montecarlo
+from jaxsky.experiment import DEFAULT, EXAMPLE, build, load_experiment, setup
 from jaxsky.harmonics import alm_ell, expand, gaussian_beam, synthesis
 from jaxsky.io import read_maps, write_maps
 from jaxsky.simulate import simulate
@@ -448,8 +448,8 @@ def test_keys_of_instruments_and_of_the_embedded_sky(folder, monkeypatch):
         asked.append(arguments)
         return galaxy
 
-    monkeypatch.setattr(experiment, "embedded_sky", recorded)
-    monkeypatch.setattr(experiment, "camb_spectra", lambda lmax, r: np.zeros((4, lmax + 1)))
+    monkeypatch.setattr(setup, "embedded_sky", recorded)
+    monkeypatch.setattr(setup, "camb_spectra", lambda lmax, r: np.zeros((4, lmax + 1)))
 
     def made(*changes):
         wide = ("fwhm = 1200.0", "fwhm = 1400.0")
@@ -470,7 +470,7 @@ def test_keys_of_instruments_and_of_the_embedded_sky(folder, monkeypatch):
 def test_keys_of_the_cmb_reach_camb(folder, monkeypatch):
     asked = []
     monkeypatch.setattr(
-        experiment, "camb_spectra", lambda *a, **k: asked.append((a, k)) or np.zeros((4, 17))
+        setup, "camb_spectra", lambda *a, **k: asked.append((a, k)) or np.zeros((4, 17))
     )
     spectra = 'spectra = "cmb.dat"\nformat = "camb"\n'
     for line in ("", "r = 0.05\n", "cosmology = { H0 = 70.0 }\n"):
@@ -685,7 +685,7 @@ def test_init_writes_an_example_that_is_valid(tmp_path, monkeypatch, capsys):
     assert path.read_text() == EXAMPLE.read_text()
     settings = load_experiment(path)
     assert settings.included() == ["dust", "synchrotron", "cmb", "noise"]
-    channels = experiment._channels(settings)
+    channels = setup._channels(settings)
     assert list(channels) == ["45", "105", "315"]
     path.write_text("mine")
     capsys.readouterr()
@@ -722,10 +722,10 @@ def test_what_is_commented_out_in_the_example_is_valid(tmp_path):
 
 def test_the_default_is_valid():
     settings = load_experiment(DEFAULT)
-    channels = experiment._channels(settings)
+    channels = setup._channels(settings)
     assert len(channels) == 15
     assert all(c.noise > 0 and c.target == 60.0 for c in channels.values())
-    experiment._check_pixels(settings.experiment.nside, dict.fromkeys(channels, 60.0))
+    setup._check_pixels(settings.experiment.nside, dict.fromkeys(channels, 60.0))
 
 
 def test_titles_of_all_kinds(folder, tmp_path, monkeypatch, capsys):

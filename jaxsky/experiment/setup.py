@@ -1,17 +1,17 @@
-"""The settings of a simulation, what they name brought together, and refusals with the numbers."""
+"""What the settings of a simulation name, brought together; refusals with the numbers."""
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import healpy
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from pydantic import Field, field_validator, model_validator
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.cmb import camb_spectra
+from jaxsky.experiment.settings import BandTable, Experiment
 from jaxsky.galaxy import GalaxyModel, embedded_sky
 from jaxsky.inputs import (
     Template,
@@ -23,178 +23,15 @@ from jaxsky.inputs import (
 from jaxsky.instrument import load_instrument
 from jaxsky.io import InputError, read_beam, read_spectra
 from jaxsky.observation import Observation, ObservedBand, Source
-from jaxsky.settings import (
-    BandpassSpec,
-    NoiseFile,
-    Nside,
-    SettingsError,
-    SettingsFile,
-    Table,
-    TemplateFile,
-    check_angles,
-    load,
-)
+from jaxsky.settings import SettingsError
 from jaxsky.small_scales import SmallScales
-from jaxsky.units import UNITS
 
-__all__ = ["DEFAULT", "EXAMPLE", "Experiment", "Setup", "build", "load_experiment"]
-
-DEFAULT = Path(__file__).with_name("core.toml")
-EXAMPLE = Path(__file__).with_name("experiment.toml")
+__all__ = ["Setup", "build"]
 
 #: A map resolves beams of so many pixels: there b_l is down to 0.43 at l = 2 nside.
 PIXELS = 1.5
 #: A beam below this lets nothing through that would be seen.
 UNSEEN_WINDOW = 1e-8
-
-
-class Main(Table):
-    """What is observed, and what is written."""
-
-    instrument: str | None = None
-    channels: list[str] | None = Field(None, min_length=1)
-    samples: int = Field(51, ge=2)
-    nside: Nside = 256
-    fwhm: float | Literal["own"] = "own"
-    stokes: Literal["QU", "IQU"] = "QU"
-    unit: Literal["uK_RJ", "uK_CMB"] = "uK_RJ"
-    include: list[str] | None = Field(None, min_length=1)
-    outputs: tuple[Literal["total", "components"], ...] = ("total",)
-    sheet: bool = True
-    diagonal_noise: bool = False
-    seed: int = Field(0, ge=0, lt=2**32)
-    small_scales_seed: int | None = Field(None, ge=0, lt=2**32)
-
-    @field_validator("fwhm")
-    @classmethod
-    def _positive(cls, value: float | str) -> float | str:
-        if not isinstance(value, str) and value <= 0:
-            raise ValueError(f"fwhm must be positive, or 'own', not {value:g}")
-        return value
-
-
-class Embedded(Table):
-    """The embedded model of the Galaxy."""
-
-    nside: Nside = 256
-    seed: int = Field(0, ge=0, lt=2**32)
-    model: dict[str, float] = Field(default={})
-
-
-class SmallScalesTable(Table):
-    """Small scales of a component; see `jaxsky.small_scales.SmallScales`."""
-
-    EE: tuple[int, int]
-    BB: tuple[int, int]
-    slope: float | tuple[float, float] | None = None
-    tilt: float = 0.0
-    amplitude: float = Field(1.0, ge=0)
-    modulation_fwhm: float = Field(180.0, gt=0)
-    correlated_with: str | None = None
-
-
-class CMBTable(Table):
-    """The CMB: from CAMB, or from a file of spectra."""
-
-    r: float = Field(0.0, ge=0)
-    cosmology: dict[str, float] = Field(default={})
-    spectra: str | None = None
-    format: Literal["camb", "planck"] | None = None
-    unit: str | None = None
-
-    @model_validator(mode="after")
-    def _one_source(self) -> "CMBTable":
-        if self.spectra is not None and (self.r or self.cosmology):
-            raise ValueError("r and cosmology are for CAMB; leave them out with spectra")
-        if self.spectra is None and (self.format or self.unit):
-            raise ValueError("format and unit are those of spectra, a file")
-        return self
-
-
-class NoiseTable(NoiseFile):
-    """Noise of a band: a uniform level [unit arcmin], or that of each pixel.
-
-    `unit` is also that of rms, map, covariance (squared) and sigma0 where a file does not say it.
-    """
-
-    KINDS = ("level", *NoiseFile.KINDS)
-
-    level: float | None = Field(None, gt=0)
-    unit: str = "uK_CMB"
-
-    @field_validator("unit")
-    @classmethod
-    def _known(cls, value: str) -> str:
-        if UNITS.get(value, (1.0, ""))[1] not in ("K_RJ", "K_CMB"):
-            raise ValueError(f"must be a temperature such as uK_RJ or mK_CMB, not {value!r}")
-        return value
-
-
-class BandTable(Table):
-    """A band of an experiment of one's own."""
-
-    name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_+-][A-Za-z0-9_.+-]*$")
-    bandpass: BandpassSpec
-    fwhm: float | None = Field(None, ge=0)
-    beam: str | None = None
-    noise: NoiseTable | None = None
-
-    @model_validator(mode="after")
-    def _one_beam(self) -> "BandTable":
-        if (self.fwhm is None) == (self.beam is None):
-            raise ValueError("give the beam either as fwhm or as the file of a window, beam")
-        return self
-
-
-class Experiment(SettingsFile):
-    """All settings of a simulation."""
-
-    experiment: Main = Main()
-    embedded: Embedded | None = None
-    templates: dict[str, TemplateFile] = Field(default={})
-    fixed: dict[str, float] = Field(default={})
-    small_scales: dict[str, SmallScalesTable] = Field(default={})
-    cmb: CMBTable = CMBTable()
-    bands: list[BandTable] = Field(default=[])
-
-    @model_validator(mode="after")
-    def _consistent(self) -> "Experiment":
-        if (self.experiment.instrument is None) == (not self.bands):
-            raise ValueError("give either experiment.instrument or bands")
-        if self.bands and self.experiment.channels:
-            raise ValueError("experiment.channels chooses from an instrument, not from bands")
-        if self.bands and "samples" in self.experiment.model_fields_set:
-            raise ValueError("experiment.samples is of an instrument's bands, not of bands")
-        if self.embedded is not None and self.templates:
-            raise ValueError("give either templates or the table embedded")
-        names = [band.name for band in self.bands]
-        if len(set(names)) < len(names):
-            raise ValueError(f"the names of the bands must differ, but are {', '.join(names)}")
-        check_angles(self.templates)
-        known = [*self.foregrounds(), "cmb", "noise"]
-        for name in self.experiment.include or []:
-            if name not in known:
-                raise ValueError(f"experiment.include: {name!r} is none of {', '.join(known)}")
-        for name in self.small_scales:
-            if name not in self.foregrounds():
-                raise ValueError(f"small_scales.{name}: there is no such component")
-        return self
-
-    def foregrounds(self) -> list[str]:
-        """Names of the components that have templates."""
-        return ["dust", "synchrotron"] if self.embedded is not None else list(self.templates)
-
-    def included(self) -> list[str]:
-        """Names of all that is simulated, "cmb" and "noise" among them."""
-        everything = [*self.foregrounds(), "cmb", "noise"]
-        return [n for n in everything if n in (self.experiment.include or everything)]
-
-
-def load_experiment(
-    path: Path, overrides: Mapping[str, Mapping[str, object]] | None = None
-) -> Experiment:
-    """Settings from a TOML file; see `jaxsky.settings.load`."""
-    return load(path, Experiment, overrides)
 
 
 class Setup(NamedTuple):

@@ -109,7 +109,7 @@ def draw_spectra(
         scaled = ell * (ell + 1) / (2 * np.pi) * spectrum
         axes.loglog(ell[shown], scaled[shown], label=name, **{"color": color, **options})
     # A few round numbers: by default, labels run into each other where there is less than a decade.
-    axes.xaxis.set_major_locator(mpl.ticker.LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_locator(mpl.ticker.LogLocator(subs=(1, 3)))
     axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(mpl.ticker.NullFormatter())
     axes.set_xlabel(r"multipole $\ell$")

@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.checks import as_array, check_positive
+from jaxsky.observation import ObservedBand
 from jaxsky.units import parse_unit
 
 __all__ = ["Channel", "Instrument", "instrument_names", "load_instrument"]
@@ -139,6 +140,27 @@ class Instrument(eqx.Module):
     def bands(self, samples: int = 51, convention: str = "RJ") -> dict[str, Bandpass]:
         """The top-hat bands of all channels by name; see `Bandpass.top_hat`."""
         return {channel.name: channel.band(samples, convention) for channel in self.channels}
+
+    def observed(
+        self, target: ArrayLike | None = None, samples: int = 51
+    ) -> dict[str, ObservedBand]:
+        """All channels by name as `Observation` takes them, with noise in uK_RJ arcmin.
+
+        Parameters
+        ----------
+        target : common beam of the maps [arcmin]; None leaves each its own
+        samples : of each top-hat band
+        """
+        bands = self.bands(samples)
+        return {
+            channel.name: ObservedBand(
+                band,
+                channel.fwhm,
+                target,
+                channel.noise * band.conversion(channel.noise_unit, "uK_RJ"),
+            )
+            for channel, band in zip(self.channels, bands.values(), strict=True)
+        }
 
 
 @cache

@@ -100,3 +100,16 @@ def test_bad_instruments():
     ]:
         with pytest.raises(error, match=words):
             Instrument("mine", channels)
+
+
+def test_observed_channels_have_their_noise_in_antenna_temperature():
+    planck = load_instrument("planck")
+    for name, band in planck.observed(target=60.0, samples=11).items():
+        channel = planck[name]
+        factor = channel.band(11).conversion("uK_CMB", "uK_RJ")
+        assert float(band.noise) == pytest.approx(float(channel.noise * factor))
+        assert (float(band.beam), float(band.target)) == (float(channel.fwhm), 60.0)
+        assert band.band.nu.size == 11
+    assert load_instrument("core").observed()["45"].target is None
+    # COrE's noise is in antenna temperature already.
+    assert float(load_instrument("core").observed()["45"].noise) == pytest.approx(8.61)

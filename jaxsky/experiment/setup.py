@@ -1,5 +1,6 @@
 """What the settings of a simulation name, brought together; refusals with the numbers."""
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -197,13 +198,10 @@ def _channels(settings: Experiment) -> dict[str, ObservedBand]:
         instrument = load_instrument(main.instrument)
         if main.channels is not None:
             instrument = instrument.select(main.channels)
-        for channel in instrument:
-            band = channel.band(main.samples)
-            level = channel.noise * band.conversion(channel.noise_unit, "uK_RJ") if noisy else None
-            channels[channel.name] = ObservedBand(
-                band, channel.fwhm, target, level, main.diagonal_noise
-            )
-        return channels
+        observed = instrument.observed(target, main.samples)
+        if noisy:
+            return observed
+        return {name: dataclasses.replace(seen, noise=None) for name, seen in observed.items()}
     for spec in settings.bands:
         band = _band(folder, spec)
         noise = None

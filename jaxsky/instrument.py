@@ -142,7 +142,7 @@ class Instrument(eqx.Module):
         return {channel.name: channel.band(samples, convention) for channel in self.channels}
 
     def observed(
-        self, target: ArrayLike | None = None, samples: int = 51
+        self, target: Array | float | None = None, samples: int = 51
     ) -> dict[str, ObservedBand]:
         """All channels by name as `Observation` takes them, with noise in uK_RJ arcmin.
 

@@ -96,10 +96,10 @@ def one_band_inputs(nside=16, fwhm=0.0, used=None, template_fwhm=0.0) -> Inputs:
 
 
 def test_a_target_finer_than_a_map_names_both():
-    words = r"resolution of 30 arcmin is finer than that of band '353', 60 arcmin"
+    words = r"target beam of 30 arcmin is finer than that of band '353', 60 arcmin"
     with pytest.raises(ValueError, match=words):
         prepare(one_band_inputs(fwhm=60.0), 8, 30.0)
-    words = r"resolution of 30 arcmin is finer than that of template 'dust', 40 arcmin"
+    words = r"target beam of 30 arcmin is finer than that of template 'dust', 40 arcmin"
     with pytest.raises(ValueError, match=words):
         prepare(one_band_inputs(template_fwhm=40.0), 8, 30.0)
     with pytest.raises(ValueError, match=r"nside 32 is larger than that of template 'dust', 16"):

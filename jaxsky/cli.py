@@ -137,7 +137,8 @@ def fit(
     for sentence in report.warnings(fits, settings.analysis.methods):
         console.print(f"[yellow](!)[/] {sentence}", highlight=False)
     written += [chains] if chains.exists() else []
-    console.print("Written: " + ", ".join(map(str, written)), highlight=False)
+    # Not wrapped, so that paths can be copied.
+    console.print("Written: " + ", ".join(map(str, written)), highlight=False, soft_wrap=True)
 
 
 #: What is simulated with --only: from the names of the foregrounds.
@@ -261,6 +262,7 @@ def simulate(
         + (f"; {kept} maps were there already" if kept else "")
         + f" ({rate}{time.perf_counter() - started:.1f} s in all).",
         highlight=False,
+        soft_wrap=True,
     )
 
 

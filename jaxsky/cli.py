@@ -209,9 +209,6 @@ def simulate(
         def report(message: str) -> None:
             progress.update(task, description=message)
 
-        import matplotlib as mpl
-
-        mpl.use("Agg")  # pictures go to files
         from jaxsky import montecarlo
         from jaxsky.io import read_maps
 
@@ -240,6 +237,9 @@ def simulate(
             raise typer.Exit(130) from None
         written = [out / "sim_*"]
         if settings.experiment.sheet:
+            import matplotlib as mpl
+
+            mpl.use("Agg")  # pictures go to files
             from jaxsky import plots
 
             report("drawing")

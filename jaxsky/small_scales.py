@@ -324,7 +324,7 @@ def continue_templates(
         resize(alm * expand(part.transfer), lmax) for alm, part in zip(alms, parts, strict=True)
     ]
     if len(maps) == 1:
-        borrowed, matrix = jnp.zeros(()), jnp.eye(2)[..., None] * parts[0].injected[:, None]
+        borrowed, matrix = jnp.zeros_like(stay[0]), jnp.eye(2)[..., None] * parts[0].injected
     else:
         ranges = [r for how in small for r in (how.EE, how.BB)]
         borrowed, matrix = _correlated_parts(jnp.concatenate(stay), parts, ranges)
@@ -339,9 +339,7 @@ def continue_templates(
     for i, (template, how) in enumerate(zip(stay, small, strict=True)):
         added = analysis(gain * synthesis(drawn[2 * i : 2 * i + 2], nside), lmax)
         added = expand(_rise((how.EE[1], how.BB[1]), lmax)) * added
-        if len(maps) > 1:
-            added = added + borrowed[2 * i : 2 * i + 2]
-        result.append(template + how.amplitude * added)
+        result.append(template + how.amplitude * (added + borrowed[2 * i : 2 * i + 2]))
     return Continued(result, parts, repaired)
 
 

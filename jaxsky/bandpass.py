@@ -1,10 +1,13 @@
 """Bandpasses: weights over frequency, their conventions, and the average of a spectrum."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.checks import as_array, check_finite, check_positive, is_concrete
@@ -12,7 +15,7 @@ from jaxsky.sed import cmb_derivative
 from jaxsky.types import Numeric
 from jaxsky.units import band_conversion, parse_unit
 
-__all__ = ["CONVENTIONS", "Bandpass", "average"]
+__all__ = ["CONVENTIONS", "Bandpass", "Samples", "average", "stack_bands"]
 
 #: convention -> factor that turns its weights into weights on antenna temperature
 CONVENTIONS: dict[str, Callable[[Array], Array]] = {
@@ -73,13 +76,12 @@ class Bandpass(eqx.Module):
             )
         check_positive("nu", self.nu)
         check_finite("weights", self.weights)
-        if is_concrete(self.nu) and float(self.nu.max()) > MAX_NU:
-            raise ValueError(
-                f"Argument `nu` reaches {float(self.nu.max()):g} GHz; it has to be in GHz, not Hz."
-            )
-        if is_concrete(self.nu) and not bool(jnp.all(jnp.diff(self.nu) > 0)):
+        if is_concrete(self.nu) and (highest := np.asarray(self.nu).max()) > MAX_NU:
+            raise ValueError(f"Argument `nu` reaches {highest:g} GHz; it has to be in GHz, not Hz.")
+        if is_concrete(self.nu) and not np.all(np.diff(self.nu) > 0):
             raise ValueError("Argument `nu` must increase strictly from sample to sample.")
-        if is_concrete(self._integrand) and not float(self._integrand.sum()) > 0:
+        integrand = _integrand(self.nu, self.weights, convention)
+        if is_concrete(integrand) and not np.asarray(integrand).sum() > 0:
             raise ValueError("Argument `weights` has an integral over `nu` that is not positive.")
 
     @classmethod
@@ -97,27 +99,18 @@ class Bandpass(eqx.Module):
         check_positive("width", width)
         if samples < 2:
             raise ValueError(f"Argument `samples` must be at least 2, but is {samples}.")
-        nu = center + width * jnp.linspace(-0.5, 0.5, samples)
-        return cls(nu, jnp.ones_like(nu), convention)
-
-    @property
-    def _integrand(self) -> Float[Array, " sample"]:
-        weights = self.weights * CONVENTIONS[self.convention](self.nu)
-        if self.nu.size == 1:
-            return weights
-        steps = jnp.diff(self.nu)
-        ends = jnp.zeros(1, steps.dtype)
-        return weights * (jnp.concatenate([ends, steps]) + jnp.concatenate([steps, ends])) / 2
+        nu = _across(center, width, samples)
+        return cls(nu, np.ones(samples, nu.dtype), convention)
 
     @property
     def quadrature(self) -> Float[Array, " sample"]:
         """Weights w_k with sum 1, such that the band reads sum_k w_k T(nu_k) in K_RJ."""
-        return self._integrand / self._integrand.sum()
+        return _quadrature(self.nu, self.weights, self.convention)
 
     @property
     def center(self) -> Float[Array, ""]:
         """Mean frequency, weighted as antenna temperature is [GHz]."""
-        return jnp.sum(self.quadrature * self.nu)
+        return jnp.dot(self.quadrature, self.nu)
 
     def shifted(self, delta: ArrayLike) -> "Bandpass":
         """The band moved by delta [GHz]; renormalised, since all averages are."""
@@ -150,7 +143,52 @@ class Bandpass(eqx.Module):
         return band_conversion(source, target, self.nu, self.quadrature, nu_ref)
 
 
-def average(sed: Callable[[Array], Array], band: Bandpass) -> Float[Array, "..."]:
+# What a band is made of is computed in compiled pieces: one operation at a time, each is a
+# program of its own, and those of a simulation's bands would take longer than its maps.
+
+
+@partial(jax.jit, static_argnames="samples")
+def _across(center: Array, width: Array, samples: int) -> Float[Array, " sample"]:
+    return center + width * jnp.linspace(-0.5, 0.5, samples)
+
+
+@partial(jax.jit, static_argnames="convention")
+def _integrand(
+    nu: Float[Array, " sample"], weights: Float[Array, " sample"], convention: str
+) -> Float[Array, " sample"]:
+    """Weights on antenna temperature times the steps of the trapezoid rule."""
+    weights = weights * CONVENTIONS[convention](nu)
+    if nu.size == 1:
+        return weights
+    steps = jnp.diff(nu)
+    ends = jnp.zeros(1, steps.dtype)
+    return weights * (jnp.concatenate([ends, steps]) + jnp.concatenate([steps, ends])) / 2
+
+
+@partial(jax.jit, static_argnames="convention")
+def _quadrature(nu, weights, convention):
+    integrand = _integrand(nu, weights, convention)
+    return integrand / integrand.sum()
+
+
+class Samples(NamedTuple):
+    """What is needed of bands to average a spectrum: frequencies [GHz], and weights with sum 1."""
+
+    nu: Float[Array, "... sample"]
+    quadrature: Float[Array, "... sample"]
+
+
+@jax.jit
+def stack_bands(bands: Sequence[Bandpass]) -> Samples:
+    """Bands as tables with one row each, for `jax.vmap`; short ones end in samples of weight 0."""
+    longest = max(band.nu.size for band in bands)
+    missing = [(0, longest - band.nu.size) for band in bands]
+    nu = [jnp.pad(band.nu, n, mode="edge") for band, n in zip(bands, missing, strict=True)]
+    weights = [jnp.pad(band.quadrature, n) for band, n in zip(bands, missing, strict=True)]
+    return Samples(jnp.stack(nu), jnp.stack(weights))
+
+
+def average(sed: Callable[[Array], Array], band: Bandpass | Samples) -> Float[Array, "..."]:
     """Band average sum_k w_k S(nu_k) of a spectrum: the direct sum, and the reference.
 
     Parameters

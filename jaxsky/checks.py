@@ -43,7 +43,7 @@ def as_array(name: str, value: object) -> Array:
 UNSEEN = -1.6e30
 
 
-def check_finite(name: str, value: Array) -> None:
+def check_finite(name: str, value: Array | np.ndarray) -> None:
     """Raise ValueError if a concrete array has NaN, infinite or UNSEEN values; says how many."""
     if not is_concrete(value):
         return
@@ -54,7 +54,7 @@ def check_finite(name: str, value: Array) -> None:
         )
 
 
-def check_positive(name: str, value: Array) -> None:
+def check_positive(name: str, value: Array | np.ndarray) -> None:
     """Raise ValueError if a concrete array has values that are not finite and positive."""
     check_finite(name, value)
     if is_concrete(value) and not np.all(np.asarray(value) > 0):

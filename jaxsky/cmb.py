@@ -1,7 +1,8 @@
 """The CMB: power spectra from CAMB, and realisations of them."""
 
-from functools import cache
+from functools import cache, partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -51,7 +52,7 @@ def camb_spectra(lmax: int, r: float = 0.0, **cosmology: float) -> Float[np.ndar
 
 
 def realisation(
-    key: Array, spectra: Float[Array, "4 ell"], stokes: str = "QU"
+    key: Array, spectra: Float[Array | np.ndarray, "4 ell"], stokes: str = "QU"
 ) -> Float[Array, "stokes alm"]:
     """Packed coefficients (E, B or I, E, B) of a Gaussian realisation of spectra.
 
@@ -68,9 +69,13 @@ def realisation(
     """
     if stokes not in ("QU", "IQU"):
         raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")
-    TT, EE, BB, TE = jnp.asarray(spectra)
+    return _realisation(key, spectra, stokes)
+
+
+@partial(jax.jit, static_argnames="stokes")
+def _realisation(key, spectra, stokes):
+    TT, EE, BB, TE = spectra
     zero = jnp.zeros_like(TT)
-    fields = jnp.stack(
-        [jnp.stack(row) for row in ([TT, TE, zero], [TE, EE, zero], [zero, zero, BB])]
-    )
+    rows = [TT, TE, zero], [TE, EE, zero], [zero, zero, BB]
+    fields = jnp.stack([jnp.stack(row) for row in rows])
     return correlated.realisation(key, fields)[3 - len(stokes) :]

@@ -67,7 +67,10 @@ def read(folder: Path, spec: MapFile) -> Maps:
 
 
 def read_templates(
-    folder: Path, specs: Mapping[str, TemplateFile], stokes: str = "QU"
+    folder: Path,
+    specs: Mapping[str, TemplateFile],
+    stokes: str = "QU",
+    dtype: type[np.floating] = np.float64,
 ) -> dict[str, Template]:
     """Templates with their laws [uK_RJ], by name; those with angles of others come last.
 
@@ -76,6 +79,7 @@ def read_templates(
     folder : of the files
     specs : by name; their angles are those of each other (`jaxsky.settings.check_angles`)
     stokes : "QU" for the last two columns of each file, "IQU" for the last three
+    dtype : of the templates; parameters that are maps are always in double precision
 
     Raises
     ------
@@ -84,16 +88,22 @@ def read_templates(
     """
     templates: dict[str, Template] = {}
     for name, spec in sorted(specs.items(), key=lambda item: item[1].angles is not None):
-        templates[name] = _read_template(folder, name, spec, templates, stokes)
+        templates[name] = _read_template(folder, name, spec, templates, stokes, dtype)
     return templates
 
 
 def _read_template(
-    folder: Path, name: str, spec: TemplateFile, others: dict[str, Template], stokes: str
+    folder: Path,
+    name: str,
+    spec: TemplateFile,
+    others: dict[str, Template],
+    stokes: str,
+    dtype: type[np.floating],
 ) -> Template:
     found = read(folder, spec)
     check_stokes(f"templates.{name}", found.names, "I" if spec.angles else stokes)
-    maps = jnp.asarray(found.maps) * conversion(found.unit, "uK_RJ", spec.nu_ref)
+    factor = np.asarray(conversion(found.unit, "uK_RJ", spec.nu_ref))
+    maps = jnp.asarray((found.maps * factor).astype(dtype))
     used = np.asarray(found.mask)
     parameters: dict[str, Any] = {"nu_ref": spec.nu_ref}
     for key, value in spec.parameters.items():

@@ -7,10 +7,11 @@ from importlib.resources import files
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.bandpass import Bandpass
-from jaxsky.checks import as_array, check_positive
+from jaxsky.checks import as_array, check_positive, is_concrete
 from jaxsky.observation import ObservedBand
 from jaxsky.units import parse_unit
 
@@ -58,7 +59,10 @@ class Channel(eqx.Module):
         self.width = self._number("width", width)
         self.fwhm = self._number("fwhm", fwhm)
         self.noise = self._number("noise", noise)
-        check_positive("center - width / 2", self.center - self.width / 2)
+        if is_concrete(self.center) and is_concrete(self.width):
+            check_positive(
+                "center - width / 2", np.asarray(self.center) - np.asarray(self.width) / 2
+            )
         parse_unit(noise_unit)
         self.noise_unit = noise_unit
 

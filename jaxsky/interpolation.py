@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsky import chebyshev
-from jaxsky.bandpass import Bandpass, average
+from jaxsky.bandpass import Bandpass, Samples, average, stack_bands
 from jaxsky.checks import is_concrete
 from jaxsky.components import Component
 
@@ -82,8 +82,17 @@ def _range(values: Array) -> tuple[Array, Array]:
     return middle, jnp.maximum((high - low) / 2, least * (1 + jnp.abs(middle)))
 
 
+def _tail(
+    rebuild: Callable[..., Component], values: list[Array], band: Samples
+) -> Float[Array, " node"]:
+    """See `_tails`: along one parameter, in one band."""
+    line = jax.vmap(lambda *v: average(rebuild(v).sed, band))(*values)
+    coefs = jnp.abs(chebyshev.coefficients(line))
+    return jnp.cumsum(coefs[::-1])[::-1] / jnp.abs(line).min()
+
+
 @jax.jit
-def _tails(component: Component, bands: tuple[Bandpass, ...]) -> Float[Array, "maps node"]:
+def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
     """Bound of the relative error of a series cut at each length, for each map, over all bands.
 
     The series along one parameter is taken at the ends and the middle of the others.
@@ -98,12 +107,8 @@ def _tails(component: Component, bands: tuple[Bandpass, ...]) -> Float[Array, "m
             unit: list[Any] = [*corner[:axis], grid, *corner[axis:]]
             values = [mid + half * u for (mid, half), u in zip(ranges, unit, strict=True)]
             values = [jnp.broadcast_to(v, (MAX_NODES,)) for v in values]
-            for band in bands:
-                line = jax.vmap(lambda *v, band=band: average(rebuild(v).sed, band))(*values)
-                coefs = jnp.abs(chebyshev.coefficients(line))
-                tail = jnp.cumsum(coefs[::-1])[::-1]
-                lines.append(tail / jnp.abs(line).min())
-        worst.append(jnp.stack(lines).max(axis=0))
+            lines.append(jax.vmap(partial(_tail, rebuild, values))(samples))
+        worst.append(jnp.concatenate(lines).max(axis=0))
     return jnp.stack(worst)
 
 
@@ -125,7 +130,7 @@ def choose_nodes(component: Component, bands: tuple[Bandpass, ...], tolerance: f
         return None
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((component, bands))):
         return NodeCounts((TRACED_NODES,) * len(maps), tolerance)
-    tails = np.asarray(_tails(component, bands))
+    tails = np.asarray(_tails(component, stack_bands(bands)))
     # A series of n terms leaves out the tail from n on; what rounding leaves there is noise.
     floor = 8 * np.finfo(tails.dtype).eps
     resolved = tails <= max(tolerance / (2 * len(maps)), floor)
@@ -136,7 +141,7 @@ def choose_nodes(component: Component, bands: tuple[Bandpass, ...], tolerance: f
 
 @partial(jax.jit, static_argnames="counts")
 def _series(
-    component: Component, band: Bandpass, counts: tuple[int, ...]
+    component: Component, band: Bandpass | Samples, counts: tuple[int, ...]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Chebyshev coefficients of the band average in the parameters that are maps, and its values.
 
@@ -155,6 +160,14 @@ def _series(
     return chebyshev.coefficients(values), values
 
 
+@partial(jax.jit, static_argnames="counts")
+def _all_series(
+    component: Component, samples: Samples, counts: tuple[int, ...]
+) -> Float[Array, "band node"]:
+    """The coefficients of `_series` in each band."""
+    return jax.vmap(lambda band: _series(component, band, counts)[0].ravel())(samples)
+
+
 def _points(component: Component) -> list[Float[Array, " pix"]]:
     """The maps, scaled to [-1, 1]."""
     maps, _ = _split(component)
@@ -171,15 +184,19 @@ class Terms(NamedTuple):
     sizes : what each adds to the maps at most, relative to the maps
     """
 
-    vectors: Float[Array, "term node"]
+    vectors: Float[np.ndarray, "term node"]
     counts: tuple[int, ...]
     sizes: tuple[float, ...]
+
+    def coefs(self, index: int) -> Float[np.ndarray, "..."]:
+        """Chebyshev coefficients of a term in the scaled parameters that are maps."""
+        return self.vectors[index].reshape(self.counts)
 
 
 def choose_terms(
     component: Component,
     bands: tuple[Bandpass, ...],
-    importance: Float[Array, " band"],
+    importance: Float[Array, " band"] | None,
     tolerance: float,
 ) -> Terms | None:
     """The fewest maps from which a component's emission in all bands can be summed up.
@@ -190,7 +207,8 @@ def choose_terms(
     Parameters
     ----------
     component, bands : concrete, not being traced
-    importance : what the template, times its law, is multiplied by to be relative to the maps
+    importance : what the template, times its law, is multiplied by to be relative to the maps;
+        not needed where no parameter is a map
     tolerance : error relative to the maps
 
     Returns
@@ -199,32 +217,32 @@ def choose_terms(
     one by one.
     """
     if not _split(component)[0]:
-        return Terms(jnp.ones((1, 1)), (), (1.0,))
+        return Terms(np.ones((1, 1)), (), (1.0,))
     nodes = choose_nodes(component, bands, tolerance)
     if nodes is None or nodes.tolerance is not None:
         return None
-    series = jnp.stack([_series(component, band, nodes.counts)[0].ravel() for band in bands])
-    _, sizes, vectors = np.linalg.svd(np.asarray(importance[:, None] * series), full_matrices=False)
+    series = np.asarray(_all_series(component, stack_bands(bands), nodes.counts))
+    weighted = np.asarray(importance)[:, None] * series
+    _, sizes, vectors = np.linalg.svd(weighted, full_matrices=False)
     kept = max(1, int(np.sum(sizes > tolerance)))
-    return Terms(jnp.asarray(vectors[:kept]), nodes.counts, tuple(map(float, sizes[:kept])))
+    return Terms(vectors[:kept], nodes.counts, tuple(map(float, sizes[:kept])))
 
 
 def term_weights(
     component: Component, bands: tuple[Bandpass, ...], terms: Terms
-) -> Float[Array, "band term"]:
+) -> tuple[Float[Array, " term"], ...]:
     """How much of each term a component shows in each band."""
-    series = [_series(component, band, terms.counts)[0].ravel() for band in bands]
-    return jnp.stack(series) @ terms.vectors.T
+    return _weights(component, stack_bands(bands), terms.vectors, terms.counts)
 
 
-def term(component: Component, terms: Terms, index: int) -> Float[Array, " pix"]:
-    """A term in each pixel; a number if no parameter is a map."""
-    return _combination(component, terms.vectors[index].reshape(terms.counts))
+@partial(jax.jit, static_argnames="counts")
+def _weights(component, samples, vectors, counts):
+    return tuple(_all_series(component, samples, counts) @ vectors.T)
 
 
 @jax.jit
-def _combination(component: Component, coefs: Float[Array, "..."]) -> Float[Array, " pix"]:
-    """A series in the scaled parameters that are maps."""
+def term(component: Component, coefs: Float[Array, "..."]) -> Float[Array, " pix"]:
+    """A term (`Terms.coefs`) in each pixel; a number if no parameter is a map."""
     return chebyshev.evaluate(coefs, *_points(component))
 
 

@@ -4,18 +4,20 @@ import json
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 import jaxsky
 from jaxsky.experiment import Experiment, Setup
+from jaxsky.interpolation import Terms
 from jaxsky.io import write_maps, write_text
 from jaxsky.simulate import Prepared, observe_bands, plan, prepare
 
@@ -143,27 +145,97 @@ def _ascii(text: str) -> str:
     return " ".join(text.split()).encode("ascii", "replace").decode()
 
 
+def _columns(
+    maps: Mapping[str, Array], stokes: str, factor: float
+) -> tuple[list[str], Float[np.ndarray, "column pix"]]:
+    """Names of the columns of a file, and the columns: the total first."""
+    wanted = ["total", *(n for n in maps if n != "total")]
+    names = [s if name == "total" else f"{s}_{name}" for name in wanted for s in stokes]
+    columns = np.concatenate([np.asarray(maps[name]) for name in wanted])
+    columns *= factor
+    return names, columns
+
+
 def _write(
     path: Path,
-    maps: Mapping[str, Array],
+    names: list[str],
+    columns: Float[np.ndarray, "column pix"],
     settings: Experiment,
     header: Mapping[str, Any],
-    factor: float,
 ) -> None:
-    stokes = settings.experiment.stokes
-    wanted = ["total", *(n for n in maps if n != "total")]
-    columns = [np.asarray(maps[name] * factor, np.float32) for name in wanted]
-    names = [s if name == "total" else f"{s}_{name}" for name in wanted for s in stokes]
     path.parent.mkdir(parents=True, exist_ok=True)
     write_maps(
         path,
-        np.concatenate(columns),
+        columns,
         names=names,
         unit=settings.experiment.unit,
         overwrite=True,
         extra_header=header,
-        single=True,
+        single=settings.experiment.precision == "single",
     )
+
+
+def _write_behind(
+    jobs: Iterator[tuple[str, Callable[[], None]]],
+) -> Iterator[tuple[str, float]]:
+    """Do each job while the next one is being made; names and seconds, as they are done."""
+    start = time.perf_counter()
+    doing: list[tuple[str, Future[None]]] = []
+
+    def done() -> tuple[str, float]:
+        nonlocal start
+        name, future = doing.pop(0)
+        future.result()
+        start, before = time.perf_counter(), start
+        return name, start - before
+
+    with ThreadPoolExecutor(1) as thread:
+        for name, job in jobs:
+            doing.append((name, thread.submit(job)))
+            del job  # and its maps with it, when it is done
+            if len(doing) > 1:
+                yield done()
+        if doing:
+            yield done()
+
+
+def _jobs(
+    settings: Experiment,
+    setup: Setup,
+    seen: Iterator[tuple[str, dict[str, Array]]],
+    files: Mapping[str, Path],
+    index: int,
+    report: Callable[[str], None],
+    claim: Callable[[], None],
+) -> Iterator[tuple[str, Callable[[], None]]]:
+    """What writes each band of a realisation; `claim` is called when a map is ready."""
+    main = settings.experiment
+    for name, maps in seen:
+        report(f"band {name}")
+        band = setup.observation.channels[name].band
+        columns = _columns(maps, main.stokes, float(band.conversion("uK_RJ", main.unit)))
+        claim()
+        header = _header(settings, setup, name, index)
+        job = partial(_write, files[name], *columns, settings, header)
+        del maps, columns  # or they would still be there when those of the next band are made
+        yield name, job
+        del job
+
+
+def _prepare(
+    key: Array, setup: Setup, terms: Mapping[str, Terms | None], keep: bool
+) -> dict[str, Prepared]:
+    """All sources in harmonic space; if they are not kept, one after the other."""
+    sources, observation = setup.sources, setup.observation
+    if keep or any(source.small_scales is not None for source in sources.values()):
+        prepared = prepare(key, sources, observation, terms)
+    else:
+        prepared = {}
+        for name in list(sources):
+            prepared |= prepare(key, {name: sources.pop(name)}, observation, terms)
+    if not keep:
+        sources.clear()
+    return prepared
 
 
 def run(
@@ -200,8 +272,14 @@ def run(
     random = main.small_scales_seed is None and any(
         source.small_scales is not None for source in setup.sources.values()
     )
-    cmb = None if setup.cmb is None else jnp.asarray(setup.cmb)
     claimed = False
+
+    def claim() -> None:
+        nonlocal claimed
+        if not claimed:
+            _claim(out, settings, overwrite)
+            claimed = True
+
     for index in indices:
         files = paths(out, observation.names, index)
         stale = overwrite and not claimed
@@ -214,26 +292,19 @@ def run(
             report("templates")
             terms = plan(setup.sources, observation) if terms is None else terms
             small = key if random else jax.random.key(main.small_scales_seed or 0)
-            prepared = prepare(small, setup.sources, observation, terms)
-            for name, source in prepared.items():
-                if setup.sources[name].correlated_with and int(source.repaired):
+            correlated = [n for n, source in setup.sources.items() if source.correlated_with]
+            prepared = _prepare(small, setup, terms, keep=random)
+            for name in correlated:
+                if repaired := int(prepared[name].repaired):
                     note(
                         f"{name}: its extrapolated cross-spectra exceed what the auto-spectra "
-                        f"allow at {source.repaired} multipoles; correlations were reduced there."
+                        f"allow at {repaired} multipoles; correlations were reduced there."
                     )
-            if not random:
-                setup.sources.clear()
-        start = time.perf_counter()
         components = "components" in main.outputs
-        seen = observe_bands(key, prepared, observation, cmb, components=components, names=missing)
-        for name, maps in seen:
-            report(f"band {name}")
-            factor = float(observation.channels[name].band.conversion("uK_RJ", main.unit))
-            header = _header(settings, setup, name, index)
-            if not claimed:
-                _claim(out, settings, overwrite)
-                claimed = True
-            _write(files[name], maps, settings, header, factor)
-            now = time.perf_counter()
-            yield Written(index, name, files[name], now - start)
-            start = now
+        seen = observe_bands(
+            key, prepared, observation, setup.cmb, components=components, names=missing
+        )
+        for name, seconds in _write_behind(
+            _jobs(settings, setup, seen, files, index, report, claim)
+        ):
+            yield Written(index, name, files[name], seconds)

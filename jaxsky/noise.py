@@ -8,7 +8,6 @@ import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxsky.checks import as_array, check_finite, is_concrete
@@ -86,16 +85,15 @@ def uniform_alm(
     """
     if stokes not in (1, 2, 3):
         raise ValueError(f"Argument `stokes` must be 1, 2 or 3, not {stokes!r}.")
-    level = as_array("noise", noise) * (math.pi / 180 / 60)
-    spins = np.array({1: [0], 2: [2, 2], 3: [0, 2, 2]}[stokes])
-    there = np.arange(lmax + 1) >= spins[:, None]
-    white = jax.random.normal(key, (stokes, (lmax + 1) ** 2), level.dtype)
-    return _scaled(white, jnp.where(there, level, 0))
+    return _uniform_alm(key, as_array("noise", noise), lmax, stokes)
 
 
-@jax.jit
-def _scaled(alm: Float[Array, "stokes alm"], levels: Float[Array, "stokes ell"]):
-    return alm * expand(levels)
+@partial(jax.jit, static_argnames=("lmax", "stokes"))
+def _uniform_alm(key, noise, lmax, stokes):
+    spins = jnp.array({1: [0], 2: [2, 2], 3: [0, 2, 2]}[stokes])
+    there = jnp.arange(lmax + 1) >= spins[:, None]
+    levels = jnp.where(there, noise * (math.pi / 180 / 60), 0)
+    return jax.random.normal(key, (stokes, (lmax + 1) ** 2), noise.dtype) * expand(levels)
 
 
 def _diagonal(variance: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:
@@ -338,6 +336,8 @@ def fit_knee(
     if not fraction:
         raise ValueError("Estimating the noise needs pixels, but none is left.")
     alm = np.asarray(analysis(jnp.where(used, maps, 0.0), lmax))
+    import optimistix as optx  # takes longer to import than many simulations take
+
     degree = alm_ell(lmax)
     power = np.bincount(degree, (alm**2).sum(axis=0)) / (2 * (2 * np.arange(lmax + 1) + 1))
     measured = jnp.asarray(power[2:] / fraction)

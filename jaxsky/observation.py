@@ -3,13 +3,17 @@
 from collections.abc import Mapping
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import Component
 from jaxsky.small_scales import SmallScales
 
-__all__ = ["Observation", "ObservedBand", "Source"]
+__all__ = ["DTYPES", "Observation", "ObservedBand", "Source"]
+
+#: Types of numbers by the name of their precision.
+DTYPES: dict[str, type[np.floating]] = {"double": np.float64, "single": np.float32}
 
 
 class Source(eqx.Module):
@@ -59,11 +63,13 @@ class Observation(eqx.Module):
     stokes : "QU" or "IQU"
     finest : beam to which small scales are made [arcmin], at most the finest one observed
     lmax : largest multipole of the sky in the maps, by default 2 nside
+    precision : "double" or "single", in which the maps are computed; single takes half the memory
+        and rounds to 1e-7 of the rms of a map
 
     Raises
     ------
     ValueError
-        If there is no channel, or `stokes` is neither.
+        If there is no channel, or `stokes` or `precision` is neither.
     """
 
     channels: dict[str, ObservedBand]
@@ -72,6 +78,7 @@ class Observation(eqx.Module):
     finest: Float[Array, ""] | float = 0.0
     names: tuple[str, ...] = eqx.field(static=True, default=())
     lmax: int = eqx.field(static=True, default=0)
+    precision: str = eqx.field(static=True, default="double")
 
     def __init__(
         self,
@@ -80,9 +87,10 @@ class Observation(eqx.Module):
         stokes: str = "QU",
         finest: Float[Array, ""] | float = 0.0,
         lmax: int | None = None,
+        precision: str = "double",
     ) -> None:
         self.channels, self.nside, self.stokes = dict(channels), nside, stokes
-        self.finest = finest
+        self.finest, self.precision = finest, precision
         self.lmax = 2 * nside if lmax is None else lmax
         # JAX sorts dictionaries when it takes them apart.
         self.names = tuple(channels)
@@ -90,6 +98,15 @@ class Observation(eqx.Module):
             raise ValueError("Argument `channels` must have at least one channel.")
         if stokes not in ("QU", "IQU"):
             raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")
+        if precision not in DTYPES:
+            raise ValueError(
+                f"Argument `precision` must be 'double' or 'single', not {precision!r}."
+            )
+
+    @property
+    def dtype(self) -> type[np.floating]:
+        """Type of the numbers in maps and coefficients."""
+        return DTYPES[self.precision]
 
     @property
     def bands(self) -> tuple[Bandpass, ...]:

@@ -8,15 +8,20 @@ With fixed keys the maps are differentiable in all numbers: spectral parameters,
 amplitudes of small scales, beams, band centres.
 """
 
+import math
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import healpy
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxsky.bandpass import Samples, average, stack_bands
+from jaxsky.checks import is_concrete
 from jaxsky.cmb import realisation
 from jaxsky.components import Component
 from jaxsky.harmonics import (
@@ -44,6 +49,8 @@ __all__ = [
 
 #: Error of the varying laws, relative to the maps of a band.
 TOLERANCE = 1e-7
+#: Most Jacobi steps of an analysis; below nside 128, where the quadrature is worse, one more.
+STEPS = 2
 
 
 def stream(key: Array, kind: str, name: str = "") -> Array:
@@ -88,7 +95,7 @@ def _continued(
         try:
             continued = continue_templates(
                 stream(key, "small scales", leader),
-                [source.component.template for source in members],
+                [source.component.template.astype(float) for source in members],
                 [source.fwhm for source in members],
                 [source.small_scales for source in members if source.small_scales is not None],
                 observation.nside,
@@ -115,7 +122,9 @@ def _at(component: Component, nside: int) -> Component:
 
 def _law(component: Component) -> Component:
     """A component without the pixels of its template."""
-    return jax.tree.map(lambda leaf: leaf[:, :0] if leaf.ndim == 2 else leaf, component)
+    return jax.tree.map(
+        lambda leaf: np.zeros((len(leaf), 0), leaf.dtype) if leaf.ndim == 2 else leaf, component
+    )
 
 
 def plan(
@@ -130,30 +139,49 @@ def plan(
     """
     # Terms are for the ranges of the maps as they are used.
     components = {n: _at(source.component, observation.nside) for n, source in sources.items()}
-    levels = _levels(components, observation)
-    total = jnp.sqrt(sum((rms * law) ** 2 for rms, law in levels.values()))
+    if any(_varies(component) for component in components.values()):
+        importance = _importance(components, stack_bands(observation.bands))
+    else:
+        importance = dict.fromkeys(components)
     return {
-        name: choose_terms(component, observation.bands, levels[name][0] / total, tolerance)
+        name: choose_terms(component, observation.bands, importance[name], tolerance)
         for name, component in components.items()
     }
 
 
+def _varies(component: Component) -> bool:
+    """True if a parameter is a map."""
+    return any(leaf.ndim == 1 for leaf in jax.tree.leaves(component))
+
+
 @jax.jit
-def _levels(
-    components: dict[str, Component], observation: Observation
-) -> dict[str, tuple[Float[Array, ""], Float[Array, " band"]]]:
-    """The rms of each template, and its law in each band at the mean of its parameters."""
-    levels = {}
+def _importance(
+    components: dict[str, Component], samples: Samples
+) -> dict[str, Float[Array, " band"]]:
+    """The rms of each template relative to all that is seen in each band.
+
+    By its law in each band at the mean of its parameters.
+    """
+    rms, levels = {}, {}
     for name, component in components.items():
         middle = jax.tree.map(lambda x: x.mean() if x.ndim == 1 else x, component)
-        law = jnp.stack([band_sed(middle, band, None) for band in observation.bands])
-        levels[name] = jnp.sqrt(jnp.mean(component.template**2)), law
-    return levels
+        rms[name] = jnp.sqrt(jnp.mean(component.template**2))
+        levels[name] = rms[name] * jax.vmap(partial(average, middle.sed))(samples)
+    total = jnp.sqrt(sum(level**2 for level in levels.values()))
+    return {name: value / total for name, value in rms.items()}
 
 
-def _iterations(size: float, nside: int) -> int:
-    """Jacobi steps for a term that adds so much: each gains at least a factor of 20."""
-    return (2 if size > 0.02 else 1 if size > 1e-3 else 0) + (nside < 128)
+def _iterations(size: float, nside: int, beam: Array | float) -> int:
+    """Jacobi steps for a term that adds so much to the maps, for an error below `TOLERANCE`.
+
+    Without steps a spectrum like that of the Galaxy is wrong by some 3e-5 of the map at nside
+    256 and a beam of 2 pixels, in proportion to the pixel, and to what the beam leaves of the
+    multipoles where the quadrature is bad. Each step gains at least a factor of 20.
+    """
+    pixels = float(beam) / healpy.nside2resol(nside, arcmin=True) if is_concrete(beam) else 0.0
+    error = 3e-5 * (256 / nside) * (2 / max(pixels, 1.0)) ** 2 * size
+    needed = math.ceil(math.log(max(error / TOLERANCE, 1.0)) / math.log(20))
+    return min(needed, STEPS + (nside < 128))
 
 
 def prepare(
@@ -179,32 +207,46 @@ def prepare(
     """
     _check_sources(sources, observation)
     terms = plan(sources, observation) if terms is None else terms
-    lmax, nside = observation.lmax, observation.nside
+    lmax, nside, dtype = observation.lmax, observation.nside, observation.dtype
     continued = _continued(key, sources, observation)
     result = {}
     for name, source in sources.items():
         chosen, component = terms[name], _law(_at(source.component, nside))
-        alm, repaired, fwhm = continued.get(name) or (
-            low_multipoles(source.component.template, lmax),
-            0,
-            source.fwhm,
-        )
+        if name in continued:
+            alm, repaired, fwhm = continued[name]
+        else:
+            maps = source.component.template.astype(dtype)
+            steps = _iterations(1.0, healpy.npix2nside(maps.shape[-1]), observation.finest)
+            alm, repaired, fwhm = low_multipoles(maps, lmax, steps), 0, source.fwhm
+        alm = alm.astype(dtype)
         if chosen is not None and not chosen.counts:
             result[name] = Prepared(component, chosen, (alm,), None, fwhm, repaired)
             continue
         if name in continued:
             fwhm = observation.finest
-            alm = alm * expand(gaussian_beam(fwhm, lmax))
+            alm = alm * expand(gaussian_beam(fwhm, lmax).astype(dtype))
         template = synthesis(alm, nside)
         if chosen is None:
             result[name] = Prepared(component, None, (), template, fwhm, repaired)
             continue
         alms = tuple(
-            analysis(template * term(component, chosen, i), lmax, _iterations(size, nside))
+            analysis(
+                _times(template, component, chosen.coefs(i)),
+                lmax,
+                _iterations(size, nside, observation.finest),
+            )
             for i, size in enumerate(chosen.sizes)
         )
         result[name] = Prepared(component, chosen, alms, None, fwhm, repaired)
     return result
+
+
+@jax.jit
+def _times(
+    template: Float[Array, "stokes pix"], component: Component, coefs: Float[Array, "..."]
+) -> Float[Array, "stokes pix"]:
+    """A template times a term of the law."""
+    return template * term(component, coefs).astype(template.dtype)
 
 
 def _check_sources(sources: Mapping[str, Source], observation: Observation) -> None:
@@ -238,16 +280,18 @@ class _Part(NamedTuple):
     """What one component adds to a band: coefficients, their weights, and a window for all."""
 
     alms: tuple[Float[Array, "stokes alm"], ...]
-    weights: Float[Array, " term"]
+    weights: Float[Array, " term"] | tuple[Float[Array, ""] | float, ...]
     window: Float[Array, " ell"]
 
 
 @jax.jit
 def _summed(parts: tuple[_Part, ...]) -> Float[Array, "stokes alm"]:
-    """The sum of the parts, in one pass."""
+    """The sum of the parts, in one pass and the precision of the coefficients."""
+    dtype = parts[0].alms[0].dtype
     return sum(
-        expand(part.window) * sum(w * a for w, a in zip(part.weights, part.alms, strict=True))
-        for part in parts
+        expand(window.astype(dtype))
+        * sum(jnp.asarray(w, dtype) * a for w, a in zip(weights, alms, strict=True))
+        for alms, weights, window in parts
     )
 
 
@@ -257,26 +301,27 @@ def _noise(
     """Noise of a channel in harmonic space or as a map, whichever it is simpler in."""
     if channel.noise is None:
         return None
-    noise, stokes, nside = jnp.asarray(channel.noise), len(observation.stokes), observation.nside
+    noise = jnp.asarray(channel.noise, observation.dtype)
+    stokes, nside = len(observation.stokes), observation.nside
     if not noise.ndim and channel.target is not None:
         # Uniform noise stays isotropic when it is smoothed.
         alm = uniform_alm(key, noise, observation.lmax, stokes)
         window = beam_ratio(channel.target, channel.beam, observation.lmax, "the channel")
-        return _Part((alm,), jnp.ones(1), window)
+        return _Part((alm,), (1.0,), window)
     if not noise.ndim:
         return uniform_map(key, noise, nside, stokes)
     white = draw(key, noise, diagonal=channel.diagonal)
     if channel.target is None:
         return white
     window = beam_ratio(channel.target, channel.beam, observation.lmax, "the channel")
-    return resample(white, window, nside)
+    return resample(white, window.astype(observation.dtype), nside)
 
 
 def observe_bands(
     key: Array,
     prepared: Mapping[str, Prepared],
     observation: Observation,
-    cmb: Float[Array, "4 ell"] | None = None,
+    cmb: Float[Array | np.ndarray, "4 ell"] | None = None,
     *,
     components: bool = False,
     names: Sequence[str] | None = None,
@@ -319,41 +364,53 @@ def observe_bands(
                 f"The spectra of the CMB end at l = {cmb.shape[-1] - 1}, but nside {nside} "
                 f"needs {lmax}."
             )
-        cmb_alm = realisation(stream(key, "cmb"), jnp.asarray(cmb)[:, : lmax + 1], stokes)
+        spectra = cmb[:, : lmax + 1].astype(observation.dtype)
+        cmb_alm = realisation(stream(key, "cmb"), spectra, stokes)
     for i, name in enumerate(observation.names):
         if names is not None and name not in names:
             continue
         channel = observation.channels[name]
         beam = channel.beam if channel.target is None else channel.target
         parts = {
-            which: _seen(source, channel, weights.get(which), i, beam, lmax, which)
+            which: _seen(
+                source, channel, weights[which][i] if which in weights else None, beam, lmax, which
+            )
             for which, source in prepared.items()
         }
         if cmb is not None:
             factor = channel.band.conversion("uK_CMB", "uK_RJ")
-            parts["cmb"] = _Part((cmb_alm,), factor[None], beam_ratio(beam, 0.0, lmax))
+            parts["cmb"] = _Part((cmb_alm,), (factor,), beam_ratio(beam, 0.0, lmax))
         noise = _noise(stream(key, "noise", name), channel, observation)
         if isinstance(noise, _Part):
             parts["noise"] = noise
-        maps = {}
-        if components:
-            maps = {which: synthesis(_summed((part,)), nside) for which, part in parts.items()}
-            total = sum(maps.values())
-        elif parts:
-            total = synthesis(_summed(tuple(parts.values())), nside)
-        else:
-            total = 0.0
-        if noise is not None and not isinstance(noise, _Part):
-            total = total + noise
-            maps = {**maps, "noise": noise} if components else maps
-        yield name, {**maps, "total": jnp.asarray(total)}
+        yield name, _maps(parts, noise, nside, components)
+
+
+def _maps(
+    parts: Mapping[str, _Part],
+    noise: _Part | Float[Array, "stokes pix"] | None,
+    nside: int,
+    components: bool,
+) -> dict[str, Float[Array, "stokes pix"]]:
+    """The total of a band, and its components if they are wanted."""
+    maps = {}
+    if components:
+        maps = {which: synthesis(_summed((part,)), nside) for which, part in parts.items()}
+        total = sum(maps.values())
+    elif parts:
+        total = synthesis(_summed(tuple(parts.values())), nside)
+    else:
+        total = 0.0
+    if noise is not None and not isinstance(noise, _Part):
+        total = total + noise
+        maps = {**maps, "noise": noise} if components else maps
+    return {**maps, "total": jnp.asarray(total)}
 
 
 def _seen(
     source: Prepared,
     channel: ObservedBand,
-    weights: Float[Array, "band term"] | None,
-    index: int,
+    weights: Float[Array, " term"] | None,
     beam: Array | float,
     lmax: int,
     name: str,
@@ -361,17 +418,18 @@ def _seen(
     """A component in a band."""
     window = beam_ratio(beam, source.fwhm, lmax, f"component {name!r}")
     if weights is not None:
-        return _Part(source.alms, weights[index], window)
+        return _Part(source.alms, weights, window)
     assert source.template is not None  # kept where there are no terms
     law = band_sed(source.component, channel.band, None)
-    return _Part((analysis(source.template * law, lmax),), jnp.ones(1), window)
+    seen = source.template * law.astype(source.template.dtype)
+    return _Part((analysis(seen, lmax),), (1.0,), window)
 
 
 def simulate(
     key: Array,
     sources: Mapping[str, Source],
     observation: Observation,
-    cmb: Float[Array, "4 ell"] | None = None,
+    cmb: Float[Array | np.ndarray, "4 ell"] | None = None,
     *,
     terms: Mapping[str, Terms | None] | None = None,
 ) -> Float[Array, "band stokes pix"]:

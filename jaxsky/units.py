@@ -4,6 +4,7 @@ Units are named by strings such as "uK_CMB", "mK_RJ", "MJy/sr". The factors are 
 arrays; the names are static. Inside the package everything is uK_RJ.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -44,12 +45,12 @@ def parse_unit(unit: str) -> tuple[float, str]:
         raise ValueError(f"Unknown unit {unit!r}; known units are {', '.join(UNITS)}.") from None
 
 
-def _ratio(source: str, target: str, K_RJ_per: dict[str, Numeric]) -> Array:
+def _ratio(source: str, target: str, K_RJ_per: Callable[[str], Numeric]) -> Array:
     (source_size, source_kind), (target_size, target_kind) = parse_unit(source), parse_unit(target)
     scale = source_size / target_size
     if source_kind == target_kind:
         return jnp.asarray(scale)
-    return jnp.asarray(scale * K_RJ_per[source_kind] / K_RJ_per[target_kind])
+    return jnp.asarray(scale * K_RJ_per(source_kind) / K_RJ_per(target_kind))
 
 
 def conversion(source: str, target: str, nu: Numeric) -> Float[Array, "..."]:
@@ -71,15 +72,13 @@ def conversion(source: str, target: str, nu: Numeric) -> Float[Array, "..."]:
     0.7772
     """
     nu = jnp.asarray(nu)
-    return _ratio(
-        source,
-        target,
-        {
-            "K_RJ": jnp.ones_like(nu),
-            "K_CMB": cmb_derivative(nu),
-            "MJy/sr": 1 / (MJYSR_PER_K_RJ_AT_1GHZ * nu**2),
-        },
-    )
+
+    def K_RJ_per(kind: str) -> Array:
+        if kind == "K_CMB":
+            return cmb_derivative(nu)
+        return jnp.ones_like(nu) if kind == "K_RJ" else 1 / (MJYSR_PER_K_RJ_AT_1GHZ * nu**2)
+
+    return _ratio(source, target, K_RJ_per)
 
 
 @partial(jax.jit, static_argnames=("source", "target"))
@@ -108,6 +107,11 @@ def band_conversion(
     ValueError
         If a unit is unknown.
     """
-    iras = jnp.sum(weights * (nu_ref / nu) / (MJYSR_PER_K_RJ_AT_1GHZ * nu**2))
-    K_CMB = jnp.sum(weights * cmb_derivative(nu))
-    return _ratio(source, target, {"K_RJ": 1.0, "K_CMB": K_CMB, "MJy/sr": iras})
+
+    def K_RJ_per(kind: str) -> Numeric:
+        if kind == "K_CMB":
+            return jnp.sum(weights * cmb_derivative(nu))
+        iras = (nu_ref / nu) / (MJYSR_PER_K_RJ_AT_1GHZ * nu**2)
+        return 1.0 if kind == "K_RJ" else jnp.sum(weights * iras)
+
+    return _ratio(source, target, K_RJ_per)

@@ -123,8 +123,8 @@ MANY = tuple(Bandpass.delta(nu) for nu in (30.0, 60.0, 100.0, 143.0, 217.0, 353.
 
 def summed(component, bands, terms):
     """The law in each band and pixel as a sum of terms, shape (band, pix)."""
-    maps = jnp.stack([term(component, terms, i) for i in range(len(terms.vectors))])
-    return term_weights(component, bands, terms) @ maps
+    maps = jnp.stack([term(component, terms.coefs(i)) for i in range(len(terms.vectors))])
+    return jnp.stack(term_weights(component, bands, terms)) @ maps
 
 
 def law(component, bands):
@@ -172,11 +172,13 @@ def test_a_law_without_maps_is_one_exact_term():
     component = Dust(MAPS)
     terms = choose_terms(component, MANY, jnp.ones(len(MANY)), 1e-2)
     assert terms.counts == ()
-    np.testing.assert_allclose(term_weights(component, MANY, terms)[:, 0], law(component, MANY))
+    weights = jnp.stack(term_weights(component, MANY, terms))
+    np.testing.assert_allclose(weights[:, 0], law(component, MANY))
     # Weights are for whatever the numbers are; a term chosen before serves all.
     other = Dust(MAPS, 1.7, 18.0)
-    np.testing.assert_allclose(term_weights(other, MANY, terms)[:, 0], law(other, MANY))
-    assert float(term(component, terms, 0)) == 1.0
+    weights = jnp.stack(term_weights(other, MANY, terms))
+    np.testing.assert_allclose(weights[:, 0], law(other, MANY))
+    assert float(term(component, terms.coefs(0))) == 1.0
 
 
 def test_no_terms_where_bands_are_better_averaged_one_by_one():

@@ -47,6 +47,7 @@ class Main(Table):
     unit: Literal["uK_RJ", "uK_CMB"] = "uK_RJ"
     include: list[str] | None = Field(None, min_length=1)
     outputs: tuple[Literal["total", "components"], ...] = ("total",)
+    precision: Literal["single", "double"] = "single"
     sheet: bool = True
     diagonal_noise: bool = False
     seed: int = Field(0, ge=0, lt=2**32)

@@ -23,7 +23,7 @@ from jaxsky.inputs import (
 )
 from jaxsky.instrument import load_instrument
 from jaxsky.io import InputError, read_beam, read_spectra
-from jaxsky.observation import Observation, ObservedBand, Source
+from jaxsky.observation import DTYPES, Observation, ObservedBand, Source
 from jaxsky.settings import SettingsError
 from jaxsky.small_scales import SmallScales
 
@@ -83,7 +83,8 @@ def build(settings: Experiment) -> Setup:
     _check_templates(settings, templates, seen)
     sources = {name: _source(settings, name, template) for name, template in templates.items()}
     lmax = _lmax(channels, target, main.nside)
-    observation = Observation(channels, main.nside, main.stokes, min(seen.values()), lmax)
+    finest = min(seen.values())
+    observation = Observation(channels, main.nside, main.stokes, finest, lmax, main.precision)
     cmb = _cmb(settings, lmax) if "cmb" in included else None
     return Setup(sources, observation, cmb, description)
 
@@ -130,7 +131,8 @@ def _check_pixels(nside: int, beams: Mapping[str, float]) -> None:
 def _templates(settings: Experiment) -> tuple[dict[str, Template], str]:
     stokes = settings.experiment.stokes
     if settings.embedded is None:
-        templates = read_templates(Path(settings.data_dir), settings.templates, stokes)
+        dtype = DTYPES[settings.experiment.precision]
+        templates = read_templates(Path(settings.data_dir), settings.templates, stokes, dtype)
         description = settings.title or "Templates from files."
     else:
         embedded = settings.embedded

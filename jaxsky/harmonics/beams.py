@@ -1,12 +1,13 @@
 """Windows in l of beams and pixels."""
 
 import math
+from functools import partial
 
 import healpy
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
-from scipy.special import j1
 
 from jaxsky.checks import is_concrete
 
@@ -29,11 +30,13 @@ def gaussian_beam(fwhm: ArrayLike, lmax: int) -> Float[Array, " ell"]:
     fwhm : full width at half maximum [arcmin]
     lmax : largest multipole
     """
-    return _gaussian(jnp.asarray(fwhm) ** 2, lmax)
+    return _gaussian(fwhm, 0.0, lmax)
 
 
-def _gaussian(squared_fwhm: Array, lmax: int) -> Float[Array, " ell"]:
-    variance = squared_fwhm * math.radians(1 / 60) ** 2 / (8 * math.log(2))
+@partial(jax.jit, static_argnames="lmax")
+def _gaussian(fwhm: ArrayLike, own: ArrayLike, lmax: int) -> Float[Array, " ell"]:
+    """Window of a Gaussian, divided by that of another."""
+    variance = (jnp.square(fwhm) - jnp.square(own)) * math.radians(1 / 60) ** 2 / (8 * math.log(2))
     ell = jnp.arange(lmax + 1)
     return jnp.exp(-ell * (ell + 1) * variance / 2)
 
@@ -58,12 +61,12 @@ def beam_ratio(
     """
     target, own = jnp.asarray(target, float), jnp.asarray(own, float)
     if not target.ndim and not own.ndim:
-        if is_concrete(target) and is_concrete(own) and target < own:
+        if is_concrete(target) and is_concrete(own) and float(target) < float(own):
             raise ValueError(
                 f"The target beam of {float(target):g} arcmin is finer than that of {what}, "
                 f"{float(own):g} arcmin."
             )
-        return _gaussian(target**2 - own**2, lmax)
+        return _gaussian(target, own, lmax)
     over, under = _window(target, lmax, "the target"), _window(own, lmax, what)
     empty = jnp.abs(under) < NEGLIGIBLE
     ratio = jnp.where(empty, 0.0, over / jnp.where(empty, 1.0, under))
@@ -94,6 +97,8 @@ def pixel_window(nside: int, lmax: int) -> Float[np.ndarray, " ell"]:
 
     healpy has its own tables, but fetches them over the network.
     """
+    from scipy.special import j1  # takes longer to import than most windows take
+
     x = np.sqrt(np.arange(lmax + 1) * np.arange(1, lmax + 2)) * math.sqrt(
         healpy.nside2pixarea(nside) / np.pi
     )

@@ -18,7 +18,9 @@ __all__ = ["average_pixels", "children", "low_multipoles", "resample", "smooth"]
 MARGIN = 3
 
 
-def low_multipoles(maps: Float[Array, "stokes pix"], lmax: int) -> Float[Array, "stokes alm"]:
+def low_multipoles(
+    maps: Float[Array, "stokes pix"], lmax: int, iterations: int | None = None
+) -> Float[Array, "stokes alm"]:
     """Packed coefficients up to lmax of maps that have higher multipoles, too.
 
     Multipoles beyond those that are analysed leak into them, so more are than are kept.
@@ -27,9 +29,10 @@ def low_multipoles(maps: Float[Array, "stokes pix"], lmax: int) -> Float[Array, 
     ----------
     maps : shape (stokes, pix), RING; one row is I, two are Q, U, three are I, Q, U
     lmax : largest multipole kept; above 2 nside of the maps coefficients are zero
+    iterations : of `analysis`
     """
     resolved = 2 * healpy.npix2nside(maps.shape[-1])
-    return resize(analysis(maps, min(resolved, MARGIN * lmax)), lmax)
+    return resize(analysis(maps, min(resolved, MARGIN * lmax), iterations), lmax)
 
 
 @partial(jax.jit, static_argnames="nside")

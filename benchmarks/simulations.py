@@ -123,6 +123,13 @@ class _Beside:
         out = self._out()
         return _command(self.settings, out, *options), out / "sim_00000"
 
+    def ours_double(self) -> Usage:
+        """A run of the command in double precision."""
+        path = self.folder / "double.toml"
+        text = self.settings.read_text()
+        path.write_text(text.replace("[experiment]", '[experiment]\nprecision = "double"'))
+        return _command(path, self._out())
+
     def theirs(self, *options: str) -> tuple[Usage, Path]:
         """A run of the peer, and where its maps are."""
         out = self._out()
@@ -176,12 +183,14 @@ def _beside_pysm(quick: bool, varying: bool, target: float) -> list[Row]:
         if not varying:
             variants["besides, templates transformed once, then scaled"] = ["--lean", "--scaled"]
         others = {name: beside.theirs(*options)[0] for name, options in variants.items()}
+        double = beside.ours_double()
         runs = [first, second, beside.ours()[0]]
     wall, peak = median(run.seconds for run in runs), median(run.peak for run in runs)
     ratio, memory = theirs.seconds / wall, theirs.peak / peak
     remarks = [
         f"{time_text(theirs.seconds)} / {time_text(wall)} "
-        f"(runs {', '.join(time_text(run.seconds) for run in runs)})",
+        f"(runs {', '.join(time_text(run.seconds) for run in runs)}; in double precision "
+        f"{time_text(double.seconds)}, {double.peak:.2f} GiB)",
         *(
             f"with {name} {time_text(run.seconds)}, {run.seconds / wall:.1f}x, "
             f"{run.peak / peak:.1f}x in memory"
@@ -201,10 +210,8 @@ def _beside_pysm(quick: bool, varying: bool, target: float) -> list[Row]:
             "; ".join(remarks),
         )
     ]
-    if varying:
-        sizes = f"{theirs.peak:.2f} / {peak:.2f} GiB"
-        row = Row("the same: peak memory", f"{memory:.1f}x", ">= 2x", memory >= 2, sizes)
-        rows.append(row)
+    sizes = f"{theirs.peak:.2f} / {peak:.2f} GiB"
+    rows.append(Row("the same: peak memory", f"{memory:.1f}x", ">= 2x", memory >= 2, sizes))
     return rows
 
 

@@ -60,7 +60,7 @@ def uniform_map(
     nside : resolution
     stokes : number of Stokes parameters, all with this noise
     """
-    sigma = as_array("noise", noise) / healpy.nside2resol(nside, arcmin=True)
+    sigma = as_array("noise", noise) / float(healpy.nside2resol(nside, arcmin=True))
     return sigma * jax.random.normal(key, (stokes, healpy.nside2npix(nside)), sigma.dtype)
 
 

@@ -8,7 +8,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxsky import Bandpass, sed
-from jaxsky.bandpass import CONVENTIONS, average
+from jaxsky.bandpass import CONVENTIONS, average, stack_bands
 from jaxsky.units import conversion
 
 NU = np.linspace(60.0, 80.0, 81)
@@ -141,3 +141,12 @@ def test_units_are_refused():
 def test_a_width_that_is_not_positive_is_refused():
     with pytest.raises(ValueError, match="`width` must be positive"):
         Bandpass.top_hat(70.0, 0.0)
+
+
+def test_stacked_bands_have_the_same_averages():
+    bands = [Bandpass.top_hat(70.0, 20.0, samples=7), Bandpass.delta(44.0), Bandpass(NU, NU, "CMB")]
+    stacked = stack_bands(bands)
+    assert stacked.nu.shape == stacked.quadrature.shape == (3, NU.size)
+    np.testing.assert_allclose(stacked.quadrature.sum(axis=1), 1)
+    seen = jax.vmap(lambda band: average(power_law, band))(stacked)
+    np.testing.assert_allclose(seen, [average(power_law, band) for band in bands], rtol=1e-14)

@@ -323,6 +323,36 @@ def test_a_stopped_run_goes_on(three, tmp_path, monkeypatch, capsys):
     assert content(out) == expected
 
 
+def test_what_cannot_be_written_stops_the_run(three, tmp_path, monkeypatch, capsys):
+    """Bands are written while the next one is made; an error there is one, and leaves no file."""
+    path, _ = three
+    written, write_maps = [], montecarlo.write_maps
+
+    def full(where, *arguments, **options):
+        if len(written) == 3:
+            raise OSError(28, "No space left on device", str(where))
+        write_maps(where, *arguments, **options)
+        written.append(where)
+
+    monkeypatch.setattr(montecarlo, "write_maps", full)
+    assert command(monkeypatch, path, "--out", tmp_path / "out", "--nsims", 3) == 2
+    assert "No space left on device" in one_sentence(capsys)
+    assert sorted((tmp_path / "out").glob("sim_*/*.fits")) == sorted(written)
+
+
+def test_double_precision(folder, tmp_path, monkeypatch):
+    path = write(folder, ("seed = 3", 'seed = 3\nprecision = "double"'), name="double")
+    assert command(monkeypatch, path, "--out", tmp_path / "out") == 0
+    file = tmp_path / "out" / "sim_00000" / "30.fits"
+    assert pyfits.getheader(file, 1)["TFORM1"].endswith("D")
+    setup = build(load_experiment(path))
+    expected = simulate(
+        montecarlo.realisation_key(3, 0), setup.sources, setup.observation, setup.cmb
+    )
+    found = read_maps(file, fields=["Q", "U"]).maps
+    np.testing.assert_allclose(found, expected[0], rtol=0, atol=1e-12 * np.abs(found).max())
+
+
 def test_another_seed_is_another_sky(three, tmp_path, monkeypatch):
     path, expected = three
     for seed in (3, 4):

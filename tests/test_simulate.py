@@ -65,9 +65,11 @@ def sources(beta=BETA, small=None, follow=None, templates=TEMPLATES):
     }
 
 
-def observation(target=None, noise=None, beam=1200.0, bands=BANDS, stokes="QU", **options):
+def observation(
+    target=None, noise=None, beam=1200.0, bands=BANDS, stokes="QU", precision="double", **options
+):
     channels = {n: ObservedBand(b, beam, target, noise, **options) for n, b in bands.items()}
-    return Observation(channels, NSIDE, stokes, finest=1000.0)
+    return Observation(channels, NSIDE, stokes, finest=1000.0, precision=precision)
 
 
 def observed(key, there, how, cmb=None, terms=None):
@@ -111,6 +113,39 @@ def test_constant_laws_are_exact():
         wanted = synthesis(jnp.asarray(alm * ratio), NSIDE)
         # Linear in the template: nothing but rounding.
         assert rms(maps - wanted) < 1e-10 * rms(wanted)
+
+
+@pytest.mark.parametrize("small", [None, SMALL], ids=["templates", "small scales"])
+def test_single_precision_is_double_precision_rounded(small):
+    results = {}
+    for precision in ("double", "single"):
+        how = observation(precision=precision)
+        results[precision] = simulate(KEY, sources(small=small), how)
+        assert results[precision].dtype == how.dtype
+    assert results["single"].dtype == np.float32
+    assert rms(results["single"] - results["double"]) < 5e-7 * rms(results["double"])
+    # Draws of CMB and noise are others: in single precision they are made in it.
+    how = observation(noise=10.0, precision="single")
+    assert simulate(KEY, {}, how, SPECTRA).dtype == np.float32
+    per_pixel = observation(1300.0, noise=np.eye(2)[..., None] * np.ones(NPIX), precision="single")
+    assert simulate(KEY, sources(1.54), per_pixel).dtype == np.float32
+
+
+@pytest.mark.parametrize("pixels", [1.5, 3.0, 6.0])
+def test_steps_of_the_analysis_are_enough_for_the_beam(pixels):
+    """A template with all multipoles that its pixels have, at a beam of so many pixels."""
+    nside = 64
+    ell = alm_ell(2 * nside)
+    alm = np.random.default_rng(0).normal(size=(2, ell.size)) / np.maximum(ell, 1) ** 1.2
+    maps = synthesis(jnp.asarray(np.where(ell > 1, alm, 0)), nside)
+    beam = pixels * healpy.nside2resol(nside, arcmin=True)
+    channel = ObservedBand(Bandpass.delta(353.0), beam)
+    found = simulate(
+        KEY, {"dust": Source(Dust(maps))}, Observation({"353": channel}, nside, finest=beam)
+    )[0]
+    expected = synthesis(expand(gaussian_beam(beam, 2 * nside)) * alm, nside)
+    # What is asked is 1e-7; a spectrum may be somewhat worse than the one of the rule.
+    assert rms(found - expected) < 4e-7 * rms(expected)
 
 
 def test_terms_agree_with_bands_one_by_one():

@@ -63,17 +63,17 @@ class Prepared(NamedTuple):
 
     Parameters
     ----------
-    component : its law, with parameters at the resolution of the observation
-    terms : what the law is made of; None where bands are averaged one by one
-    alms : coefficients of the template times each term, with the beam that it has
-    template : the template where bands are averaged one by one, else None
+    alms : coefficients of the template times each term of its law, with the beam that it has
+    weights : of the terms in each band; None where bands are averaged one by one
+    component : where they are, the law, with parameters at the resolution of the observation
+    template : where they are, the template
     fwhm : beam [arcmin]
     repaired : multipoles whose matrix of correlated small scales was repaired
     """
 
-    component: Component
-    terms: Terms | None
     alms: tuple[Float[Array, "stokes alm"], ...]
+    weights: tuple[Float[Array, " term"], ...] | None
+    component: Component | None
     template: Float[Array, "stokes pix"] | None
     fwhm: Float[Array, ""] | float
     repaired: Int[Array, ""] | int = 0
@@ -220,14 +220,15 @@ def prepare(
             alm, repaired, fwhm = low_multipoles(maps, lmax, steps), 0, source.fwhm
         alm = alm.astype(dtype)
         if chosen is not None and not chosen.counts:
-            result[name] = Prepared(component, chosen, (alm,), None, fwhm, repaired)
+            weights = term_weights(component, observation.bands, chosen)
+            result[name] = Prepared((alm,), weights, None, None, fwhm, repaired)
             continue
         if name in continued:
             fwhm = observation.finest
             alm = alm * expand(gaussian_beam(fwhm, lmax).astype(dtype))
         template = synthesis(alm, nside)
         if chosen is None:
-            result[name] = Prepared(component, None, (), template, fwhm, repaired)
+            result[name] = Prepared((), None, component, template, fwhm, repaired)
             continue
         alms = tuple(
             analysis(
@@ -237,7 +238,8 @@ def prepare(
             )
             for i, size in enumerate(chosen.sizes)
         )
-        result[name] = Prepared(component, chosen, alms, None, fwhm, repaired)
+        weights = term_weights(component, observation.bands, chosen)
+        result[name] = Prepared(alms, weights, None, None, fwhm, repaired)
     return result
 
 
@@ -353,11 +355,6 @@ def observe_bands(
             raise ValueError(
                 f"Nothing is left to be observed in band {name!r}: no component, no CMB, no noise."
             )
-    weights = {
-        name: term_weights(source.component, observation.bands, source.terms)
-        for name, source in prepared.items()
-        if source.terms is not None
-    }
     if cmb is not None:
         if cmb.shape[-1] <= lmax:
             raise ValueError(
@@ -372,9 +369,7 @@ def observe_bands(
         channel = observation.channels[name]
         beam = channel.beam if channel.target is None else channel.target
         parts = {
-            which: _seen(
-                source, channel, weights[which][i] if which in weights else None, beam, lmax, which
-            )
+            which: _seen(source, channel, i, beam, lmax, which)
             for which, source in prepared.items()
         }
         if cmb is not None:
@@ -410,16 +405,18 @@ def _maps(
 def _seen(
     source: Prepared,
     channel: ObservedBand,
-    weights: Float[Array, " term"] | None,
+    index: int,
     beam: Array | float,
     lmax: int,
     name: str,
 ) -> _Part:
     """A component in a band."""
     window = beam_ratio(beam, source.fwhm, lmax, f"component {name!r}")
-    if weights is not None:
-        return _Part(source.alms, weights, window)
-    assert source.template is not None  # kept where there are no terms
+    if source.weights is not None:
+        return _Part(source.alms, source.weights[index], window)
+    # Kept where there are no weights.
+    assert source.component is not None
+    assert source.template is not None
     law = band_sed(source.component, channel.band, None)
     seen = source.template * law.astype(source.template.dtype)
     return _Part((analysis(seen, lmax),), (1.0,), window)

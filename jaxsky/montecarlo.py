@@ -17,7 +17,6 @@ from jaxtyping import Array, Float
 
 import jaxsky
 from jaxsky.experiment import Experiment, Setup
-from jaxsky.interpolation import Terms
 from jaxsky.io import write_maps, write_text
 from jaxsky.simulate import Prepared, observe_bands, plan, prepare
 
@@ -151,6 +150,8 @@ def _columns(
     """Names of the columns of a file, and the columns: the total first."""
     wanted = ["total", *(n for n in maps if n != "total")]
     names = [s if name == "total" else f"{s}_{name}" for name in wanted for s in stokes]
+    if len(wanted) == 1 and factor == 1:
+        return names, np.asarray(maps["total"])
     columns = np.concatenate([np.asarray(maps[name]) for name in wanted])
     columns *= factor
     return names, columns
@@ -222,22 +223,6 @@ def _jobs(
         del job
 
 
-def _prepare(
-    key: Array, setup: Setup, terms: Mapping[str, Terms | None], keep: bool
-) -> dict[str, Prepared]:
-    """All sources in harmonic space; if they are not kept, one after the other."""
-    sources, observation = setup.sources, setup.observation
-    if keep or any(source.small_scales is not None for source in sources.values()):
-        prepared = prepare(key, sources, observation, terms)
-    else:
-        prepared = {}
-        for name in list(sources):
-            prepared |= prepare(key, {name: sources.pop(name)}, observation, terms)
-    if not keep:
-        sources.clear()
-    return prepared
-
-
 def run(
     settings: Experiment,
     setup: Setup,
@@ -293,7 +278,7 @@ def run(
             terms = plan(setup.sources, observation) if terms is None else terms
             small = key if random else jax.random.key(main.small_scales_seed or 0)
             correlated = [n for n, source in setup.sources.items() if source.correlated_with]
-            prepared = _prepare(small, setup, terms, keep=random)
+            prepared = prepare(small, setup.sources, observation, terms, release=not random)
             for name in correlated:
                 if repaired := int(prepared[name].repaired):
                     note(

@@ -189,6 +189,8 @@ def prepare(
     sources: Mapping[str, Source],
     observation: Observation,
     terms: Mapping[str, Terms | None] | None = None,
+    *,
+    release: bool = False,
 ) -> dict[str, Prepared]:
     """Sources with their small scales, in harmonic space.
 
@@ -199,6 +201,7 @@ def prepare(
     observation : how they are observed
     terms : from `plan`, by default made here; None for a source averages its bands one by one,
         as is necessary where its parameters that are maps are being traced
+    release : take each source out of `sources`, a dict, when it has served, to free its memory
 
     Raises
     ------
@@ -210,15 +213,17 @@ def prepare(
     lmax, nside, dtype = observation.lmax, observation.nside, observation.dtype
     continued = _continued(key, sources, observation)
     result = {}
-    for name, source in sources.items():
-        chosen, component = terms[name], _law(_at(source.component, nside))
+    for name in list(sources):
+        chosen, component = terms[name], _law(_at(sources[name].component, nside))
         if name in continued:
             alm, repaired, fwhm = continued[name]
         else:
-            maps = source.component.template.astype(dtype)
-            steps = _iterations(1.0, healpy.npix2nside(maps.shape[-1]), observation.finest)
-            alm, repaired, fwhm = low_multipoles(maps, lmax, steps), 0, source.fwhm
+            repaired, fwhm = 0, sources[name].fwhm
+            alm = _low_multipoles(sources[name].component.template.astype(dtype), observation)
         alm = alm.astype(dtype)
+        if release:
+            assert isinstance(sources, dict)
+            del sources[name]
         if chosen is not None and not chosen.counts:
             weights = term_weights(component, observation.bands, chosen)
             result[name] = Prepared((alm,), weights, None, None, fwhm, repaired)
@@ -230,25 +235,36 @@ def prepare(
         if chosen is None:
             result[name] = Prepared((), None, component, template, fwhm, repaired)
             continue
-        alms = tuple(
-            analysis(
-                _times(template, component, chosen.coefs(i)),
-                lmax,
-                _iterations(size, nside, observation.finest),
-            )
-            for i, size in enumerate(chosen.sizes)
-        )
+        alms = []
+        for i, size in enumerate(chosen.sizes):
+            steps = _iterations(size, nside, observation.finest)
+            alms.append(_term_alm(template, component, chosen.coefs(i), lmax, steps))
+            if is_concrete(alms[-1]):
+                # JAX would make the maps of all terms ahead of their analysis.
+                alms[-1].block_until_ready()
         weights = term_weights(component, observation.bands, chosen)
-        result[name] = Prepared(alms, weights, None, None, fwhm, repaired)
+        result[name] = Prepared(tuple(alms), weights, None, None, fwhm, repaired)
     return result
 
 
-@jax.jit
-def _times(
-    template: Float[Array, "stokes pix"], component: Component, coefs: Float[Array, "..."]
-) -> Float[Array, "stokes pix"]:
-    """A template times a term of the law."""
-    return template * term(component, coefs).astype(template.dtype)
+def _low_multipoles(
+    template: Float[Array, "stokes pix"], observation: Observation
+) -> Float[Array, "stokes alm"]:
+    """Coefficients of a template, with the steps that its pixels need at the beam observed."""
+    steps = _iterations(1.0, healpy.npix2nside(template.shape[-1]), observation.finest)
+    return low_multipoles(template, observation.lmax, steps)
+
+
+@partial(jax.jit, static_argnames=("lmax", "steps"))
+def _term_alm(
+    template: Float[Array, "stokes pix"],
+    component: Component,
+    coefs: Float[Array, "..."],
+    lmax: int,
+    steps: int,
+) -> Float[Array, "stokes alm"]:
+    """Coefficients of a template times a term of the law; in one program the product is no map."""
+    return analysis(template * term(component, coefs).astype(template.dtype), lmax, steps)
 
 
 def _check_sources(sources: Mapping[str, Source], observation: Observation) -> None:

@@ -44,9 +44,9 @@ def _rings(nside: int) -> Int[Array, " pix"]:
     return jnp.where(belt, (pixel - cap) // (4 * nside) + nside - 1, ring)
 
 
-def _blocks(stokes: int) -> list[tuple[slice, int]]:
+def _blocks(stokes: int, spin: int) -> list[tuple[slice, int]]:
     """Rows of I, of Q, U or of I, Q, U maps that are transformed together, with their spin."""
-    scalar, polarized = (slice(0, 1), 0), (slice(stokes - 2, stokes), 2)
+    scalar, polarized = (slice(0, 1), 0), (slice(stokes - 2, stokes), spin)
     return {1: [scalar], 2: [polarized], 3: [scalar, polarized]}[stokes]
 
 
@@ -62,9 +62,9 @@ def _check_engine(engine: str) -> None:
         raise ValueError(f"Argument `engine` must be one of {', '.join(ENGINES)}, not {engine!r}.")
 
 
-@partial(jax.jit, static_argnames=("nside", "engine"))
+@partial(jax.jit, static_argnames=("nside", "engine", "spin"))
 def synthesis(
-    alm: Float[Array, "stokes alm"], nside: int, engine: str = "ducc"
+    alm: Float[Array, "stokes alm"], nside: int, engine: str = "ducc", spin: int = 2
 ) -> Float[Array, "stokes pix"]:
     """Maps I, or Q, U, or I, Q, U from packed coefficients I, or E, B, or I, E, B.
 
@@ -73,6 +73,7 @@ def synthesis(
     alm : packed coefficients, shape (stokes, (lmax+1)^2)
     nside : resolution of the maps; lmax may exceed 3 nside - 1, the maps are then samples
     engine : "ducc", or "healpy", which has no gradients
+    spin : of the last two rows, if there are two; 2 for polarization
 
     Raises
     ------
@@ -83,20 +84,20 @@ def synthesis(
     lmax = lmax_of(alm)
     if engine == "healpy":
         shape = jax.ShapeDtypeStruct((len(alm), healpy.nside2npix(nside)), alm.dtype)
-        return jax.pure_callback(partial(_healpy_synthesis, nside=nside), shape, alm)
+        return jax.pure_callback(partial(_healpy_synthesis, nside=nside, spin=spin), shape, alm)
     return jnp.concatenate(
-        [_transform(nside, lmax, spin)(alm[rows])[0] for rows, spin in _blocks(len(alm))]
+        [_transform(nside, lmax, s)(alm[rows])[0] for rows, s in _blocks(len(alm), spin)]
     )
 
 
-def _healpy_synthesis(alm: np.ndarray, nside: int) -> np.ndarray:
+def _healpy_synthesis(alm: np.ndarray, nside: int, spin: int) -> np.ndarray:
     """`synthesis` by healpy."""
     lmax = lmax_of(alm)
     maps = [
         healpy.alm2map(parts[0], nside, lmax=lmax)[None]
-        if spin == 0
-        else healpy.alm2map_spin(list(parts), nside, spin, lmax)
-        for rows, spin in _blocks(len(alm))
+        if s == 0
+        else healpy.alm2map_spin(list(parts), nside, s, lmax)
+        for rows, s in _blocks(len(alm), spin)
         for parts in [alm_to_healpy(alm[rows], lmax)]
     ]
     return np.concatenate(maps)
@@ -113,20 +114,23 @@ def _healpy_analysis(maps: np.ndarray, lmax: int, iterations: int) -> np.ndarray
     return alm_from_healpy(alm, lmax)
 
 
-@partial(jax.jit, static_argnames="lmax")
-def adjoint_synthesis(maps: Float[Array, "stokes pix"], lmax: int) -> Float[Array, "stokes alm"]:
+@partial(jax.jit, static_argnames=("lmax", "spin"))
+def adjoint_synthesis(
+    maps: Float[Array, "stokes pix"], lmax: int, spin: int = 2
+) -> Float[Array, "stokes alm"]:
     """Transpose of `synthesis`: inner products of maps with the spherical harmonics."""
     nside = healpy.npix2nside(maps.shape[-1])
     empty = jax.ShapeDtypeStruct((len(maps), (lmax + 1) ** 2), maps.dtype)
-    return jax.linear_transpose(partial(synthesis, nside=nside), empty)(maps)[0]
+    return jax.linear_transpose(partial(synthesis, nside=nside, spin=spin), empty)(maps)[0]
 
 
-@partial(jax.jit, static_argnames=("lmax", "iterations", "engine"))
+@partial(jax.jit, static_argnames=("lmax", "iterations", "engine", "spin"))
 def analysis(
     maps: Float[Array, "stokes pix"],
     lmax: int,
     iterations: int | None = None,
     engine: str = "ducc",
+    spin: int = 2,
 ) -> Float[Array, "stokes alm"]:
     """Packed coefficients of maps I, or Q, U, or I, Q, U: the inverse of `synthesis`.
 
@@ -140,7 +144,8 @@ def analysis(
     lmax : largest multipole, at most 3 nside - 1
     iterations : Jacobi steps; by default one up to lmax = 1.5 nside and two above, and one more
         below nside 128, where the quadrature is worse
-    engine : "ducc", or "healpy", which has no gradients
+    engine : "ducc", or "healpy", which has no gradients and no other spin
+    spin : of the last two rows, if there are two; 2 for polarization
 
     Raises
     ------
@@ -156,9 +161,10 @@ def analysis(
         call = partial(_healpy_analysis, lmax=lmax, iterations=iterations)
         return jax.pure_callback(call, shape, maps)
     weights = jnp.asarray(_ring_weights(nside), maps.dtype)[_rings(nside)]
-    alm = adjoint_synthesis(weights * maps, lmax)
+    alm = adjoint_synthesis(weights * maps, lmax, spin)
     for _ in range(iterations):
-        alm = alm + adjoint_synthesis(weights * (maps - synthesis(alm, nside)), lmax)
+        residual = maps - synthesis(alm, nside, spin=spin)
+        alm = alm + adjoint_synthesis(weights * residual, lmax, spin)
     return alm
 
 

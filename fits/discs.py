@@ -1,0 +1,112 @@
+"""The paper's small patches of the sky: discs at high latitude, and the field of BICEP2."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import healpy
+import numpy as np
+from jaxtyping import Float
+
+from jaxsky.harmonics import gaussian_beam, smooth
+
+__all__ = ["BICEP2", "Patch", "bicep2_mask", "disc_centers", "disc_mask", "paper_patches"]
+
+#: Radius of the paper's discs: 400 square degrees.
+RADIUS = 11.3
+#: FWHM of the Gaussian with which masks are smoothed [deg].
+APODIZATION = 2.0
+#: The field of BICEP2 and Keck: right ascension within +-50 deg, declination -65 to -50 deg.
+BICEP2 = (50.0, -65.0, -50.0)
+
+
+class Patch(NamedTuple):
+    """A part of the sky.
+
+    Parameters
+    ----------
+    name : for tables and pictures
+    lon, lat : Galactic coordinates of its middle [deg]
+    mask : weight of each pixel, RING
+    """
+
+    name: str
+    lon: float
+    lat: float
+    mask: Float[np.ndarray, " pix"]
+
+
+def disc_centers(nside: int = 4, latitude: float = 45.0) -> Float[np.ndarray, "2 disc"]:
+    """Galactic longitude and latitude [deg] of pixels at |b| above a latitude.
+
+    The paper has 48 discs there, and names the pixels of nside 8; 48 are those of nside 4, while
+    nside 8 has 224.
+    """
+    lon, lat = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)
+    return np.stack([lon, lat])[:, np.abs(lat) > latitude]
+
+
+def _smoothed_disc(radius: float, fwhm: float, angle: np.ndarray) -> np.ndarray:
+    """A disc of ones smoothed by a Gaussian, at angles from its middle [deg]; closed form."""
+    lmax = int(np.ceil(6.0 / np.radians(fwhm) * np.sqrt(8 * np.log(2)))) if fwhm else 0
+    ell = np.arange(lmax + 2)
+    legendre = np.polynomial.legendre.legvander(np.array([np.cos(np.radians(radius))]), lmax + 2)[0]
+    # 2 pi int P_l over the disc, times (2l+1)/4 pi of the sum over harmonics
+    coefs = np.empty(lmax + 2)
+    coefs[0] = (1 - legendre[1]) / 2
+    coefs[1:] = (legendre[ell[1:] - 1] - legendre[ell[1:] + 1]) / 2
+    window = np.asarray(gaussian_beam(60 * fwhm, lmax + 1))
+    return np.polynomial.legendre.legval(np.cos(np.radians(angle)), coefs * window)
+
+
+def disc_mask(
+    nside: int, lon: float, lat: float, radius: float = RADIUS, fwhm: float = APODIZATION
+) -> Float[np.ndarray, " pix"]:
+    """A disc smoothed by a Gaussian.
+
+    Parameters
+    ----------
+    nside : resolution
+    lon, lat : Galactic coordinates of its middle [deg]
+    radius : of the disc [deg]
+    fwhm : of the Gaussian [deg]; what it leaves below 1e-5 is zero
+
+    Raises
+    ------
+    ValueError
+        If the Gaussian is wider than the disc, or either is not positive.
+    """
+    if not 0 < fwhm <= radius <= 180:
+        raise ValueError(
+            f"Argument `fwhm`, {fwhm:g} deg, must be positive and not wider than the disc's "
+            f"`radius`, {radius:g} deg."
+        )
+    middle = healpy.ang2vec(lon, lat, lonlat=True)
+    reach = radius + 2 * fwhm
+    near = healpy.query_disc(nside, middle, np.radians(reach))
+    directions = np.stack(healpy.pix2vec(nside, near))
+    across = np.linalg.norm(np.cross(middle, directions, axisb=0), axis=-1)
+    angle = np.degrees(np.arctan2(across, middle @ directions))
+    grid = np.linspace(0, reach, 4000)
+    profile = _smoothed_disc(radius, fwhm, grid)
+    profile = np.where(profile > 1e-5, np.minimum(profile, 1.0), 0.0)
+    mask = np.zeros(healpy.nside2npix(nside))
+    mask[near] = np.interp(angle, grid, profile)
+    return mask
+
+
+def bicep2_mask(nside: int, fwhm: float = APODIZATION) -> Float[np.ndarray, " pix"]:
+    """The field of BICEP2 and Keck, smoothed as the discs are."""
+    lon, lat = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)
+    ra, dec = healpy.Rotator(coord=["G", "C"])(lon, lat, lonlat=True)
+    half, south, north = BICEP2
+    inside = (np.abs((ra + 180) % 360 - 180) < half) & (dec > south) & (dec < north)
+    mask = np.asarray(smooth(inside[None].astype(float), 60 * fwhm))[0]
+    return np.where(mask > 1e-3, np.minimum(mask, 1.0), 0.0)
+
+
+def paper_patches(nside: int) -> Iterator[Patch]:
+    """The paper's 48 discs at |b| > 45 deg, and the field of BICEP2."""
+    for lon, lat in disc_centers().T:
+        yield Patch(f"l {lon:.0f}, b {lat:.0f}", lon, lat, disc_mask(nside, lon, lat))
+    lon, lat = healpy.Rotator(coord=["C", "G"])(0.0, -57.5, lonlat=True)
+    yield Patch("BICEP2", float(lon), float(lat), bicep2_mask(nside))

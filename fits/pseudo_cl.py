@@ -1,0 +1,322 @@
+"""Spectra of polarization on part of the sky: MASTER pseudo-C_l with the mixing of E and B.
+
+A mask mixes multipoles, and E with B. The mean of the spectra of masked maps is a matrix times
+the spectra of the sky (Hivon et al. 2002; for polarization Brown, Castro & Taylor 2005); in bins
+that are wide against the mask's own resolution it can be inverted.
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+from ducc0.misc import wigner3j_int
+from ducc0.misc.experimental import coupling_matrix_rect
+from jaxtyping import Array, Float
+
+from jaxsky.harmonics import analysis, expand, power_spectrum, synthesis
+
+__all__ = [
+    "MaskedSpectra",
+    "band_covariance",
+    "band_powers",
+    "bin_edges",
+    "coupling_matrices",
+    "masked_spectra",
+    "pure_coupling_matrices",
+]
+
+#: Fewest modes of a field in a bin that a mean power can be taken of.
+LEAST_MODES = 4.0
+
+
+class MaskedSpectra(NamedTuple):
+    """How spectra are taken on part of the sky; from `masked_spectra`.
+
+    Parameters
+    ----------
+    mask : weight of each pixel, 0 to 1
+    edges : first multipole of each bin, and the one after the last
+    lmax : largest multipole that is taken into account
+    derivatives : of the mask, spin 1 and 2, where B is purified; shape (4, pix)
+    inverse : from pseudo-spectra EE, BB to band powers D_b, shape (2, bin, 2, ell)
+    windows : band powers of the sky's C_l, shape (2, bin, 2, ell); the beam is in it
+    spread : correlation of pseudo-spectra within and between E and B, shape (2, ell, ell)
+    mixing : pseudo-spectra EE, BB of the sky's, without window, shape (2, 2, ell, ell)
+    """
+
+    mask: Float[np.ndarray, " pix"]
+    edges: tuple[int, ...]
+    lmax: int
+    derivatives: Float[np.ndarray, "4 pix"] | None
+    inverse: Float[np.ndarray, "2 bin 2 ell"]
+    windows: Float[np.ndarray, "2 bin 2 ell"]
+    spread: Float[np.ndarray, "2 ell ell"]
+    mixing: Float[np.ndarray, "2 2 ell ell"]
+
+    @property
+    def centers(self) -> Float[np.ndarray, " bin"]:
+        """Middle multipole of each bin."""
+        edges = np.array(self.edges)
+        return (edges[:-1] + edges[1:] - 1) / 2
+
+
+def bin_edges(lmin: int, lmax: int, width: int) -> tuple[int, ...]:
+    """Edges of bins from lmin to lmax inclusive, all of the width but the last, which is wider."""
+    count = max(1, (lmax + 1 - lmin) // width)
+    return (*(lmin + width * i for i in range(count)), lmax + 1)
+
+
+def coupling_matrices(
+    power: Float[np.ndarray, " ell"], lmax: int
+) -> Float[np.ndarray, "2 ell ell"]:
+    """What a mask does to spectra: pseudo-EE = M[0] EE + M[1] BB, and with E and B exchanged.
+
+    Parameters
+    ----------
+    power : spectrum C_l of the mask, at best up to 2 lmax
+    lmax : largest multipole of the spectra
+    """
+    spectrum = np.zeros(2 * lmax + 1)
+    kept = min(len(power), len(spectrum))
+    spectrum[:kept] = power[:kept]
+    matrices = np.empty((2, lmax + 1, lmax + 1))
+    coupling_matrix_rect(spectrum[None], (4,), matrices, nthreads=0)
+    matrices[:, :2] = matrices[:, :, :2] = 0  # a field of spin 2 has no multipoles below 2
+    return matrices * (2 * np.arange(lmax + 1) + 1)
+
+
+def _pure_factors(lmax: int) -> Float[np.ndarray, "3 ell"]:
+    """Factors of the three terms of a purified harmonic."""
+    ell = np.maximum(np.arange(lmax + 1), 2.0)
+    return np.stack(
+        [
+            np.ones_like(ell),
+            2 / np.sqrt((ell - 1) * (ell + 2)),
+            1 / np.sqrt((ell - 1) * ell * (ell + 1) * (ell + 2)),
+        ]
+    )
+
+
+def _rises(count: int) -> Float[np.ndarray, "3 ell"]:
+    """sqrt((l + n)! / (l - n)!): a scalar's n-th derivative in harmonics of spin n = 0, 1, 2."""
+    ell = np.arange(count, dtype=float)
+    second = (ell - 1) * ell * (ell + 1) * (ell + 2)
+    return np.stack([np.ones(count), np.sqrt(ell * (ell + 1)), np.sqrt(np.maximum(second, 0))])
+
+
+def pure_coupling_matrices(
+    power: Float[np.ndarray, " ell"], lmax: int
+) -> Float[np.ndarray, "2 ell ell"]:
+    """`coupling_matrices` of a purified field (Smith 2006).
+
+    In place of the mask times a harmonic of spin 2 stands the second derivative of the mask times
+    a scalar harmonic, three terms with a Wigner symbol each. M[1] is zero but for rounding, where
+    all multipoles of the mask are given: that is what purifying is for.
+
+    Parameters
+    ----------
+    power : spectrum C_l of the mask, at best up to 2 lmax
+    lmax : largest multipole of the spectra
+    """
+    count = min(len(power), 2 * lmax + 1)
+    weights = power[:count] * (2 * np.arange(count) + 1) / (4 * math.pi)
+    factors, rises = _pure_factors(lmax), _rises(count)
+    matrices = np.zeros((2, lmax + 1, lmax + 1))
+    degree = np.arange(count)
+    for ell in range(2, lmax + 1):
+        others = np.arange(max(2, ell - count + 1), min(lmax, ell + count - 1) + 1)
+        symbols = np.zeros((len(others), count))
+        for row, other in zip(symbols, others, strict=True):
+            for n in range(3):
+                first, values = wigner3j_int(int(other), ell, -2, 2 - n)
+                stop = min(first + len(values), count)
+                row[first:stop] += factors[n, ell] * rises[n, first:stop] * values[: stop - first]
+        squares = symbols**2 * weights
+        odd = (ell + others[:, None] + degree) % 2 == 1
+        matrices[0, ell, others] = np.where(odd, 0, squares).sum(axis=1)
+        matrices[1, ell, others] = np.where(odd, squares, 0).sum(axis=1)
+    return matrices * (2 * np.arange(lmax + 1) + 1)
+
+
+def _all_edges(edges: Sequence[int], lmax: int) -> np.ndarray:
+    """The bins, and as wide ones below and above, whose power is in the masked maps, too."""
+    first, last = edges[1] - edges[0], edges[-1] - edges[-2]
+    below = np.arange(edges[0], 2, -first)[::-1]
+    above = np.arange(edges[-1], lmax + 1, last)
+    inner = edges[1:-1]
+    every = np.concatenate([[2], below[below > 2], inner, above[above < lmax + 1], [lmax + 1]])
+    return np.unique(every)
+
+
+def masked_spectra(
+    mask: Float[np.ndarray, " pix"],
+    edges: Sequence[int],
+    *,
+    lmax: int | None = None,
+    window: Float[np.ndarray, " ell"] | None = None,
+    pure: bool = False,
+) -> MaskedSpectra:
+    """Prepare to take spectra on part of the sky.
+
+    Parameters
+    ----------
+    mask : weight of each pixel, 0 to 1, best falling smoothly to 0; RING
+    edges : first multipole of each bin, and the one after the last
+    lmax : largest multipole whose power is taken into account, by default twice that of the bins,
+        at most 2 nside
+    window : window b_l of the maps (beam and pixels), by default 1
+    pure : purify B, so that E adds no variance to it; takes a mask with two derivatives
+
+    Raises
+    ------
+    ValueError
+        For a mask with values outside 0 to 1 or that leaves too few pixels for the bins, edges
+        that do not increase or reach beyond lmax, or a window that ends before lmax.
+    """
+    mask = np.asarray(mask, dtype=float)
+    nside, edges = healpy.npix2nside(mask.size), tuple(int(edge) for edge in edges)
+    lmax = min(2 * nside, 2 * edges[-1]) if lmax is None else lmax
+    _check(mask, edges, lmax, window)
+    window = np.ones(lmax + 1) if window is None else np.asarray(window, float)[: lmax + 1]
+    reach = min(2 * lmax, 2 * nside)
+    alm = analysis(jnp.asarray(mask)[None], reach)
+    power = np.asarray(power_spectrum(alm)[0])
+    standard = coupling_matrices(power, lmax)
+    purified = pure_coupling_matrices(power, lmax) if pure else standard
+    # [out, in]: pseudo-EE and pseudo-BB of the sky's EE and BB
+    mixing = np.array([[standard[0], standard[1]], [purified[1], purified[0]]])
+    of_sky = mixing * window**2
+    every = _all_edges(edges, lmax)
+    ell = np.arange(lmax + 1)
+    inside = (ell >= every[:-1, None]) & (ell < every[1:, None])
+    to_D = np.maximum(ell * (ell + 1), 1) / (2 * math.pi)
+    binning = inside * to_D / np.diff(every)[:, None]
+    binned = np.einsum("bl,ijlm,cm->ibjc", binning, of_sky, inside / to_D, optimize=True)
+    bins = len(every) - 1
+    solved = np.linalg.inv(binned.reshape(2 * bins, 2 * bins)).reshape(2, bins, 2, bins)
+    wanted = np.isin(every[:-1], edges[:-1])
+    inverse = np.einsum("ibjc,cl->ibjl", solved[:, wanted], binning, optimize=True)
+    windows = np.einsum("ibjl,jklm->ibkm", inverse, of_sky, optimize=True)
+    squared = analysis(jnp.asarray(mask**2)[None], reach, 0)
+    spread = coupling_matrices(np.asarray(power_spectrum(squared)[0]), lmax) / (2 * ell + 1)
+    derivatives = _derivatives(alm, nside) if pure else None
+    return MaskedSpectra(mask, edges, lmax, derivatives, inverse, windows, spread, mixing)
+
+
+def _check(mask: np.ndarray, edges: tuple[int, ...], lmax: int, window: np.ndarray | None) -> None:
+    nside = healpy.npix2nside(mask.size)
+    if not np.isfinite(mask).all() or mask.min() < 0 or mask.max() > 1:
+        raise ValueError(
+            f"Argument `mask` must be between 0 and 1, but reaches from {mask.min():g} to "
+            f"{mask.max():g}."
+        )
+    if len(edges) < 2 or min(np.diff(edges)) < 1 or edges[0] < 2:
+        raise ValueError(
+            f"Argument `edges` must increase from 2 or more and give one bin at least, not {edges}."
+        )
+    if not edges[-1] - 1 <= lmax <= 2 * nside:
+        raise ValueError(
+            f"Argument `lmax` must be between the end of the bins, {edges[-1] - 1}, and 2 nside, "
+            f"{2 * nside}, but is {lmax}."
+        )
+    if window is not None and len(window) <= lmax:
+        raise ValueError(f"Argument `window` ends at l = {len(window) - 1}, not at {lmax}.")
+    fraction = _fraction(mask)
+    for low, high in itertools.pairwise(edges):
+        modes = fraction * (high**2 - low**2)
+        if modes < LEAST_MODES:
+            raise ValueError(
+                f"The mask leaves too few pixels: {fraction:.2g} of the sky has {modes:.2g} modes "
+                f"at l = {low} to {high - 1}, and {LEAST_MODES:g} are needed."
+            )
+
+
+def _fraction(mask: np.ndarray) -> float:
+    """Fraction of the sky that has as many modes as there are within the mask."""
+    fourth = float(np.mean(mask**4))
+    return float(np.mean(mask**2)) ** 2 / fourth if fourth else 0.0
+
+
+def _derivatives(alm: Float[Array, "1 alm"], nside: int) -> Float[np.ndarray, "4 pix"]:
+    """First and second derivative of a mask, as fields of spin 1 and 2."""
+    rises = _rises(math.isqrt(alm.shape[-1]))
+    zero = jnp.zeros_like(alm[0])
+    first, second = (jnp.stack([alm[0] * expand(jnp.asarray(rise)), zero]) for rise in rises[1:])
+    return np.concatenate([synthesis(first, nside, spin=1), synthesis(second, nside)])
+
+
+@partial(jax.jit, static_argnames="lmax")
+def _masked_alm(
+    mask: Float[Array, " pix"],
+    derivatives: Float[Array, "4 pix"] | None,
+    maps: Float[Array, "2 pix"],
+    lmax: int,
+) -> Float[Array, "2 alm"]:
+    """E and B of masked maps, B purified if the mask's derivatives are given."""
+    E, B = analysis(mask * maps, lmax, 0)
+    if derivatives is not None:
+        (Q, U), first, second = maps, derivatives[:2], derivatives[2:]
+        # (Q + iU) times the conjugate of a derivative; its maps are minus the real and imaginary
+        # part, as Q and U are of E + iB.
+        once = analysis(-_turned_back(Q, U, *first), lmax, 0, spin=1)[1]
+        twice = -analysis(-_turned_back(Q, U, *second)[1:], lmax, 0)[0]
+        _, of_once, of_twice = jnp.asarray(_pure_factors(lmax))
+        B = B + expand(of_once) * once + expand(of_twice) * twice
+    return jnp.stack([E, B])
+
+
+def _turned_back(Q, U, real, imaginary):
+    return jnp.stack([Q * real + U * imaginary, U * real - Q * imaginary])
+
+
+def band_powers(
+    spectra: MaskedSpectra,
+    maps: Float[Array, "2 pix"],
+    other: Float[Array, "2 pix"] | None = None,
+) -> Float[np.ndarray, "2 bin"]:
+    """Band powers D_b = l (l + 1) C_l / 2 pi of EE and BB; the spectra of noise are in them.
+
+    Parameters
+    ----------
+    spectra : from `masked_spectra`
+    maps : Q and U, RING, values outside the mask do not matter
+    other : Q and U of another map, for cross-spectra, which noise of its own does not bias
+    """
+    alms = [
+        _masked_alm(spectra.mask, spectra.derivatives, jnp.asarray(m), spectra.lmax)
+        for m in (maps, maps if other is None else other)
+    ]
+    return np.einsum("ibjl,jl->ib", spectra.inverse, power_spectrum(*alms))
+
+
+def band_covariance(
+    spectra: MaskedSpectra, EE: Float[np.ndarray, " ell"], BB: Float[np.ndarray, " ell"]
+) -> Float[np.ndarray, "2 bin 2 bin"]:
+    """Covariance of band powers of a Gaussian field.
+
+    Where the spectra vary little over the width of the mask's own spectrum, pseudo-spectra are
+    correlated as modes of the squared mask (Efstathiou 2004; Challinor & Chon 2005).
+    Of purified B the largest scales of the mask have some 20 % more than is said here.
+
+    Parameters
+    ----------
+    spectra : from `masked_spectra`
+    EE, BB : spectra C_l of the maps, window and noise included, up to `spectra.lmax` at least
+    """
+    given = np.stack([EE, BB])[:, : spectra.lmax + 1]
+    # What leaks from E adds to the variance of B.
+    total = spectra.mixing.sum(axis=(1, 3))
+    seen = np.einsum("ijlm,jm->il", spectra.mixing, given) / np.where(total > 0, total, 1.0)
+    root = np.sqrt(seen[:, :, None] * seen[:, None])
+    same, cross = spectra.spread
+    blocks = np.array([[same * root[0] ** 2, cross * root[0] * root[1]],
+                       [cross * root[0] * root[1], same * root[1] ** 2]])  # fmt: skip
+    return 2 * np.einsum(
+        "ibjl,jklm,nckm->ibnc", spectra.inverse, blocks, spectra.inverse, optimize=True
+    )

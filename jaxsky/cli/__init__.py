@@ -1,0 +1,70 @@
+"""The command line: `jaxsky fit`, `jaxsky simulate`, `jaxsky data`."""
+
+import contextlib
+import ctypes
+import sys
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+import jaxsky
+from jaxsky.cli import data, fit, simulate
+from jaxsky.cli.console import console
+
+__all__ = ["app", "main"]
+
+#: Parameters of glibc's mallopt: M_ARENA_MAX, M_MMAP_THRESHOLD.
+MALLOC = {-8: 1, -3: 8 * 2**20}
+
+app = typer.Typer(
+    help="A JAX-differentiable model of the polarized microwave sky, with the tools to fit it.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+app.command()(fit.fit)
+app.command()(simulate.simulate)
+app.add_typer(data.data, name="data")
+
+
+def _version(value: bool) -> None:
+    if value:
+        typer.echo(f"jaxsky {jaxsky.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """A JAX-differentiable model of the polarized microwave sky, with the tools to fit it."""
+
+
+def _return_memory() -> None:
+    """Have memory returned when it is freed.
+
+    JAX computes in threads, and glibc gives each a heap that keeps what was freed in it, maps of
+    up to 32 MiB among it: a third of all memory in use. So there is one heap for all threads,
+    and large arrays are outside.
+    """
+    with contextlib.suppress(OSError, AttributeError):  # other systems have other ways
+        mallopt = ctypes.CDLL(None).mallopt
+        for parameter, value in MALLOC.items():
+            mallopt(parameter, value)
+
+
+def main() -> None:
+    """Run the command line: double precision on, mistakes as one sentence and exit code 2."""
+    _return_memory()
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    try:
+        app()
+    except (ValueError, KeyError, OSError) as error:
+        message = error.args[0] if isinstance(error, KeyError) else error
+        console.print(f"[red]jaxsky:[/] {escape(str(message))}", highlight=False, soft_wrap=True)
+        sys.exit(2)

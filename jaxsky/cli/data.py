@@ -1,0 +1,130 @@
+"""`jaxsky data`: official data products."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
+from rich.table import Table
+
+from jaxsky.cli.console import console
+
+__all__ = ["data"]
+
+data = typer.Typer(
+    help="Official data products: what there is, download, and checks.", no_args_is_help=True
+)
+
+Words = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="[PRODUCT ...]", help="Names of files, parts of them, or groups; without, all."
+    ),
+]
+Folder = Annotated[
+    Path | None, typer.Option("--dir", help="Where files are kept; default $JAXSKY_DATA, or the "
+                              "platform's folder for caches.")
+]  # fmt: skip
+
+
+def _size(number: int | None) -> str:
+    return "" if number is None else f"{number / 1e6:.0f} MB"
+
+
+@data.command("list")
+def list_products(products: Words = None, folder: Folder = None) -> None:
+    """Name the products, and say which are there."""
+    from jaxsky.archive import cache_folder, find
+
+    folder = folder or cache_folder()
+    table = Table("file", "what", "nside", "unit", "size", "here", title=f"Kept in {folder}")
+    group = None
+    for product in find(products or []):
+        if product.group != group:
+            group = product.group
+            table.add_section()
+            table.add_row(f"[bold]{group}[/]", product.title)
+        path = folder / product.name
+        here = path.exists()
+        size = path.stat().st_size if here else product.size
+        table.add_row(
+            product.name,
+            product.what,
+            str(product.nside or ""),
+            product.unit,
+            _size(size),
+            "yes" if here else "",
+        )
+    Console(width=None if console.is_terminal else 200).print(table)
+
+
+@data.command()
+def fetch(
+    products: Annotated[
+        list[str],
+        typer.Argument(metavar="PRODUCT ...", help="Names of files, parts of them, or groups."),
+    ],
+    folder: Folder = None,
+    mirror: Annotated[
+        str | None,
+        typer.Option(envvar="JAXSKY_MIRROR", help="Address of a folder with the files."),
+    ] = None,
+    accept: Annotated[
+        bool, typer.Option("--accept", help="Take files of another size or hash.")
+    ] = False,
+) -> None:
+    """Download products, unless they are there; what was cut is gone on with."""
+    from jaxsky import archive
+
+    folder = folder or archive.cache_folder()
+    wanted = archive.find(products)
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        console=console,
+    ) as progress:
+        for product in wanted:
+            task = progress.add_task(product.name, total=product.size)
+
+            def report(have: int, total: int | None, task=task) -> None:
+                progress.update(task, completed=have, total=total)
+
+            def waiting(name: str = product.name) -> None:
+                console.print(f"{name}: another process fetches it; waiting.")
+
+            path = archive.fetch(
+                product, folder, mirror=mirror, accept=accept, report=report, waiting=waiting
+            )
+            size = path.stat().st_size
+            progress.update(task, completed=size, total=size)
+    console.print(f"In {folder}: {len(wanted)} files.", highlight=False, soft_wrap=True)
+
+
+@data.command()
+def verify(products: Words = None, folder: Folder = None) -> None:
+    """Check files that are there: size, hash, columns, units, and that they are complete."""
+    from jaxsky import archive
+    from jaxsky.io import InputError
+
+    folder = folder or archive.cache_folder()
+    wanted = archive.find(products or [])
+    if not products:
+        wanted = [product for product in wanted if (folder / product.name).exists()]
+    wrong = 0
+    for product in wanted:
+        try:
+            console.print(
+                f"{product.name}: {archive.verify(product, folder)}",
+                highlight=False,
+                soft_wrap=True,
+            )
+        except InputError as error:
+            wrong += 1
+            console.print(f"[red]{error}[/]", highlight=False, soft_wrap=True)
+    if wrong:
+        raise typer.Exit(1)
+    if not wanted:
+        console.print(f"No product is in {folder}.", highlight=False, soft_wrap=True)

@@ -1,0 +1,119 @@
+"""`jaxsky fit`."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from jaxsky.cli.console import console, write_example
+
+__all__ = ["fit"]
+
+#: What a fit leaves in its folder.
+RESULTS = (
+    "result.json",
+    "log.json",
+    "grid.png",
+    "marginals.png",
+    "posterior.png",
+    "chain.h5",
+)
+
+
+def fit(
+    settings_file: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[ANALYSIS.toml]", help="Settings; without, the embedded sky is fitted."
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/fit"),
+    init: Annotated[
+        bool, typer.Option("--init", help="Write a commented example of the settings and stop.")
+    ] = False,
+    seed: Annotated[int | None, typer.Option(help="Seed of simulated maps and chains.")] = None,
+    region: Annotated[
+        list[str] | None, typer.Option(help="strip, outside, full or a mask file; repeatable.")
+    ] = None,
+    stokes: Annotated[list[str] | None, typer.Option(help="Q, U or QU; repeatable.")] = None,
+    nside: Annotated[int | None, typer.Option(help="Common nside of the comparison.")] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the chains in --out.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the results that are in --out.")
+    ] = False,
+) -> None:
+    """Fit spectral indices to polarization maps: on a grid, by gradient and by MCMC."""
+    started = time.perf_counter()
+    from fits import settings as fit_settings
+
+    if init:
+        write_example(settings_file or Path("analysis.toml"), fit_settings.EXAMPLE)
+        return
+    if resume and overwrite:
+        raise ValueError("--resume and --overwrite exclude each other.")
+    # Files on the command line are relative to the folder one is in, not to the settings.
+    files = [str(Path(r).resolve()) if Path(r).is_file() else r for r in region or []]
+    overrides = {"seed": seed, "regions": files or None, "stokes": stokes, "nside": nside}
+    settings = fit_settings.load_settings(settings_file or fit_settings.EMBEDDED, overrides)
+    if not (resume or overwrite) and any((out / name).exists() for name in RESULTS):
+        raise ValueError(
+            f"{out}: holds results already; go on with --resume, replace them with --overwrite, "
+            "or choose another --out."
+        )
+
+    with console.status("starting") as status:
+        import matplotlib as mpl
+
+        mpl.use("Agg")  # pictures go to files
+        from fits import inputs as fit_inputs
+        from fits import report, spectral_index
+
+        status.update("reading and preparing maps")
+        regions = spectral_index.region_masks(settings)
+        inputs = (
+            fit_inputs.embedded_inputs(settings)
+            if settings.embedded
+            else fit_inputs.read_inputs(settings)
+        )
+        prepared = spectral_index.prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
+        chains = _claim(out, overwrite)
+
+        def report_step(message: str) -> None:
+            # emcee's progress bar takes the place of the status line.
+            (status.stop if message.endswith("mcmc") else status.start)()
+            status.update(message)
+
+        try:
+            fits = spectral_index.run(
+                settings, prepared, regions, chains, report_step, progress=True
+            )
+        except KeyboardInterrupt:
+            status.stop()
+            console.print("Stopped; go on with --resume.")
+            raise typer.Exit(130) from None
+        status.start()
+        status.update("drawing")
+        seconds = time.perf_counter() - started
+        written = report.write_report(out, inputs, settings, fits, seconds)
+    console.print(inputs.description, highlight=False)
+    Console().print(report.result_table(fits))
+    for sentence in report.warnings(fits, settings.analysis.methods):
+        console.print(f"[yellow](!)[/] {sentence}", highlight=False)
+    written += [chains] if chains.exists() else []
+    # Not wrapped, so that paths can be copied.
+    console.print("Written: " + ", ".join(map(str, written)), highlight=False, soft_wrap=True)
+
+
+def _claim(out: Path, overwrite: bool) -> Path:
+    """The place of the chains in the folder of the results, made, and emptied if wanted."""
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out}: is not a folder; choose another --out.")
+    out.mkdir(parents=True, exist_ok=True)
+    if overwrite:
+        for name in RESULTS:
+            (out / name).unlink(missing_ok=True)
+    return out / "chain.h5"

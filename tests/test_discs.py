@@ -1,0 +1,58 @@
+"""The paper's patches: where they are, how large, and how they fall off."""
+
+import healpy
+import numpy as np
+import pytest
+
+from fits.discs import BICEP2, bicep2_mask, disc_centers, disc_mask, paper_patches
+from jaxsky.harmonics import smooth
+
+SQUARE_DEGREES = 4 * np.pi * np.degrees(1) ** 2
+
+
+def test_the_paper_has_48_discs():
+    assert disc_centers().shape == (2, 48)
+    assert disc_centers(8).shape == (2, 224)
+    assert np.abs(disc_centers()[1]).min() > 45
+
+
+def test_a_disc_is_the_smoothed_one():
+    """In closed form, against smoothing the pixels of a disc, whose edge is ragged."""
+    nside = 512
+    mask = disc_mask(nside, 30.0, 50.0)
+    sharp = np.zeros(mask.size)
+    middle = healpy.ang2vec(30.0, 50.0, lonlat=True)
+    sharp[healpy.query_disc(nside, middle, np.radians(11.3))] = 1
+    smoothed = np.asarray(smooth(sharp[None], 120.0))[0]
+    assert np.abs(mask - smoothed).max() < 0.01
+    # Smoothing keeps the area: 400 square degrees.
+    assert mask.mean() * SQUARE_DEGREES == pytest.approx(400, rel=2e-3)
+    assert mask.max() == pytest.approx(1, abs=1e-6)
+    assert mask.min() == 0
+
+
+def test_a_disc_is_where_it_should_be():
+    mask = disc_mask(64, 200.0, -60.0)
+    directions = np.array(healpy.pix2vec(64, np.arange(mask.size)))
+    lon, lat = healpy.vec2ang((directions * mask).sum(axis=1), lonlat=True)
+    assert lon[0] == pytest.approx(200, abs=0.1)
+    assert lat[0] == pytest.approx(-60, abs=0.1)
+
+
+def test_the_field_of_bicep2():
+    mask = bicep2_mask(64)
+    half, south, north = BICEP2
+    area = 2 * half * np.degrees(np.sin(np.radians(north)) - np.sin(np.radians(south)))
+    assert area == pytest.approx(800, rel=0.02)  # as the paper says
+    assert mask.mean() * SQUARE_DEGREES == pytest.approx(area, rel=0.02)
+    *discs, field = paper_patches(16)
+    assert len(discs) == 48
+    assert field.name == "BICEP2"
+    # Its middle, at right ascension 0 and declination -57.5 deg.
+    assert field.mask[healpy.ang2pix(16, field.lon, field.lat, lonlat=True)] > 0.9
+
+
+def test_refusals():
+    for radius, fwhm in ((2.0, 3.0), (2.0, 0.0), (200.0, 2.0)):
+        with pytest.raises(ValueError, match="must be positive and not wider than the disc's"):
+            disc_mask(8, 0.0, 90.0, radius, fwhm)

@@ -1,0 +1,164 @@
+"""Spectra on part of the sky: coupling, means and errors over simulations, purified B."""
+
+import functools
+import itertools
+import re
+
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from ducc0.misc import wigner3j_int
+
+from fits.discs import disc_mask
+from fits.pseudo_cl import (
+    band_covariance,
+    band_powers,
+    bin_edges,
+    coupling_matrices,
+    masked_spectra,
+    pure_coupling_matrices,
+)
+from jaxsky.correlated import realisation
+from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis
+
+NSIDE, LMAX = 64, 128
+EDGES = bin_edges(20, 79, 20)
+ELL = np.arange(LMAX + 1)
+#: C_l of D_l ~ l^-0.4, with more E than B, as dust has.
+DUST = np.where(ELL > 1, np.array([[2.0], [1.0]]) * np.maximum(ELL, 2.0) ** -2.4, 0.0)
+BEAM = np.asarray(gaussian_beam(120.0, LMAX))
+
+
+@functools.cache
+def disc():
+    return disc_mask(NSIDE, 40.0, 60.0, radius=25.0, fwhm=8.0)
+
+
+@functools.partial(jax.jit, static_argnames="nside")
+def sky(key, EE, BB, nside=NSIDE):
+    """Maps Q, U of a Gaussian sky."""
+    zero = jnp.zeros_like(EE)
+    spectra = jnp.stack([jnp.stack([EE, zero]), jnp.stack([zero, BB])])
+    return synthesis(realisation(key, spectra), nside)
+
+
+def test_coupling_matrices_are_sums_of_wigner_symbols():
+    lmax = 9
+    power = np.random.default_rng(0).random(2 * lmax + 1)
+    expected = np.zeros((2, lmax + 1, lmax + 1))
+    for ell in range(2, lmax + 1):
+        for other in range(2, lmax + 1):
+            first, symbols = wigner3j_int(ell, other, 2, -2)
+            third = first + np.arange(symbols.size)
+            terms = (2 * third + 1) * power[third] * symbols**2 * (2 * other + 1) / (4 * np.pi)
+            odd = (ell + other + third) % 2
+            expected[0, ell, other] = terms[odd == 0].sum()
+            expected[1, ell, other] = terms[odd == 1].sum()
+    np.testing.assert_allclose(coupling_matrices(power, lmax), expected, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("matrices", [coupling_matrices, pure_coupling_matrices])
+def test_the_full_sky_does_not_couple(matrices):
+    power = np.zeros(41)
+    power[0] = 4 * np.pi  # of a map of ones
+    same, mixed = matrices(power, 20)
+    np.testing.assert_allclose(same[2:, 2:], np.eye(19), atol=1e-12)
+    np.testing.assert_allclose(mixed, 0, atol=1e-12)
+
+
+def test_purified_multipoles_do_not_mix():
+    power = np.exp(-np.arange(61) / 4.0)
+    same, mixed = pure_coupling_matrices(power, 30)
+    assert np.abs(mixed).max() < 1e-12 * np.abs(same).max()
+    standard = coupling_matrices(power, 30)
+    assert np.abs(standard[1]).max() > 1e-2 * np.abs(standard[0]).max()
+
+
+def test_the_full_sky_has_its_own_spectra():
+    alm = realisation(jax.random.key(1), jnp.asarray(np.eye(2)[..., None] * DUST[0]))
+    whole = np.ones(12 * NSIDE**2)
+    spectra = masked_spectra(whole, EDGES, lmax=LMAX)
+    D = ELL * (ELL + 1) / (2 * np.pi) * np.asarray(power_spectrum(alm))
+    expected = [[row[a:b].mean() for a, b in itertools.pairwise(EDGES)] for row in D]
+    # The quadrature without Jacobi steps.
+    np.testing.assert_allclose(band_powers(spectra, synthesis(alm, NSIDE)), expected, rtol=1e-3)
+    # A beam weights the multipoles of a bin, and the windows say how.
+    spectra = masked_spectra(whole, EDGES, lmax=LMAX, window=BEAM)
+    seen = band_powers(spectra, synthesis(alm * expand(jnp.asarray(BEAM)), NSIDE))
+    expected = np.einsum("ibjl,jl->ib", spectra.windows, power_spectrum(alm))
+    np.testing.assert_allclose(seen, expected, rtol=1e-3)
+
+
+@functools.cache
+def simulated(pure, count=300):
+    """Band powers of simulated skies with the mask, and how they were taken."""
+    spectra = masked_spectra(disc(), EDGES, lmax=LMAX, window=BEAM, pure=pure)
+    seen = [jnp.asarray(row * BEAM**2) for row in DUST]
+    keys = jax.random.split(jax.random.key(3), count)
+    return spectra, np.stack([band_powers(spectra, sky(key, *seen)) for key in keys])
+
+
+@pytest.mark.parametrize("pure", [False, True])
+def test_band_powers_are_those_of_the_sky_with_the_right_errors(pure):
+    spectra, powers = simulated(pure)
+    expected = np.einsum("ibjl,jl->ib", spectra.windows, DUST)
+    # D_l at the middle of a bin is near; the first one is wide, and next to a wider one.
+    middle = spectra.centers
+    D = middle * (middle + 1) / (2 * np.pi) * np.array([[2.0], [1.0]]) * middle**-2.4
+    np.testing.assert_allclose(expected, D, rtol=0.1)
+    mean, error = powers.mean(axis=0), powers.std(axis=0, ddof=1)
+    assert np.abs((mean - expected) / error).max() < 4 / np.sqrt(len(powers))
+    covariance = band_covariance(spectra, *(DUST * BEAM**2))
+    predicted = np.sqrt(np.einsum("ibib->ib", covariance))
+    # 300 skies measure a standard deviation to 4 %. Purified multipoles of the size of the mask
+    # have fewer modes than the mask has pixels for: their errors are said 20 % too small.
+    np.testing.assert_allclose(predicted / error, 1, atol=0.25 if pure else 0.12)
+    # Not only the errors: all together, whatever the correlations.
+    delta = (powers - expected).reshape(len(powers), -1)
+    n = delta.shape[1]
+    chi2 = np.einsum("si,ij,sj->s", delta, np.linalg.inv(covariance.reshape(n, n)), delta)
+    assert chi2.mean() == pytest.approx(n, rel=0.25 if pure else 0.1)
+
+
+def test_purified_B_does_not_see_E():
+    EE = jnp.asarray(DUST[0])
+    maps = sky(jax.random.key(4), EE, 0 * EE)
+    levels = []
+    for pure in (False, True):
+        spectra = masked_spectra(disc(), EDGES, lmax=LMAX, pure=pure)
+        EE_found, BB_found = band_powers(spectra, maps)
+        levels.append(np.abs(BB_found).max() / EE_found.max())
+        np.testing.assert_allclose(EE_found[0], DUST[0][20:40].mean() * 29.5**2 / 6.28, rtol=1)
+    assert levels[1] < 1e-3
+    assert levels[1] < levels[0] / 20
+
+
+def test_cross_spectra_have_no_noise_in_the_mean():
+    spectra = masked_spectra(disc(), EDGES, lmax=LMAX)
+    signal = sky(jax.random.key(5), *map(jnp.asarray, DUST))
+    noise = [1e-3 * jax.random.normal(jax.random.key(i), signal.shape) for i in (6, 7)]
+    auto = band_powers(spectra, signal + noise[0])
+    cross = band_powers(spectra, signal + noise[0], signal + noise[1])
+    alone = band_powers(spectra, signal)
+    np.testing.assert_allclose(band_powers(spectra, signal, signal), alone, rtol=1e-12)
+    assert np.all(np.abs(cross - alone) < 0.5 * np.abs(auto - alone).max())
+
+
+def test_refusals():
+    ones, half = np.ones(12 * 8**2), np.zeros(12 * 8**2)
+    half[:3] = 1.0
+    for mask, edges, options, words in (
+        (2 * ones, (2, 5), {}, "`mask` must be between 0 and 1, but reaches from 2 to 2"),
+        (ones, (5, 5), {}, "`edges` must increase from 2 or more"),
+        (ones, (1, 5), {}, "`edges` must increase from 2 or more"),
+        (ones, (2, 9), {"lmax": 6}, "`lmax` must be between the end of the bins, 8, and 2 nside"),
+        (ones, (2, 19), {}, "`lmax` must be between the end of the bins, 18, and 2 nside, 16"),
+        (ones, (2, 9), {"window": np.ones(4)}, "`window` ends at l = 3, not at 16"),
+        (half, (2, 5), {}, "The mask leaves too few pixels: 0.0039 of the sky has 0.082 modes"),
+        (0 * ones, (2, 5), {}, "The mask leaves too few pixels: 0 of the sky"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(words)):
+            masked_spectra(mask, edges, **options)
+    assert healpy.npix2nside(ones.size) == 8

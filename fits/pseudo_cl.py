@@ -19,7 +19,7 @@ from ducc0.misc import wigner3j_int
 from ducc0.misc.experimental import coupling_matrix_rect
 from jaxtyping import Array, Float
 
-from jaxsky.harmonics import analysis, expand, power_spectrum, synthesis
+from jaxsky.harmonics import analysis, expand, lmax_of, power_spectrum, synthesis
 
 __all__ = [
     "MaskedSpectra",
@@ -245,7 +245,7 @@ def _fraction(mask: np.ndarray) -> float:
 
 def _derivatives(alm: Float[Array, "1 alm"], nside: int) -> Float[np.ndarray, "4 pix"]:
     """First and second derivative of a mask, as fields of spin 1 and 2."""
-    rises = _rises(math.isqrt(alm.shape[-1]))
+    rises = _rises(lmax_of(alm) + 1)
     zero = jnp.zeros_like(alm[0])
     first, second = (jnp.stack([alm[0] * expand(jnp.asarray(rise)), zero]) for rise in rises[1:])
     return np.concatenate([synthesis(first, nside, spin=1), synthesis(second, nside)])
@@ -259,6 +259,8 @@ def _masked_alm(
     lmax: int,
 ) -> Float[Array, "2 alm"]:
     """E and B of masked maps, B purified if the mask's derivatives are given."""
+    # Pixels that are not used may hold anything: a purified harmonic reaches a little beyond them.
+    maps = jnp.where(mask > 0, maps, 0.0)
     E, B = analysis(mask * maps, lmax, 0)
     if derivatives is not None:
         (Q, U), first, second = maps, derivatives[:2], derivatives[2:]

@@ -18,7 +18,8 @@ from jaxtyping import Array, Float
 import jaxsky
 from jaxsky.experiment import Experiment, Setup
 from jaxsky.io import write_maps, write_text
-from jaxsky.simulate import Prepared, observe_bands, plan, prepare
+from jaxsky.preparation import Prepared, plan, prepare
+from jaxsky.simulate import observe_bands
 
 __all__ = ["LOG", "Written", "check_folder", "paths", "realisation_key", "run"]
 

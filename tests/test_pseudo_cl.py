@@ -146,6 +146,15 @@ def test_cross_spectra_have_no_noise_in_the_mean():
     assert np.all(np.abs(cross - alone) < 0.5 * np.abs(auto - alone).max())
 
 
+@pytest.mark.parametrize("pure", [False, True])
+def test_pixels_that_are_not_used_may_hold_anything(pure):
+    spectra = masked_spectra(disc(), EDGES, lmax=LMAX, pure=pure)
+    maps = np.asarray(sky(jax.random.key(8), *map(jnp.asarray, DUST)))
+    for unused in (healpy.UNSEEN, np.nan):
+        others = np.where(disc() > 0, maps, unused)
+        np.testing.assert_array_equal(band_powers(spectra, others), band_powers(spectra, maps))
+
+
 def test_refusals():
     ones, half = np.ones(12 * 8**2), np.zeros(12 * 8**2)
     half[:3] = 1.0

@@ -7,11 +7,16 @@ transforms of the rows; no simulation, no matrix over pixels.
 """
 
 import equinox as eqx
+import healpy
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from fits.preparation import Preparation
-from jaxsky.harmonics import adjoint_synthesis, alm_ell
+from jaxsky.cmb import realisation
+from jaxsky.harmonics import adjoint_synthesis, alm_ell, expand, synthesis
+from jaxsky.noise import draw
+from jaxsky.streams import stream
 
 __all__ = ["Fluctuations"]
 
@@ -63,6 +68,37 @@ class Fluctuations(eqx.Module):
             )
             total = total + modes @ modes.T
         return total
+
+    @eqx.filter_jit
+    def noise_realisation(self, key: Array) -> Float[Array, "band stokes pix"]:
+        """Noise of all bands at the common resolution [uK_RJ]."""
+        maps = []
+        for b, (preparation, noise) in enumerate(zip(self.preparations, self.noise, strict=True)):
+            total = preparation(draw(stream(key, "noise", str(b)), noise))
+            if (spectrum := self.correlated[b]) is not None:
+                white = jax.random.normal(stream(key, "correlated", str(b)), (2, spectrum.size**2))
+                total = total + synthesis(white * expand(jnp.sqrt(spectrum)), preparation.nside)
+            maps.append(total)
+        return jnp.stack(maps)
+
+    @eqx.filter_jit
+    def cmb_realisation(self, key: Array) -> Float[Array, "band stokes pix"]:
+        """The CMB in all bands at the common resolution [uK_RJ]; zero without CMB."""
+        nside = self.preparations[0].nside
+        if self.cmb_spectra is None or self.cmb_windows is None:
+            return jnp.zeros((len(self.preparations), 2, healpy.nside2npix(nside)))
+        EE, BB = self.cmb_spectra
+        zero = jnp.zeros_like(EE)
+        alm = realisation(stream(key, "cmb"), jnp.stack([zero, EE, BB, zero]))
+        seen = self.cmb_factors[:, None] * self.cmb_windows
+        return jnp.stack([synthesis(alm * expand(window), nside) for window in seen])
+
+    def cmb_power(self) -> Float[Array, "band 2 ell"]:
+        """Mean spectra EE and BB of the CMB in the maps of each band [uK_RJ^2]."""
+        if self.cmb_spectra is None or self.cmb_windows is None:
+            return jnp.zeros((len(self.preparations), 2, 1))
+        seen = self.cmb_factors[:, None] * self.cmb_windows
+        return seen[:, None] ** 2 * self.cmb_spectra
 
     def sigma(self) -> Float[Array, "band stokes pix"]:
         """Standard deviation of the noise in each pixel of the prepared maps [uK_RJ].

@@ -1,4 +1,4 @@
-"""What a spectral-index fit starts from: templates and observed maps, from files or embedded."""
+"""What an analysis starts from: templates and observed maps, from files or embedded."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -17,6 +17,7 @@ from jaxsky import (
     Sky,
     get_parameters,
     observe,
+    observe_band,
     parameter_names,
     set_parameters,
 )
@@ -41,14 +42,23 @@ from jaxsky.noise import (
     uniform_covariance,
 )
 
-__all__ = ["Band", "Inputs", "embedded_inputs", "read_inputs"]
+__all__ = ["Band", "Inputs", "Leakage", "embedded_inputs", "inputs_of", "leak", "read_inputs"]
+
+
+class Leakage(NamedTuple):
+    """Intensity leaked into Q and U of a band [uK_RJ], at the resolution of its own map."""
+
+    maps: Float[Array, "stokes pix"]
+    used: Bool[np.ndarray, " pix"]
+    fwhm: float
 
 
 class Band(NamedTuple):
     """Observed Q and U [uK_RJ] of a band at the resolution of the map.
 
     `noise` is the covariance of Q and U in each pixel, `correlated` the spectrum of noise
-    beyond that, if there is any [uK_RJ^2].
+    beyond that, if there is any [uK_RJ^2]. `leakage` is in the maps, and subtracted where they
+    are brought to a common resolution.
     """
 
     maps: Float[Array, "stokes pix"]
@@ -57,6 +67,7 @@ class Band(NamedTuple):
     fwhm: float
     noise: Float[Array, "stokes stokes pix"]
     correlated: Float[Array, " ell"] | None = None
+    leakage: Leakage | None = None
 
 
 class Inputs(NamedTuple):
@@ -73,8 +84,13 @@ class Inputs(NamedTuple):
     description: str
 
 
+def inputs_of(settings: Settings) -> Inputs:
+    """The embedded sky where the settings have it, else what they name; see there."""
+    return embedded_inputs(settings) if settings.embedded else read_inputs(settings)
+
+
 def embedded_inputs(settings: Settings) -> Inputs:
-    """The embedded model of the Galaxy, observed with an instrument's channels.
+    """The embedded model of the Galaxy, observed with channels of instruments.
 
     The sky is the paper's baseline with the fixed parameters of the settings; CMB and noise are
     drawn from the seed.
@@ -83,32 +99,54 @@ def embedded_inputs(settings: Settings) -> Inputs:
     assert embedded is not None
     galaxy = embedded_sky(embedded.nside)
     sky = set_parameters(galaxy.sky("QU"), settings.fixed)
-    instrument = load_instrument(embedded.instrument).select(embedded.channels)
+    channels = [
+        channel
+        for name, chosen in embedded.channels.items()
+        for channel in load_instrument(name).select(chosen)
+    ]
+    bandpasses = [channel.band() for channel in channels]
     lmax = 2 * embedded.nside  # what the pixels resolve without aliasing
     spectra = camb_spectra(2 * lmax, settings.cmb.r) if settings.cmb.include else None
-    cmb_key, *noise_keys = jax.random.split(jax.random.key(seed), 1 + len(embedded.channels))
+    cmb_key, *noise_keys = jax.random.split(jax.random.key(seed), 1 + len(channels))
     components = dict(sky.components)
     if spectra is not None:
         alm = realisation(cmb_key, jnp.asarray(spectra)[:, : lmax + 1])
         components["cmb"] = CMB(synthesis(alm, embedded.nside))
-    seen = observe(Sky(components), list(instrument.bands().values()))
+    seen = observe(Sky(components), bandpasses)
 
     bands = {}
     used = np.ones(healpy.nside2npix(embedded.nside), bool)
-    for channel, bandpass, maps, key in zip(
-        instrument, instrument.bands().values(), seen, noise_keys, strict=True
-    ):
+    for channel, bandpass, maps, key in zip(channels, bandpasses, seen, noise_keys, strict=True):
         factor = bandpass.conversion(channel.noise_unit, "uK_RJ")
         noise = uniform_covariance(channel.noise * factor, embedded.nside)
-        smoothed = resample(maps, gaussian_beam(channel.fwhm, lmax), embedded.nside)
-        bands[channel.name] = Band(
-            smoothed + draw(key, noise), used, bandpass, float(channel.fwhm), noise
-        )
+        beam, fwhm, leakage = gaussian_beam(channel.fwhm, lmax), float(channel.fwhm), None
+        smoothed = resample(maps, beam, embedded.nside) + draw(key, noise)
+        if fraction := embedded.leakage.get(channel.name):
+            whole = set_parameters(galaxy.sky("IQU"), settings.fixed)
+            leaked = leak(fraction * observe_band(whole, bandpass)[0])
+            leakage = Leakage(resample(leaked, beam, embedded.nside), used, fwhm)
+            smoothed = smoothed + leakage.maps
+        bands[channel.name] = Band(smoothed, used, bandpass, fwhm, noise, leakage=leakage)
     templates = {name: Template(sky[name], 0.0, used) for name in sky}
     known = parameter_names(sky)
     free = get_parameters(sky, [name for name in settings.free if name in known])
     truth = {name: float(value) for name, value in free.items()}
     return Inputs(templates, bands, spectra, truth, galaxy.description)
+
+
+def leak(intensity: Float[Array, " pix"]) -> Float[Array, "2 pix"]:
+    """Q and U of an intensity that is polarized along the meridians of the ecliptic.
+
+    As detectors with different bandpasses see it that turn about the Sun's direction once a
+    minute and always have the same angle to the direction in which they move.
+    """
+    nside = healpy.npix2nside(intensity.size)
+    theta, phi = healpy.pix2ang(nside, np.arange(intensity.size))
+    pole = healpy.Rotator(coord=["E", "G"])(np.array([0.0, 0.0, 1.0]))
+    south = [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)]
+    east = [-np.sin(phi), np.cos(phi), np.zeros_like(phi)]
+    angle = 2 * np.arctan2(np.einsum("i,ip", pole, east), np.einsum("i,ip", pole, south))
+    return intensity * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
 def read_inputs(settings: Settings) -> Inputs:
@@ -133,9 +171,10 @@ def _read_band(folder: Path, spec: BandSettings) -> Band:
     bandpass = read_bandpass_spec(folder, spec.bandpass)
     factor = bandpass.conversion(found.unit, "uK_RJ")
     maps, used = jnp.asarray(found.maps[-2:]) * factor, np.asarray(found.mask)
+    leakage = _read_leakage(folder, spec, bandpass) if spec.leakage else None
     if spec.noise.estimate_above is not None:
         noise, correlated = _estimated_noise(spec.noise, maps, used)
-        return Band(maps, used, bandpass, spec.fwhm, noise, correlated)
+        return Band(maps, used, bandpass, spec.fwhm, noise, correlated, leakage)
     noise, known = read_noise(
         folder,
         spec.noise,
@@ -145,7 +184,17 @@ def _read_band(folder: Path, spec: BandSettings) -> Band:
         unit=found.unit,
         own=spec,
     )
-    return Band(jnp.where(known, maps, 0), used & known, bandpass, spec.fwhm, noise)
+    maps = jnp.where(known, maps, 0)
+    return Band(maps, used & known, bandpass, spec.fwhm, noise, leakage=leakage)
+
+
+def _read_leakage(folder: Path, spec: BandSettings, bandpass: Bandpass) -> Leakage:
+    assert spec.leakage is not None  # as called
+    found = read(folder, spec.leakage)
+    check_stokes(f"bands.{spec.name}.leakage", found.names, "QU")
+    factor = bandpass.conversion(found.unit, "uK_RJ")
+    maps = jnp.asarray(found.maps[-2:]) * factor
+    return Leakage(maps, np.asarray(found.mask), spec.leakage.fwhm)
 
 
 def _estimated_noise(noise, maps, used):

@@ -1,11 +1,6 @@
 """What a fit leaves behind: a table, result.json, pictures and a log, each written whole."""
 
-import json
-import platform
-import sys
 from collections.abc import Sequence
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +9,14 @@ from rich.table import Table
 
 from fits import plots
 from fits.inputs import Inputs
+from fits.record import write_json, write_log
 from fits.settings import Settings
 from fits.spectral_index import Fit, all_free
-from jaxsky.io import write_text
 
 __all__ = ["result_table", "warnings", "write_report"]
 
 #: A fit with a smaller probability to exceed its chi^2 is pointed out.
 UNLIKELY = 0.01
-PACKAGES = ("jaxsky", "jax", "numpy", "healpy", "optimistix", "emcee", "getdist", "camb", "ducc0")
-
-
-def _finite(value: Any) -> Any:
-    """Numbers that are not finite as None, which JSON has."""
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _result(fit: Fit, method: str) -> dict[str, Any]:
@@ -72,7 +57,7 @@ def result_json(inputs: Inputs, settings: Settings, fits: Sequence[Fit]) -> dict
     }
 
 
-def _with_errors(best: float, low: float, high: float) -> str:
+def with_errors(best: float, low: float, high: float) -> str:
     """A value with its interval as differences, to two digits of the smaller one."""
     smaller = min(abs(high - best), abs(best - low))
     usable = np.isfinite(smaller) and smaller > 0
@@ -97,7 +82,7 @@ def result_table(fits: Sequence[Fit]) -> Table:
     for fit in fits:
         for method, result in fit.results.items():
             cells = [
-                _with_errors(result.best_fit[n], *result.interval_68[n]) if n in result.free else ""
+                with_errors(result.best_fit[n], *result.interval_68[n]) if n in result.free else ""
                 for n in free
             ]
             mark = "" if result.converged else " (!)"
@@ -138,8 +123,7 @@ def write_report(
     Pictures that the fits do not allow (a grid of more than two parameters) are left out.
     """
     written = [out / "result.json", out / "log.json"]
-    results = _finite(result_json(inputs, settings, fits))
-    write_text(written[0], json.dumps(results, indent=2, allow_nan=False) + "\n")
+    write_json(written[0], result_json(inputs, settings, fits))
     for name, plot in {
         "grid.png": plots.plot_grids,
         "marginals.png": plots.plot_marginals,
@@ -147,14 +131,5 @@ def write_report(
     }.items():
         if plot(out / name, fits, inputs.truth, settings.title):
             written.append(out / name)
-    log = {
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": sys.argv,
-        "seconds": round(seconds, 2),
-        "python": platform.python_version(),
-        "machine": platform.platform(),
-        "versions": {name: version(name) for name in PACKAGES},
-        "settings": settings.model_dump(mode="json", exclude_none=True),
-    }
-    write_text(written[1], json.dumps(log, indent=2) + "\n")
+    write_log(written[1], settings, seconds)
     return written

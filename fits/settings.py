@@ -1,6 +1,6 @@
-"""The settings of a spectral-index fit: a TOML file, validated with a sentence for each mistake."""
+"""The settings of an analysis: a TOML file, validated with a sentence for each mistake."""
 
-from collections.abc import Iterable
+import re
 from pathlib import Path
 from typing import Any, Literal
 
@@ -80,6 +80,16 @@ class Noise(NoiseFile):
         return self
 
 
+class Leakage(MapFile):
+    """What leaked from intensity into Q and U, to be subtracted; in the map's unit."""
+
+    fwhm: float = Field(0.0, ge=0)
+
+
+#: Release and correction in the names of Planck's files.
+_RELEASE = re.compile(r"_R(\d)\.\d\d")
+
+
 class Band(MapFile):
     """An observed map with its bandpass, beam and noise."""
 
@@ -87,14 +97,43 @@ class Band(MapFile):
     bandpass: BandpassSpec
     fwhm: float = Field(0.0, ge=0)
     noise: Noise
+    leakage: Leakage | None = None
+
+    @model_validator(mode="after")
+    def _one_release(self) -> "Band":
+        if self.leakage is None:
+            return self
+        if "BPassCorrected" in self.file:
+            raise ValueError(f"leakage is subtracted from {self.file} already")
+        releases = [_RELEASE.search(file) for file in (self.file, self.leakage.file)]
+        found = [release[1] for release in releases if release]
+        if len(set(found)) > 1:
+            raise ValueError(
+                f"leakage {self.leakage.file} is of release {found[1]}, but the map {self.file} "
+                f"of release {found[0]}"
+            )
+        return self
 
 
 class Embedded(Table):
-    """The embedded model of the Galaxy, observed with channels of an instrument."""
+    """The embedded model of the Galaxy, observed with channels of instruments.
 
-    instrument: str = "planck"
-    channels: list[str] = Field(["44", "70"], min_length=1)
-    nside: int = Field(128, gt=0)
+    `leakage` is the fraction of the intensity that leaks into Q and U of a channel, and is
+    known: it is subtracted again.
+    """
+
+    channels: dict[str, list[str]] = Field({"planck": ["44", "70"]}, min_length=1)
+    nside: Nside = 128
+    leakage: dict[str, float] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _known_channels(self) -> "Embedded":
+        names = [name for names in self.channels.values() for name in names]
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"channels must be some, with different names, not {names}")
+        if unknown := set(self.leakage) - set(names):
+            raise ValueError(f"leakage: there is no channel {', '.join(sorted(unknown))}")
+        return self
 
 
 class CMBSettings(Table):
@@ -117,11 +156,22 @@ class MCMC(Table):
     nsteps: int = Field(3000, ge=1)
 
 
+class Compare(Table):
+    """How maps are compared with the model."""
+
+    nsims: int = Field(100, ge=30)
+    lmax: int = Field(100, ge=10)
+    width: int = Field(10, ge=1)
+    panel_nside: Nside = 32
+    patches: str | None = None
+    patches_nside: Nside = 256
+
+
 class Settings(SettingsFile):
-    """All settings of a fit."""
+    """All settings of an analysis: a fit, a comparison, or both."""
 
     analysis: Analysis = Analysis()
-    free: dict[str, Parameter] = Field(min_length=1)
+    free: dict[str, Parameter] = Field(default_factory=dict)
     fixed: dict[str, float] = Field(default_factory=dict)
     embedded: Embedded | None = None
     templates: dict[str, TemplateFile] = Field(default_factory=dict)
@@ -129,6 +179,7 @@ class Settings(SettingsFile):
     cmb: CMBSettings = CMBSettings()
     grid: Grid = Grid()
     mcmc: MCMC = MCMC()
+    compare: Compare = Compare()
 
     @model_validator(mode="after")
     def _consistent(self) -> "Settings":
@@ -141,6 +192,13 @@ class Settings(SettingsFile):
         names = [band.name for band in self.bands]
         if len(set(names)) < len(names):
             raise ValueError(f"the names of the bands must differ, but are {', '.join(names)}")
+        if self.embedded is not None:
+            names = [name for names in self.embedded.channels.values() for name in names]
+        if self.compare.patches not in (None, *names):
+            raise ValueError(
+                f"compare.patches: there is no band {self.compare.patches!r} among "
+                f"{', '.join(names)}"
+            )
         check_angles(self.templates)
         return self
 
@@ -155,7 +213,7 @@ class Settings(SettingsFile):
 
 
 def load_settings(path: Path, overrides: dict[str, Any] | None = None) -> Settings:
-    """Settings of a fit from a TOML file.
+    """Settings of an analysis from a TOML file.
 
     Parameters
     ----------
@@ -168,8 +226,3 @@ def load_settings(path: Path, overrides: dict[str, Any] | None = None) -> Settin
         If the file is absent, is not TOML, or has a mistake; the message names file and key.
     """
     return load(path, Settings, {"analysis": overrides or {}})
-
-
-def known_regions() -> Iterable[str]:
-    """Names of regions that are not files."""
-    return ("strip", "outside", "full")

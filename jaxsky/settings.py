@@ -42,7 +42,7 @@ class SettingsError(ValueError):
 class Table(BaseModel):
     """A table of settings: its fields are the keys, and no others."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 def _power_of_two(value: int) -> int:

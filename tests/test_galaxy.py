@@ -53,7 +53,7 @@ def test_uniform_field_has_the_closed_form():
     model = GalaxyModel(
         r_sun=1e7, psi1=0, chi0=0, turbulence=0, electron_radius=1e12, dust_radius=1e12
     )
-    nside = 16
+    nside, height = 16, float(model.dust_height)
     theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
     away = abs(np.cos(theta)) > 0.3
     dust, synchrotron = np.array(line_of_sight(model, nside, steps=400))[..., away]
@@ -68,8 +68,8 @@ def test_uniform_field_has_the_closed_form():
     np.testing.assert_allclose(synchrotron[0], depth * across, rtol=1e-4)
     polarized = np.array([np.cos(2 * angle), np.sin(2 * angle)]) * across
     np.testing.assert_allclose(synchrotron[1:], 0.75 * depth * polarized, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(dust[0], 0.1 * depth * (1 - 0.2 * (across - 2 / 3)), rtol=1e-4)
-    np.testing.assert_allclose(dust[1:], 0.02 * depth * polarized, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(dust[0], height * depth * (1 - 0.2 * (across - 2 / 3)), rtol=1e-4)
+    np.testing.assert_allclose(dust[1:], 0.2 * height * depth * polarized, rtol=1e-4, atol=1e-6)
 
 
 def test_toroidal_field_is_seen_alike_after_half_a_turn_about_the_direction_to_the_centre():
@@ -208,7 +208,7 @@ def test_gradients_of_all_parameters():
 
 def test_gradients_with_the_normalisation():
     def maps(scale):
-        model = GalaxyModel(chi0=25.0 * scale, dust_height=0.1 * scale, slope=-2.4 * scale)
+        model = GalaxyModel(chi0=25.0 * scale, dust_height=0.2 * scale, slope=-2.4 * scale)
         galaxy = embedded_sky(8, 0, model, steps=24)
         return jnp.stack([galaxy.dust, galaxy.synchrotron])
 

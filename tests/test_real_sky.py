@@ -8,7 +8,9 @@ import pytest
 
 from fits import settings as fit_settings
 from fits.inputs import read_inputs
-from fits.spectral_index import prepare, region_masks, run
+from fits.regions import region_masks
+from fits.resolution import prepare
+from fits.spectral_index import run
 from jaxsky import cli
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "wmap7_vw.toml"

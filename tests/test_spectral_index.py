@@ -12,7 +12,9 @@ from fits.inputs import Band, Inputs, embedded_inputs
 from fits.likelihood import likelihood
 from fits.optimize import best_fit
 from fits.preparation import Preparation, prepare_component
-from fits.spectral_index import prepare, region_masks, run
+from fits.regions import region_masks
+from fits.resolution import prepare
+from fits.spectral_index import run
 from jaxsky import Bandpass, Dust, Sky, observe
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.galaxy import embedded_sky

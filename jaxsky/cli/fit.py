@@ -69,17 +69,15 @@ def fit(
         import matplotlib as mpl
 
         mpl.use("Agg")  # pictures go to files
-        from fits import inputs as fit_inputs
         from fits import report, spectral_index
+        from fits.inputs import inputs_of
+        from fits.regions import region_masks
+        from fits.resolution import prepare
 
         status.update("reading and preparing maps")
-        regions = spectral_index.region_masks(settings)
-        inputs = (
-            fit_inputs.embedded_inputs(settings)
-            if settings.embedded
-            else fit_inputs.read_inputs(settings)
-        )
-        prepared = spectral_index.prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
+        regions = region_masks(settings)
+        inputs = inputs_of(settings)
+        prepared = prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
         chains = _claim(out, overwrite)
 
         def report_step(message: str) -> None:

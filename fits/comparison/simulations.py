@@ -1,0 +1,134 @@
+"""Simulated noise and CMB: how far from the model the maps may be by chance."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from fits.resolution import Prepared
+from jaxsky.harmonics import analysis, lmax_of, power_spectrum
+from jaxsky.io import InputError, whole
+
+__all__ = ["Simulated", "full_sky_spectra", "simulate", "sums_of_squares"]
+
+
+class Simulated(NamedTuple):
+    """Of each realisation, what is compared with the data.
+
+    Parameters
+    ----------
+    chi2 : of the residual maps, for Q, U and both
+    squares : sum of their squares [uK_RJ^2]
+    spectra : C_l of EE and BB of the complete model: foregrounds, CMB, noise [uK_RJ^2]
+    noise : C_l of the noise alone
+    """
+
+    chi2: Float[np.ndarray, "sim band region 3"]
+    squares: Float[np.ndarray, "sim band region 3"]
+    spectra: Float[np.ndarray, "sim band 2 ell"]
+    noise: Float[np.ndarray, "sim band 2 ell"]
+
+
+@jax.jit
+def sums_of_squares(
+    maps: Float[Array, "band stokes pix"], regions: Bool[Array, "region pix"]
+) -> Float[Array, "band region 3"]:
+    """Sum over the pixels of each region of the squares of Q, of U and of both."""
+    single = jnp.einsum("bsp,rp->brs", maps**2, regions.astype(maps.dtype))
+    return jnp.concatenate([single, single.sum(axis=-1, keepdims=True)], axis=-1)
+
+
+def full_sky_spectra(
+    maps: Float[Array, "band stokes pix"], lmax: int
+) -> Float[Array, "band 2 ell"]:
+    """C_l of EE and BB of each band, up to lmax."""
+    return power_spectrum(_alms(maps, lmax))
+
+
+def _alms(maps: Float[Array, "band stokes pix"], lmax: int) -> Float[Array, "band 2 alm"]:
+    return jnp.stack([analysis(band, lmax) for band in maps])
+
+
+def _realisation(
+    prepared: Prepared,
+    foregrounds: Float[Array, "band 2 alm"],
+    regions: Bool[Array, "region pix"],
+    key: Array,
+) -> tuple[Array, ...]:
+    lmax = lmax_of(foregrounds)
+    noise = prepared.fluctuations.noise_realisation(key)
+    cmb = prepared.fluctuations.cmb_realisation(key)
+    noise_alms = _alms(noise, lmax)
+    spectra = power_spectrum(foregrounds + noise_alms + _alms(cmb, lmax))
+    chi2 = sums_of_squares((noise + cmb) / prepared.sigma, regions)
+    squares = sums_of_squares(noise + cmb, regions)
+    return chi2, squares, spectra, power_spectrum(noise_alms)
+
+
+def simulate(
+    prepared: Prepared,
+    model: Float[Array, "band stokes pix"],
+    regions: Mapping[str, Bool[np.ndarray, " pix"]],
+    lmax: int,
+    nsims: int,
+    seed: int,
+    path: Path | None = None,
+    mark: str = "",
+    report: Callable[[int], None] = lambda done: None,
+) -> Simulated:
+    """Realisations of noise and CMB on top of the model's foregrounds.
+
+    Parameters
+    ----------
+    prepared : templates and maps at the common resolution
+    model : foregrounds of each band [uK_RJ]
+    regions : pixels of each region
+    lmax : largest multipole of the spectra
+    nsims, seed : number of realisations; each depends on the seed and its own number only
+    path : file that keeps what is done; what it holds already is not made again
+    mark : of data and settings; a file with another one is refused
+    report : called with the number of realisations done
+
+    Raises
+    ------
+    jaxsky.io.InputError
+        If the file is damaged, or holds realisations of other data or settings.
+    """
+    done = [] if path is None else _load(path, mark)
+    foregrounds = _alms(model, lmax)
+    inside = jnp.asarray(np.stack(list(regions.values())))
+    for i in range(len(done), nsims):
+        report(i)
+        key = jax.random.fold_in(jax.random.key(seed), i)
+        done.append([np.asarray(x) for x in _realisation(prepared, foregrounds, inside, key)])
+        if path is not None:
+            _save(path, mark, done)
+    report(nsims)
+    return Simulated(*map(np.stack, zip(*done[:nsims], strict=True)))
+
+
+def _save(path: Path, mark: str, done: list[list[np.ndarray]]) -> None:
+    stacked = dict(zip(Simulated._fields, map(np.stack, zip(*done, strict=True)), strict=True))
+    with whole(path) as beside, beside.open("wb") as file:
+        np.savez(file, mark=np.array(mark), **stacked)
+
+
+def _load(path: Path, mark: str) -> list[list[np.ndarray]]:
+    if not path.exists():
+        return []
+    try:
+        with np.load(path) as archive:
+            found = str(archive["mark"])
+            arrays = [archive[name] for name in Simulated._fields]
+    except Exception as error:
+        raise InputError(f"{path}: is damaged ({error}); start again with --overwrite.") from None
+    if found != mark:
+        raise InputError(
+            f"{path}: holds realisations of other data or settings; choose another --out, or "
+            "start again with --overwrite."
+        )
+    return [list(row) for row in zip(*arrays, strict=True)]

@@ -1,0 +1,201 @@
+"""Full-sky spectra EE and BB, observed and of the complete model, with their errors."""
+
+import itertools
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+from jaxtyping import Array, Float
+
+from fits.comparison.simulations import Simulated, full_sky_spectra
+from fits.pseudo_cl import bin_edges
+from fits.resolution import Prepared
+from jaxsky.types import Numeric
+
+__all__ = ["LMIN", "BandSpectra", "compare_spectra", "cosmic_error", "hotelling"]
+
+#: Polarization has no multipoles below.
+LMIN = 2
+
+
+class BandSpectra(NamedTuple):
+    """EE and BB of one band; C_l in uK_RJ^2 at all multipoles, D_l in bins.
+
+    Parameters
+    ----------
+    band : name
+    observed : C_l of the map
+    uncorrected : the same before leakage was subtracted, or None
+    foregrounds : C_l of the model's foregrounds
+    complete : C_l of foregrounds, and one realisation of CMB and noise
+    noise : mean C_l of realisations of the noise, the paper's N_l
+    cmb : C_l of the CMB
+    error : the paper's Delta C_l, sqrt(2 / (2l+1)) (C_l^CMB + N_l)
+    edges : of the bins
+    binned, binned_uncorrected : observed D_l in bins
+    mean, std : of realisations of the complete model, D_l in bins
+    chi2, pte : of the observed bins (`hotelling`), for EE and BB
+    pte_uncorrected : the same before leakage was subtracted
+    """
+
+    band: str
+    observed: Float[np.ndarray, "2 ell"]
+    uncorrected: Float[np.ndarray, "2 ell"] | None
+    foregrounds: Float[np.ndarray, "2 ell"]
+    complete: Float[np.ndarray, "2 ell"]
+    noise: Float[np.ndarray, "2 ell"]
+    cmb: Float[np.ndarray, "2 ell"]
+    error: Float[np.ndarray, "2 ell"]
+    edges: tuple[int, ...]
+    binned: Float[np.ndarray, "2 bin"]
+    binned_uncorrected: Float[np.ndarray, "2 bin"] | None
+    mean: Float[np.ndarray, "2 bin"]
+    std: Float[np.ndarray, "2 bin"]
+    chi2: Float[np.ndarray, " 2"]
+    pte: Float[np.ndarray, " 2"]
+    pte_uncorrected: Float[np.ndarray, " 2"] | None
+
+    @property
+    def centers(self) -> Float[np.ndarray, " bin"]:
+        """Middle multipole of each bin."""
+        edges = np.array(self.edges)
+        return (edges[:-1] + edges[1:] - 1) / 2
+
+    @property
+    def chi2_bins(self) -> Float[np.ndarray, "2 bin"]:
+        """((observed - mean) / std)^2 in each bin."""
+        return ((self.binned - self.mean) / self.std) ** 2
+
+    @property
+    def largest_error(self) -> Float[np.ndarray, " 2"]:
+        """Largest of the paper's errors as a fraction of the observed spectrum."""
+        return (self.error[:, LMIN:] / self.observed[:, LMIN:]).max(axis=-1)
+
+
+def cosmic_error(power: Float[Array, "... ell"], signal: Numeric = 0.0) -> Float[Array, "... ell"]:
+    """Standard deviation of the full-sky spectrum of a random field, the paper's eq. 9.
+
+    sqrt(2 / (2l+1)) C_l; where the field is added to a signal that does not vary, the chance
+    correlation of both, which the paper leaves out, adds to it: sqrt(2 / (2l+1) C_l (C_l + 2 F_l)).
+
+    Parameters
+    ----------
+    power : mean spectrum C_l of the field (CMB and noise)
+    signal : spectrum F_l of what does not vary (foregrounds)
+    """
+    ell = jnp.arange(power.shape[-1])
+    return jnp.sqrt(2 / (2 * ell + 1) * power * (power + 2 * signal))
+
+
+def hotelling(
+    observed: Float[np.ndarray, " bin"], simulated: Float[np.ndarray, "sim bin"]
+) -> tuple[float, float]:
+    """chi^2 of a measurement among simulations, and the probability to exceed it.
+
+    Mean and covariance are those of the simulations, and so are uncertain; Hotelling's T^2, with
+    its F distribution, is exact for Gaussian simulations in any number.
+
+    Parameters
+    ----------
+    observed : the measurement
+    simulated : independent simulations of it
+
+    Raises
+    ------
+    ValueError
+        If there are not more simulations than bins.
+    """
+    n, p = simulated.shape
+    if n <= p:
+        raise ValueError(f"{p} bins need more than {p} simulations, but there are {n}.")
+    difference = observed - simulated.mean(axis=0)
+    covariance = np.atleast_2d(np.cov(simulated, rowvar=False))
+    chi2 = float(difference @ np.linalg.solve(covariance, difference))
+    ratio = n / (n + 1) * (n - p) / (p * (n - 1)) * chi2
+    return chi2, float(scipy.stats.f.sf(ratio, p, n - p))
+
+
+def _binned(spectra: Float[np.ndarray, "... ell"], edges: tuple[int, ...]) -> np.ndarray:
+    """Mean D_l = l (l+1) C_l / 2 pi of each bin."""
+    ell = np.arange(spectra.shape[-1])
+    scaled = ell * (ell + 1) / (2 * np.pi) * spectra
+    return np.stack(
+        [scaled[..., a:b].mean(axis=-1) for a, b in itertools.pairwise(edges)],
+        axis=-1,
+    )
+
+
+def compare_spectra(
+    prepared: Prepared,
+    model: Float[Array, "band stokes pix"],
+    simulated: Simulated,
+    width: int,
+) -> list[BandSpectra]:
+    """Spectra of the observed maps against those of the complete model.
+
+    They are those of the full sky, which the paper takes: no mode of E shows as B there.
+
+    Parameters
+    ----------
+    prepared : templates and maps at the common resolution, without missing pixels
+    model : foregrounds of each band [uK_RJ]
+    simulated : realisations
+    width : multipoles in a bin
+
+    Raises
+    ------
+    ValueError
+        If pixels are missing.
+    """
+    if missing := int(np.sum(~prepared.used)):
+        raise ValueError(
+            f"Spectra of the full sky need all pixels, but {missing} of {prepared.used.size} have "
+            "no value."
+        )
+    lmax = simulated.spectra.shape[-1] - 1
+    edges = bin_edges(LMIN, lmax, width)
+    observed = np.asarray(full_sky_spectra(prepared.data, lmax))
+    foregrounds = np.asarray(full_sky_spectra(model, lmax))
+    noise = simulated.noise.mean(axis=0)
+    cmb = np.zeros_like(noise)
+    theory = np.asarray(prepared.fluctuations.cmb_power())[..., : lmax + 1]
+    cmb[..., : theory.shape[-1]] = theory
+    error = np.asarray(cosmic_error(jnp.asarray(cmb + noise)))
+    results = []
+    for b, band in enumerate(prepared.bands):
+        uncorrected = None
+        if band in prepared.leakage:
+            before = prepared.data[b] + prepared.leakage[band]
+            uncorrected = np.asarray(full_sky_spectra(before[None], lmax))[0]
+        sims = _binned(simulated.spectra[:, b], edges)
+
+        def test(spectrum, sims=sims):
+            binned = _binned(spectrum, edges)
+            return binned, np.array([hotelling(binned[i], sims[:, i]) for i in (0, 1)]).T
+
+        binned, (chi2, pte) = test(observed[b])
+        binned_before, (_, pte_before) = (
+            (None, (None, None)) if uncorrected is None else test(uncorrected)
+        )
+        results.append(
+            BandSpectra(
+                band,
+                observed[b],
+                uncorrected,
+                foregrounds[b],
+                simulated.spectra[0, b],
+                noise[b],
+                cmb[b],
+                error[b],
+                edges,
+                binned,
+                binned_before,
+                sims.mean(axis=0),
+                sims.std(axis=0, ddof=1),
+                chi2,
+                pte,
+                pte_before,
+            )
+        )
+    return results

@@ -1,0 +1,58 @@
+"""What a run leaves besides pictures: numbers, circumstances, and the mark of its data."""
+
+import hashlib
+import json
+import platform
+import sys
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from pydantic import BaseModel
+
+from jaxsky.io import write_text
+
+__all__ = ["fingerprint", "write_json", "write_log"]
+
+PACKAGES = ("jaxsky", "jax", "numpy", "healpy", "optimistix", "emcee", "getdist", "camb", "ducc0")
+
+
+def fingerprint(tree: Any) -> str:
+    """A hash of all arrays of a tree."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists, and numbers that are not finite as None: what JSON has."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def write_json(path: Path, results: dict[str, Any]) -> None:
+    """Results of a run; arrays become lists, and what is not finite null."""
+    write_text(path, json.dumps(_plain(results), indent=2, allow_nan=False) + "\n")
+
+
+def write_log(path: Path, settings: BaseModel, seconds: float) -> None:
+    """When, where, how long, with which versions and settings a run was made."""
+    log = {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": sys.argv,
+        "seconds": round(seconds, 2),
+        "python": platform.python_version(),
+        "machine": platform.platform(),
+        "versions": {name: version(name) for name in PACKAGES},
+        "settings": settings.model_dump(mode="json", exclude_none=True),
+    }
+    write_text(path, json.dumps(log, indent=2) + "\n")

@@ -1,0 +1,57 @@
+"""Parts of the sky by name: latitudes, or masks in files."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import healpy
+import numpy as np
+from jaxtyping import Bool
+
+from fits.settings import Settings
+from jaxsky.io import degrade_mask, read_mask
+from jaxsky.settings import SettingsError
+
+__all__ = ["known_regions", "region_masks"]
+
+
+def known_regions() -> Iterable[str]:
+    """Names of regions that are not files."""
+    return ("strip", "outside", "full")
+
+
+def region_masks(settings: Settings) -> dict[str, Bool[np.ndarray, " pix"]]:
+    """Pixels of each region at the common nside.
+
+    Raises
+    ------
+    SettingsError, jaxsky.io.InputError
+        For a region that is neither known nor a readable mask.
+    """
+    analysis, folder = settings.analysis, Path(settings.data_dir)
+    npix = healpy.nside2npix(analysis.nside)
+    latitude = healpy.pix2ang(analysis.nside, np.arange(npix), lonlat=True)[1]
+    common = np.ones(npix, bool)
+    if analysis.mask is not None:
+        mask = analysis.mask
+        path = folder / mask.file
+        common = degrade_mask(read_mask(path, key=mask.key, ordering=mask.ordering), analysis.nside)
+    regions = {}
+    for name in analysis.regions:
+        if name == "strip":
+            region = np.abs(latitude) <= analysis.latitude
+        elif name == "outside":
+            region = np.abs(latitude) > analysis.latitude
+        elif name == "full":
+            region = np.ones(npix, bool)
+        elif (folder / name).is_file():
+            region = degrade_mask(read_mask(folder / name), analysis.nside)
+        else:
+            raise SettingsError(
+                f"analysis.regions: {name!r} is neither {', '.join(known_regions())} nor a file "
+                f"in {folder}."
+            )
+        label = name if name in known_regions() else Path(name).stem
+        if label in regions:
+            raise SettingsError(f"analysis.regions: two regions are called {label!r}.")
+        regions[label] = np.asarray(region & common)
+    return regions

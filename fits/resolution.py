@@ -1,0 +1,199 @@
+"""Templates and maps at a common resolution, where they can be compared."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import healpy
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from fits.covariance import Fluctuations
+from fits.inputs import Inputs
+from fits.likelihood import Likelihood, likelihood
+from fits.preparation import Preparation, prepare_component
+from jaxsky import Bandpass, Sky
+from jaxsky.harmonics import gaussian_beam, pixel_window
+from jaxsky.types import Numeric
+
+__all__ = ["Prepared", "prepare"]
+
+#: A pixel is used if no more than this fraction of what was smoothed or averaged was missing.
+MISSING = 0.01
+
+
+class Prepared(NamedTuple):
+    """Templates and maps at the common resolution.
+
+    `leakage` is what was subtracted from the data, by band.
+    """
+
+    sky: Sky
+    bands: dict[str, Bandpass]
+    data: Float[Array, "band stokes pix"]
+    sigma: Float[Array, "band stokes pix"]
+    used: Bool[np.ndarray, " pix"]
+    fluctuations: Fluctuations
+    leakage: dict[str, Float[Array, "stokes pix"]]
+
+    def likelihood(
+        self,
+        start: Mapping[str, Numeric],
+        *,
+        stokes: str = "QU",
+        region: Bool[np.ndarray, " pix"] | None = None,
+        kind: str = "exact",
+    ) -> Likelihood:
+        """The likelihood of the parameters in `start`; see `fits.likelihood.likelihood`.
+
+        Parameters
+        ----------
+        start : free parameters by name
+        stokes : "Q", "U" or "QU"
+        region : pixels to use, of those that can be; default all
+        kind : "exact", or "diagonal" for the paper's sum over pixels
+
+        Raises
+        ------
+        KeyError, ValueError
+            For unknown parameters, a region without pixels or an unknown kind.
+        """
+        if kind not in ("exact", "diagonal"):
+            raise ValueError(f"Argument `kind` must be 'exact' or 'diagonal', not {kind!r}.")
+        used = self.used if region is None else self.used & region
+        return likelihood(
+            self.sky,
+            self.bands,
+            self.data,
+            jnp.where(used, self.sigma, jnp.inf),
+            start,
+            stokes=stokes,
+            covariance_of=self.fluctuations.covariance if kind == "exact" else None,
+        )
+
+
+def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
+    """Bring templates and maps to a common nside and, if fwhm > 0, a common beam.
+
+    With fwhm = 0 pixels are averaged and beams stay as they are. Otherwise all maps are cut at
+    one multipole, that to which the coarsest is good.
+
+    Parameters
+    ----------
+    inputs : templates and maps
+    nside, fwhm : common resolution; fwhm in arcmin
+
+    Raises
+    ------
+    ValueError
+        If a map is coarser than the common resolution.
+    """
+    maps = {f"template {name!r}": (t.used, t.fwhm) for name, t in inputs.templates.items()}
+    maps |= {f"band {name!r}": (b.used, b.fwhm) for name, b in inputs.bands.items()}
+    maps |= {
+        f"leakage of band {name!r}": (b.leakage.used, b.leakage.fwhm)
+        for name, b in inputs.bands.items()
+        if b.leakage is not None
+    }
+    nsides = {name: healpy.npix2nside(used.size) for name, (used, _) in maps.items()}
+    lmax = min(3 * nside - 1, 2 * min(nsides.values()))
+    operators = {}
+    for name, (_, own) in maps.items():
+        if fwhm:
+            operator = Preparation.smoothing(nsides[name], own, nside, fwhm, lmax, name)
+        else:
+            operator = Preparation.averaging(nsides[name], nside, name)
+        operators[name] = operator
+
+    holes = _common_holes([own_used for own_used, _ in maps.values()]) if fwhm else {}
+    used = np.ones(healpy.nside2npix(nside), bool)
+    for name, (own_used, _) in maps.items():
+        if not own_used.all():
+            spread = operators[name]
+            if fwhm:  # the whole beam, without the ringing that the cut at lmax causes
+                window = gaussian_beam(fwhm, 2 * nsides[name])
+                spread = Preparation(window, nsides[name], nside)
+                own_used = holes[nsides[name]]
+            kept = spread(jnp.asarray(own_used[None], float))[0]
+            used &= np.asarray(kept) > 1 - MISSING
+    sky = Sky(
+        {
+            name: prepare_component(
+                template.component,
+                operators[f"template {name!r}"],
+                holes.get(nsides[f"template {name!r}"]),
+            )
+            for name, template in inputs.templates.items()
+        }
+    )
+    preparations = tuple(operators[f"band {name!r}"] for name in inputs.bands)
+    whole = [holes.get(op.nside_in, np.ones(1, bool)) for op in preparations]
+    leakage = {
+        name: operators[f"leakage of band {name!r}"](
+            band.leakage.maps * holes.get(healpy.npix2nside(band.leakage.used.size), np.ones(1))
+        )
+        for name, band in inputs.bands.items()
+        if band.leakage is not None
+    }
+    data = jnp.stack(
+        [
+            op(band.maps * kept) - leakage.get(name, 0.0)
+            for op, (name, band), kept in zip(
+                preparations, inputs.bands.items(), whole, strict=True
+            )
+        ]
+    )
+    bandpasses = {name: band.bandpass for name, band in inputs.bands.items()}
+    factors = jnp.stack([b.conversion("uK_CMB", "uK_RJ") for b in bandpasses.values()])
+    spectra = windows = None
+    if not fwhm:  # averaged pixels hold multipoles beyond those they resolve
+        lmax = 4 * nside
+    if inputs.cmb is not None:
+        beams = [fwhm or band.fwhm for band in inputs.bands.values()]
+        windows = jnp.stack([gaussian_beam(beam, lmax) for beam in beams])
+        if not fwhm:
+            windows = windows * pixel_window(nside, lmax)
+        spectra = jnp.asarray(inputs.cmb)[1:3, : lmax + 1]
+    noise = tuple(
+        band.noise * kept for band, kept in zip(inputs.bands.values(), whole, strict=True)
+    )
+    correlated = tuple(
+        _prepared_spectrum(band.correlated, op, lmax)
+        for op, band in zip(preparations, inputs.bands.values(), strict=True)
+    )
+    fluctuations = Fluctuations(preparations, noise, correlated, spectra, windows, factors)
+    sigma = fluctuations.sigma()
+    known = np.asarray(jnp.isfinite(sigma).all(axis=(0, 1)))
+    return Prepared(
+        sky, bandpasses, data, jnp.where(known, sigma, jnp.inf), used & known, fluctuations, leakage
+    )
+
+
+def _common_holes(maps: Sequence[Bool[np.ndarray, " pix"]]) -> dict[int, np.ndarray]:
+    """Pixels that no map misses, at each nside of the maps; empty if none misses any.
+
+    Smoothing spreads what surrounds a hole into it and the hole into what surrounds it, so all
+    maps, templates and data, get the same holes.
+    """
+    if all(used.all() for used in maps):
+        return {}
+    nsides = {healpy.npix2nside(used.size) for used in maps}
+    return {
+        nside: np.logical_and.reduce(
+            [healpy.ud_grade(u.astype(float), nside) > 0.999 for u in maps]
+        )
+        for nside in nsides
+    }
+
+
+def _prepared_spectrum(
+    spectrum: Float[Array, " ell"] | None, preparation: Preparation, lmax: int
+) -> Float[Array, " ell"] | None:
+    """Spectrum of a prepared map, from that before."""
+    if spectrum is None:
+        return None
+    window = preparation.window
+    if window is None:
+        pixels = pixel_window(preparation.nside, lmax) / pixel_window(preparation.nside_in, lmax)
+        window = jnp.asarray(pixels)
+    return spectrum[: lmax + 1] * window**2

@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from jaxsky.io import write_text
 
-__all__ = ["fingerprint", "write_json", "write_log"]
+__all__ = ["fingerprint", "probability", "with_error", "write_json", "write_log"]
 
 PACKAGES = ("jaxsky", "jax", "numpy", "healpy", "optimistix", "emcee", "getdist", "camb", "ducc0")
 
@@ -26,6 +26,18 @@ def fingerprint(tree: Any) -> str:
     for leaf in jax.tree.leaves(tree):
         digest.update(np.ascontiguousarray(leaf).tobytes())
     return digest.hexdigest()
+
+
+def with_error(value: float, error: float) -> str:
+    """A value with its standard error, both to two digits of the error."""
+    usable = np.isfinite(error) and error > 0
+    digits = max(0, 1 - int(np.floor(np.log10(error)))) if usable else 4
+    return f"{value:.{digits}f} \u00b1 {error:.{digits}f}"
+
+
+def probability(value: float) -> str:
+    """A probability in two digits, or its order of magnitude."""
+    return f"{value:.2f}" if value >= 0.01 else f"{value:.0e}"
 
 
 def _plain(value: Any) -> Any:

@@ -23,6 +23,7 @@ from jaxsky.settings import (
 __all__ = ["Settings", "load_settings"]
 
 EMBEDDED = Path(__file__).with_name("embedded.toml")
+EMBEDDED_COMPARISON = Path(__file__).with_name("comparison") / "embedded.toml"
 EXAMPLE = Path(__file__).with_name("example.toml")
 
 
@@ -212,17 +213,19 @@ class Settings(SettingsFile):
         return {name: prior for name, prior in priors.items() if prior is not None}
 
 
-def load_settings(path: Path, overrides: dict[str, Any] | None = None) -> Settings:
+def load_settings(
+    path: Path, analysis: dict[str, Any] | None = None, compare: dict[str, Any] | None = None
+) -> Settings:
     """Settings of an analysis from a TOML file.
 
     Parameters
     ----------
     path : the file; relative paths in it are relative to its `data_dir`, and that to its folder
-    overrides : values for the table `analysis` that replace those of the file; None is ignored
+    analysis, compare : values that replace those of the tables in the file; None is ignored
 
     Raises
     ------
     jaxsky.settings.SettingsError
         If the file is absent, is not TOML, or has a mistake; the message names file and key.
     """
-    return load(path, Settings, {"analysis": overrides or {}})
+    return load(path, Settings, {"analysis": analysis or {}, "compare": compare or {}})

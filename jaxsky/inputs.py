@@ -17,6 +17,7 @@ from jaxsky.noise import (
     covariance_from_columns,
     hits_covariance,
     rms_covariance,
+    weights_covariance,
 )
 from jaxsky.parameters import set_parameters
 from jaxsky.settings import (
@@ -218,7 +219,8 @@ def _covariance(folder, noise, bandpass, nside, stokes, where, unit, own):
     if noise.rms is not None:
         rms = noise.rms * unit_factor(unit, "uK_RJ", bandpass)
         return rms_covariance(jnp.full((n, npix), rms)), np.ones(npix, bool)
-    kind = next(k for k in ("map", "covariance", "hits") if getattr(noise, k) is not None)
+    kinds = ("map", "covariance", "hits", "weights")
+    kind = next(k for k in kinds if getattr(noise, k) is not None)
     spec, where = getattr(noise, kind), f"{where}.{kind}"
     found = read(folder, _file(spec, own, where))
     if found.nside != nside:
@@ -235,6 +237,12 @@ def _covariance(folder, noise, bandpass, nside, stokes, where, unit, own):
         return covariance_from_columns(columns)[-n:, -n:], known
     _check_number(f"{where}.sigma0", len(spec.sigma0), stokes)
     sigma0 = jnp.array(spec.sigma0)[-n:] * unit_factor(spec.sigma0_unit or unit, "uK_RJ", bandpass)
+    if kind == "weights":
+        if n != 2:
+            raise SettingsError(f"{where}: weights are those of Q and U, not of {stokes}.")
+        known = known & (maps[0] * maps[2] > 0)
+        weights = jnp.where(known, maps, jnp.array([1.0, 0.0, 1.0])[:, None])
+        return weights_covariance(jnp.broadcast_to(sigma0, (n,)), weights), known
     known = known & (found.maps[0] != 0)
     hits = jnp.where(known, maps[0], 1.0)
     return hits_covariance(jnp.broadcast_to(sigma0, (n,)), hits, n), known

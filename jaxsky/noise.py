@@ -27,6 +27,7 @@ __all__ = [
     "uniform_alm",
     "uniform_covariance",
     "uniform_map",
+    "weights_covariance",
 ]
 
 #: Columns of a covariance by their number, in the order of Planck's maps.
@@ -157,6 +158,41 @@ def hits_covariance(
     if is_concrete(hits) and (bad := int(jnp.sum(hits <= 0))):
         raise ValueError(f"Argument `hits` is not positive in {bad} of {hits.size} pixels.")
     return _diagonal(jnp.broadcast_to(sigma0, (stokes,))[:, None] ** 2 / hits)
+
+
+def weights_covariance(
+    sigma0: ArrayLike, weights: Float[Array, "3 pix"]
+) -> Float[Array, "2 2 pix"]:
+    """Covariance of Q and U in each pixel from weights QQ, QU, UU: sigma_0^2 times their inverse.
+
+    WMAP's maps have such weights, which like numbers of observations grow with time (Jarosik et
+    al. 2011).
+
+    Parameters
+    ----------
+    sigma0 : noise of one observation of Q or U, a number or one for each
+    weights : elements QQ, QU, UU; a pixel whose weights have no inverse gets no finite covariance
+
+    Raises
+    ------
+    TypeError
+        If an argument carries a unit.
+    ValueError
+        For wrong shapes.
+    """
+    sigma0, weights = as_array("sigma0", sigma0), as_array("weights", weights)
+    if sigma0.shape not in ((), (2,)):
+        raise ValueError(
+            f"Argument `sigma0` must be a number or have shape (2,), but has shape {sigma0.shape}."
+        )
+    if weights.ndim != 2 or len(weights) != 3:
+        raise ValueError(
+            f"Argument `weights` must have shape (3, pix), but has shape {weights.shape}."
+        )
+    QQ, QU, UU = weights
+    inverse = jnp.stack([jnp.stack([UU, -QU]), jnp.stack([-QU, QQ])]) / (QQ * UU - QU**2)
+    scale = jnp.broadcast_to(sigma0, (2,))
+    return scale[:, None, None] * scale[:, None] * inverse
 
 
 def covariance_from_columns(

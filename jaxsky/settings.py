@@ -30,6 +30,7 @@ __all__ = [
     "SettingsFile",
     "Table",
     "TemplateFile",
+    "Weights",
     "check_angles",
     "load",
 ]
@@ -154,15 +155,25 @@ class Hits(NoiseColumns):
         return value if isinstance(value, list | tuple) else [value]
 
 
+class Weights(Hits):
+    """Weights QQ, QU, UU of each pixel, in this order: the inverse of Q and U's covariance.
+
+    In units of the noise of one observation, `sigma0`, as in the second table of WMAP's maps.
+    """
+
+    fields: list[str | int] = Field(min_length=3, max_length=3)
+
+
 class NoiseFile(Table):
     """Noise of a map: exactly one of these; per pixel of the map as it is in the file."""
 
-    KINDS: ClassVar[tuple[str, ...]] = ("rms", "map", "covariance", "hits")
+    KINDS: ClassVar[tuple[str, ...]] = ("rms", "map", "covariance", "hits", "weights")
 
     rms: float | None = Field(None, gt=0)
     map: MapFile | None = None
     covariance: CovarianceColumns | None = None
     hits: Hits | None = None
+    weights: Weights | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> "NoiseFile":

@@ -270,7 +270,10 @@ class Example(SettingsFile):
 @pytest.mark.parametrize(
     ("noise", "words"),
     [
-        ("{ }", "noise: give the noise as exactly one of rms, map, covariance, hits, not none."),
+        (
+            "{ }",
+            "noise: give the noise as exactly one of rms, map, covariance, hits, weights, not none.",
+        ),
         ("{ rms = 1.0, covariance = ['a', 'b', 'c'] }", "not rms, covariance."),
         ("{ level = 1.0 }", "noise.level: unknown key"),
         ("{ covariance = ['a', 'b', 'c', 'd'] }", "noise.covariance.fields: name the columns QQ, "),
@@ -319,7 +322,9 @@ def test_a_model_of_noise_with_more_kinds(tmp_path):
         level: float | None = None
 
     assert Levels(level=2.0).level == 2.0
-    with pytest.raises(ValueError, match=r"one of rms, map, covariance, hits, level, not rms, lev"):
+    with pytest.raises(
+        ValueError, match=r"one of rms, map, covariance, hits, weights, level, not rms, lev"
+    ):
         Levels(level=2.0, rms=1.0)
 
 

@@ -1,10 +1,11 @@
-"""What all commands share: the console, and the example of the settings."""
+"""What commands share: the console, the example of the settings, the folder of results."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
-__all__ = ["console", "write_example"]
+__all__ = ["check_out", "claim", "console", "write_example"]
 
 console = Console(stderr=True)
 
@@ -15,3 +16,24 @@ def write_example(path: Path, example: Path) -> None:
         raise ValueError(f"{path}: exists already and is left as it is.")
     path.write_text(example.read_text())
     console.print(f"Written: {path}")
+
+
+def check_out(out: Path, results: Sequence[str], resume: bool, overwrite: bool) -> None:
+    """Refuse a folder that has results, unless they are to be gone on with or replaced."""
+    if resume and overwrite:
+        raise ValueError("--resume and --overwrite exclude each other.")
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out}: is not a folder; choose another --out.")
+    if not (resume or overwrite) and any((out / name).exists() for name in results):
+        raise ValueError(
+            f"{out}: holds results already; go on with --resume, replace them with --overwrite, "
+            "or choose another --out."
+        )
+
+
+def claim(out: Path, results: Sequence[str], overwrite: bool) -> None:
+    """Make the folder of the results, and with overwrite remove those that it has."""
+    out.mkdir(parents=True, exist_ok=True)
+    if overwrite:
+        for name in results:
+            (out / name).unlink(missing_ok=True)

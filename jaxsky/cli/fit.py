@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from jaxsky.cli.console import console, write_example
+from jaxsky.cli.console import check_out, claim, console, write_example
 
 __all__ = ["fit"]
 
@@ -53,17 +53,11 @@ def fit(
     if init:
         write_example(settings_file or Path("analysis.toml"), fit_settings.EXAMPLE)
         return
-    if resume and overwrite:
-        raise ValueError("--resume and --overwrite exclude each other.")
     # Files on the command line are relative to the folder one is in, not to the settings.
     files = [str(Path(r).resolve()) if Path(r).is_file() else r for r in region or []]
     overrides = {"seed": seed, "regions": files or None, "stokes": stokes, "nside": nside}
     settings = fit_settings.load_settings(settings_file or fit_settings.EMBEDDED, overrides)
-    if not (resume or overwrite) and any((out / name).exists() for name in RESULTS):
-        raise ValueError(
-            f"{out}: holds results already; go on with --resume, replace them with --overwrite, "
-            "or choose another --out."
-        )
+    check_out(out, RESULTS, resume, overwrite)
 
     with console.status("starting") as status:
         import matplotlib as mpl
@@ -78,7 +72,8 @@ def fit(
         regions = region_masks(settings)
         inputs = inputs_of(settings)
         prepared = prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
-        chains = _claim(out, overwrite)
+        claim(out, RESULTS, overwrite)
+        chains = out / "chain.h5"
 
         def report_step(message: str) -> None:
             # emcee's progress bar takes the place of the status line.
@@ -104,14 +99,3 @@ def fit(
     written += [chains] if chains.exists() else []
     # Not wrapped, so that paths can be copied.
     console.print("Written: " + ", ".join(map(str, written)), highlight=False, soft_wrap=True)
-
-
-def _claim(out: Path, overwrite: bool) -> Path:
-    """The place of the chains in the folder of the results, made, and emptied if wanted."""
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{out}: is not a folder; choose another --out.")
-    out.mkdir(parents=True, exist_ok=True)
-    if overwrite:
-        for name in RESULTS:
-            (out / name).unlink(missing_ok=True)
-    return out / "chain.h5"

@@ -1,0 +1,94 @@
+"""The comparison of the paper's section 4, from prepared maps to numbers."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from fits.comparison.pixels import Scatter, compare_pixels
+from fits.comparison.simulations import simulate
+from fits.comparison.spectra import BandSpectra, compare_spectra
+from fits.record import fingerprint
+from fits.resolution import Prepared
+from fits.settings import Settings
+from jaxsky import observe
+from jaxsky.settings import SettingsError
+
+__all__ = ["Comparison", "compare"]
+
+
+class Comparison(NamedTuple):
+    """Observed maps, the model, and how they compare.
+
+    Parameters
+    ----------
+    prepared : templates and maps at the common resolution
+    model : foregrounds of each band [uK_RJ]
+    regions : pixels of each region that are used
+    scatters : by band, region and Stokes parameter
+    spectra : by band; none if pixels are missing
+    """
+
+    prepared: Prepared
+    model: Float[Array, "band stokes pix"]
+    regions: dict[str, Bool[np.ndarray, " pix"]]
+    scatters: list[Scatter]
+    spectra: list[BandSpectra]
+
+    def scatter(self, band: str, region: str, stokes: str) -> Scatter:
+        """One of the scatters."""
+        wanted = (band, region, stokes)
+        return next(s for s in self.scatters if (s.band, s.region, s.stokes) == wanted)
+
+
+def compare(
+    settings: Settings,
+    prepared: Prepared,
+    regions: Mapping[str, Bool[np.ndarray, " pix"]],
+    simulations: Path | None = None,
+    report: Callable[[int, int], None] = lambda done, of: None,
+) -> Comparison:
+    """Compare the maps with the model of foregrounds, CMB and noise.
+
+    Parameters
+    ----------
+    settings : how; the parameters of the model are those of the prepared sky
+    prepared : templates and maps at the common resolution
+    regions : pixels of each region
+    simulations : file that keeps realisations; those that it has are not made again
+    report : called with the number of realisations done, and that of all
+
+    Raises
+    ------
+    SettingsError, jaxsky.io.InputError
+        For a region without pixels, multipoles that the maps do not have, or a file of
+        realisations of other data.
+    """
+    how = settings.compare
+    used = {name: inside & prepared.used for name, inside in regions.items()}
+    for name, pixels in used.items():
+        if not pixels.any():
+            raise SettingsError(f"analysis.regions: region {name!r} leaves no pixel.")
+    if how.lmax > (limit := 2 * settings.analysis.nside):
+        raise SettingsError(
+            f"compare.lmax: multipoles reach to 2 nside, {limit}, but {how.lmax} is asked for."
+        )
+    model = observe(prepared.sky, list(prepared.bands.values()))
+    simulated = simulate(
+        prepared,
+        model,
+        used,
+        how.lmax,
+        how.nsims,
+        settings.analysis.seed,
+        simulations,
+        f"{fingerprint((prepared, used))} {settings.analysis.seed} {how.lmax}",
+        lambda done: report(done, how.nsims),
+    )
+    scatters = compare_pixels(prepared, model, used, simulated)
+    spectra = []
+    if prepared.used.all():
+        spectra = compare_spectra(prepared, model, simulated, how.width)
+    return Comparison(prepared, model, used, scatters, spectra)

@@ -1,0 +1,110 @@
+"""What a comparison leaves behind: a table, comparison.json, pictures and a log."""
+
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.table import Table
+
+from fits.comparison import plots
+from fits.comparison.compare import Comparison
+from fits.inputs import Inputs
+from fits.record import probability, with_error, write_json, write_log
+from fits.settings import Settings
+
+__all__ = ["comparison_json", "comparison_table", "warnings", "write_report"]
+
+#: A comparison with a smaller probability is pointed out.
+UNLIKELY = 0.01
+
+
+def comparison_json(comparison: Comparison, inputs: Inputs) -> dict[str, Any]:
+    """All numbers: `pixels` by band, region and Stokes parameter, `spectra` by band."""
+    pixels: dict[str, Any] = {}
+    for s in comparison.scatters:
+        numbers = s._asdict() | {"slope_pte": s.slope_pte}
+        here = pixels.setdefault(s.band, {}).setdefault(s.region, {})
+        here[s.stokes] = {k: v for k, v in numbers.items() if k not in ("band", "region", "stokes")}
+    spectra = {
+        s.band: s._asdict()
+        | {"centers": s.centers, "chi2_bins": s.chi2_bins, "largest_error": s.largest_error}
+        for s in comparison.spectra
+    }
+    return {"description": inputs.description, "pixels": pixels, "spectra": spectra}
+
+
+def comparison_table(comparison: Comparison) -> Table:
+    """Slopes, correlations and probabilities for the terminal."""
+    table = Table(
+        box=box.SIMPLE,
+        pad_edge=False,
+        caption="Slope of observed on model with the error of noise and CMB; rms of their "
+        "difference, and that expected of noise and CMB, in uK_RJ; PTE: probability that noise and "
+        "CMB alone give a larger chi2, in pixels, EE and BB."
+    )
+    for column in ("band", "region", ""):
+        table.add_column(column, no_wrap=True)
+    for column in ("slope", "r", "rms", "exp.", "PTE", "EE", "BB"):
+        table.add_column(column, justify="right", no_wrap=True)
+    spectra = {s.band: s for s in comparison.spectra}
+    for band in comparison.prepared.bands:
+        for i, s in enumerate(s for s in comparison.scatters if s.band == band):
+            power = ["", ""]
+            if i == 0 and band in spectra:
+                power = [probability(p) for p in spectra[band].pte]
+            table.add_row(
+                band if i == 0 else "",
+                s.region,
+                s.stokes,
+                with_error(s.slope, s.error).replace(" ", ""),
+                f"{s.correlation:.2f}",
+                f"{s.rms:.3g}",
+                f"{s.expected:.3g}",
+                probability(s.pte),
+                *power,
+            )
+        table.add_section()
+    return table
+
+
+def warnings(comparison: Comparison) -> list[str]:
+    """What a user should know before using the numbers, a sentence each."""
+    sentences = []
+    if not comparison.spectra:
+        missing = int((~comparison.prepared.used).sum())
+        sentences.append(
+            f"Spectra were left out: they are those of the full sky, and {missing} of "
+            f"{comparison.prepared.used.size} pixels have no value."
+        )
+    for s in comparison.spectra:
+        unlikely = [n for n, p in zip(("EE", "BB"), s.pte, strict=True) if p < UNLIKELY]
+        if unlikely:
+            sentences.append(
+                f"{s.band}: {' and '.join(unlikely)} differ from the model by more than noise and "
+                f"CMB do (PTE below {UNLIKELY:g})."
+            )
+    return sentences
+
+
+def write_report(
+    out: Path, inputs: Inputs, settings: Settings, comparison: Comparison, seconds: float
+) -> list[Path]:
+    """Write comparison.json, pictures and log.json to a folder; returns what was written."""
+    written = [out / "comparison.json", out / "log.json"]
+    write_json(written[0], comparison_json(comparison, inputs))
+    bands, title = list(comparison.prepared.bands), settings.title
+    for region in comparison.regions:
+        written.append(out / f"scatter_{region}.png")
+        plots.plot_scatter(written[-1], comparison, region, bands, f"{title}\n{region}")
+    nside = min(settings.compare.panel_nside, settings.analysis.nside)
+    for stokes in "QU":
+        written.append(out / f"maps_{stokes}.png")
+        plots.plot_maps(written[-1], comparison, stokes, bands, nside, title)
+    if comparison.spectra:
+        written.append(out / "spectra.png")
+        plots.plot_spectra(written[-1], comparison.spectra, title)
+    if leaky := [s for s in comparison.spectra if s.uncorrected is not None]:
+        written.append(out / "leakage.png")
+        plots.plot_leakage(written[-1], leaky, title)
+    write_log(written[1], settings, seconds)
+    return written

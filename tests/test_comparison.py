@@ -1,0 +1,296 @@
+"""Observed maps against the model: slopes and spectra with errors that simulations confirm."""
+
+import json
+import sys
+from pathlib import Path
+
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from fits import settings as fit_settings
+from fits.comparison import compare
+from fits.comparison.pixels import compare_pixels
+from fits.comparison.report import warnings
+from fits.comparison.simulations import full_sky_spectra, simulate
+from fits.comparison.spectra import compare_spectra, cosmic_error, hotelling
+from fits.inputs import inputs_of
+from fits.regions import region_masks
+from fits.resolution import prepare
+from jaxsky import cli, observe
+from jaxsky.io import InputError
+from jaxsky.settings import SettingsError
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "wmap7_vw.toml"
+SETTINGS = """
+title = "small"
+[embedded]
+channels = { planck = ["44", "70"], wmap = ["K"] }
+nside = 32
+leakage = { "70" = 0.2 }
+[analysis]
+nside = 16
+fwhm = 300.0
+regions = ["strip", "outside"]
+seed = 3
+[compare]
+nsims = 30
+lmax = 25
+width = 8
+panel_nside = 8
+"""
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory):
+    path = tmp_path_factory.mktemp("compare") / "compare.toml"
+    path.write_text(SETTINGS)
+    return fit_settings.load_settings(path)
+
+
+@pytest.fixture(scope="module")
+def prepared(settings):
+    return prepare(inputs_of(settings), settings.analysis.nside, settings.analysis.fwhm)
+
+
+@pytest.fixture(scope="module")
+def model(prepared):
+    return observe(prepared.sky, list(prepared.bands.values()))
+
+
+@pytest.fixture(scope="module")
+def regions(settings):
+    return region_masks(settings)
+
+
+@pytest.fixture(scope="module")
+def simulated(prepared, model, regions):
+    return simulate(prepared, model, regions, 25, 150, 0)
+
+
+@pytest.fixture(scope="module")
+def realised(prepared):
+    """Noise and CMB of 150 realisations."""
+    fluctuations = prepared.fluctuations
+    keys = [jax.random.fold_in(jax.random.key(0), i) for i in range(150)]
+    return [fluctuations.noise_realisation(k) + fluctuations.cmb_realisation(k) for k in keys]
+
+
+def test_realisations_have_the_covariance(prepared, realised):
+    """Of any inner products; that of three bands is 3 x 3, with the CMB in all of them."""
+    rng = np.random.default_rng(1)
+    rows = jnp.asarray(rng.normal(size=(3, 1, 2, prepared.used.size)))
+    rows = rows.at[:].set(rows[0])  # alike, so that the CMB correlates the bands
+    expected = np.asarray(prepared.fluctuations.covariance(rows))
+    products = np.array([jnp.einsum("brsp,bsp->br", rows, maps).ravel() for maps in realised])
+    found = products.T @ products / len(products)
+    root = np.sqrt(np.diag(expected))
+    # One standard error of an element is (1 + rho^2)^(1/2) / sqrt(150) of the roots: 4 of them.
+    assert np.abs((found - expected) / np.outer(root, root)).max() < 4 * np.sqrt(2 / 150)
+    assert expected[0, 1] > 0.05 * root[0] * root[1]
+
+
+def test_slopes_are_those_of_the_maps_and_their_errors_are_honest(
+    prepared, model, regions, simulated, realised
+):
+    exact = prepared._replace(data=1.25 * model)
+    assert [s.slope for s in compare_pixels(exact, model, regions, simulated)] == pytest.approx(
+        [1.25] * 18
+    )
+    pulls = []
+    for maps in realised:
+        found = compare_pixels(prepared._replace(data=model + maps), model, regions, simulated)
+        pulls.append([(s.slope - 1) / s.error for s in found])
+    # 150 realisations: the mean is good to 0.08, the standard deviation to 6 %; four of each.
+    assert np.abs(np.mean(pulls, axis=0)).max() < 0.33
+    assert np.abs(np.std(pulls, axis=0) - 1).max() < 0.24
+
+
+def test_probabilities_of_pixels_are_ranks(prepared, model, regions, simulated, realised):
+    tests = [
+        [
+            s.pte
+            for s in compare_pixels(prepared._replace(data=model + m), model, regions, simulated)
+        ]
+        for m in realised[:40]
+    ]
+    # The same realisations: a rank among them, each one in 151.
+    ranks = np.array(tests) * 151
+    np.testing.assert_allclose(ranks, np.round(ranks), atol=1e-9)
+    assert ranks.min() >= 2  # it exceeds itself
+    double = compare_pixels(prepared._replace(data=3 * model), model, regions, simulated)
+    assert double[0].pte == pytest.approx(1 / 151)
+
+
+def test_numbers_of_a_scatter(prepared, model, regions, simulated):
+    scatter = compare_pixels(prepared, model, regions, simulated)[2]
+    assert (scatter.band, scatter.region, scatter.stokes) == ("44", "strip", "QU")
+    inside = regions["strip"]
+    x, y = np.asarray(model[0])[:, inside].ravel(), np.asarray(prepared.data[0])[:, inside].ravel()
+    assert scatter.pixels == x.size
+    assert scatter.correlation == pytest.approx(np.corrcoef(x, y)[0, 1])
+    assert scatter.rms == pytest.approx(np.sqrt(np.mean((y - x) ** 2)))
+    assert scatter.expected == pytest.approx(scatter.rms, rel=0.1)
+    sigma = np.asarray(prepared.sigma[0])[:, inside].ravel()
+    assert scatter.chi2 == pytest.approx(np.sum(((y - x) / sigma) ** 2))
+    assert scatter.slope_pte == pytest.approx(
+        scipy.stats.chi2.sf(((scatter.slope - 1) / scatter.error) ** 2, 1)
+    )
+
+
+def test_the_paper_s_error_and_the_chance_correlation():
+    """The scatter of spectra of a Gaussian field, alone and on top of a signal that is fixed."""
+    lmax = 12
+    rng = np.random.default_rng(2)
+    ell = np.concatenate([np.arange(lmax + 1), np.repeat(*_counted(lmax))])
+    fixed = rng.normal(size=ell.size) * 2.0
+    power = np.where(np.arange(lmax + 1) > 1, 1.0 / (1 + np.arange(lmax + 1.0)), 0.0)
+    white = rng.normal(size=(4000, ell.size)) * np.sqrt(power)[ell]
+
+    def spectrum(alm):
+        return np.array([np.bincount(ell, a**2) for a in alm]) / (2 * np.arange(lmax + 1) + 1)
+
+    signal = spectrum(fixed[None])[0]
+    for sky, own in ((white, 0.0), (white + fixed, signal)):
+        expected = np.asarray(cosmic_error(jnp.asarray(power), jnp.asarray(own)))[2:]
+        # 4000 draws know a standard deviation to some 1.5 %.
+        np.testing.assert_allclose(spectrum(sky).std(axis=0)[2:], expected, rtol=0.07)
+
+
+def _counted(lmax):
+    m = np.arange(1, lmax + 1)
+    degrees = np.concatenate([np.arange(k, lmax + 1) for k in m])
+    return degrees, np.full(degrees.size, 2)
+
+
+def test_hotelling_is_exact():
+    rng = np.random.default_rng(3)
+    mixing = rng.normal(size=(4, 4))
+    tests = np.array(
+        [
+            hotelling(mixing @ rng.normal(size=4), rng.normal(size=(15, 4)) @ mixing.T)[1]
+            for _ in range(600)
+        ]
+    )
+    # Probabilities are uniform: Kolmogorov-Smirnov.
+    assert scipy.stats.kstest(tests, "uniform").pvalue > 1e-3
+    many = rng.normal(size=(200_000, 4))
+    chi2, probability = hotelling(np.array([1.0, -2.0, 0.5, 1.0]), many)
+    assert chi2 == pytest.approx(6.25, rel=0.02)
+    assert probability == pytest.approx(scipy.stats.chi2.sf(6.25, 4), rel=0.03)
+    with pytest.raises(ValueError, match="4 bins need more than 4 simulations, but there are 4"):
+        hotelling(np.zeros(4), rng.normal(size=(4, 4)))
+
+
+def test_spectra_are_healpys(prepared, model, simulated):
+    found = compare_spectra(prepared, model, simulated, 8)
+    zero = np.zeros(prepared.used.size)
+    for spectra, maps in zip(found, prepared.data, strict=True):
+        cls = healpy.anafast([zero, *np.asarray(maps)], lmax=40, iter=10)[1:3, :26]
+        # The maps hold multipoles up to 47, beyond what pixels of nside 16 tell apart.
+        np.testing.assert_allclose(spectra.observed[:, 2:], cls[:, 2:], rtol=1e-2)
+        assert spectra.edges == (2, 10, 18, 26)
+        D = np.arange(26) * np.arange(1, 27) / (2 * np.pi) * spectra.observed
+        np.testing.assert_allclose(spectra.binned[:, 0], D[:, 2:10].mean(axis=1))
+        np.testing.assert_array_equal(spectra.centers, [5.5, 13.5, 21.5])
+        assert spectra.chi2_bins.shape == (2, 3)
+        # The paper's error is that of noise and CMB, which are also what is simulated.
+        total = spectra.noise + spectra.cmb
+        np.testing.assert_allclose(
+            spectra.error[:, 2:], (np.sqrt(2 / (2 * np.arange(26) + 1)) * total)[:, 2:]
+        )
+        assert (spectra.largest_error > 0).all()
+        assert (spectra.pte > 1e-3).all()
+    assert [s.uncorrected is not None for s in found] == [False, True, False]
+    # 20 % of the intensity leaked; it is seen, and gone with the correction.
+    assert found[1].pte_uncorrected.max() < 1e-3
+
+
+def test_spectra_do_not_depend_on_the_common_nside(settings, prepared):
+    fine = prepare(inputs_of(settings), 32, settings.analysis.fwhm)
+    found, finer = full_sky_spectra(prepared.data, 25), full_sky_spectra(fine.data, 25)
+    np.testing.assert_allclose(found[..., 2:], finer[..., 2:], rtol=1e-2)
+
+
+def test_missing_pixels_leave_spectra_out(settings, prepared, model, regions, simulated):
+    used = prepared.used.copy()
+    used[:3] = False
+    holes = prepared._replace(used=used)
+    with pytest.raises(ValueError, match="3 of 3072 have no value"):
+        compare_spectra(holes, model, simulated, 8)
+    found = compare(settings, holes, regions)
+    assert not found.spectra
+    assert "3 of 3072 pixels have no value" in warnings(found)[0]
+    assert found.scatter("K", "outside", "Q").pixels == int(regions["outside"].sum()) - 3
+
+
+def test_realisations_are_kept(prepared, model, regions, tmp_path):
+    path, counts = tmp_path / "sims.npz", []
+    first = simulate(prepared, model, regions, 20, 2, 0, path, "a")
+    more = simulate(prepared, model, regions, 20, 3, 0, path, "a", counts.append)
+    assert counts == [2, 3]
+    np.testing.assert_array_equal(more.chi2[:2], first.chi2)
+    fresh = simulate(prepared, model, regions, 20, 3, 0)
+    np.testing.assert_allclose(more.spectra, fresh.spectra, rtol=1e-12)
+    with pytest.raises(InputError, match="holds realisations of other data or settings"):
+        simulate(prepared, model, regions, 20, 3, 0, path, "b")
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(InputError, match=r"sims.npz: is damaged .* start again with --overwrite"):
+        simulate(prepared, model, regions, 20, 3, 0, path, "a")
+
+
+def test_what_cannot_be_compared_is_refused(settings, prepared, regions):
+    how = settings.compare.model_copy(update={"lmax": 33})
+    with pytest.raises(SettingsError, match="multipoles reach to 2 nside, 32, but 33 is asked"):
+        compare(settings.model_copy(update={"compare": how}), prepared, regions)
+    with pytest.raises(SettingsError, match="region 'nothing' leaves no pixel"):
+        compare(settings, prepared, {"nothing": np.zeros(3072, bool)})
+    with pytest.raises(ValueError, match=r"there is no band '353' among 44, 70, K"):
+        fit_settings.Settings.model_validate(
+            settings.model_dump() | {"compare": {"patches": "353"}}
+        )
+    with pytest.raises(ValueError, match=r"leakage: there is no channel 30"):
+        fit_settings.Embedded(leakage={"30": 0.1})
+    with pytest.raises(ValueError, match=r"channels must be some, with different names"):
+        fit_settings.Embedded(channels={"planck": ["30"], "wmap": []} | {"core": ["30"]})
+
+
+def run(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["jaxsky", "compare", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    return stop.value.code or 0
+
+
+def test_command_line(tmp_path, monkeypatch, capsys):
+    (tmp_path / "a.toml").write_text(SETTINGS)
+    out = tmp_path / "out"
+    assert run(monkeypatch, tmp_path / "a.toml", "--out", out) == 0
+    pictures = {"scatter_strip", "scatter_outside", "maps_Q", "maps_U", "spectra", "leakage"}
+    assert {p.stem for p in out.glob("*.png")} == pictures
+    numbers = json.loads((out / "comparison.json").read_text())
+    assert set(numbers["pixels"]["44"]["strip"]) == {"Q", "U", "QU"}
+    assert 0.8 < numbers["pixels"]["K"]["strip"]["QU"]["slope"] < 1.2
+    assert len(numbers["spectra"]["70"]["chi2_bins"][1]) == 3
+    assert "Model of the Galaxy (not data)" in capsys.readouterr().err
+    assert run(monkeypatch, tmp_path / "a.toml", "--out", out) == 2
+    assert "holds results already" in capsys.readouterr().err
+    assert run(monkeypatch, tmp_path / "a.toml", "--out", out, "--resume", "--nsims", 31) == 0
+    assert run(monkeypatch, tmp_path / "a.toml", "--out", out, "--resume", "--seed", 9) == 2
+    assert "holds realisations of other data" in capsys.readouterr().err
+    assert (out / "comparison.json").exists()
+
+
+def test_wmap_on_the_real_sky(data_dir, monkeypatch):
+    """V and W against the real templates: slopes of 1 within errors, at low latitude and above."""
+    monkeypatch.setenv("JAXSKY_DATA", str(data_dir))
+    analysis = {"regions": ["strip", "outside"]}
+    settings = fit_settings.load_settings(EXAMPLE, analysis, {"nsims": 30})
+    found = compare(settings, prepare(inputs_of(settings), 32, 0.0), region_masks(settings))
+    for scatter in found.scatters:
+        assert abs(scatter.slope - 1) < 3 * scatter.error
+        assert scatter.rms == pytest.approx(scatter.expected, rel=0.15)
+    assert found.scatter("V", "strip", "QU").correlation > 0.5

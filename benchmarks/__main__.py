@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 from rich.console import Console
 
-from benchmarks import band_averages, command, likelihoods, simulations
+from benchmarks import band_averages, command, comparisons, likelihoods, simulations
 from benchmarks.table import Row, conditions, markdown, rich_table
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
@@ -28,9 +28,12 @@ BENCHMARKS = {
     "analysis": simulations.transform,
     "smoothing-nside": simulations.growth,
     "correlated": simulations.correlated_alm,
+    "coupling": comparisons.coupling,
+    "patches": comparisons.patches,
+    "commands": comparisons.commands,
 }
 #: These take minutes: they are run by name, and when the table is kept.
-LONG = ("nside-2048",)
+LONG = ("nside-2048", "commands")
 
 
 def _arguments() -> argparse.Namespace:

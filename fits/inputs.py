@@ -22,7 +22,7 @@ from jaxsky import (
     set_parameters,
 )
 from jaxsky.cmb import camb_spectra, realisation
-from jaxsky.galaxy import embedded_sky
+from jaxsky.galaxy import EmbeddedSky, embedded_sky
 from jaxsky.harmonics import gaussian_beam, resample, synthesis
 from jaxsky.inputs import (
     Template,
@@ -84,20 +84,20 @@ class Inputs(NamedTuple):
     description: str
 
 
-def inputs_of(settings: Settings) -> Inputs:
+def inputs_of(settings: Settings, galaxy: EmbeddedSky | None = None) -> Inputs:
     """The embedded sky where the settings have it, else what they name; see there."""
-    return embedded_inputs(settings) if settings.embedded else read_inputs(settings)
+    return embedded_inputs(settings, galaxy) if settings.embedded else read_inputs(settings)
 
 
-def embedded_inputs(settings: Settings) -> Inputs:
+def embedded_inputs(settings: Settings, galaxy: EmbeddedSky | None = None) -> Inputs:
     """The embedded model of the Galaxy, observed with channels of instruments.
 
     The sky is the paper's baseline with the fixed parameters of the settings; CMB and noise are
-    drawn from the seed.
+    drawn from the seed. `galaxy` is the model at the settings' nside, if it is made already.
     """
     embedded, seed = settings.embedded, settings.analysis.seed
     assert embedded is not None
-    galaxy = embedded_sky(embedded.nside)
+    galaxy = galaxy or embedded_sky(embedded.nside)
     sky = set_parameters(galaxy.sky("QU"), settings.fixed)
     channels = [
         channel

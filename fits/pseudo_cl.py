@@ -19,6 +19,8 @@ from ducc0.misc import wigner3j_int
 from ducc0.misc.experimental import coupling_matrix_rect
 from jaxtyping import Array, Float
 
+from fits.discs import zonal, zonal_products
+from jaxsky.correlated import realisation
 from jaxsky.harmonics import analysis, expand, lmax_of, power_spectrum, synthesis
 
 __all__ = [
@@ -27,8 +29,10 @@ __all__ = [
     "band_powers",
     "bin_edges",
     "coupling_matrices",
+    "covariance_terms",
     "masked_spectra",
     "pure_coupling_matrices",
+    "sky_fraction",
 ]
 
 #: Fewest modes of a field in a bin that a mean power can be taken of.
@@ -227,7 +231,7 @@ def _check(mask: np.ndarray, edges: tuple[int, ...], lmax: int, window: np.ndarr
         )
     if window is not None and len(window) <= lmax:
         raise ValueError(f"Argument `window` ends at l = {len(window) - 1}, not at {lmax}.")
-    fraction = _fraction(mask)
+    fraction = sky_fraction(mask)
     for low, high in itertools.pairwise(edges):
         modes = fraction * (high**2 - low**2)
         if modes < LEAST_MODES:
@@ -237,7 +241,7 @@ def _check(mask: np.ndarray, edges: tuple[int, ...], lmax: int, window: np.ndarr
             )
 
 
-def _fraction(mask: np.ndarray) -> float:
+def sky_fraction(mask: Float[np.ndarray, " pix"]) -> float:
     """Fraction of the sky that has as many modes as there are within the mask."""
     fourth = float(np.mean(mask**4))
     return float(np.mean(mask**2)) ** 2 / fourth if fourth else 0.0
@@ -298,27 +302,86 @@ def band_powers(
 
 
 def band_covariance(
-    spectra: MaskedSpectra, EE: Float[np.ndarray, " ell"], BB: Float[np.ndarray, " ell"]
+    spectra: MaskedSpectra,
+    EE: Float[np.ndarray, " ell"],
+    BB: Float[np.ndarray, " ell"],
+    *,
+    simulations: int = 0,
+    key: Array | None = None,
 ) -> Float[np.ndarray, "2 bin 2 bin"]:
     """Covariance of band powers of a Gaussian field.
 
-    Where the spectra vary little over the width of the mask's own spectrum, pseudo-spectra are
-    correlated as modes of the squared mask (Efstathiou 2004; Challinor & Chon 2005).
-    Of purified B the largest scales of the mask have some 20 % more than is said here.
+    Exact for masks that do not depend on longitude about their middle, purified or not. For others
+    it is an approximation (`covariance_terms`), good to some 10 % but for purified B: in the lowest
+    bands, of the size of the mask, its errors are up to 50 % larger, which simulations correct.
 
     Parameters
     ----------
     spectra : from `masked_spectra`
     EE, BB : spectra C_l of the maps, window and noise included, up to `spectra.lmax` at least
+    simulations : number of Gaussian skies from which the standard deviations are taken, while the
+        correlations stay; 200 measure them to 5 %. By default none
+    key : of jax.random, for the simulations
+
+    Raises
+    ------
+    ValueError
+        For one simulation, or without a key for them.
     """
-    given = np.stack([EE, BB])[:, : spectra.lmax + 1]
+    covariance = 2 * covariance_terms(spectra, np.stack([EE, BB])[None])[0, 0]
+    if not simulations:
+        return covariance
+    if simulations < 2 or key is None:
+        raise ValueError(
+            "Argument `simulations` must be 0, or 2 and more with a `key` of jax.random; "
+            f"it is {simulations}, with key = {key}."
+        )
+    nside, zero = healpy.npix2nside(spectra.mask.size), np.zeros(spectra.lmax + 1)
+    rows = [np.asarray(row)[: spectra.lmax + 1] for row in (EE, BB)]
+    matrix = jnp.array([[rows[0], zero], [zero, rows[1]]])
+    powers = [
+        band_powers(spectra, synthesis(realisation(one, matrix), nside))
+        for one in jax.random.split(key, simulations)
+    ]
+    scale = np.std(powers, axis=0, ddof=1) / np.sqrt(np.einsum("ibib->ib", covariance))
+    return covariance * scale[..., None, None] * scale
+
+
+def covariance_terms(
+    spectra: MaskedSpectra, fields: Float[np.ndarray, "field 2 ell"]
+) -> Float[np.ndarray, "field field 2 bin 2 bin"]:
+    """Half the covariance of band powers of independent Gaussian fields, for each pair of them.
+
+    The covariance of the sum of fields with p_i times the spectra is 2 sum_ij p_i p_j terms[i, j].
+    Exact for symmetric masks (`zonal`). For others pseudo-spectra are correlated as modes of the
+    squared mask, and the spectra taken to vary little over the width of the mask's own spectrum
+    (Efstathiou 2004; Challinor & Chon 2005).
+
+    Parameters
+    ----------
+    spectra : from `masked_spectra`
+    fields : spectra EE, BB of each, window included, up to `spectra.lmax` at least
+    """
+    given = np.asarray(fields, float)[..., : spectra.lmax + 1]
+    reach = min(2 * spectra.lmax, 2 * healpy.npix2nside(spectra.mask.size))
+    profile = zonal(np.asarray(analysis(jnp.asarray(spectra.mask)[None], reach)[0]))
+    if profile is None:
+        blocks = _narrow_products(spectra, given)
+    else:
+        factors = None if spectra.derivatives is None else _pure_factors(spectra.lmax)
+        blocks = zonal_products(profile * _rises(len(profile)), given, factors)
+    inverse = spectra.inverse
+    return np.einsum("ibjl,xyjlkm,nckm->xyibnc", inverse, blocks, inverse, optimize=True)
+
+
+def _narrow_products(
+    spectra: MaskedSpectra, given: Float[np.ndarray, "field 2 ell"]
+) -> Float[np.ndarray, "field field 2 ell 2 ell"]:
+    """`zonal_products` of any mask, for spectra that vary little over the width of its own."""
     # What leaks from E adds to the variance of B.
     total = spectra.mixing.sum(axis=(1, 3))
-    seen = np.einsum("ijlm,jm->il", spectra.mixing, given) / np.where(total > 0, total, 1.0)
-    root = np.sqrt(seen[:, :, None] * seen[:, None])
+    seen = np.einsum("ijlm,xjm->xil", spectra.mixing, given) / np.where(total > 0, total, 1.0)
+    root = np.sqrt(seen[:, None] * seen)
     same, cross = spectra.spread
-    blocks = np.array([[same * root[0] ** 2, cross * root[0] * root[1]],
-                       [cross * root[0] * root[1], same * root[1] ** 2]])  # fmt: skip
-    return 2 * np.einsum(
-        "ibjl,jklm,nckm->ibnc", spectra.inverse, blocks, spectra.inverse, optimize=True
-    )
+    pairs = np.array([[same, cross], [cross, same]])
+    return np.einsum("xyjl,jklm,xykm->xyjlkm", root, pairs, root)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxsky import correlated
 
-__all__ = ["PLANCK_2018", "camb_spectra", "realisation"]
+__all__ = ["PLANCK_2018", "camb_spectra", "realisation", "tensor_spectra"]
 
 #: Planck 2018 results VI, TT,TE,EE+lowE+lensing; arguments of `camb.set_params`.
 PLANCK_2018 = {
@@ -49,6 +49,35 @@ def camb_spectra(lmax: int, r: float = 0.0, **cosmology: float) -> Float[np.ndar
     )
     results = camb.get_results(params)
     return np.asarray(results.get_total_cls(lmax, CMB_unit="muK", raw_cl=True)).T
+
+
+@cache
+def tensor_spectra(lmax: int, **cosmology: float) -> Float[np.ndarray, "4 ell"]:
+    """Spectra C_l of TT, EE, BB, TE of tensors with r = 1 [uK_CMB^2], l = 0 ... lmax.
+
+    Their primordial spectrum has no tilt, so for another r they are these times r. They are not
+    lensed.
+
+    Parameters
+    ----------
+    lmax : largest multipole
+    **cosmology : of `camb.set_params`, instead of `PLANCK_2018`
+    """
+    import camb
+
+    lowest = max(lmax, 600)  # CAMB's own
+    params = camb.set_params(
+        **(cosmology or PLANCK_2018),
+        r=1.0,
+        nt=0.0,
+        WantTensors=True,
+        WantScalars=False,
+        lmax=lowest,
+        max_l_tensor=lowest,
+        max_eta_k_tensor=2.5 * lowest,
+    )
+    results = camb.get_results(params)
+    return np.asarray(results.get_tensor_cls(lmax, CMB_unit="muK", raw_cl=True)).T
 
 
 def realisation(

@@ -45,33 +45,49 @@ def save(figure: plt.Figure, path: Path) -> None:
 
 
 def _image(
-    axes: Axes, pixels: np.ndarray, limit: float, label: str, linear: bool = False, **options: Any
+    axes: Axes,
+    pixels: np.ndarray,
+    limit: float,
+    label: str,
+    linear: bool = False,
+    middle: float = 0.0,
+    **options: Any,
 ) -> None:
     """Values about zero with a bar of colours, linear up to a tenth of the limit, then logarithmic.
 
-    So the Galactic plane and high latitudes show in one picture. Or linear throughout. The limit
-    is rounded to one digit.
+    So the Galactic plane and high latitudes show in one picture. Or linear throughout, about any
+    value. The limit is rounded to one digit.
     """
     limit = float(f"{limit:.1g}")
     norm: mpl.colors.Normalize
     if linear:
-        norm, between = mpl.colors.Normalize(-limit, limit), limit / 2
+        norm, between = mpl.colors.Normalize(middle - limit, middle + limit), limit / 2
     else:
         norm, between = mpl.colors.AsinhNorm(limit / 10, -limit, limit), limit / 10
     image = axes.imshow(pixels, origin="lower", cmap="RdBu_r", norm=norm, **options)
     bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02, extend="both")
-    bar.set_ticks([-limit, -between, 0, between, limit])
+    bar.set_ticks([middle + tick for tick in (-limit, -between, 0, between, limit)])
     bar.ax.yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
     bar.ax.minorticks_off()
     bar.set_label(label)
 
 
-def draw_map(axes: Axes, values: Float[np.ndarray, " pix"], limit: float, label: str) -> None:
-    """A map of the full sky in Galactic coordinates, centred on l = 0, l growing to the left."""
+def draw_map(
+    axes: Axes,
+    values: Float[np.ndarray, " pix"],
+    limit: float,
+    label: str,
+    middle: float | None = None,
+) -> None:
+    """A map of the full sky in Galactic coordinates, centred on l = 0, l growing to the left.
+
+    With a middle, the colours are linear about it.
+    """
     nside = healpy.npix2nside(values.size)
     projector = healpy.projector.MollweideProj(xsize=600)
     pixels = projector.projmap(np.asarray(values), lambda x, y, z: healpy.vec2pix(nside, x, y, z))
-    _image(axes, np.ma.masked_invalid(np.where(pixels == -np.inf, np.nan, pixels)), limit, label)
+    pixels = np.ma.masked_invalid(np.where(pixels == -np.inf, np.nan, pixels))
+    _image(axes, pixels, limit, label, middle is not None, middle or 0.0)
     axes.axis("off")
 
 
@@ -85,14 +101,20 @@ def draw_patch(
 ) -> None:
     """A square patch of the sky about (l, b), all in degrees; gnomonic, l growing to the left.
 
-    Unlike those of `draw_map`, its colours are linear.
+    Unlike those of `draw_map`, its colours are linear, and where its pixels are finer than those
+    of the map, values are interpolated between them.
     """
-    nside = healpy.npix2nside(values.size)
+    nside, values = healpy.npix2nside(values.size), np.asarray(values)
     xsize = 300
     projector = healpy.projector.GnomonicProj(
         rot=(*center, 0.0), xsize=xsize, reso=size * 60 / xsize
     )
-    pixels = projector.projmap(np.asarray(values), lambda x, y, z: healpy.vec2pix(nside, x, y, z))
+    if size * 60 / xsize < healpy.nside2resol(nside, arcmin=True):
+        vectors = projector.xy2vec(projector.ij2xy())
+        theta, phi = healpy.vec2ang(np.stack(vectors, axis=-1).reshape(-1, 3))
+        pixels = healpy.get_interp_val(values, theta, phi).reshape(xsize, xsize)
+    else:
+        pixels = projector.projmap(values, lambda x, y, z: healpy.vec2pix(nside, x, y, z))
     half = size / 2
     _image(axes, pixels, limit, label, linear=True, extent=(half, -half, -half, half))
     axes.set_xlabel(rf"$(l - {center[0]:g}^\circ)\,\cos b$ [deg]")

@@ -39,6 +39,15 @@ def test_polarization_alone_is_that_of_a_realisation_with_intensity():
     np.testing.assert_array_equal(cmb.realisation(key, spectra), both[1:])
 
 
+def test_tensors_are_what_r_adds():
+    tensors = cmb.tensor_spectra(LMAX)
+    assert tensors.shape == (4, LMAX + 1)
+    # CAMB tilts them by -r/8, which is little for a small r.
+    added = (cmb.camb_spectra(LMAX, r=1e-3) - cmb.camb_spectra(LMAX)) / 1e-3
+    np.testing.assert_allclose(tensors[1:3, 2:], added[1:3, 2:], rtol=3e-3)
+    assert not tensors[:, :2].any()
+
+
 def test_refuses_nonsense():
     with pytest.raises(ValueError, match="`r` must not be negative, but is -1"):
         cmb.camb_spectra(10, r=-1)

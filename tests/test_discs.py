@@ -4,8 +4,16 @@ import healpy
 import numpy as np
 import pytest
 
-from fits.discs import BICEP2, bicep2_mask, disc_centers, disc_mask, paper_patches
-from jaxsky.harmonics import smooth
+from fits.discs import (
+    BICEP2,
+    bicep2_mask,
+    disc_centers,
+    disc_mask,
+    paper_patches,
+    ring_functions,
+    zonal,
+)
+from jaxsky.harmonics import alm_from_healpy, analysis, smooth, synthesis
 
 SQUARE_DEGREES = 4 * np.pi * np.degrees(1) ** 2
 
@@ -50,6 +58,38 @@ def test_the_field_of_bicep2():
     assert field.name == "BICEP2"
     # Its middle, at right ascension 0 and declination -57.5 deg.
     assert field.mask[healpy.ang2pix(16, field.lon, field.lat, lonlat=True)] > 0.9
+
+
+def test_harmonics_on_a_ring():
+    nside, lmax = 16, 20
+    orders = np.array([1, 3])
+    theta, phi = healpy.pix2ang(nside, np.array([500, 900]))
+    for spin in (0, 1, 2):
+        functions = ring_functions(spin, lmax, theta, orders)
+        for i, m in enumerate(orders):
+            alm = np.zeros(healpy.Alm.getsize(lmax), complex)
+            alm[healpy.Alm.getidx(lmax, 12, m)] = 1
+            packed = np.stack([alm_from_healpy(alm, lmax), np.zeros((lmax + 1) ** 2)])
+            maps = np.asarray(synthesis(packed[: 1 + (spin > 0)], nside, spin=spin or 2))
+            # A real map has m and -m.
+            found = 2 * np.real(functions[:, i, 12] * [[1], [1j]] * np.exp(1j * m * phi))
+            np.testing.assert_allclose(found[: len(maps)], maps[:, [500, 900]], atol=1e-12)
+
+
+def test_only_discs_are_symmetric():
+    nside, lmax = 64, 64
+    alm, bicep2 = (
+        np.asarray(analysis(mask[None], lmax)[0])
+        for mask in (disc_mask(nside, 200.0, -30.0, 15.0, 5.0), bicep2_mask(nside))
+    )
+    assert zonal(bicep2) is None
+    # About its middle a disc is what it is about the pole.
+    pole = np.asarray(analysis(disc_mask(nside, 0.0, 90.0, 15.0, 5.0)[None], lmax)[0])
+    np.testing.assert_allclose(zonal(alm), pole[: lmax + 1], atol=1e-4)
+    whole = np.asarray(analysis(np.ones((1, 12 * nside**2)), lmax)[0])
+    np.testing.assert_allclose(
+        zonal(whole), np.sqrt(4 * np.pi) * (np.arange(lmax + 1) == 0), atol=1e-6
+    )
 
 
 def test_refusals():

@@ -603,7 +603,7 @@ RMS = '{ rms = 1.0, unit = "uK_RJ" }'
         ([('"beam.txt"', '"cmb.dat"')], "cmb.dat"),
         ([("width = 6.0", "width = 70.0")], "bands.30.bandpass: Argument `nu` must be positive"),
         ([("level = 300.0", "level = 300.0, rms = 1.0")],
-         "bands.0.noise: give the noise as exactly one of level, rms, map, covariance, hits, weights"),
+         "bands.0.noise: give the noise as exactly one of level, rms, map, covariance, hits"),
         ([("level = 300.0", "level = 0.0")], "bands.0.noise.level: input should be greater than 0"),
         ([("level = 300.0", 'level = 300.0, unit = "MJy/sr"')],
          "bands.0.noise.unit: must be a temperature such as uK_RJ or mK_CMB, not 'MJy/sr'"),

@@ -272,7 +272,7 @@ class Example(SettingsFile):
     [
         (
             "{ }",
-            "noise: give the noise as exactly one of rms, map, covariance, hits, weights, not none.",
+            "exactly one of rms, map, covariance, hits, weights, not none.",
         ),
         ("{ rms = 1.0, covariance = ['a', 'b', 'c'] }", "not rms, covariance."),
         ("{ level = 1.0 }", "noise.level: unknown key"),

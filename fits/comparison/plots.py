@@ -3,23 +3,34 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax.numpy as jnp
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
 from fits.comparison.compare import Comparison
+from fits.comparison.patches import PatchComparison
 from fits.comparison.pixels import Scatter
 from fits.comparison.spectra import LMIN, BandSpectra
+from fits.patches import PatchFits
 from fits.record import probability, with_error
 from jaxsky.harmonics import average_pixels
 from jaxsky.plots import COLORS, STYLE, UNITS, draw_map, save
 
-__all__ = ["plot_leakage", "plot_maps", "plot_scatter", "plot_spectra"]
+__all__ = [
+    "plot_leakage",
+    "plot_maps",
+    "plot_patches",
+    "plot_scatter",
+    "plot_spectra",
+    "plot_template_patches",
+]
 
 OBSERVED, MODEL, FOREGROUNDS, NOISE = COLORS[1], COLORS[2], COLORS[0], "0.55"
 UNIT = UNITS["uK_RJ"]
 POWER = rf"$D_\ell$ [{UNIT}$^2$]"
+FIELDS = ("EE", "BB")
 #: Panels beside each other.
 COLUMNS = 3
 
@@ -81,31 +92,47 @@ def plot_scatter(
 def plot_maps(
     path: Path, comparison: Comparison, stokes: str, bands: Sequence[str], nside: int, title: str
 ) -> None:
-    """Observed maps beside the model, in one scale of colours a band (the paper's fig. 6)."""
-    names, s = list(comparison.prepared.bands), "QU".index(stokes)
+    """Observed maps beside the model, in one scale of colours (the paper's fig. 6).
+
+    Parameters
+    ----------
+    path : picture to write
+    comparison : the maps
+    stokes : "Q", "U" or "QU", two columns for each
+    bands : a row for each
+    nside : of the pixels that are drawn
+    title : of the figure
+    """
+    names = list(comparison.prepared.bands)
     region = "full" if "full" in comparison.regions else next(iter(comparison.regions))
+    weights = jnp.asarray(comparison.prepared.used[None], float)
+    used = np.asarray(average_pixels(weights, nside))[0] > 0.5
     with plt.rc_context(STYLE):
         figure, grid = plt.subplots(
-            len(bands), 2, figsize=(7.2, 1.85 * len(bands) + 0.4), squeeze=False,
+            len(bands),
+            2 * len(stokes),
+            figsize=(7.0 * len(stokes), 1.85 * len(bands) + 0.4),
+            squeeze=False,
             layout="constrained",
-        )  # fmt: skip
+        )
         for row, band in zip(grid, bands, strict=True):
             b = names.index(band)
-            maps = [
-                np.asarray(average_pixels(m[b], nside))[s]
+            both = [
+                np.asarray(average_pixels(m[b], nside))
                 for m in (comparison.prepared.data, comparison.model)
             ]
-            used = np.asarray(average_pixels(comparison.prepared.used[None] * 1.0, nside))[0] > 0.5
-            limit = float(np.quantile(np.abs(maps[1]), 0.99)) or 1.0
-            scatter = comparison.scatter(band, region, stokes)
-            heads = (
-                f"{band}: {stokes} observed",
-                f"model; slope {with_error(scatter.slope, scatter.error)}, "
-                f"r = {scatter.correlation:.2f} ({region})",
-            )
-            for axes, values, head in zip(row, maps, heads, strict=True):
-                draw_map(axes, np.where(used, values, np.nan), limit, UNIT)
-                axes.set_title(head)
+            for s, kind in enumerate(stokes):
+                maps = [m["QU".index(kind)] for m in both]
+                limit = float(np.quantile(np.abs(maps[1]), 0.99)) or 1.0
+                scatter = comparison.scatter(band, region, kind)
+                heads = (
+                    f"{band}: {kind} observed",
+                    f"model; slope {with_error(scatter.slope, scatter.error)}, "
+                    f"r = {scatter.correlation:.2f} ({region})",
+                )
+                for axes, values, head in zip(row[2 * s :], maps, heads, strict=False):
+                    draw_map(axes, np.where(used, values, np.nan), limit, UNIT)
+                    axes.set_title(head)
         figure.suptitle(title, fontsize=9)
         save(figure, path)
 
@@ -123,7 +150,7 @@ def _log_axes(axes: Axes) -> None:
 
 
 def _spectrum_panel(axes: Axes, spectra: BandSpectra, index: int) -> None:
-    name = ("EE", "BB")[index]
+    name = FIELDS[index]
     ell, observed = _dl(spectra.observed[index])
     _, error = _dl(spectra.error[index])
     axes.fill_between(
@@ -187,3 +214,121 @@ def plot_leakage(path: Path, spectra: Sequence[BandSpectra], title: str) -> None
         grid[0, 0].set_ylabel(POWER)
         figure.suptitle(title, fontsize=9)
         save(figure, path)
+
+
+def _round_numbers(axes: Axes) -> None:
+    """Logarithmic axes with a few round numbers."""
+    axes.set(xscale="log", yscale="log")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(mpl.ticker.LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(mpl.ticker.NullFormatter())
+
+
+def _patch_panel(
+    axes: Axes,
+    points: Sequence[tuple[str, str, np.ndarray, np.ndarray]],
+    star: np.ndarray,
+    logarithmic: bool,
+) -> None:
+    """Values with errors against each other, and the line of equals; a star where it is true.
+
+    Parameters
+    ----------
+    axes : to draw on
+    points : of each series, name, colour, and for x and y values and errors, (2, 2, patch)
+    star : patches to mark, and the patches of each series that are shown in its third entry
+    logarithmic : both axes
+    """
+    every = []
+    for name, color, shown, values in points:
+        (x, dx), (y, dy) = values
+        for chosen, marker, size in ((shown & ~star, "x", 4), (shown & star, "*", 11)):
+            axes.errorbar(
+                x[chosen], y[chosen], yerr=dy[chosen], xerr=dx[chosen], fmt=marker, color=color,
+                ms=size, elinewidth=0.4, alpha=0.8, zorder=3,
+            )  # fmt: skip
+        axes.plot([], [], "x", color=color, label=f"{name}: {shown.sum()} of {shown.size} patches")
+        every += [x[shown], y[shown]]
+    line = np.array([axes.get_xlim(), axes.get_ylim()])
+    if logarithmic:
+        _round_numbers(axes)
+        if (found := np.concatenate(every)).size:
+            line = np.array([found.min() / 1.5, found.max() * 1.5])
+    ends = line.min(), line.max()
+    axes.plot(ends, ends, color="k", lw=1)
+    axes.set(xlim=ends, ylim=ends, aspect="equal")
+    axes.plot([], [], "k*", ms=9, label="BICEP2")
+
+
+def _plot_patch_pairs(path, points, star, labels, heads, title):
+    """A on the left and alpha on the right."""
+    with plt.rc_context(STYLE):
+        figure, panels = plt.subplots(1, 2, figsize=(7.2, 4.0), layout="constrained")
+        for axes, what, symbol, head in zip(
+            panels, ("A", "alpha"), (rf"$A$ [{UNIT}$^2$]", r"$\alpha$"), heads, strict=True
+        ):
+            _patch_panel(axes, points(what), star, what == "A")
+            axes.set(xlabel=f"{symbol}, {labels[0]}", ylabel=f"{symbol}, {labels[1]}")
+            axes.set_title(head, fontsize=8)
+        handles, names = panels[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False)
+        figure.suptitle(title, fontsize=9)
+        save(figure, path)
+
+
+def _with_errors(fit: PatchFits, what: str, index: int) -> np.ndarray:
+    return np.array([getattr(fit, what)[:, index], getattr(fit, f"{what}_error")[:, index]])
+
+
+def plot_patches(path: Path, patches: PatchComparison, title: str) -> None:
+    """A and alpha of the patches, model and observed (the paper's fig. 10)."""
+
+    def points(what):
+        return [
+            (
+                name,
+                COLORS[i],
+                patches.detected(i),
+                np.array([_with_errors(f, what, i) for f in (patches.model, patches.observed)]),
+            )
+            for i, name in enumerate(FIELDS)
+        ]
+
+    def head(what, numbers):
+        found = [f"{name} {with_error(*numbers(i))}" for i, name in enumerate(FIELDS)]
+        return f"{what}: {', '.join(found)}"
+
+    _plot_patch_pairs(
+        path,
+        points,
+        np.array([name == "BICEP2" for name in patches.model.names]),
+        ("model", "observed"),
+        (
+            head("observed / model", patches.ratio),
+            head("observed - model", patches.slope_difference),
+        ),
+        f"{title}\n{patches.band}: patches of 400 square degrees",
+    )
+
+
+def plot_template_patches(path: Path, fit: PatchFits, title: str) -> None:
+    """A and alpha of the patches of one map, BB against EE."""
+    both = fit.detected.all(axis=1)
+
+    def points(what):
+        values = np.array([_with_errors(fit, what, i) for i in (0, 1)])
+        return [("EE and BB", COLORS[0], both, values)]
+
+    medians = [np.median(getattr(fit, what)[both], axis=0) for what in ("A", "alpha")]
+    _plot_patch_pairs(
+        path,
+        points,
+        np.array([name == "BICEP2" for name in fit.names]),
+        FIELDS,
+        (
+            f"median BB / EE: {np.median(fit.A[both, 1] / fit.A[both, 0]):.2f}",
+            f"median: EE {medians[1][0]:.2f}, BB {medians[1][1]:.2f}",
+        ),
+        f"{title}\npatches of 400 square degrees",
+    )

@@ -8,6 +8,7 @@ from rich.table import Table
 
 from fits.comparison import plots
 from fits.comparison.compare import Comparison
+from fits.comparison.patches import PatchComparison
 from fits.inputs import Inputs
 from fits.record import probability, with_error, write_json, write_log
 from fits.settings import Settings
@@ -18,8 +19,10 @@ __all__ = ["comparison_json", "comparison_table", "warnings", "write_report"]
 UNLIKELY = 0.01
 
 
-def comparison_json(comparison: Comparison, inputs: Inputs) -> dict[str, Any]:
-    """All numbers: `pixels` by band, region and Stokes parameter, `spectra` by band."""
+def comparison_json(
+    comparison: Comparison, inputs: Inputs, patches: PatchComparison | None = None
+) -> dict[str, Any]:
+    """All numbers: `pixels` by band, region and Stokes parameter, `spectra` by band, `patches`."""
     pixels: dict[str, Any] = {}
     for s in comparison.scatters:
         numbers = s._asdict() | {"slope_pte": s.slope_pte}
@@ -30,7 +33,21 @@ def comparison_json(comparison: Comparison, inputs: Inputs) -> dict[str, Any]:
         | {"centers": s.centers, "chi2_bins": s.chi2_bins, "largest_error": s.largest_error}
         for s in comparison.spectra
     }
-    return {"description": inputs.description, "pixels": pixels, "spectra": spectra}
+    found = {"description": inputs.description, "pixels": pixels, "spectra": spectra}
+    if patches is not None:
+        found["patches"] = {
+            "band": patches.band,
+            "observed": patches.observed._asdict(),
+            "model": patches.model._asdict(),
+        } | {
+            name: {
+                "ratio": patches.ratio(i),
+                "slope_difference": patches.slope_difference(i),
+                "correlation": patches.correlation(i),
+            }
+            for i, name in enumerate(("EE", "BB"))
+        }
+    return found
 
 
 def comparison_table(comparison: Comparison) -> Table:
@@ -40,7 +57,7 @@ def comparison_table(comparison: Comparison) -> Table:
         pad_edge=False,
         caption="Slope of observed on model with the error of noise and CMB; rms of their "
         "difference, and that expected of noise and CMB, in uK_RJ; PTE: probability that noise and "
-        "CMB alone give a larger chi2, in pixels, EE and BB."
+        "CMB alone give a larger chi2, in pixels, EE and BB.",
     )
     for column in ("band", "region", ""):
         table.add_column(column, no_wrap=True)
@@ -58,8 +75,8 @@ def comparison_table(comparison: Comparison) -> Table:
                 s.stokes,
                 with_error(s.slope, s.error).replace(" ", ""),
                 f"{s.correlation:.2f}",
-                f"{s.rms:.3g}",
-                f"{s.expected:.3g}",
+                f"{s.rms:.2f}",
+                f"{s.expected:.2f}",
                 probability(s.pte),
                 *power,
             )
@@ -87,11 +104,16 @@ def warnings(comparison: Comparison) -> list[str]:
 
 
 def write_report(
-    out: Path, inputs: Inputs, settings: Settings, comparison: Comparison, seconds: float
+    out: Path,
+    inputs: Inputs,
+    settings: Settings,
+    comparison: Comparison,
+    seconds: float,
+    patches: PatchComparison | None = None,
 ) -> list[Path]:
     """Write comparison.json, pictures and log.json to a folder; returns what was written."""
     written = [out / "comparison.json", out / "log.json"]
-    write_json(written[0], comparison_json(comparison, inputs))
+    write_json(written[0], comparison_json(comparison, inputs, patches))
     bands, title = list(comparison.prepared.bands), settings.title
     for region in comparison.regions:
         written.append(out / f"scatter_{region}.png")
@@ -106,5 +128,8 @@ def write_report(
     if leaky := [s for s in comparison.spectra if s.uncorrected is not None]:
         written.append(out / "leakage.png")
         plots.plot_leakage(written[-1], leaky, title)
+    if patches is not None:
+        written.append(out / "patches.png")
+        plots.plot_patches(written[-1], patches, title)
     write_log(written[1], settings, seconds)
     return written

@@ -1,4 +1,4 @@
-"""The command line: `jaxsky fit`, `jaxsky simulate`, `jaxsky data`."""
+"""The command line: `jaxsky simulate`, `fit`, `compare`, `forecast`, `paper`, `data`."""
 
 import contextlib
 import ctypes
@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 
 import jaxsky
-from jaxsky.cli import data, fit, simulate
+from jaxsky.cli import compare, data, fit, forecast, paper, simulate
 from jaxsky.cli.console import console
 
 __all__ = ["app", "main"]
@@ -23,8 +23,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-app.command()(fit.fit)
 app.command()(simulate.simulate)
+app.command()(fit.fit)
+app.command()(compare.compare)
+app.command()(forecast.forecast)
+app.command()(paper.paper)
 app.add_typer(data.data, name="data")
 
 

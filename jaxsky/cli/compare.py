@@ -71,7 +71,7 @@ def compare(
         import matplotlib as mpl
 
         mpl.use("Agg")  # pictures go to files
-        from fits.comparison import compare, report
+        from fits.comparison import compare, compare_patches, report
         from fits.inputs import inputs_of
         from fits.regions import region_masks
         from fits.resolution import prepare
@@ -89,9 +89,13 @@ def compare(
             progress.stop()
             console.print("Stopped; go on with --resume.")
             raise typer.Exit(130) from None
+        patches = None
+        if settings.compare.patches is not None:
+            progress.update(task, description="patches")
+            patches = compare_patches(settings, inputs)
         progress.update(task, description="drawing")
         seconds = time.perf_counter() - started
-        written = report.write_report(out, inputs, settings, found, seconds)
+        written = report.write_report(out, inputs, settings, found, seconds, patches)
     console.print(inputs.description, highlight=False)
     Console().print(report.comparison_table(found))
     for sentence in report.warnings(found):

@@ -18,16 +18,20 @@ def write_example(path: Path, example: Path) -> None:
     console.print(f"Written: {path}")
 
 
-def check_out(out: Path, results: Sequence[str], resume: bool, overwrite: bool) -> None:
-    """Refuse a folder that has results, unless they are to be gone on with or replaced."""
+def check_out(out: Path, results: Sequence[str], resume: bool | None, overwrite: bool) -> None:
+    """Refuse a folder that has results, unless they are to be gone on with or replaced.
+
+    `resume` is None for commands that have nothing to go on with.
+    """
     if resume and overwrite:
         raise ValueError("--resume and --overwrite exclude each other.")
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is not a folder; choose another --out.")
     if not (resume or overwrite) and any((out / name).exists() for name in results):
+        go_on = "" if resume is None else "go on with --resume, "
         raise ValueError(
-            f"{out}: holds results already; go on with --resume, replace them with --overwrite, "
-            "or choose another --out."
+            f"{out}: holds results already; {go_on}replace them with --overwrite, or choose "
+            "another --out."
         )
 
 

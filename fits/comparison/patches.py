@@ -1,0 +1,146 @@
+"""Power laws on small patches, observed against the complete model: the paper's figure 10."""
+
+from typing import NamedTuple
+
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fits.discs import paper_patches
+from fits.inputs import Band, Inputs
+from fits.patches import PatchFits, PreparedPatches, fit_patches, prepare_patches
+from fits.resolution import Prepared, prepare
+from fits.settings import Settings
+from jaxsky import observe
+from jaxsky.harmonics import average_pixels, gaussian_beam, pixel_window
+from jaxsky.streams import stream
+
+__all__ = ["PatchComparison", "compare_patches", "template_patches"]
+
+
+class PatchComparison(NamedTuple):
+    """A and alpha of the patches in one band.
+
+    Parameters
+    ----------
+    band : name
+    observed, model : fits to the map, and to foregrounds with a realisation of CMB and noise
+    """
+
+    band: str
+    observed: PatchFits
+    model: PatchFits
+
+    def detected(self, index: int) -> np.ndarray:
+        """Patches that show EE (0) or BB (1) in both."""
+        return self.observed.detected[:, index] & self.model.detected[:, index]
+
+    def ratio(self, index: int) -> tuple[float, float]:
+        """Mean logarithm of A observed over A of the model, as a factor, and its error.
+
+        The error is that of the scatter over the patches that show EE (0) or BB (1).
+        """
+        both = self.detected(index)
+        logs = np.log(self.observed.A[both, index] / self.model.A[both, index])
+        if len(logs) < 2:
+            return float("nan"), float("nan")
+        mean = float(np.exp(logs.mean()))
+        return mean, mean * float(logs.std(ddof=1) / np.sqrt(len(logs)))
+
+    def slope_difference(self, index: int) -> tuple[float, float]:
+        """Mean of alpha observed less alpha of the model, and its error, over the same patches."""
+        both = self.detected(index)
+        difference = (self.observed.alpha - self.model.alpha)[both, index]
+        if len(difference) < 2:
+            return float("nan"), float("nan")
+        return float(difference.mean()), float(difference.std(ddof=1) / np.sqrt(len(difference)))
+
+    def correlation(self, index: int) -> tuple[float, float]:
+        """Pearson's coefficient of log A and of alpha between map and model."""
+        both = self.detected(index)
+        if both.sum() < 3:
+            return float("nan"), float("nan")
+        pairs = (
+            np.log([self.observed.A[both, index], self.model.A[both, index]]),
+            [self.observed.alpha[both, index], self.model.alpha[both, index]],
+        )
+        A, alpha = (float(np.corrcoef(*pair)[0, 1]) for pair in pairs)
+        return A, alpha
+
+
+def _window(band: Band, nside: int, fwhm: float, lmax: int) -> Float[Array, " ell"]:
+    """Window of prepared maps: the common beam, or the band's own and that of averaged pixels."""
+    if fwhm:
+        return gaussian_beam(fwhm, lmax)
+    return gaussian_beam(band.fwhm, lmax) * pixel_window(nside, lmax)
+
+
+def _noise(
+    band: Band, prepared: Prepared, patches: PreparedPatches
+) -> Float[np.ndarray, "patch 2 ell"]:
+    """Spectrum of the noise in the prepared maps, on each patch that of its own pixels."""
+    (preparation,), lmax = prepared.fluctuations.preparations, patches.spectra[0].lmax
+    nside = preparation.nside
+    variance = average_pixels(jnp.stack([band.noise[0, 0], band.noise[1, 1]]), nside)
+    weights = np.stack([one.mask**2 for one in patches.spectra])
+    # Q and U turn into each other on a patch, and E and B have the mean of both.
+    mean = np.asarray(variance).mean(axis=0) @ weights.T / weights.sum(axis=1)
+    white = mean * healpy.nside2pixarea(preparation.nside_in)
+    if preparation.window is None:
+        power = (pixel_window(nside, lmax) / pixel_window(preparation.nside_in, lmax)) ** 2
+    else:
+        power = np.zeros(lmax + 1)
+        known = np.asarray(preparation.window)[: lmax + 1] ** 2
+        power[: known.size] = known
+    total = white[:, None] * power
+    if (correlated := prepared.fluctuations.correlated[0]) is not None:
+        total[:, : correlated.size] += np.asarray(correlated)[: lmax + 1]
+    return np.repeat(total[:, None], 2, axis=1)
+
+
+def compare_patches(settings: Settings, inputs: Inputs) -> PatchComparison:
+    """The paper's 48 discs and the field of BICEP2, in the band that the settings name.
+
+    Parameters
+    ----------
+    settings : `compare.patches` is the band
+    inputs : templates and maps
+
+    Raises
+    ------
+    ValueError
+        If the maps do not have the multipoles.
+    """
+    name, nside = str(settings.compare.patches), settings.compare.patches_nside
+    fwhm = settings.analysis.fwhm
+    band = inputs.bands[name]
+    prepared = prepare(inputs._replace(bands={name: band}), nside, fwhm)
+    lmax = 2 * nside
+    window = np.asarray(_window(band, nside, fwhm, lmax))
+    patches = prepare_patches(paper_patches(nside), window)
+    noise = _noise(band, prepared, patches)
+    # Realisations of their own: those of the embedded observation come from another key.
+    key = stream(jax.random.key(settings.analysis.seed), "patches")
+    model = observe(prepared.sky, list(prepared.bands.values()))[0]
+    fluctuations = prepared.fluctuations
+    model = model + fluctuations.noise_realisation(key)[0] + fluctuations.cmb_realisation(key)[0]
+    return PatchComparison(
+        name,
+        fit_patches(prepared.data[0], patches, noise=noise),
+        fit_patches(model, patches, noise=noise),
+    )
+
+
+def template_patches(maps: Float[Array, "2 pix"], fwhm: float) -> PatchFits:
+    """The same patches in a template, at its own resolution and taken to be without noise.
+
+    Parameters
+    ----------
+    maps : Q and U, RING
+    fwhm : of their beam [arcmin]
+    """
+    nside = healpy.npix2nside(maps.shape[-1])
+    patches = prepare_patches(paper_patches(nside), np.asarray(gaussian_beam(fwhm, 2 * nside)))
+    return fit_patches(maps, patches)

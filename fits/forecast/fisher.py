@@ -1,0 +1,363 @@
+"""Errors on spectral parameters and r from many bands: the Fisher matrix of Gaussian fields.
+
+E and B of the bands are Gaussian fields with the covariance
+
+    C_l^ij = sum_cc' s_c^i s_c'^j C_l^cc' + delta_ij N_l^i / (b_l^i)^2,
+
+s_c^i the law of component c in band i (that of the CMB is 1 in uK_CMB), and C_l^cc' the spectra of
+components: power laws in l with one correlation coefficient for each pair, and r times those of
+tensors beside the lensed scalars. Then F_ab = f_sky sum_l (2 l + 1) / 2 Tr(C^-1 dC_a C^-1 dC_b)
+(Tegmark, Taylor & Heavens 1997, eq. 15), summed over E and B.
+
+r is hardly correlated with the laws: what a small error of these leaves of the foregrounds is of
+second order in it. That their laws vary over the sky is not in this model.
+
+F is built from derivatives of the laws s and of the spectra C^cc' apart, in an orthonormal basis
+of the laws. Products of whole matrices would lose what matters: foregrounds have up to 1e8 times
+the variance of the noise, and what tells parameters apart is the difference.
+"""
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fits.forecast.b_modes import PIVOT, BandLaw
+from jaxsky import Bandpass, Sky, get_parameters, parameter_names, set_parameters
+from jaxsky.bandpass import Samples, average, stack_bands
+from jaxsky.checks import check_double
+from jaxsky.parameters import unknown_parameter
+
+__all__ = [
+    "Errors",
+    "Model",
+    "covariance",
+    "fiducial",
+    "fisher_errors",
+    "foreground_names",
+    "unit_sky",
+]
+
+#: Combinations of parameters that change the data by less than this, relative to each parameter
+#: by itself, are not told apart.
+LEAST_CHANGE = 1e-9
+#: Parameters with less than this share of such a combination are not part of it.
+LEAST_SHARE = 0.01
+#: What rounding adds to eigenvalues of correlations.
+ROUNDING = 1e-12
+
+
+class Model(eqx.Module):
+    """What a covariance of bands depends on beside its parameters.
+
+    Parameters
+    ----------
+    sky : foregrounds of amplitude 1 in one pixel; see `unit_sky`
+    bands : frequencies and weights of bandpasses
+    to_cmb : factors from uK_RJ to uK_CMB in each band
+    weights : b_l over the noise [1 / (uK_CMB rad)], shape (ell, band)
+    tensors : C_l of tensors for r = 1 [uK_CMB^2], a row for each field, shape (field, ell)
+    scalars : C_l of lensed scalars [uK_CMB^2], shape (field, ell)
+    ell : multipoles
+    sky_fraction : fraction of the sky, as it has modes
+    fields : "EE", "BB" or both
+    """
+
+    sky: Sky
+    bands: Samples
+    to_cmb: Float[Array, " band"]
+    weights: Float[Array, "ell band"]
+    tensors: Float[Array, "field ell"]
+    scalars: Float[Array, "field ell"]
+    ell: Float[Array, " ell"]
+    sky_fraction: Float[Array, ""]
+    fields: tuple[str, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, sky: Sky, bands: Sequence[Bandpass], *rest: Any) -> "Model":
+        """The model for bandpasses; the rest are the fields from `weights` on."""
+        factors = [band.conversion("uK_RJ", "uK_CMB") for band in bands]
+        return cls(sky, stack_bands(bands), jnp.stack(factors), *rest)
+
+
+class Errors(NamedTuple):
+    """Errors of a forecast.
+
+    Parameters
+    ----------
+    free : names of the free parameters, in the order of the covariance
+    fiducial : their values
+    covariance : shape (par, par), priors included
+    known : error of each, were all others known
+    priors : those that were given, by name
+    """
+
+    free: tuple[str, ...]
+    fiducial: dict[str, float]
+    covariance: Float[np.ndarray, "par par"]
+    known: dict[str, float]
+    priors: dict[str, float]
+
+    def sigma(self, name: str) -> float:
+        """Standard deviation of a parameter, all others free."""
+        i = self.free.index(name)
+        return float(np.sqrt(self.covariance[i, i]))
+
+    def correlation(self, first: str, second: str) -> float:
+        """Correlation coefficient of two parameters."""
+        i, j = self.free.index(first), self.free.index(second)
+        return float(self.covariance[i, j] / (self.sigma(first) * self.sigma(second)))
+
+
+def unit_sky(sky: Sky, mask: Float[np.ndarray, " pix"]) -> Sky:
+    """The laws of a sky: amplitude 1 in one pixel, parameters that are maps at their mean.
+
+    Parameters
+    ----------
+    sky : foregrounds
+    mask : weight of each pixel
+    """
+
+    def reduced(leaf):
+        if leaf.ndim == 2:
+            return jnp.ones((2, 1), leaf.dtype)
+        return jnp.average(leaf, weights=mask) if leaf.ndim else leaf
+
+    return jax.tree.map(reduced, sky)
+
+
+def foreground_names(
+    components: Iterable[str], fields: Iterable[str], kinds: Sequence[str]
+) -> tuple[str, ...]:
+    """Names of parameters of foreground spectra, such as "BB.dust.amplitude".
+
+    Parameters
+    ----------
+    components : names, in order
+    fields : "EE", "BB" or both
+    kinds : of "amplitude" (D_l at l = 80, uK_RJ^2 at the reference frequency), "slope" (of C_l)
+        and "correlation" (of a pair, "BB.dust.synchrotron.correlation")
+    """
+    components = tuple(components)
+    names = []
+    for field in fields:
+        for kind in kinds:
+            pairs = itertools.combinations(components, 2)
+            of = map(".".join, pairs) if kind == "correlation" else components
+            names += [f"{field}.{which}.{kind}" for which in of]
+    return tuple(names)
+
+
+def fiducial(
+    sky: Sky,
+    laws: Mapping[tuple[str, str], BandLaw],
+    correlations: Mapping[tuple[str, str, str], float],
+    r: float,
+    A_lens: float,
+) -> dict[str, float]:
+    """All parameters of the covariance by name, with their values.
+
+    Parameters
+    ----------
+    sky : from `unit_sky`
+    laws : of each field and component, amplitude D_l at l = 80 [uK_RJ^2]
+    correlations : of each field and pair of components, in the order of the sky
+    r : tensor-to-scalar ratio
+    A_lens : fraction of the lensing BB that is left
+
+    Raises
+    ------
+    ValueError
+        If the correlation coefficients of a field are those of no fields.
+    """
+    _check_correlations(list(sky), correlations)
+    names = [name for name in parameter_names(sky) if not name.endswith(".amplitude")]
+    values = {"r": r, "A_lens": A_lens}
+    values |= {name: float(value) for name, value in get_parameters(sky, names).items()}
+    for (field, component), law in laws.items():
+        values[f"{field}.{component}.amplitude"] = law.amplitude
+        values[f"{field}.{component}.slope"] = law.slope
+    for key, value in correlations.items():
+        values[".".join(key) + ".correlation"] = value
+    return values
+
+
+def _check_correlations(
+    components: list[str], correlations: Mapping[tuple[str, str, str], float]
+) -> None:
+    for field in {field for field, _, _ in correlations}:
+        matrix = np.eye(len(components))
+        for (of, *pair), value in correlations.items():
+            if of == field:
+                i, j = map(components.index, pair)
+                matrix[i, j] = matrix[j, i] = value
+        if (least := np.linalg.eigvalsh(matrix).min()) < -ROUNDING:
+            listed = ", ".join(f"{a} x {b} {v:.3g}" for (f, a, b), v in correlations.items()
+                               if f == field)  # fmt: skip
+            raise ValueError(
+                f"The correlations of {field}, {listed}, are those of no sky (their matrix has the "
+                f"eigenvalue {least:.2g}); use more of the sky, or a wider range of multipoles."
+            )
+
+
+def _laws(params: Mapping[str, Array], model: Model) -> Float[Array, "band component"]:
+    """What each component shows in each band [uK_CMB], the CMB last."""
+    known = parameter_names(model.sky)
+    sky = set_parameters(model.sky, {name: params[name] for name in params if name in known})
+    columns = [jnp.ones_like(model.to_cmb)]
+    for component in sky.components.values():
+        seen = jax.vmap(partial(average, component.sed))(model.bands)
+        columns.insert(-1, component.template[-1, 0] * seen * model.to_cmb)
+    return jnp.stack(columns, axis=-1)
+
+
+def _spectra(
+    params: Mapping[str, Array], model: Model
+) -> Float[Array, "field ell component component"]:
+    """Spectra C_l of the components [uK_RJ^2], that of the CMB last [uK_CMB^2]."""
+    names = list(model.sky)
+    found = []
+    for field, tensors, scalars in zip(model.fields, model.tensors, model.scalars, strict=True):
+        lensing = params["A_lens"] if field == "BB" else 1.0
+        matrix = [[jnp.zeros_like(model.ell)] * (1 + len(names)) for _ in range(1 + len(names))]
+        matrix[-1][-1] = params["r"] * tensors + lensing * scalars
+        roots = []
+        for name in names:
+            to_C = 2 * jnp.pi / (PIVOT * (PIVOT + 1)) * params[f"{field}.{name}.amplitude"]
+            slope = params[f"{field}.{name}.slope"]
+            roots.append(jnp.sqrt(to_C) * (model.ell / PIVOT) ** (slope / 2))
+        for i, j in itertools.product(range(len(names)), repeat=2):
+            first, second = names[min(i, j)], names[max(i, j)]
+            rho = 1.0 if i == j else params[f"{field}.{first}.{second}.correlation"]
+            matrix[i][j] = rho * roots[i] * roots[j]
+        found.append(jnp.stack([jnp.stack(row) for row in matrix]))
+    return jnp.moveaxis(jnp.stack(found), -1, 1)
+
+
+@jax.jit
+def covariance(params: Mapping[str, Array], model: Model) -> Float[Array, "field ell band band"]:
+    """The covariance C_l of bands, their beams taken out [uK_CMB^2]: the formula above."""
+    laws = _laws(params, model)
+    noise = jax.vmap(jnp.diag)(model.weights**-2)
+    return jnp.einsum("ic,flcd,jd->flij", laws, _spectra(params, model), laws) + noise
+
+
+def _columns(weights, modes, spectra, d_spectra, laws, d_laws):
+    """Numbers for each parameter whose products are its share of F, at one l of one field.
+
+    With G the laws over the noise, G = Q R, the covariance over the noise is 1 + G B G^T, which
+    is M = 1 + R B R^T in the basis Q and 1 outside of it. The derivatives have a part inside, and
+    one that connects inside and outside, twice. The CMB is the last column of G, so that R keeps
+    it apart from foregrounds of far more power.
+    """
+    Q, R = jnp.linalg.qr(weights[:, None] * laws)
+    d_laws = weights[:, None] * d_laws
+    M = jnp.eye(len(R)) + R @ spectra @ R.T
+    root = jnp.linalg.cholesky(M)
+    along = jnp.einsum("ik,pic->pkc", Q, d_laws)
+    half = along @ spectra @ R.T
+    inside = half + half.mT + R @ d_spectra @ R.T
+    across = (d_laws - Q @ along) @ spectra @ R.T
+
+    def whiten(rows):
+        return jax.vmap(lambda x: jax.scipy.linalg.solve_triangular(root, x.T, lower=True).T)(rows)
+
+    inside, across = whiten(whiten(inside).mT), whiten(across)
+    parts = [part.reshape(len(part), -1) for part in (inside, jnp.sqrt(2.0) * across)]
+    return jnp.sqrt(modes) * jnp.concatenate(parts, axis=-1)
+
+
+@partial(jax.jit, static_argnames="free")
+def _root(
+    params: Mapping[str, Array], model: Model, free: tuple[str, ...]
+) -> Float[Array, "par par"]:
+    """A triangular root of the Fisher matrix, F = root^T root."""
+
+    def parts(theta):
+        values = {**params, **dict(zip(free, theta, strict=True))}
+        return _laws(values, model), _spectra(values, model)
+
+    theta = jnp.stack([params[name] for name in free])
+    laws, spectra = parts(theta)
+    d_laws, d_spectra = jax.tree.map(lambda x: jnp.moveaxis(x, -1, -3), jax.jacfwd(parts)(theta))
+    modes = model.sky_fraction * (2 * model.ell + 1) / 2
+    over_ell = jax.vmap(partial(_columns, laws=laws, d_laws=d_laws))
+    columns = jax.vmap(partial(over_ell, model.weights, modes))(spectra, d_spectra)
+    return jnp.linalg.qr(jnp.moveaxis(columns, -2, -1).reshape(-1, len(free)), mode="r")
+
+
+def fisher_errors(
+    model: Model,
+    params: Mapping[str, float],
+    free: Sequence[str],
+    priors: Mapping[str, float] | None = None,
+) -> Errors:
+    """Errors on free parameters, all others of `params` held.
+
+    Parameters
+    ----------
+    model : what is observed
+    params : all parameters, from `fiducial`
+    free : names of those that are free
+    priors : standard deviations of Gaussian priors, by name
+
+    Raises
+    ------
+    RuntimeError
+        Without double precision.
+    KeyError
+        For a name that does not exist; lists the known ones.
+    ValueError
+        For a prior of a parameter that is not free, spectra that no sky has, and parameters that
+        the data do not tell apart, with their names.
+    """
+    check_double("A Fisher matrix")
+    free, priors = tuple(free), dict(priors or {})
+    for name in (*free, *priors):
+        if name not in params:
+            raise unknown_parameter(name, params)
+    for name in priors:
+        if name not in free:
+            raise ValueError(f"The prior of {name!r} has no effect, as that is not free.")
+    values = {name: jnp.asarray(value, float) for name, value in params.items()}
+    root = np.asarray(_root(values, model, free))
+    if not np.isfinite(root).all():
+        raise ValueError(
+            "The covariance of the bands is not positive definite; an amplitude is negative, or a "
+            "correlation is not within -1 to 1."
+        )
+    rows = [np.eye(len(free))[free.index(name)] / sigma for name, sigma in priors.items()]
+    root = np.concatenate([root, *np.reshape(rows, (1, -1, len(free)))])
+    size = np.linalg.norm(root, axis=0)
+    _refuse_degenerate(root, size, free)
+    # Of F = V s^2 V^T, relative to the size of each parameter.
+    _, singular, vectors = np.linalg.svd(root / size, full_matrices=False)
+    scaled = vectors.T / singular
+    return Errors(
+        free,
+        {name: float(params[name]) for name in free},
+        scaled @ scaled.T / np.outer(size, size),
+        {name: float(1 / s) for name, s in zip(free, size, strict=True)},
+        priors,
+    )
+
+
+def _refuse_degenerate(root: np.ndarray, size: np.ndarray, free: tuple[str, ...]) -> None:
+    if blind := [name for name, s in zip(free, size, strict=True) if s == 0]:
+        raise ValueError(f"Nothing that is observed depends on {', '.join(blind)}.")
+    _, singular, vectors = np.linalg.svd(root / size)
+    singular = np.pad(singular, (0, len(free) - len(singular)))
+    null = vectors[singular < LEAST_CHANGE]
+    if len(null):
+        part = np.abs(null).max(axis=0) > LEAST_SHARE
+        names = [name for name, within in zip(free, part, strict=True) if within]
+        raise ValueError(
+            f"The bands do not tell these parameters apart: {', '.join(names)}; hold "
+            f"{'one' if len(null) == 1 else len(null)} of them, or give priors."
+        )

@@ -1,0 +1,158 @@
+"""A forecast, from its settings to numbers."""
+
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from fits.forecast import b_modes
+from fits.forecast.b_modes import BandLaw
+from fits.forecast.fisher import Errors, Model, fiducial, fisher_errors, foreground_names, unit_sky
+from fits.forecast.settings import ForecastSettings
+from fits.forecast.setup import Setup, build
+from fits.pseudo_cl import (
+    MaskedSpectra,
+    band_powers,
+    bin_edges,
+    masked_spectra,
+    sky_fraction,
+)
+from jaxsky.checks import check_double
+from jaxsky.cmb import camb_spectra, tensor_spectra
+from jaxsky.harmonics import gaussian_beam
+
+__all__ = ["FIELDS", "Forecast", "forecast"]
+
+FIELDS = ("EE", "BB")
+
+
+class Forecast(NamedTuple):
+    """What a forecast finds.
+
+    Parameters
+    ----------
+    setup : what was forecast
+    spectra : how band powers were taken
+    powers : band powers D_b of EE and BB by band [uK_CMB^2]
+    laws : power laws fitted to BB, by band
+    equal_r : r whose BB equals the foregrounds, by band and range of multipoles
+    tensors : C_l of TT, EE, BB, TE for r = 1 [uK_CMB^2]
+    lensed : those of lensed scalars
+    parameters : all parameters of the bands' covariance, with their values
+    errors : from the Fisher matrix
+    without_foregrounds : error of r without any, None where r is not free
+    """
+
+    setup: Setup
+    spectra: MaskedSpectra
+    powers: dict[str, Float[np.ndarray, "2 bin"]]
+    laws: dict[str, BandLaw]
+    equal_r: dict[str, dict[str, float]]
+    tensors: Float[np.ndarray, "4 ell"]
+    lensed: Float[np.ndarray, "4 ell"]
+    parameters: dict[str, float]
+    errors: Errors
+    without_foregrounds: float | None
+
+
+def forecast(
+    settings: ForecastSettings, report: Callable[[str], None] = lambda message: None
+) -> Forecast:
+    """Foreground B modes against primordial ones, and errors from the Fisher matrix.
+
+    Parameters
+    ----------
+    settings : what is forecast
+    report : told what is being done
+
+    Raises
+    ------
+    RuntimeError
+        Without double precision.
+    jaxsky.io.InputError, KeyError, ValueError
+        For settings and files that cannot work; see `fits.forecast.setup.build` and
+        `fits.forecast.fisher.fisher_errors`.
+    """
+    check_double("A forecast")
+    report("reading templates and mask")
+    setup, spec = build(settings), settings.spectra
+    report("spectra outside the mask")
+    edges = bin_edges(spec.lmin, spec.lmax, spec.width)
+    window = np.asarray(gaussian_beam(setup.fwhm, 2 * edges[-1]))
+    spectra = masked_spectra(setup.mask, edges, window=window)
+    bands = setup.instrument.select(setup.shown).bands()
+    powers = b_modes.foreground_powers(setup.sky, bands, spectra)
+    laws = {
+        name: b_modes.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
+        for name, D in powers.items()
+    }
+    highest = max(spectra.lmax, settings.fisher.lmax, b_modes.PIVOT)
+    tensors, lensed = tensor_spectra(highest), camb_spectra(highest)
+    equal = {
+        name: b_modes.equal_r(spectra, powers[name], law, tensors) for name, law in laws.items()
+    }
+    report("Fisher matrix")
+    model, parameters = _model(settings, setup, spectra, tensors, lensed)
+    errors, without = _errors(settings, model, parameters)
+    return Forecast(
+        setup, spectra, powers, laws, equal, tensors, lensed, parameters, errors, without
+    )
+
+
+def _model(
+    settings: ForecastSettings,
+    setup: Setup,
+    spectra: MaskedSpectra,
+    tensors: np.ndarray,
+    lensed: np.ndarray,
+) -> tuple[Model, dict[str, float]]:
+    """The covariance of all bands, with the foregrounds' spectra measured outside the mask."""
+    spec, fit = settings.fisher, settings.spectra.fit
+    sky, fields = setup.sky, tuple(f for f in FIELDS if f in spec.spectra)
+    rows = [FIELDS.index(field) for field in fields]
+    maps = {name: sky[name].amplitude for name in sky}
+    auto = {name: band_powers(spectra, values) for name, values in maps.items()}
+    laws: dict[tuple[str, str], BandLaw] = {}
+    correlations: dict[tuple[str, str, str], float] = {}
+    for field, row in zip(fields, rows, strict=True):
+        for name, D in auto.items():
+            laws[field, name] = b_modes.fit_law(spectra, D[row], fit, f"{field} of {name!r}")
+    for first, second in itertools.combinations(maps, 2):
+        cross = band_powers(spectra, maps[first], maps[second])
+        for field, row in zip(fields, rows, strict=True):
+            correlations[field, first, second] = b_modes.correlation(
+                spectra, cross[row], auto[first][row], auto[second][row], fit
+            )
+    ell = np.arange(spec.lmin, spec.lmax + 1)
+    weights = [
+        np.asarray(gaussian_beam(channel.fwhm, spec.lmax))[ell] / b_modes.noise_level(channel)
+        for channel in setup.instrument
+    ]
+    cmb_rows = np.array(rows) + 1
+    model = Model.of(
+        unit_sky(sky, setup.mask),
+        list(setup.instrument.bands().values()),
+        jnp.asarray(np.stack(weights, axis=1)),
+        jnp.asarray(tensors[cmb_rows[:, None], ell]),
+        jnp.asarray(lensed[cmb_rows[:, None], ell]),
+        jnp.asarray(ell, float),
+        jnp.asarray(sky_fraction(setup.mask)),
+        fields,
+    )
+    return model, fiducial(model.sky, laws, correlations, spec.r, spec.A_lens)
+
+
+def _errors(
+    settings: ForecastSettings, model: Model, parameters: dict[str, float]
+) -> tuple[Errors, float | None]:
+    spec = settings.fisher
+    nuisance = foreground_names(model.sky, model.fields, spec.foregrounds)
+    free = list(dict.fromkeys((*spec.free, *nuisance)))
+    errors = fisher_errors(model, parameters, free, spec.priors)
+    if "r" not in spec.free:
+        return errors, None
+    none = {n: 0.0 if n.endswith(".amplitude") else v for n, v in parameters.items()}
+    return errors, fisher_errors(model, none, ["r"]).sigma("r")

@@ -1,0 +1,105 @@
+"""Pictures of a forecast: B modes of foregrounds and primordial ones; errors."""
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+
+from fits.forecast.b_modes import noise_spectrum, to_D
+from fits.forecast.fisher import Errors
+from fits.forecast.forecast import Forecast
+from fits.forecast.settings import ForecastSettings
+from fits.plots import label
+from jaxsky.plots import COLORS, STYLE, UNITS, save
+
+__all__ = ["plot_b_modes", "plot_errors"]
+
+#: Primordial spectra, from the largest r on.
+DASHES = ("-", "--", "-.", ":")
+LENSING = "#888888"
+#: Width of a column of a paper [inch].
+COLUMN = 3.5
+
+
+def plot_b_modes(path: Path, found: Forecast, settings: ForecastSettings) -> None:
+    """BB of the foregrounds in some bands and their noise, against primordial BB."""
+    lmax = settings.spectra.lmax
+    ell, D = np.arange(2, lmax + 1), to_D(lmax)[2:]
+    with mpl.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(COLUMN, 3.9), layout="constrained")
+        for (name, powers), color in zip(found.powers.items(), COLORS, strict=False):
+            BB = np.where(powers[1] > 0, powers[1], np.nan)
+            axes.loglog(found.spectra.centers, BB, color=color, lw=1.8, label=_band(name))
+            noise = noise_spectrum(found.setup.instrument[name], lmax)[2:]
+            axes.loglog(ell, D * noise, color=color, lw=0.7)
+        axes.loglog(ell, D * found.lensed[2, 2 : lmax + 1], color=LENSING, lw=1.2)
+        bottom = 1.0
+        for r, dashes in zip(sorted(settings.spectra.r, reverse=True), DASHES, strict=False):
+            primordial = r * D * found.tensors[2, 2 : lmax + 1]
+            axes.loglog(ell, primordial, color="k", ls=dashes, lw=1.1, label=f"$r = {r:g}$")
+            bottom = min(bottom, primordial[: min(100, len(ell))].min())
+        axes.plot([], [], color=LENSING, lw=1.2, label="lensing")
+        axes.plot([], [], color="k", lw=0.7, label="noise (thin)")
+        axes.set(
+            xlim=(2, lmax),
+            ylim=(bottom / 2, None),
+            xlabel=r"multipole $\ell$",
+            ylabel=rf"$\ell(\ell+1)C_\ell^{{BB}}/2\pi$ [{UNITS['uK_CMB']}$^2$]",
+        )
+        axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.yaxis.set_major_locator(mpl.ticker.LogLocator(numticks=20))
+        figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=7)
+        save(figure, path)
+
+
+def _band(name: str) -> str:
+    """A band's name, with a unit if it is a number."""
+    return f"{name} GHz" if name.isdigit() else name
+
+
+def plot_errors(path: Path, found: Forecast) -> None:
+    """Values with errors, and how the errors are correlated, without foregrounds' spectra in l."""
+    errors = found.errors
+    beside = [n for n in errors.free if not n.startswith(("EE.", "BB."))]
+    names = beside or list(errors.free)
+    count = len(names)
+    matrix = np.array([[errors.correlation(a, b) for b in names] for a in names])
+    matrix[np.triu_indices(count)] = np.nan
+    with mpl.rc_context(STYLE):
+        height = 0.75 + (COLUMN - 1.9) / max(count, 3) * count
+        figure, axes = plt.subplots(figsize=(COLUMN, height), layout="constrained")
+        axes.imshow(matrix, cmap="RdBu_r", vmin=-1.3, vmax=1.3, aspect="auto")
+        for (row, column), value in np.ndenumerate(matrix):
+            if row > column:
+                text = f"{value:+.2f}".replace("0.", ".").replace("-", "\u2212")
+                text = "0" if abs(value) < 0.005 else text
+                color = "w" if abs(value) > 0.6 else "k"
+                axes.text(column, row, text, ha="center", va="center", fontsize=7, color=color)
+        symbols = [f"${_symbol(name)[0]}$" for name in names]
+        turned: Any = {"rotation": 40, "ha": "right", "rotation_mode": "anchor"}
+        axes.set_xticks(range(count), symbols, fontsize=8, **turned)
+        axes.set_yticks(range(count), [_value(errors, name) for name in names], fontsize=8)
+        axes.tick_params(length=0)
+        axes.spines[:].set_visible(False)
+        axes.set_title("errors of 68 % and their correlation", fontsize=8, loc="right")
+        save(figure, path)
+
+
+def _symbol(name: str) -> tuple[str, str]:
+    """TeX for a parameter, and its unit."""
+    symbol = {"r": "r", "A_lens": r"A_{\rm lens}"}.get(name) or label(name)
+    symbol, _, unit = symbol.partition(r"\ [")
+    return symbol, rf"\ {unit.rstrip(']')}" if unit else ""
+
+
+def _value(errors: Errors, name: str) -> str:
+    """A parameter with its value and two digits of its error."""
+    value, sigma = errors.fiducial[name], errors.sigma(name)
+    symbol, unit = _symbol(name)
+    power = int(np.floor(np.log10(sigma)))
+    if not value and power < -2:
+        return rf"${symbol} = 0 \pm {sigma / 10.0**power:.1f} \times 10^{{{power}}}{unit}$"
+    digits = max(0, 1 - power)
+    return rf"${symbol} = {value:.{digits}f} \pm {sigma:.{digits}f}{unit}$"

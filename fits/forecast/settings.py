@@ -1,0 +1,140 @@
+"""The settings of a forecast: a TOML file, validated with a sentence for each mistake."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from jaxsky.settings import Nside, SettingsFile, Table, TemplateFile, check_angles, load
+from jaxsky.units import UNITS
+
+__all__ = ["DEFAULT", "EXAMPLE", "Fisher", "ForecastSettings", "Mask", "Spectra", "load_forecast"]
+
+DEFAULT = Path(__file__).with_name("default.toml")
+EXAMPLE = Path(__file__).with_name("example.toml")
+
+Positive = Annotated[float, Field(gt=0)]
+Multipole = Annotated[int, Field(ge=2)]
+
+
+class Experiment(Table):
+    """An instrument of `jaxsky.instrument`."""
+
+    instrument: str | None = None
+    channels: list[str] | None = Field(None, min_length=1)
+
+
+class BandTable(Table):
+    """A band of an experiment of one's own; see `jaxsky.instrument.Channel`."""
+
+    name: str = Field(min_length=1)
+    center: Positive
+    width: Positive
+    fwhm: Positive
+    noise: Positive
+    noise_unit: str = "uK_CMB"
+
+    @field_validator("noise_unit")
+    @classmethod
+    def _temperature(cls, value: str) -> str:
+        if UNITS.get(value, (1.0, ""))[1] not in ("K_RJ", "K_CMB"):
+            raise ValueError(f"must be a temperature such as uK_RJ or mK_CMB, not {value!r}")
+        return value
+
+
+class Embedded(Table):
+    """The embedded model of the Galaxy."""
+
+    nside: Nside = 128
+    seed: int = Field(0, ge=0, lt=2**32)
+
+
+class Mask(Table):
+    """What is used of the sky: a mask in a file, or latitudes above one; its edge made smooth."""
+
+    file: str | None = None
+    key: str | None = None
+    ordering: Literal["RING", "NESTED"] | None = None
+    latitude: float | None = Field(None, ge=0, lt=90)
+    apodization: float = Field(4.0, ge=0, lt=90)
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "Mask":
+        if (self.file is None) == (self.latitude is None):
+            raise ValueError("give either the file of a mask or a latitude; 0 is the full sky")
+        if self.file is None and (self.key or self.ordering):
+            raise ValueError("key and ordering are those of a file")
+        return self
+
+
+class Spectra(Table):
+    """Spectra of the foregrounds outside the mask, and what they are shown against."""
+
+    bands: list[str] | None = Field(None, min_length=1, max_length=7)
+    lmin: Multipole = 2
+    lmax: Multipole = 250
+    width: int = Field(10, ge=1)
+    fit: tuple[Multipole, Multipole] = (20, 200)
+    r: list[Positive] = Field([0.1, 0.01, 0.001], min_length=1, max_length=4)
+
+    @model_validator(mode="after")
+    def _ranges(self) -> "Spectra":
+        if not self.lmin < self.lmax:
+            raise ValueError(f"lmax, {self.lmax}, must be above lmin, {self.lmin}")
+        if not self.fit[0] < self.fit[1]:
+            raise ValueError(f"fit must increase, but is {self.fit[0]}, {self.fit[1]}")
+        return self
+
+
+class Fisher(Table):
+    """The Fisher matrix: what is free, and what is known of it before."""
+
+    free: list[str] = Field(["r"], min_length=1)
+    foregrounds: list[Literal["amplitude", "slope", "correlation"]] = Field(
+        ["amplitude", "slope", "correlation"]
+    )
+    priors: dict[str, Positive] = Field(default={})
+    spectra: list[Literal["EE", "BB"]] = Field(["BB"], min_length=1)
+    lmin: Multipole = 2
+    lmax: Multipole = 300
+    r: float = Field(0.0, ge=0)
+    A_lens: float = Field(1.0, ge=0)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Fisher":
+        if not self.lmin < self.lmax:
+            raise ValueError(f"lmax, {self.lmax}, must be above lmin, {self.lmin}")
+        for key in ("free", "spectra", "foregrounds"):
+            names = getattr(self, key)
+            if len(set(names)) < len(names):
+                raise ValueError(f"{key} has a name twice: {', '.join(names)}")
+        return self
+
+
+class ForecastSettings(SettingsFile):
+    """All settings of a forecast."""
+
+    experiment: Experiment = Experiment()
+    bands: list[BandTable] = Field(default=[])
+    embedded: Embedded | None = None
+    templates: dict[str, TemplateFile] = Field(default={})
+    fixed: dict[str, float] = Field(default={})
+    mask: Mask
+    spectra: Spectra = Spectra()
+    fisher: Fisher = Fisher()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "ForecastSettings":
+        if (self.experiment.instrument is None) == (not self.bands):
+            raise ValueError("give either experiment.instrument or bands")
+        if self.bands and self.experiment.channels:
+            raise ValueError("experiment.channels chooses from an instrument, not from bands")
+        if (self.embedded is None) == (not self.templates):
+            raise ValueError("give either templates or the table embedded")
+        check_angles(self.templates)
+        return self
+
+
+def load_forecast(path: Path) -> ForecastSettings:
+    """Settings from a TOML file; see `jaxsky.settings.load`."""
+    return load(path, ForecastSettings)

@@ -1,0 +1,19 @@
+"""The figures and tables of Hervias-Caimapo, Bonaldi & Brown (2016), remade; `jaxsky paper`."""
+
+from fits.paper.item import Impossible, Item, Number, Table
+from fits.paper.run import STEPS, Step, run
+from fits.paper.settings import PaperSettings, load_paper
+from fits.paper.sources import Sources
+
+__all__ = [
+    "STEPS",
+    "Impossible",
+    "Item",
+    "Number",
+    "PaperSettings",
+    "Sources",
+    "Step",
+    "Table",
+    "load_paper",
+    "run",
+]

@@ -1,0 +1,107 @@
+"""Maps of spectral indices: read, taken from templates, or drawn."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fits.paper.settings import IndexFile, SynchrotronIndexFile
+from jaxsky.harmonics import expand, gaussian_beam, synthesis
+from jaxsky.inputs import read
+from jaxsky.presets import from_pysm_beta
+from jaxsky.settings import SettingsError
+from jaxsky.templates import dust_index, steepening
+
+__all__ = ["STEEPENING", "SYMBOLS", "Index", "drawn_index", "held_index", "read_index"]
+
+#: Resolution of the paper's maps [arcmin], and by how much its synchrotron is made steeper.
+FWHM = {"beta_dust": 180.0, "beta_syn": 600.0}
+STEEPENING = 0.13
+#: Names as they are shown.
+SYMBOLS = {"beta_dust": "β_dust", "beta_syn": "β_syn"}
+#: What a map has that is drawn: the paper's mean; its scatter, of which the paper gives that of
+#: the synchrotron only; and the exponent of its spectrum.
+MEAN = {"beta_dust": 1.53, "beta_syn": 2.9}
+SCATTER = {"beta_dust": 0.04, "beta_syn": 0.1}
+SLOPE = -2.0
+
+
+class Index(NamedTuple):
+    """A map of a spectral index.
+
+    Parameters
+    ----------
+    values : the index, T ~ nu^-beta_syn for the synchrotron
+    fwhm : resolution [arcmin]
+    steepening : by how much it was made steeper; None if it is what was drawn
+    origin : where it is from, to be part of a sentence
+    """
+
+    values: Float[Array, " pix"]
+    fwhm: float
+    steepening: float | None
+    origin: str
+
+
+def drawn_index(key: Array, name: str, nside: int) -> Index:
+    """A Gaussian field with the mean and the scatter of the paper's map."""
+    lmax, fwhm = 2 * nside, FWHM[name]
+    ell = jnp.arange(lmax + 1)
+    root = jnp.where(ell < 1, 0.0, jnp.maximum(ell, 1) ** (SLOPE / 2))
+    white = jax.random.normal(key, (1, (lmax + 1) ** 2))
+    field = synthesis(white * expand(root * gaussian_beam(fwhm, lmax)), nside)[0]
+    values = MEAN[name] + SCATTER[name] * (field - field.mean()) / field.std()
+    origin = (
+        f"{SYMBOLS[name]} is a Gaussian field of mean {MEAN[name]:g} and scatter {SCATTER[name]:g}"
+    )
+    return Index(values, fwhm, None, origin)
+
+
+def held_index(name: str, values: Float[Array, " pix"]) -> Index:
+    """The index that a template has in each pixel."""
+    nside = healpy.npix2nside(values.size)
+    smooth = dust_index(values, 0.0, FWHM[name], nside)
+    return Index(smooth, FWHM[name], 0.0, f"{SYMBOLS[name]} is that of the template")
+
+
+def read_index(folder: Path, name: str, spec: IndexFile) -> Index:
+    """The index of a file, smoothed; that of the synchrotron made steeper, if so wished.
+
+    Raises
+    ------
+    SettingsError, jaxsky.io.InputError
+        For files that cannot be read as what they should be.
+    """
+    found = read(folder, spec)
+    if len(found.maps) != 1:
+        raise SettingsError(
+            f"paper.{name}.fields: must name one map, not {', '.join(found.names)}."
+        )
+    values, used = jnp.asarray(found.maps[0]), np.asarray(found.mask)
+    origin, fwhm, by = (
+        f"{SYMBOLS[name]} is that of {Path(spec.file).name}",
+        max(FWHM[name], spec.fwhm),
+        0.0,
+    )
+    if name == "beta_syn" and bool(jnp.all(values[used] < 0)):
+        values, origin = from_pysm_beta(values), f"{origin} with the other sign"
+    smooth = dust_index(values, spec.fwhm, fwhm, found.nside, None if used.all() else used)
+    if isinstance(spec, SynchrotronIndexFile):
+        by = spec.steepening + _of_spectrum(folder, spec.spectrum)
+        origin += f", made steeper by {by:.2f}" if by else ", not made steeper"
+    return Index(smooth + by, fwhm, by, origin)
+
+
+def _of_spectrum(folder: Path, file: str | None) -> float:
+    """By how much a spectrum in a file steepens; 0 without one."""
+    if file is None:
+        return 0.0
+    try:
+        nu, temperature = np.loadtxt(folder / file, unpack=True, usecols=(0, 1))
+        return float(steepening(nu, temperature))
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"paper.beta_syn.spectrum: {folder / file}: {error}") from None

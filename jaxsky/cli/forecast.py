@@ -1,0 +1,56 @@
+"""`jaxsky forecast`."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from jaxsky.cli.console import check_out, claim, console, write_example
+
+__all__ = ["forecast"]
+
+
+def forecast(
+    settings_file: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[FORECAST.toml]", help="Settings; without, COrE and the embedded sky."
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/forecast"),
+    init: Annotated[
+        bool, typer.Option("--init", help="Write a commented example of the settings and stop.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the results that are in --out.")
+    ] = False,
+) -> None:
+    """Forecast B modes: foregrounds against primordial ones, and errors on r and the laws."""
+    started = time.perf_counter()
+    from fits.forecast import settings as forecast_settings
+
+    if init:
+        write_example(settings_file or Path("forecast.toml"), forecast_settings.EXAMPLE)
+        return
+    settings = forecast_settings.load_forecast(settings_file or forecast_settings.DEFAULT)
+    with console.status("starting") as status:
+        import matplotlib as mpl
+
+        mpl.use("Agg")  # pictures go to files
+        from fits.forecast import report
+        from fits.forecast.forecast import forecast as run
+
+        check_out(out, report.RESULTS, None, overwrite)
+        found = run(settings, status.update)
+        status.update("drawing")
+        claim(out, report.RESULTS, overwrite)
+        written = report.write_report(out, found, settings, time.perf_counter() - started)
+    console.print(found.setup.description, highlight=False, markup=False)
+    for table in report.tables(found):
+        Console().print(table)
+    for sentence in report.warnings(found):
+        console.print(f"[yellow](!)[/] {sentence}", highlight=False)
+    # Not wrapped, so that paths can be copied.
+    console.print("Written: " + ", ".join(map(str, written)), highlight=False, soft_wrap=True)

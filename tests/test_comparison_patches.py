@@ -1,0 +1,104 @@
+"""Power laws on small patches, observed against the model, with the noise of each patch."""
+
+import itertools
+
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fits import settings as fit_settings
+from fits.comparison.patches import _noise, compare_patches, template_patches
+from fits.comparison.plots import plot_patches, plot_template_patches
+from fits.discs import paper_patches
+from fits.inputs import inputs_of
+from fits.patches import fit_patches, prepare_patches
+from fits.pseudo_cl import band_powers
+from fits.resolution import prepare
+from jaxsky.harmonics import gaussian_beam
+
+NSIDE = 64
+
+
+@pytest.fixture(scope="module")
+def settings():
+    return fit_settings.Settings.model_validate(
+        {
+            "embedded": {"channels": {"planck": ["353"]}, "nside": NSIDE},
+            "compare": {"patches": "353", "patches_nside": NSIDE},
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def inputs(settings):
+    return inputs_of(settings)
+
+
+@pytest.fixture(scope="module")
+def found(settings, inputs):
+    return compare_patches(settings, inputs)
+
+
+def test_noise_is_that_of_each_patch(inputs):
+    """Twice as much on one half of the sky."""
+    band = inputs.bands["353"]
+    north = healpy.pix2ang(NSIDE, np.arange(band.used.size), lonlat=True)[1] > 0
+    uneven = band._replace(noise=band.noise * jnp.where(north, 4.0, 1.0))
+    prepared = prepare(inputs._replace(bands={"353": uneven}), NSIDE, 60.0)
+    patches = prepare_patches(
+        itertools.islice(paper_patches(NSIDE), 0, 48, 16), np.asarray(gaussian_beam(60.0, 128))
+    )
+    assert (patches.lat > 0).any()
+    assert (patches.lat < 0).any()
+    noise = _noise(uneven, prepared, patches)
+    keys = jax.random.split(jax.random.key(1), 40)
+    maps = [prepared.fluctuations.noise_realisation(key)[0] for key in keys]
+    for one, row in zip(patches.spectra, noise, strict=True):
+        expected = np.einsum("ibjl,jklm,km->ib", one.inverse, one.mixing, row)
+        powers = np.array([band_powers(one, m) for m in maps])
+        error = powers.std(axis=0) / np.sqrt(len(maps))
+        assert np.abs((powers.mean(axis=0) - expected) / error).max() < 4
+    levels = noise[:, 0, 80]
+    assert levels.max() / levels.min() == pytest.approx(4.0, rel=1e-6)
+
+
+def test_map_and_model_agree(found):
+    """The same sky with noise of its own: amplitudes agree, and correlate."""
+    assert found.band == "353"
+    assert found.observed.A.shape == (49, 2)
+    assert found.observed.names[-1] == "BICEP2"
+    for index in (0, 1):
+        pulls = (found.observed.A - found.model.A)[:, index] / np.hypot(
+            found.observed.A_error, found.model.A_error
+        )[:, index]
+        # Both have the sky in common, so they agree better than their errors say.
+        assert np.std(pulls) < 1.2
+        assert abs(np.mean(pulls)) < 4 / 7
+        ratio, error = found.ratio(index)
+        assert abs(np.log(ratio)) < 4 * error / ratio
+        difference, error = found.slope_difference(index)
+        assert abs(difference) < 4 * error
+
+
+def test_a_template_alone(inputs, tmp_path):
+    maps = inputs.templates["dust"].component.amplitude
+    fit = template_patches(maps, 0.0)
+    expected = fit_patches(maps, prepare_patches(paper_patches(NSIDE), np.ones(2 * NSIDE + 1)))
+    np.testing.assert_allclose(fit.A, expected.A)
+    plot_template_patches(tmp_path / "patches.png", fit, "dust")
+    assert (tmp_path / "patches.png").stat().st_size > 10_000
+
+
+def test_picture(found, tmp_path):
+    plot_patches(tmp_path / "patches.png", found, "small")
+    assert (tmp_path / "patches.png").stat().st_size > 10_000
+
+
+def test_pixels_too_wide_for_the_multipoles(settings, inputs):
+    how = settings.compare.model_copy(update={"patches_nside": 32})
+    with pytest.raises(
+        ValueError, match=r"Argument `lmax` must be between .* 100, and 2 nside, 64"
+    ):
+        compare_patches(settings.model_copy(update={"compare": how}), inputs)

@@ -1,0 +1,346 @@
+"""The figures of the paper: all are made, their numbers are right, and the page shows them."""
+
+import html.parser
+import json
+import sys
+from pathlib import Path
+
+import healpy
+import jax
+import numpy as np
+import pytest
+
+from fits.paper import STEPS, Impossible, Item, Number, Sources, Step, run
+from fits.paper.experiment import _observation, _prepared
+from fits.paper.item import NUMBERS
+from fits.paper.run import labels_of
+from fits.paper.settings import EMBEDDED, EXAMPLE, PaperSettings, load_paper
+from jaxsky import cli
+from jaxsky.harmonics import gaussian_beam, power_spectrum
+from jaxsky.io import read_maps
+from jaxsky.observation import Source
+from jaxsky.power_law import fit_power_law
+from jaxsky.preparation import prepare
+
+LABELS = [*(f"Figure {n}" for n in (1, 2, 3, 4, 13)), "Table 1", "Figure 14"]
+REAL = """
+title = "Maps of the real sky"
+data_dir = "{folder}"
+[analysis]
+nside = 32
+fwhm = 0
+[templates.sky_dust]
+law = "dust"
+file = "templates/dust_d1_353GHz_n64.fits"
+fields = ["Q_STOKES", "U_STOKES"]
+nu_ref = 353.0
+[templates.sky_synchrotron]
+law = "synchrotron"
+file = "templates/synch_s1_30GHz_n64.fits"
+fields = ["Q_STOKES", "U_STOKES"]
+nu_ref = 30.0
+[[bands]]
+name = "V"
+file = "wmap7/wmap_band_iqumap_r9_7yr_V_v4_udgraded32.fits"
+fields = ["Q_STOKES", "U_STOKES"]
+unit = "mK_CMB"
+coordinates = "G"
+fwhm = 21.0
+bandpass = {{ file = "bandpass/wmap_V.tbl" }}
+noise = {{ estimate_above = 30.0 }}
+[paper]
+fwhm = 80.0
+[paper.ame]
+file = "templates/ame_a2_30GHz_n64.fits"
+fields = ["I_STOKES"]
+nu_ref = 30.0
+[paper.beta_dust]
+file = "templates/pysm2_d1_QU353GHz_betad_Td_n64.fits"
+fields = ["BETA_D"]
+[paper.beta_syn]
+file = "templates/pysm2_s1_QU23GHz_betas_n64.fits"
+fields = ["BETA_S"]
+spectrum = "{spectrum}"
+"""
+
+
+@pytest.fixture(scope="module")
+def small() -> PaperSettings:
+    """The embedded sky at the resolution of the real maps, so that programs serve both."""
+    settings = load_paper(EMBEDDED)
+    raw = settings.model_dump()
+    raw["embedded"] |= {"nside": 64}
+    raw["paper"] |= {"fwhm": 80.0}
+    return PaperSettings.model_validate(raw)
+
+
+@pytest.fixture(scope="module")
+def made(small, tmp_path_factory) -> tuple[Path, dict[str, Item]]:
+    out = tmp_path_factory.mktemp("paper") / "embedded"
+    return out, {item.label: item for item in run(small, out, LABELS)}
+
+
+@pytest.fixture(scope="module")
+def real(data_dir, tmp_path_factory) -> tuple[PaperSettings, Path, dict[str, Item]]:
+    folder = tmp_path_factory.mktemp("paper")
+    nu = np.geomspace(0.4, 40, 300)
+    # 2.7 below 5 GHz, 2.83 above: steeper by the paper's 0.13.
+    temperature = np.where(nu < 5, (nu / 5) ** -2.7, (nu / 5) ** -2.83)
+    np.savetxt(folder / "spectrum.txt", np.stack([nu, temperature], axis=1))
+    text = REAL.format(folder=data_dir.resolve(), spectrum=folder / "spectrum.txt")
+    (folder / "paper.toml").write_text(text)
+    settings = load_paper(folder / "paper.toml")
+    items = run(settings, folder / "out", LABELS)
+    return settings, folder / "out", {item.label: item for item in items}
+
+
+def numbers_of(items: dict[str, Item]) -> dict[str, Number]:
+    return {number.what: number for item in items.values() for number in item.numbers}
+
+
+def value(number: Number) -> float:
+    return float(number.ours.split(" ")[0])
+
+
+def check_items(out: Path, items: dict[str, Item]) -> None:
+    assert list(items) == [*LABELS, NUMBERS]
+    for item in items.values():
+        assert item.caption
+        assert item.differs
+        assert item.table or (out / item.picture).read_bytes().startswith(b"\x89PNG")
+    rows = items[NUMBERS].table.rows
+    assert [row[0] for row in rows] == [n.what for i in items.values() for n in i.numbers]
+    assert len(items["Table 1"].table.header) == 16
+    assert items["Table 1"].table.rows[0][1:4] == ("23.3", "14.0", "10.0")
+
+
+def check_slopes(settings: PaperSettings, items: dict[str, Item]) -> None:
+    """Against healpy's transform of the templates."""
+    sources, numbers = Sources(settings), numbers_of(items)
+    for name in ("dust", "synchrotron"):
+        layer = sources.template(name)
+        lmax = 2 * layer.nside
+        full = [np.zeros(layer.maps.shape[-1]), *np.asarray(layer.maps)]
+        alms = healpy.map2alm(full, lmax=lmax, iter=10, use_weights=True)[1:]
+        for kind, alm in zip(("EE", "BB"), alms, strict=True):
+            spectrum = healpy.alm2cl(alm) / np.asarray(gaussian_beam(layer.fwhm, lmax)) ** 2
+            law = fit_power_law(jax.numpy.asarray(spectrum), *getattr(layer.small, kind))
+            shown = value(numbers[f"slope of {name} {kind}"])
+            assert shown == pytest.approx(float(law.slope), abs=0.01)
+
+
+def check_correlations(settings: PaperSettings, items: dict[str, Item]) -> None:
+    ame, numbers = Sources(settings).ame(), numbers_of(items)
+    for i, stokes in enumerate("QU"):
+        r = np.corrcoef(np.asarray(ame.maps[i]), np.asarray(ame.dust[i]))[0, 1]
+        shown = numbers[f"correlation of dust and AME, {stokes}"]
+        assert value(shown) == pytest.approx(r, abs=6e-4)
+
+
+def test_embedded_sky(small, made):
+    out, items = made
+    check_items(out, items)
+    check_slopes(small, items)
+    check_correlations(small, items)
+    for label in LABELS:
+        known = label in ("Figure 3", "Table 1")  # these show nothing of the model
+        assert ("embedded model" in items[label].differs) != known
+    numbers = numbers_of(items)
+    assert value(numbers["mean of β_dust"]) == pytest.approx(1.53, abs=1e-3)
+    assert value(numbers["mean of β_syn"]) == pytest.approx(2.9, abs=1e-3)
+    assert value(numbers["scatter of β_syn"]) == pytest.approx(0.1, abs=1e-3)
+    assert numbers["mean of β_syn"].note == "by construction"
+
+
+def test_real_sky(real, data_dir):
+    settings, out, items = real
+    check_items(out, items)
+    check_slopes(settings, items)
+    check_correlations(settings, items)
+    numbers = numbers_of(items)
+    files = {
+        "dust": ("pysm2_d1_QU353GHz_betad_Td_n64.fits", "BETA_D", 1, 0.0, 180.0),
+        "syn": ("pysm2_s1_QU23GHz_betas_n64.fits", "BETA_S", -1, 0.13, 600.0),
+    }
+    for name, (file, column, sign, steeper, fwhm) in files.items():
+        raw = read_maps(data_dir / "templates" / file, fields=[column], unit="").maps[0]
+        beta = healpy.smoothing(sign * np.asarray(raw, float), np.radians(fwhm / 60)) + steeper
+        assert value(numbers[f"mean of β_{name}"]) == pytest.approx(beta.mean(), abs=1e-3)
+        assert value(numbers[f"scatter of β_{name}"]) == pytest.approx(beta.std(), abs=1e-3)
+    assert numbers["steepening of β_syn from 0.49 ... 2.12 to 20 ... 30 GHz"].ours == "0.13"
+    assert "with the other sign, made steeper by 0.13" in items["Figure 3"].differs
+    assert "embedded" not in items["Figure 4"].differs
+
+
+def test_patch_shows_the_small_scales_of_the_spectra(small):
+    """Those that are there already are the ones that `prepare` makes."""
+    sources = Sources(small)
+    observation = _observation(small, sources)
+    layers = {name: sources.template(name) for name in ("dust", "synchrotron")}
+    given = {
+        name: Source(layer.component, layer.fwhm, layer.small) for name, layer in layers.items()
+    }
+    expected, found = prepare(sources.key, given, observation), _prepared(sources, observation)
+    for name, one in expected.items():
+        np.testing.assert_allclose(found[name].alms[0], one.alms[0], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(found[name].weights, one.weights)
+        assert found[name].fwhm == one.fwhm == 0
+        assert power_spectrum(one.alms[0])[:, 40:].min() > 0
+
+
+class Page(html.parser.HTMLParser):
+    """What is in a page."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.tags, self.links, self.ids, self.headings = set(), [], [], []
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag, attributes):
+        given = dict(attributes)
+        self.tags.add(tag)
+        self.links += [given[key] for key in ("href", "src") if key in given]
+        self.ids += [given["id"]] if "id" in given else []
+
+    def handle_data(self, data):
+        if self.lasttag == "h2" and data.strip():
+            self.headings.append(data.strip())
+
+
+def test_page(made):
+    out, items = made
+    page = Page(out / "index.html")
+    assert page.headings[: len(items)] == [f"{item.label}: {item.title}" for item in items.values()]
+    assert not page.tags & {"script", "link", "iframe", "object"}
+    for link in page.links:
+        assert link[1:] in page.ids if link[0] == "#" else (out / link).is_file()
+    assert len(page.links) == len(items) + 2 * sum(i.picture is not None for i in items.values())
+    assert "not data" in (out / "index.html").read_text()
+
+
+def step(label: str, made: list[str], stop: type[BaseException] | None = None) -> Step:
+    """A figure that is quickly drawn."""
+
+    def make(settings, sources, out):
+        made.append(label)
+        if stop is not None:
+            raise stop("it takes a <map>.")
+        (out / f"{label}.png").write_text("picture")
+        return Item(label, "a & b", "c", "d", f"{label}.png", numbers=(Number("x", "1", "2"),))
+
+    return Step(label, make)
+
+
+def test_a_stopped_run_goes_on(small, tmp_path):
+    made = []
+    with pytest.raises(KeyboardInterrupt):
+        run(
+            small,
+            tmp_path,
+            steps=[step("Figure 1", made), step("Figure 2", made, KeyboardInterrupt)],
+        )
+    assert Page(tmp_path / "index.html").headings[0] == "Figure 1: a & b"
+    two = [step("Figure 1", made), step("Figure 2", made)]
+    items = run(small, tmp_path, resume=True, steps=two)
+    assert made == ["Figure 1", "Figure 2", "Figure 2"]
+    assert [item.label for item in items] == ["Figure 1", "Figure 2", NUMBERS]
+    (tmp_path / "Figure 1.png").unlink()
+    run(small, tmp_path, resume=True, steps=two)
+    assert made[3:] == ["Figure 1"]
+    run(small, tmp_path, ["2"], overwrite=True, steps=two)
+    assert made[4:] == ["Figure 2"]
+    assert len(json.loads((tmp_path / "items.json").read_text())["items"]) == 2
+
+
+def test_real_figures_are_not_made_again(small, made):
+    out, items = made
+    before = {path: path.stat().st_mtime_ns for path in out.glob("*.png")}
+    assert run(small, out, LABELS, resume=True) == list(items.values())
+    assert {path: path.stat().st_mtime_ns for path in out.glob("*.png")} == before
+
+
+def test_a_figure_that_cannot_be_made_is_said_and_left_out(small, tmp_path):
+    made = []
+    steps = [step("Figure 1", made, Impossible), step("Figure 2", made)]
+    items = run(small, tmp_path, steps=steps)
+    assert items[0].differs == "Not made: it takes a <map>."
+    assert "it takes a &lt;map&gt;." in (tmp_path / "index.html").read_text()
+    assert items[1].picture == "Figure 2.png"
+    run(small, tmp_path, resume=True, steps=steps)
+    assert made == ["Figure 1", "Figure 2", "Figure 1"]
+
+
+def test_other_settings_are_refused_or_replaced(small, tmp_path):
+    made = []
+    steps = [step("Figure 1", made), step("Figure 2", made)]
+    run(small, tmp_path, steps=steps)
+    other = small.model_copy(update={"title": "another sky"})
+    with pytest.raises(ValueError, match="holds figures already; go on with --resume"):
+        run(small, tmp_path, steps=steps)
+    with pytest.raises(ValueError, match="holds figures of other settings"):
+        run(other, tmp_path, resume=True, steps=steps)
+    items = run(other, tmp_path, ["1"], overwrite=True, steps=steps)
+    assert [item.label for item in items] == ["Figure 1", NUMBERS]
+    assert not (tmp_path / "Figure 2.png").exists()
+    (tmp_path / "items.json").write_text("{")
+    with pytest.raises(ValueError, match="is damaged"):
+        run(other, tmp_path, resume=True, steps=steps)
+
+
+def test_labels():
+    assert labels_of([]) == [step.label for step in STEPS]
+    assert labels_of(["14", "Table  1", "figure 2"]) == ["Figure 2", "Table 1", "Figure 14"]
+    order = [step.label for step in STEPS]
+    assert [label for label in order if label in LABELS] == LABELS
+    assert len(set(order)) == len(order)
+
+
+def test_example_is_valid(monkeypatch):
+    monkeypatch.delenv("JAXSKY_DATA", raising=False)
+    settings = load_paper(EXAMPLE)
+    assert settings.paper.ame.nu_ref == 22.8
+
+
+def jaxsky(monkeypatch, capsys, *arguments) -> tuple[int, str]:
+    monkeypatch.setattr(sys, "argv", ["jaxsky", "paper", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    return stop.value.code or 0, capsys.readouterr().err
+
+
+def test_command_line(monkeypatch, capsys, tmp_path):
+    code, said = jaxsky(monkeypatch, capsys, "--out", tmp_path / "out", "--only", "table 1")
+    assert code == 0
+    assert "index.html" in said
+    page = Page(tmp_path / "out" / "index.html")
+    assert page.headings[0] == "Table 1: COrE"
+    for arguments, sentence in {
+        ("--only", "15"): "there is no '15'; there are Figure 1,",
+        ("--only", "table 1"): "holds figures already",
+        ("--resume", "--overwrite"): "exclude each other",
+        ("absent.toml",): "cannot be read",
+    }.items():
+        code, said = jaxsky(monkeypatch, capsys, *arguments, "--out", tmp_path / "out")
+        assert code == 2
+        assert sentence in said.replace("\n", " ")
+        assert "Traceback" not in said
+    code, said = jaxsky(monkeypatch, capsys, "--out", __file__)
+    assert code == 2
+    assert "is not a folder" in said
+    monkeypatch.chdir(tmp_path)
+    assert jaxsky(monkeypatch, capsys, "--init", "mine.toml")[0] == 0
+    assert (tmp_path / "mine.toml").read_text() == EXAMPLE.read_text()
+
+
+def test_settings_that_cannot_work(real):
+    settings, _, _ = real
+    raw = settings.model_dump()
+    raw["paper"]["ame"] |= {"fields": ["I_STOKES", "Q_STOKES"]}
+    with pytest.raises(ValueError, match=r"paper.ame.fields: must name one intensity map"):
+        Sources(PaperSettings.model_validate(raw)).ame()
+    raw["paper"]["beta_syn"] |= {"spectrum": "absent.txt"}
+    with pytest.raises(ValueError, match=r"paper.beta_syn.spectrum: .*absent.txt"):
+        Sources(PaperSettings.model_validate(raw)).index("beta_syn")
+    del raw["templates"]["sky_synchrotron"]
+    with pytest.raises(Impossible, match="one template of the law 'synchrotron', but there are 0"):
+        Sources(PaperSettings.model_validate(raw)).template("synchrotron")

@@ -1,0 +1,208 @@
+"""Power laws on small patches: means, errors and pulls over simulated skies, noise, refusals."""
+
+import functools
+import re
+
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fits.discs import Patch, bicep2_mask, disc_centers, disc_mask
+from fits.patches import EDGES, fit_patches, prepare_patches
+from fits.patches.bands import Bands, decorrelate, minimise
+from jaxsky.correlated import realisation
+from jaxsky.harmonics import gaussian_beam, synthesis
+
+NSIDE, LMAX = 64, 128
+ELL = np.arange(LMAX + 1)
+WINDOW = np.asarray(gaussian_beam(60.0, LMAX))
+SLOPE = -2.42
+TO_C = np.where(ELL > 1, 2 * np.pi / np.maximum(ELL * (ELL + 1), 1), 0.0)
+#: C_l of EE and BB as seen, of dust, whose E is twice its B.
+TRUTH = np.array([2.0, 1.0])
+SEEN = TRUTH[:, None] * TO_C * (np.maximum(ELL, 2) / 80) ** (SLOPE + 2) * WINDOW**2
+#: White noise with the power that BB has at l = 80.
+NOISE = np.where(ELL > 1, SEEN[1, 80], 0.0)
+
+
+@functools.cache
+def patches():
+    """Discs that do not overlap: independent, and all of one shape."""
+    centers = [(lon, lat) for lon, lat in disc_centers(2, 15.0).T]
+    return prepare_patches(
+        [Patch(f"{lon:.0f}", lon, lat, disc_mask(NSIDE, lon, lat)) for lon, lat in centers], WINDOW
+    )
+
+
+@jax.jit
+def sky(key, EE, BB):
+    zero = jnp.zeros_like(EE)
+    spectra = jnp.stack([jnp.stack([EE, zero]), jnp.stack([zero, BB])])
+    return synthesis(realisation(key, spectra), NSIDE)
+
+
+def simulated(noise, count, cross=False, signal=1.0):
+    """Fits to skies with noise, one after the other: A / true A, alpha, and their errors."""
+    rows = []
+    for key in jax.random.split(jax.random.key(1), count):
+        one, *others = jax.random.split(key, 3)
+        maps = sky(one, *(signal * jnp.asarray(SEEN)))
+        maps, other = (maps + sky(k, *2 * [jnp.asarray(noise * NOISE)]) for k in others)
+        given = {"other": other} if cross else {"noise": noise * NOISE}
+        rows.append(fit_patches(maps, patches(), **given))
+    A, alpha, A_error, alpha_error = (
+        np.concatenate([getattr(row, name) for row in rows])
+        for name in ("A", "alpha", "A_error", "alpha_error")
+    )
+    return A / TRUTH, alpha, A_error / TRUTH, alpha_error, rows
+
+
+@pytest.mark.parametrize(
+    ("noise", "cross"), [(0.0, False), (1.0, False), (1.0, True)], ids=["clean", "noisy", "cross"]
+)
+def test_amplitudes_and_slopes_are_true_on_average_with_the_right_errors(noise, cross):
+    A, alpha, A_error, alpha_error, rows = simulated(noise, 7, cross)
+    n = len(A)
+    # Linear equations have a zero mean; their solution, a bias of second order in errors of 20 to
+    # 40 %: with 2000 discs A is 1 to 2 % low.
+    spread = A.std(axis=0)
+    np.testing.assert_array_less(np.abs(A.mean(axis=0) - 1), 0.02 + 3 * spread / np.sqrt(n))
+    bias = (alpha.mean(axis=0) - SLOPE) / alpha.std(axis=0)
+    np.testing.assert_array_less(np.abs(bias), 0.1 + 3 / np.sqrt(n))
+    # Standard deviations of 280 pulls are known to 4 %. An alpha that noise leaves open is held
+    # by its prior, the error is that of the posterior.
+    for pulls, lowest in (((A - 1) / A_error, 0.9), ((alpha - SLOPE) / alpha_error, 0.75)):
+        np.testing.assert_array_less(pulls.std(axis=0), 1.2)
+        np.testing.assert_array_less(lowest, pulls.std(axis=0))
+    assert all(row.converged.all() for row in rows)
+    # Fits are good, and no better than they should be.
+    pte = np.concatenate([row.pte for row in rows])
+    np.testing.assert_allclose(np.mean(pte < 0.5, axis=0), 0.5, atol=0.5 * 4 / np.sqrt(n))
+    np.testing.assert_array_less(np.mean(pte < 0.01, axis=0), 0.05)
+
+
+def test_another_slope_is_found():
+    """The prior does not make the answer, and neither does the slope that errors are taken for."""
+    steeper = TO_C * (np.maximum(ELL, 40) / 80) ** (-4.5 + 2) * WINDOW**2
+    found = [
+        fit_patches(sky(key, *2 * [jnp.asarray(steeper)]), patches())
+        for key in jax.random.split(jax.random.key(2), 4)
+    ]
+    alpha = np.concatenate([one.alpha for one in found])
+    # Errors of 1 and a prior of 3 around -2.4 leave 0.9 of the difference.
+    expected = -4.5 + 2.1 * 0.1
+    np.testing.assert_allclose(alpha.mean(axis=0), expected, atol=0.35)
+
+
+def test_noise_alone_is_no_detection():
+    A, _, A_error, alpha_error, rows = simulated(1.0, 4, signal=0.0)
+    for name in ("A", "alpha", "covariance", "chi2", "pte", "powers", "errors"):
+        assert all(np.isfinite(getattr(row, name)).all() for row in rows)
+    assert np.mean([row.detected for row in rows]) < 0.1
+    assert np.abs(A.mean(axis=0) / A.std(axis=0)).max() < 4 / np.sqrt(len(A))
+    assert np.mean(np.abs(A) < 2 * A_error) > 0.85
+    # All there is is the prior.
+    assert np.median(alpha_error) > 2
+    np.testing.assert_array_less(alpha_error, 3.0001)
+
+
+def test_units_do_not_matter():
+    maps = sky(jax.random.key(3), *jnp.asarray(SEEN + NOISE))
+    one = fit_patches(maps, patches(), noise=NOISE)
+    other = fit_patches(1e-6 * maps, patches(), noise=1e-12 * NOISE)
+    np.testing.assert_allclose(1e12 * other.A, one.A, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(other.alpha, one.alpha, atol=1e-4)
+    np.testing.assert_allclose(1e24 * other.covariance[..., 0, 0], one.covariance[..., 0, 0], 1e-5)
+
+
+def test_noise_may_be_a_level_or_a_spectrum():
+    level = 30.0
+    maps = sky(jax.random.key(4), *jnp.asarray(SEEN))
+    white = np.full(LMAX + 1, np.radians(level / 60) ** 2)
+    one = fit_patches(maps, patches(), noise=level)
+    for shape in ((LMAX + 1,), (2, LMAX + 1), (len(patches().names), 2, LMAX + 1)):
+        other = fit_patches(maps, patches(), noise=np.broadcast_to(white, shape))
+        np.testing.assert_allclose(other.A, one.A, rtol=1e-10)
+    none = fit_patches(maps, patches())
+    assert np.all(none.powers > one.powers)
+    # That of one patch is its own matter.
+    rows = np.zeros((len(patches().names), 2, LMAX + 1))
+    rows[1] = white
+    other = fit_patches(maps, patches(), noise=rows)
+    np.testing.assert_allclose(other.powers[1], one.powers[1])
+    np.testing.assert_allclose(other.powers[2], none.powers[2])
+
+
+def test_a_single_clean_band_of_chi2_is_its_own_amplitude():
+    """For independent bands without noise the amplitude is the mean over the modes."""
+    nu, data = np.array([[4.0, 10.0, 30.0]]), np.array([[0.7, 1.3, 1.1]])
+    laws = np.zeros((1, 3, LMAX + 1))
+    laws[0, :, 80] = 1.0  # no slope in it
+    bands = Bands(data, nu, 0 * nu, 1e-3 + 0 * nu, laws)
+    A, alpha, *_, good = minimise(
+        jax.tree.map(jnp.asarray, bands), jnp.array([-2.4, 3.0]), (40, 100)
+    )
+    assert bool(good[0])
+    assert float(A[0]) == pytest.approx(np.sum(nu * data) / np.sum(nu), rel=1e-5)
+    assert float(alpha[0]) == pytest.approx(-2.4)
+
+
+def test_decorrelated_bands():
+    rng = np.random.default_rng(0)
+    expected = np.array([1.0, 2.0, 3.0])
+    root = np.eye(3) + 0.2 * rng.random((3, 3))
+    covariance = root @ root.T
+    turn = decorrelate(covariance, expected)
+    np.testing.assert_allclose(turn @ expected, expected)
+    turned = turn @ covariance @ turn.T
+    np.testing.assert_allclose(turned, np.diag(np.diag(turned)), atol=1e-12)
+    # Strong correlations of unequal bands: a combination would measure the negative.
+    covariance = np.array([[1.0, 0.95], [0.95, 1.0]])
+    np.testing.assert_array_equal(decorrelate(covariance, np.array([1.0, 0.1])), np.eye(2))
+
+
+def test_patches_of_one_shape_share_their_covariance():
+    masks = [disc_mask(NSIDE, 10.0, 60.0), disc_mask(NSIDE, 200.0, -50.0), bicep2_mask(NSIDE)]
+    found = prepare_patches([Patch("", 0.0, 0.0, mask) for mask in masks], WINDOW)
+    assert found.shapes == (0, 0, 2)
+    assert set(patches().shapes) == {0}
+    fits = fit_patches(sky(jax.random.key(5), *jnp.asarray(SEEN)), found)
+    # Twice the area: smaller errors.
+    assert np.all(fits.A_error[2] / fits.A[2] < 0.9 * fits.A_error[0] / fits.A[0])
+
+
+def test_refusals():
+    disc = Patch("north", 0.0, 90.0, disc_mask(NSIDE, 0.0, 90.0))
+    small = Patch("dot", 0.0, 90.0, disc_mask(NSIDE, 0.0, 90.0, 2.0, 1.0))
+    for given, window, edges, words in (
+        ([small], WINDOW, EDGES, "Patch dot: The mask leaves too few pixels"),
+        ([disc], WINDOW[:100], EDGES, "Patch north: Argument `window` ends at l = 99, not at 128"),
+        ([disc], WINDOW, (40, 70, 101), "`edges` must give three bins at least"),
+        ([disc], WINDOW, (40, 60, 50, 101), "Patch north: Argument `edges` must increase from 2"),
+        ([disc], WINDOW, (40, 90, 120, 150), "`lmax` must be between the end of the bins, 149"),
+        ([], WINDOW, EDGES, "Argument `patches` has no patch in it"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(words)):
+            prepare_patches(given, window, edges=edges)
+    prepared = prepare_patches([disc], WINDOW)
+    maps = np.asarray(sky(jax.random.key(6), *jnp.asarray(SEEN)))
+    hole = np.where(disc.mask == 1, healpy.UNSEEN, maps)
+    for given, options, words in (
+        (maps[:1], {}, "Argument `maps` must have shape (2, 49152), not (1, 49152)"),
+        (hole, {}, "Argument `maps` has no value in"),
+        (maps, {"other": np.where(disc.mask > 0, np.nan, maps)}, "Argument `other` has no value"),
+        (maps, {"noise": -1.0}, "Argument `noise` has values that are negative or not finite"),
+        (maps, {"noise": np.ones(100)}, "reach l = 128, but has shape (100,)"),
+        (maps, {"noise": np.ones((3, 2, 200))}, "Argument `noise` must be a level or have shape"),
+        (maps, {"slope": (-2.4, 0.0)}, "Argument `slope` must be a mean and a positive width"),
+        (0 * maps, {}, "The patch north has neither signal nor noise"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(words)):
+            fit_patches(given, prepared, **options)
+    # What is not used may hold anything.
+    outside = np.where(disc.mask > 0, maps, np.nan)
+    np.testing.assert_array_equal(
+        fit_patches(outside, prepared, other=outside).A, fit_patches(maps, prepared, other=maps).A
+    )

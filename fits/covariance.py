@@ -69,12 +69,12 @@ class Fluctuations(eqx.Module):
             total = total + modes @ modes.T
         return total
 
-    @eqx.filter_jit
+    # Not one program: in that XLA draws the normals anew for each row.
     def noise_realisation(self, key: Array) -> Float[Array, "band stokes pix"]:
         """Noise of all bands at the common resolution [uK_RJ]."""
         maps = []
         for b, (preparation, noise) in enumerate(zip(self.preparations, self.noise, strict=True)):
-            total = preparation(draw(stream(key, "noise", str(b)), noise))
+            total = preparation.of_noise(draw(stream(key, "noise", str(b)), noise))
             if (spectrum := self.correlated[b]) is not None:
                 white = jax.random.normal(stream(key, "correlated", str(b)), (2, spectrum.size**2))
                 total = total + synthesis(white * expand(jnp.sqrt(spectrum)), preparation.nside)

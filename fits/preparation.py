@@ -9,7 +9,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsky.components import Component
-from jaxsky.harmonics import average_pixels, beam_ratio, resample
+from jaxsky.harmonics import (
+    analysis,
+    average_pixels,
+    beam_ratio,
+    expand,
+    resample,
+    synthesis,
+)
 
 __all__ = ["Preparation", "prepare_component"]
 
@@ -58,6 +65,18 @@ class Preparation(eqx.Module):
         if self.window is not None:
             return resample(maps, self.window, self.nside)
         return average_pixels(maps, self.nside)
+
+    @eqx.filter_jit
+    def of_noise(self, maps: Float[Array, "stokes pix"]) -> Float[Array, "stokes pix"]:
+        """White noise at the common resolution, in a tenth of the time that other maps take.
+
+        Without refinement and multipoles beyond those that are kept: its mean spectrum is the
+        same to 1e-4, and it is not the same realisation.
+        """
+        if self.window is None:
+            return average_pixels(maps, self.nside)
+        alm = analysis(maps, self.window.size - 1, 0)
+        return synthesis(alm * expand(self.window), self.nside)
 
     @eqx.filter_jit
     def transpose(self, maps: Float[Array, "stokes pix"]) -> Float[Array, "stokes pix"]:

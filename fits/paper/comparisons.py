@@ -47,9 +47,9 @@ def _compared(settings: PaperSettings, sources: Sources) -> Comparison:
 
 
 def _chosen(comparison: Comparison, wanted: Sequence[str]) -> list[str]:
-    """Those of the wanted bands that are there; all bands if none is."""
+    """The wanted bands; all that there are if one of those is missing."""
     bands = list(comparison.prepared.bands)
-    return [band for band in wanted if band in bands] or bands
+    return list(wanted) if set(wanted) <= set(bands) else bands
 
 
 def _region(comparison: Comparison) -> str:

@@ -24,8 +24,8 @@ LATITUDE = 21.7
 def _settings(settings: PaperSettings, sources: Sources) -> ForecastSettings:
     """Those of a forecast with the sky of the figures."""
     mask = Mask(latitude=LATITUDE)
-    if settings.analysis.mask is not None:
-        mask = Mask(**settings.analysis.mask.model_dump())
+    if settings.paper.mask is not None:
+        mask = Mask(**settings.paper.mask.model_dump())
     lmax = LMAX
     sky: dict[str, object] = {"embedded": Embedded(nside=NSIDE)}
     if not sources.embedded:

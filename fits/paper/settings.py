@@ -6,7 +6,7 @@ from pydantic import Field
 
 from fits.settings import Settings
 from jaxsky.experiment.settings import SmallScalesTable
-from jaxsky.settings import MapFile, Table, load
+from jaxsky.settings import MapFile, MaskFile, Table, load
 from jaxsky.small_scales import DUST, SYNCHROTRON
 
 __all__ = ["EMBEDDED", "EXAMPLE", "PaperSettings", "load_paper"]
@@ -50,6 +50,7 @@ class Paper(Table):
     ame: IntensityFile | None = None
     beta_dust: IndexFile | None = None
     beta_syn: SynchrotronIndexFile | None = None
+    mask: MaskFile | None = None
 
 
 class PaperSettings(Settings):

@@ -1,0 +1,102 @@
+"""The paper's figures of model against maps: made, and their numbers those of the commands."""
+
+from pathlib import Path
+
+import pytest
+
+from fits.comparison import compare
+from fits.forecast.forecast import forecast
+from fits.inputs import inputs_of
+from fits.paper import STEPS, run
+from fits.paper.forecasts import _settings
+from fits.paper.settings import EMBEDDED, PaperSettings, load_paper
+from fits.paper.sources import Sources
+from fits.record import with_error
+from fits.regions import region_masks
+from fits.resolution import prepare
+
+LABELS = [f"Figure {n}" for n in range(5, 13)]
+EXAMPLE = Path(__file__).parents[1] / "examples" / "paper_real_sky.toml"
+
+
+@pytest.fixture(scope="module")
+def small() -> PaperSettings:
+    raw = load_paper(EMBEDDED).model_dump()
+    raw["embedded"] |= {"nside": 64}
+    raw["embedded"]["channels"] = {"planck": ["44", "70", "353"], "wmap": ["K"]}
+    raw["analysis"] |= {"nside": 32, "fwhm": 120.0}
+    raw["compare"] |= {"nsims": 30, "lmax": 60, "patches_nside": 64}
+    return PaperSettings.model_validate(raw)
+
+
+@pytest.fixture(scope="module")
+def made(small, tmp_path_factory):
+    out = tmp_path_factory.mktemp("paper") / "out"
+    return out, {item.label: item for item in run(small, out, LABELS)}
+
+
+def numbers(items):
+    return {number.what: number for item in items.values() for number in item.numbers}
+
+
+def test_figures(made):
+    out, items = made
+    assert set(LABELS) <= set(items)
+    for label in LABELS:
+        item = items[label]
+        assert item.caption
+        assert item.differs
+        assert (out / item.picture).read_bytes().startswith(b"\x89PNG")
+    page = (out / "index.html").read_text()
+    assert all(items[label].picture in page for label in LABELS)
+
+
+def test_numbers_are_those_of_the_comparison(small, made):
+    found = compare(
+        small,
+        prepare(inputs_of(small), small.analysis.nside, small.analysis.fwhm),
+        region_masks(small),
+    )
+    shown = numbers(made[1])
+    for band in ("44", "70", "353", "K"):
+        scatter = found.scatter(band, "strip", "QU")
+        assert shown[f"slope, {band}, Q and U"].ours == with_error(scatter.slope, scatter.error)
+    leaky = next(s for s in found.spectra if s.band == "70")
+    assert f"after {leaky.pte[1]:.2f}" in shown["PTE of BB, 70"].ours
+
+
+def test_indices_agree_with_the_truth(made):
+    shown = numbers(made[1])
+    for name, truth in (("dust.beta_dust", 1.53), ("synchrotron.beta_syn", 3.1)):
+        number = shown[f"{name}, full, Q and U"]
+        best, low, high = map(float, number.ours.split())
+        assert number.note == f"truth {truth:g}"
+        assert abs(best - truth) < 2 * (high - low)
+
+
+def test_b_modes_are_those_of_the_forecast(small, made):
+    found = forecast(_settings(small, Sources(small)))
+    shown = numbers(made[1])
+    for band, equal in found.equal_r.items():
+        assert shown[f"r with as much BB at l = 80, {band} GHz"].ours == f"{equal['l = 80']:.3g}"
+
+
+def test_without_bands_of_the_paper(data_dir, monkeypatch, tmp_path):
+    """The real maps are WMAP's: no Planck spectra, no leakage, and patches of the template."""
+    monkeypatch.setenv("JAXSKY_DATA", str(data_dir))
+    settings = load_paper(EXAMPLE)
+    how = settings.compare.model_copy(update={"nsims": 30})
+    settings = settings.model_copy(update={"compare": how})
+    items = {i.label: i for i in run(settings, tmp_path / "out", [str(n) for n in range(5, 13)])}
+    assert items["Figure 7"].differs.startswith("Not made: None of the bands 30, 44, 70, 353")
+    assert items["Figure 9"].differs.startswith("Not made: No band has a map of leakage")
+    shown = numbers(items)
+    assert {"slope, V, Q and U", "slope, W, Q and U"} <= set(shown)
+    # Planck finds half as much power in B as in E (intermediate results XXX).
+    assert 0.4 < float(shown["median A of BB / EE"].ours) < 0.65
+
+
+def test_all_figures_have_a_step():
+    figures = [step.label for step in STEPS if step.label.startswith("Figure")]
+    assert figures == [f"Figure {n}" for n in range(1, 15)]
+    assert [step.label for step in STEPS].index("Table 1") == 13

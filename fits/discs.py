@@ -95,8 +95,13 @@ def disc_mask(
     Raises
     ------
     ValueError
-        If the Gaussian is wider than the disc, or either is not positive.
+        If the Gaussian is wider than the disc, either is not positive, or lon and lat are no
+        direction.
     """
+    if not (np.isfinite(lon) and -90 <= lat <= 90):
+        raise ValueError(
+            f"Arguments `lon` and `lat` must be a direction in degrees, not {lon} and {lat}."
+        )
     if not 0 < fwhm <= radius <= 180:
         raise ValueError(
             f"Argument `fwhm`, {fwhm:g} deg, must be positive and not wider than the disc's "

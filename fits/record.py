@@ -37,6 +37,8 @@ def with_error(value: float, error: float) -> str:
 
 def probability(value: float) -> str:
     """A probability in two digits, or its order of magnitude."""
+    if value < 1e-99:
+        return "<1e-99"
     return f"{value:.2f}" if value >= 0.01 else f"{value:.0e}"
 
 

@@ -25,7 +25,8 @@ MISSING = 0.01
 class Prepared(NamedTuple):
     """Templates and maps at the common resolution.
 
-    `leakage` is what was subtracted from the data, by band.
+    `leakage` is what was subtracted from the data, by band, and `sources` the nside of each
+    template and map as they were given.
     """
 
     sky: Sky
@@ -35,6 +36,7 @@ class Prepared(NamedTuple):
     used: Bool[np.ndarray, " pix"]
     fluctuations: Fluctuations
     leakage: dict[str, Float[Array, "stokes pix"]]
+    sources: dict[str, int]
 
     def likelihood(
         self,
@@ -165,7 +167,14 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
     sigma = fluctuations.sigma()
     known = np.asarray(jnp.isfinite(sigma).all(axis=(0, 1)))
     return Prepared(
-        sky, bandpasses, data, jnp.where(known, sigma, jnp.inf), used & known, fluctuations, leakage
+        sky,
+        bandpasses,
+        data,
+        jnp.where(known, sigma, jnp.inf),
+        used & known,
+        fluctuations,
+        leakage,
+        nsides,
     )
 
 

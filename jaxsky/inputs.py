@@ -233,6 +233,8 @@ def _covariance(folder, noise, bandpass, nside, stokes, where, unit, own):
     if kind == "covariance":
         if len(maps) == 3 and n == 3:
             raise SettingsError(f"{where}: I, Q and U need six columns, II, IQ, IU, QQ, QU, UU.")
+        pairs = ("QQ", "QU", "UU") if len(maps) == 3 else ("II", "IQ", "IU", "QQ", "QU", "UU")
+        _check_pairs(where, found.names, pairs)
         columns = maps * unit_factor(found.unit, "uK_RJ^2", bandpass)
         return covariance_from_columns(columns)[-n:, -n:], known
     _check_number(f"{where}.sigma0", len(spec.sigma0), stokes)
@@ -240,12 +242,22 @@ def _covariance(folder, noise, bandpass, nside, stokes, where, unit, own):
     if kind == "weights":
         if n != 2:
             raise SettingsError(f"{where}: weights are those of Q and U, not of {stokes}.")
+        _check_pairs(where, found.names, ("QQ", "QU", "UU"))
         known = known & (maps[0] * maps[2] > 0)
         weights = jnp.where(known, maps, jnp.array([1.0, 0.0, 1.0])[:, None])
         return weights_covariance(jnp.broadcast_to(sigma0, (n,)), weights), known
     known = known & (found.maps[0] != 0)
     hits = jnp.where(known, maps[0], 1.0)
     return hits_covariance(jnp.broadcast_to(sigma0, (n,)), hits, n), known
+
+
+def _check_pairs(where: str, names: Sequence[str], wanted: Sequence[str]) -> None:
+    """Refuse columns that by their names are other pairs of Stokes parameters than wanted."""
+    said = [stokes_of(name) for name in names]
+    if any(len(s) == 2 and s != w for s, w in zip(said, wanted, strict=True)):
+        raise SettingsError(
+            f"{where}.fields: {', '.join(names)} are not {', '.join(wanted)} by their names."
+        )
 
 
 def _file(spec: MapFile | NoiseColumns, own: MapFile | None, where: str) -> MapFile:

@@ -259,8 +259,17 @@ def test_what_cannot_be_compared_is_refused(settings, prepared, regions):
     how = settings.compare.model_copy(update={"lmax": 33})
     with pytest.raises(SettingsError, match="multipoles reach to 2 nside, 32, but 33 is asked"):
         compare(settings.model_copy(update={"compare": how}), prepared, regions)
-    with pytest.raises(SettingsError, match="region 'nothing' leaves no pixel"):
+    with pytest.raises(SettingsError, match="region 'nothing' leaves fewer than 10 pixels"):
         compare(settings, prepared, {"nothing": np.zeros(3072, bool)})
+    how = settings.compare.model_copy(update={"width": 1})
+    with pytest.raises(SettingsError, match=r"compare.width: 1 makes 24 bins .*nsims is 30"):
+        compare(settings.model_copy(update={"compare": how}), prepared, regions)
+    how = settings.compare.model_copy(update={"patches": "K"})
+    with pytest.raises(SettingsError, match=r"patches_nside: 256 is finer than that of .*, 32"):
+        compare(settings.model_copy(update={"compare": how}), prepared, regions)
+    how = how.model_copy(update={"patches_nside": 32})
+    with pytest.raises(SettingsError, match=r"patches_nside: 32 resolves l = 64, .* take 100"):
+        compare(settings.model_copy(update={"compare": how}), prepared, regions)
     with pytest.raises(ValueError, match=r"there is no band '353' among 44, 70, K"):
         fit_settings.Settings.model_validate(
             settings.model_dump() | {"compare": {"patches": "353"}}
@@ -294,7 +303,23 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     assert run(monkeypatch, tmp_path / "a.toml", "--out", out, "--resume", "--nsims", 31) == 0
     assert run(monkeypatch, tmp_path / "a.toml", "--out", out, "--resume", "--seed", 9) == 2
     assert "holds realisations of other data" in capsys.readouterr().err
+    # What cannot work removes nothing; what works leaves nothing of the old.
+    (tmp_path / "bad.toml").write_text(SETTINGS.replace("lmax = 25", "lmax = 33"))
+    assert run(monkeypatch, tmp_path / "bad.toml", "--out", out, "--overwrite") == 2
     assert (out / "comparison.json").exists()
+    tight = SETTINGS.replace('leakage = { "70" = 0.2 }', "").replace('"strip", ', "")
+    (tmp_path / "b.toml").write_text(tight)
+    assert run(monkeypatch, tmp_path / "b.toml", "--out", out, "--overwrite") == 0
+    assert {p.stem for p in out.glob("*.png")} == pictures - {"scatter_strip", "leakage"}
+
+
+def test_a_model_that_is_wrong_is_pointed_out(settings, prepared, regions):
+    bright = prepared._replace(data=1.5 * prepared.data)
+    sentences = " ".join(warnings(compare(settings, bright, regions)))
+    assert "44, strip: the slope is 1.5" in sentences
+    assert "more than in any of 30 realisations of noise and CMB" in sentences
+    found = compare(settings, bright, regions).scatter("K", "strip", "QU")
+    assert found.pte_text == "<0.03"
 
 
 def test_wmap_on_the_real_sky(data_dir, monkeypatch):

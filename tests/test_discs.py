@@ -96,3 +96,9 @@ def test_refusals():
     for radius, fwhm in ((2.0, 3.0), (2.0, 0.0), (200.0, 2.0)):
         with pytest.raises(ValueError, match="must be positive and not wider than the disc's"):
             disc_mask(8, 0.0, 90.0, radius, fwhm)
+
+
+@pytest.mark.parametrize(("lon", "lat"), [(np.nan, 60.0), (0.0, 95.0), (0.0, np.nan)])
+def test_directions_that_are_none(lon, lat):
+    with pytest.raises(ValueError, match="`lon` and `lat` must be a direction in degrees"):
+        disc_mask(16, lon, lat)

@@ -222,7 +222,7 @@ def test_hits_in_another_file_with_a_unit_of_sigma0(folder):
             {"covariance": [*SIX[:3], "QU_COV", "QQ_COV", "UU_COV"]},
             "QU",
             PLANCK,
-            r"noise: Argument `noise` is not positive definite in \d+ of 191 pixels",
+            r"noise.covariance.fields: .*QU_COV, QQ_COV.* are not II, IQ, IU, QQ, QU, UU by their",
         ),
         ({"hits": {"fields": ["N_OBS"], "sigma0": 1.0}}, "QU", None, "hits: file is missing"),
         (

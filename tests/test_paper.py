@@ -287,6 +287,37 @@ def test_other_settings_are_refused_or_replaced(small, tmp_path):
         run(other, tmp_path, resume=True, steps=steps)
 
 
+def test_what_fails_removes_nothing(small, tmp_path):
+    """Of other settings, figures go when the first new one is there, and not before."""
+
+    def item(label):
+        def make(settings, sources, out):
+            (out / f"{label}.png").write_bytes(b"picture")
+            return Item(label, label, "", "", f"{label}.png")
+
+        return make
+
+    def fail(settings, sources, out):
+        raise ValueError("no such file")
+
+    out = tmp_path / "out"
+    steps = [Step("Figure 1", item("Figure 1")), Step("Figure 2", item("Figure 2"))]
+    run(small, out, steps=steps)
+    held = (out / "items.json").read_text()
+    other = small.model_copy(update={"title": "another"})
+    with pytest.raises(ValueError, match="no such file"):
+        run(other, out, steps=[Step("Figure 1", fail), steps[1]], overwrite=True)
+    assert (out / "items.json").read_text() == held
+    assert {p.stem for p in out.glob("*.png")} == {"Figure 1", "Figure 2"}
+    items = run(other, out, ["2"], steps=steps, overwrite=True)
+    assert [i.label for i in items] == ["Figure 2"]
+    assert {p.stem for p in out.glob("*.png")} == {"Figure 2"}
+    # A first run that fails leaves nothing that has to be overwritten.
+    with pytest.raises(ValueError, match="no such file"):
+        run(small, tmp_path / "new", steps=[Step("Figure 1", fail)])
+    run(small, tmp_path / "new", steps=steps[:1])
+
+
 def test_labels():
     assert labels_of([]) == [step.label for step in STEPS]
     assert labels_of(["14", "Table  1", "figure 2"]) == ["Figure 2", "Table 1", "Figure 14"]

@@ -1,6 +1,6 @@
 """Observed maps against the model: pixels, maps, spectra and patches; `jaxsky compare`."""
 
-from fits.comparison.compare import Comparison, compare
+from fits.comparison.compare import Comparison, check_comparison, compare
 from fits.comparison.patches import PatchComparison, compare_patches
 
-__all__ = ["Comparison", "PatchComparison", "compare", "compare_patches"]
+__all__ = ["Comparison", "PatchComparison", "check_comparison", "compare", "compare_patches"]

@@ -9,14 +9,19 @@ from jaxtyping import Array, Bool, Float
 
 from fits.comparison.pixels import Scatter, compare_pixels
 from fits.comparison.simulations import simulate
-from fits.comparison.spectra import BandSpectra, compare_spectra
+from fits.comparison.spectra import LMIN, BandSpectra, compare_spectra
+from fits.patches import EDGES
+from fits.pseudo_cl import bin_edges
 from fits.record import fingerprint
 from fits.resolution import Prepared
 from fits.settings import Settings
 from jaxsky import observe
 from jaxsky.settings import SettingsError
 
-__all__ = ["Comparison", "compare"]
+__all__ = ["Comparison", "check_comparison", "compare"]
+
+#: A slope and a correlation take a few pixels.
+LEAST_PIXELS = 10
 
 
 class Comparison(NamedTuple):
@@ -43,6 +48,49 @@ class Comparison(NamedTuple):
         return next(s for s in self.scatters if (s.band, s.region, s.stokes) == wanted)
 
 
+def check_comparison(
+    settings: Settings, prepared: Prepared, regions: Mapping[str, Bool[np.ndarray, " pix"]]
+) -> None:
+    """Refuse at once what `compare` and `compare_patches` would find out late.
+
+    Raises
+    ------
+    SettingsError
+        For a region without pixels, multipoles that the maps do not have, more bins than
+        realisations can test, and patches finer than the maps.
+    """
+    how = settings.compare
+    for name, inside in regions.items():
+        if (inside & prepared.used).sum() < LEAST_PIXELS:
+            raise SettingsError(
+                f"analysis.regions: region {name!r} leaves fewer than {LEAST_PIXELS} pixels."
+            )
+    if how.lmax > (limit := 2 * settings.analysis.nside):
+        raise SettingsError(
+            f"compare.lmax: multipoles reach to 2 nside, {limit}, but {how.lmax} is asked for."
+        )
+    bins = len(bin_edges(LMIN, how.lmax, how.width)) - 1
+    if bins > how.nsims / 2:
+        raise SettingsError(
+            f"compare.width: {how.width} makes {bins} bins up to l = {how.lmax}, and these take "
+            f"twice as many realisations; compare.nsims is {how.nsims}."
+        )
+    if how.patches is None:
+        return
+    sources = prepared.sources
+    finest = min(sources, key=sources.__getitem__)
+    if how.patches_nside > sources[finest]:
+        raise SettingsError(
+            f"compare.patches_nside: {how.patches_nside} is finer than that of {finest}, "
+            f"{sources[finest]}."
+        )
+    if 2 * how.patches_nside < EDGES[-1] - 1:
+        raise SettingsError(
+            f"compare.patches_nside: {how.patches_nside} resolves l = {2 * how.patches_nside}, "
+            f"and the patches take {EDGES[-1] - 1}."
+        )
+
+
 def compare(
     settings: Settings,
     prepared: Prepared,
@@ -66,15 +114,9 @@ def compare(
         For a region without pixels, multipoles that the maps do not have, or a file of
         realisations of other data.
     """
+    check_comparison(settings, prepared, regions)
     how = settings.compare
     used = {name: inside & prepared.used for name, inside in regions.items()}
-    for name, pixels in used.items():
-        if not pixels.any():
-            raise SettingsError(f"analysis.regions: region {name!r} leaves no pixel.")
-    if how.lmax > (limit := 2 * settings.analysis.nside):
-        raise SettingsError(
-            f"compare.lmax: multipoles reach to 2 nside, {limit}, but {how.lmax} is asked for."
-        )
     model = observe(prepared.sky, list(prepared.bands.values()))
     simulated = simulate(
         prepared,

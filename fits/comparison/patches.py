@@ -27,11 +27,13 @@ class PatchComparison(NamedTuple):
     ----------
     band : name
     observed, model : fits to the map, and to foregrounds with a realisation of CMB and noise
+    overlap : fraction of modes that patches have in common
     """
 
     band: str
     observed: PatchFits
     model: PatchFits
+    overlap: Float[np.ndarray, "patch patch"]
 
     def detected(self, index: int) -> np.ndarray:
         """Patches that show EE (0) or BB (1) in both."""
@@ -40,22 +42,26 @@ class PatchComparison(NamedTuple):
     def ratio(self, index: int) -> tuple[float, float]:
         """Mean logarithm of A observed over A of the model, as a factor, and its error.
 
-        The error is that of the scatter over the patches that show EE (0) or BB (1).
+        The error is that of the scatter over the patches that show EE (0) or BB (1), with what
+        these have in common.
         """
         both = self.detected(index)
         logs = np.log(self.observed.A[both, index] / self.model.A[both, index])
-        if len(logs) < 2:
+        mean, error = self._mean(logs, both)
+        return float(np.exp(mean)), float(np.exp(mean)) * error
+
+    def _mean(self, values: np.ndarray, patches: np.ndarray) -> tuple[float, float]:
+        """Mean over patches, and its error; NaN for less than two."""
+        if (count := len(values)) < 2:
             return float("nan"), float("nan")
-        mean = float(np.exp(logs.mean()))
-        return mean, mean * float(logs.std(ddof=1) / np.sqrt(len(logs)))
+        shared = self.overlap[np.ix_(patches, patches)].sum() / count
+        return float(values.mean()), float(values.std(ddof=1) * np.sqrt(shared / count))
 
     def slope_difference(self, index: int) -> tuple[float, float]:
         """Mean of alpha observed less alpha of the model, and its error, over the same patches."""
         both = self.detected(index)
         difference = (self.observed.alpha - self.model.alpha)[both, index]
-        if len(difference) < 2:
-            return float("nan"), float("nan")
-        return float(difference.mean()), float(difference.std(ddof=1) / np.sqrt(len(difference)))
+        return self._mean(difference, both)
 
     def correlation(self, index: int) -> tuple[float, float]:
         """Pearson's coefficient of log A and of alpha between map and model."""
@@ -100,6 +106,14 @@ def _noise(
     return np.repeat(total[:, None], 2, axis=1)
 
 
+def _overlap(patches: PreparedPatches) -> Float[np.ndarray, "patch patch"]:
+    """Correlation of the powers of a field that has all scales alike, 1 for a patch itself."""
+    squares = np.stack([one.mask**2 for one in patches.spectra])
+    products = squares @ squares.T
+    own = np.sqrt(np.diag(products))
+    return products / np.outer(own, own)
+
+
 def compare_patches(settings: Settings, inputs: Inputs) -> PatchComparison:
     """The paper's 48 discs and the field of BICEP2, in the band that the settings name.
 
@@ -130,6 +144,7 @@ def compare_patches(settings: Settings, inputs: Inputs) -> PatchComparison:
         name,
         fit_patches(prepared.data[0], patches, noise=noise),
         fit_patches(model, patches, noise=noise),
+        _overlap(patches),
     )
 
 

@@ -10,6 +10,7 @@ import scipy.stats
 from jaxtyping import Array, Bool, Float
 
 from fits.comparison.simulations import Simulated, sums_of_squares
+from fits.record import probability
 from fits.resolution import Prepared
 
 __all__ = ["STOKES", "Scatter", "compare_pixels"]
@@ -29,7 +30,8 @@ class Scatter(NamedTuple):
     correlation : Pearson's coefficient
     rms, expected : rms of observed - model, and that of noise and CMB [uK_RJ]
     chi2 : sum of (observed - model)^2 / sigma^2, sigma that of the noise
-    pte : probability that noise and CMB alone give a larger chi2, from simulations
+    pte : probability that noise and CMB alone give a larger chi2, from simulations; never below
+        `floor`, one in their number
     """
 
     band: str
@@ -43,6 +45,14 @@ class Scatter(NamedTuple):
     expected: float
     chi2: float
     pte: float
+    floor: float
+
+    @property
+    def pte_text(self) -> str:
+        """The probability in words, an upper limit where no realisation exceeds the maps."""
+        if self.pte > self.floor:
+            return probability(self.pte)
+        return f"<{probability(self.floor)}"
 
     @property
     def slope_pte(self) -> float:
@@ -115,6 +125,7 @@ def compare_pixels(
                         math.sqrt(float(squares[b, r, s]) / x.size),
                         float(found[b, r, s]),
                         float(pte[b, r, s]),
+                        1 / (1 + len(simulated.chi2)),
                     )
                 )
     return rows

@@ -49,7 +49,7 @@ def _scatter_panel(axes: Axes, scatter: Scatter, x: np.ndarray, y: np.ndarray) -
         0.04,
         0.96,
         f"slope {with_error(scatter.slope, scatter.error)}\nr = {scatter.correlation:.3f}\n"
-        f"PTE {probability(scatter.pte)}",
+        f"PTE {scatter.pte_text}",
         transform=axes.transAxes,
         va="top",
         fontsize=7,

@@ -77,7 +77,7 @@ def comparison_table(comparison: Comparison) -> Table:
                 f"{s.correlation:.2f}",
                 f"{s.rms:.2f}",
                 f"{s.expected:.2f}",
-                probability(s.pte),
+                s.pte_text,
                 *power,
             )
         table.add_section()
@@ -93,12 +93,23 @@ def warnings(comparison: Comparison) -> list[str]:
             f"Spectra were left out: they are those of the full sky, and {missing} of "
             f"{comparison.prepared.used.size} pixels have no value."
         )
-    for s in comparison.spectra:
-        unlikely = [n for n, p in zip(("EE", "BB"), s.pte, strict=True) if p < UNLIKELY]
+    for s in comparison.scatters:
+        if s.stokes == "QU" and s.slope_pte < UNLIKELY:
+            sentences.append(
+                f"{s.band}, {s.region}: the slope is {with_error(s.slope, s.error)}, further from "
+                f"1 than noise and CMB explain (PTE {probability(s.slope_pte)})."
+            )
+        if s.stokes == "QU" and s.pte <= s.floor:
+            sentences.append(
+                f"{s.band}, {s.region}: the maps differ from the model by {s.rms:.3g} uK_RJ, more "
+                f"than in any of {round(1 / s.floor) - 1} realisations of noise and CMB."
+            )
+    for one in comparison.spectra:
+        unlikely = [n for n, p in zip(("EE", "BB"), one.pte, strict=True) if p < UNLIKELY]
         if unlikely:
             sentences.append(
-                f"{s.band}: {' and '.join(unlikely)} differ from the model by more than noise and "
-                f"CMB do (PTE below {UNLIKELY:g})."
+                f"{one.band}: {' and '.join(unlikely)} differ from the model by more than noise "
+                f"and CMB do (PTE below {UNLIKELY:g})."
             )
     return sentences
 

@@ -96,7 +96,7 @@ class Fisher(Table):
     priors: dict[str, Positive] = Field(default={})
     spectra: list[Literal["EE", "BB"]] = Field(["BB"], min_length=1)
     lmin: Multipole = 2
-    lmax: Multipole = 300
+    lmax: Annotated[int, Field(ge=2, le=3000)] = 300
     r: float = Field(0.0, ge=0)
     A_lens: float = Field(1.0, ge=0)
 

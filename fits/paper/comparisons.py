@@ -57,7 +57,34 @@ def _region(comparison: Comparison) -> str:
     return "strip" if "strip" in comparison.regions else next(iter(comparison.regions))
 
 
-def _differs(sources: Sources, more: str = "") -> str:
+def _where(settings: PaperSettings, region: str) -> str:
+    latitude = f"{settings.analysis.latitude:g} deg"
+    words = {
+        "strip": f"|b| <= {latitude}",
+        "outside": f"|b| > {latitude}",
+        "full": "the full sky",
+    }
+    return words.get(region, f"the mask {region}")
+
+
+def _beam(settings: PaperSettings) -> str:
+    fwhm = settings.analysis.fwhm
+    return f"smoothed to {fwhm:g} arcmin" if fwhm else "averaged, not smoothed"
+
+
+def _set_up(settings: PaperSettings, bands: Sequence[str], wanted: Sequence[str]) -> str:
+    """What of the comparison is not as in the paper, in a sentence; or nothing."""
+    analysis, found = settings.analysis, []
+    if set(wanted) - set(bands):
+        found.append(f"the bands are {listed(bands)}")
+    if analysis.nside != 64:
+        found.append(f"nside is {analysis.nside} rather than 64")
+    if analysis.fwhm != 60:
+        found.append(f"maps are {_beam(settings)} rather than to 60 arcmin")
+    return f"Here, {listed(found)}." if found else ""
+
+
+def _differs(sources: Sources, *more: str) -> str:
     if sources.embedded:
         first = (
             "The observed maps are simulated from the model, with CMB and noise: what differs is "
@@ -65,7 +92,7 @@ def _differs(sources: Sources, more: str = "") -> str:
         )
     else:
         first = sources.sky_differs
-    return " ".join(filter(None, (first, more)))
+    return " ".join(filter(None, (first, *more)))
 
 
 def figure_scatter(settings: PaperSettings, sources: Sources, out: Path) -> Item:
@@ -81,18 +108,19 @@ def figure_scatter(settings: PaperSettings, sources: Sources, out: Path) -> Item
                 f"slope, {band}, Q and U",
                 "1 by eye",
                 with_error(scatter.slope, scatter.error),
-                f"r = {scatter.correlation:.3f}, PTE {probability(scatter.pte)}",
+                f"r = {scatter.correlation:.3f}, PTE {scatter.pte_text}",
             )
         )
     return Item(
         "Figure 5",
         "observed and modelled pixels",
-        f"Pixels of nside {settings.analysis.nside} at |b| <= {settings.analysis.latitude:g} deg, "
-        f"smoothed to {settings.analysis.fwhm:g} arcmin: Q in the upper row of each pair, U in the "
-        "lower. Slopes have the errors of noise and CMB; PTE is the probability that these alone "
+        f"Pixels of nside {settings.analysis.nside}, {_where(settings, region)}, "
+        f"{_beam(settings)}: Q in the upper row of each pair, U in the lower. "
+        "Slopes have the errors of noise and CMB; PTE is the probability that these alone "
         "leave larger differences.",
         _differs(
             sources,
+            _set_up(settings, bands, SHOWN),
             "Slopes, errors and probabilities are added; the paper shows the points and the line.",
         ),
         picture,
@@ -110,7 +138,11 @@ def figure_maps(settings: PaperSettings, sources: Sources, out: Path) -> Item:
         "observed maps and the model",
         f"Q (left) and U (right), observed and modelled, averaged to nside {nside}, each pair in "
         "one scale of colours.",
-        _differs(sources, "Colours are linear up to a tenth of the scale and logarithmic beyond."),
+        _differs(
+            sources,
+            _set_up(settings, list(found.prepared.bands), SHOWN),
+            "Colours are linear up to a tenth of the scale and logarithmic beyond.",
+        ),
         picture,
     )
 
@@ -146,12 +178,27 @@ def _spectra(
         f"bins is that among {settings.compare.nsims} realisations of the complete model.",
         _differs(
             sources,
+            _spectra_set_up(settings, [s.band for s in spectra], wanted),
             "The shaded error is the paper's; the probabilities count the chance correlation of "
             "foregrounds with CMB and noise as well, which it leaves out.",
         ),
         picture,
         numbers=tuple(numbers),
     )
+
+
+def _spectra_set_up(settings: PaperSettings, bands: Sequence[str], wanted: Sequence[str]) -> str:
+    nside, lmax, r = settings.analysis.nside, settings.compare.lmax, settings.cmb.r
+    found = [f"the spectra are of maps of nside {nside} rather than 256"]
+    if set(wanted) - set(bands):
+        found.append(f"the bands are {listed(bands)}")
+    if settings.analysis.fwhm != 60:
+        found.append(f"maps are {_beam(settings)} rather than to 60 arcmin")
+    if lmax != 100:
+        found.append(f"they end at l = {lmax} rather than 100")
+    if not settings.cmb.include or r != 0.1:
+        found.append(f"r is {r:g} rather than 0.1" if settings.cmb.include else "there is no CMB")
+    return f"Here, {listed(found)}."
 
 
 def _probabilities(spectra: BandSpectra) -> Number:
@@ -227,8 +274,13 @@ def figure_patches(settings: PaperSettings, sources: Sources, out: Path) -> Item
         "small patches",
         f"D_l = A (l/80)^(alpha+2) at l = 40 to 100 on discs of 400 square degrees and the field "
         f"of BICEP2, {found.band} GHz: those where A is twice its error in both.",
-        _differs(sources, "The 48 discs lie on pixels of nside 4; nside 8, which the paper names, "
-                 "has 224 there. Errors are drawn, and patches lost in noise left out."),
+        _differs(
+            sources,
+            "The paper draws a line through log C_l of maps with their noise; here noise is "
+            "subtracted and A and alpha are fitted with the variance of few modes, alpha with a "
+            "prior of -2.4 +- 3. The 48 discs lie on pixels of nside 4 (nside 8, which the paper "
+            "names, has 224 there); errors are drawn, and patches lost in noise left out.",
+        ),
         picture,
         numbers=tuple(numbers),
     )  # fmt: skip

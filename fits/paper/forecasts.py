@@ -10,6 +10,7 @@ from fits.paper.item import Impossible, Item, Number, picture_of
 from fits.paper.settings import PaperSettings
 from fits.paper.sources import Sources
 from fits.pseudo_cl import sky_fraction
+from jaxsky.io import InputError
 
 __all__ = ["figure_b_modes"]
 
@@ -46,6 +47,8 @@ def figure_b_modes(settings: PaperSettings, sources: Sources, out: Path) -> Item
     try:
         chosen = _settings(settings, sources)
         found = forecast(chosen)
+    except InputError:
+        raise
     except ValueError as reason:
         raise Impossible(str(reason)) from None
     picture = picture_of("Figure 12")

@@ -143,9 +143,7 @@ def run(
     steps = list(STEPS if steps is None else steps)
     order, wanted = [step.label for step in steps], labels_of(only, steps)
     store, sources = Store(out, settings, resume, overwrite), Sources(settings)
-    if overwrite:
-        store.discard(wanted)
-    todo = [step for step in steps if step.label in wanted and not store.has(step.label)]
+    todo = [s for s in steps if s.label in wanted and (overwrite or not store.has(s.label))]
     for done, step in enumerate(todo):
         report(step.label, done, len(todo))
         start = time.perf_counter()

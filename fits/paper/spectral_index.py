@@ -42,7 +42,7 @@ def figure_probability(settings: PaperSettings, sources: Sources, out: Path) -> 
     except SettingsError as error:
         raise Impossible(str(error)) from None
     plots.plot_grids(out / picture, fits, inputs.truth, settings.title)
-    numbers = []
+    numbers, truth = [], inputs.truth or {}
     for fit in fits:
         result = fit.results["grid"]
         numbers += [
@@ -50,7 +50,7 @@ def figure_probability(settings: PaperSettings, sources: Sources, out: Path) -> 
                 f"{name}, {fit.region}, Q and U",
                 PAPER.get((fit.region, name), "not given"),
                 with_errors(result.best_fit[name], *result.interval_68[name]),
-                "" if inputs.truth is None else f"truth {inputs.truth[name]:g}",
+                f"truth {truth[name]:g}" if name in truth else "",
             )
             for name in result.free
             if fit.stokes == "QU"

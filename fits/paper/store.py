@@ -37,7 +37,8 @@ class Store:
     out : the folder, made if it is not there
     settings : of the items
     resume : go on with those that are there
-    overwrite : those that are there may be replaced; of other settings, they are discarded
+    overwrite : those that are there may be replaced; of other settings, they are discarded when
+        the first new one is there
 
     Raises
     ------
@@ -54,6 +55,7 @@ class Store:
         if out.exists() and not out.is_dir():
             raise ValueError(f"{out}: is not a folder; choose another --out.")
         self.out, self.items = out, dict[str, Item]()
+        self._stale = False
         self._settings = settings.model_dump(mode="json", exclude_none=True)
         path = out / FILE
         if path.exists() and not (resume or overwrite):
@@ -64,7 +66,6 @@ class Store:
         if path.exists():
             self._load(path, overwrite)
         out.mkdir(parents=True, exist_ok=True)
-        self._write()
 
     def _load(self, path: Path, overwrite: bool) -> None:
         try:
@@ -83,25 +84,22 @@ class Store:
                 f"{self.out}: holds figures of other settings; choose another --out, or start "
                 "again with --overwrite."
             )
-        self.discard(items)
-
-    def discard(self, labels: Iterable[str]) -> None:
-        """Forget items, and remove their pictures."""
-        for label in list(labels):
-            item = self.items.pop(label, None)
-            if item is not None and item.picture is not None:
-                (self.out / item.picture).unlink(missing_ok=True)
-        self._write()
+        self._stale = True
 
     def has(self, label: str) -> bool:
         """True if an item could be made, and its picture is there."""
-        item = self.items.get(label)
+        item = None if self._stale else self.items.get(label)
         if item is None or (item.picture is None and item.table is None):
             return False
         return item.picture is None or (self.out / item.picture).is_file()
 
     def add(self, item: Item) -> None:
-        """Keep an item, whose picture is written already."""
+        """Keep an item, whose picture is written already; those of other settings go."""
+        if self._stale:
+            old = {i.picture for i in self.items.values()} - {None, item.picture}
+            for picture in old:
+                (self.out / str(picture)).unlink(missing_ok=True)
+            self.items, self._stale = {}, False
         self.items[item.label] = item
         self._write()
 

@@ -12,8 +12,17 @@ from jaxsky.cli.console import check_out, claim, console, write_example
 
 __all__ = ["compare"]
 
-#: What a comparison leaves in its folder, besides its pictures.
-RESULTS = ("comparison.json", "log.json", "simulations.npz")
+#: What a comparison leaves in its folder.
+RESULTS = (
+    "comparison.json",
+    "log.json",
+    "simulations.npz",
+    "scatter_*.png",
+    "maps_[QU].png",
+    "spectra.png",
+    "leakage.png",
+    "patches.png",
+)
 
 
 def compare(
@@ -28,7 +37,9 @@ def compare(
     init: Annotated[
         bool, typer.Option("--init", help="Write a commented example of the settings and stop.")
     ] = False,
-    seed: Annotated[int | None, typer.Option(help="Seed of simulations.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of realisations, and of the maps of the embedded sky.")
+    ] = None,
     region: Annotated[
         list[str] | None, typer.Option(help="strip, outside, full or a mask file; repeatable.")
     ] = None,
@@ -71,7 +82,7 @@ def compare(
         import matplotlib as mpl
 
         mpl.use("Agg")  # pictures go to files
-        from fits.comparison import compare, compare_patches, report
+        from fits.comparison import check_comparison, compare, compare_patches, report
         from fits.inputs import inputs_of
         from fits.regions import region_masks
         from fits.resolution import prepare
@@ -82,6 +93,7 @@ def compare(
         regions = region_masks(settings)
         inputs = inputs_of(settings)
         prepared = prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
+        check_comparison(settings, prepared, regions)
         claim(out, RESULTS, overwrite)
         try:
             found = compare(settings, prepared, regions, out / "simulations.npz", show)

@@ -19,7 +19,7 @@ def write_example(path: Path, example: Path) -> None:
 
 
 def check_out(out: Path, results: Sequence[str], resume: bool | None, overwrite: bool) -> None:
-    """Refuse a folder that has results, unless they are to be gone on with or replaced.
+    """Refuse a folder that has results (patterns), unless they are to be kept or replaced.
 
     `resume` is None for commands that have nothing to go on with.
     """
@@ -27,7 +27,7 @@ def check_out(out: Path, results: Sequence[str], resume: bool | None, overwrite:
         raise ValueError("--resume and --overwrite exclude each other.")
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is not a folder; choose another --out.")
-    if not (resume or overwrite) and any((out / name).exists() for name in results):
+    if not (resume or overwrite) and any(any(out.glob(name)) for name in results):
         go_on = "" if resume is None else "go on with --resume, "
         raise ValueError(
             f"{out}: holds results already; {go_on}replace them with --overwrite, or choose "
@@ -40,4 +40,5 @@ def claim(out: Path, results: Sequence[str], overwrite: bool) -> None:
     out.mkdir(parents=True, exist_ok=True)
     if overwrite:
         for name in results:
-            (out / name).unlink(missing_ok=True)
+            for path in out.glob(name):
+                path.unlink()

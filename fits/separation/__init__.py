@@ -1,0 +1,31 @@
+"""Component separation with parametric laws: spectra first, then maps of the components."""
+
+from fits.separation.fit import fisher, fit_spectra, hessian
+from fits.separation.likelihood import SpectralLikelihood, spectral_likelihood
+from fits.separation.maps import (
+    ComponentMaps,
+    component_maps,
+    noise_degradation,
+    residual_maps,
+)
+from fits.separation.noise import Noise, as_noise
+from fits.separation.regions import clusters, latitude_bands, superpixels
+from fits.separation.results import SpectralFit
+
+__all__ = [
+    "ComponentMaps",
+    "Noise",
+    "SpectralFit",
+    "SpectralLikelihood",
+    "as_noise",
+    "clusters",
+    "component_maps",
+    "fisher",
+    "fit_spectra",
+    "hessian",
+    "latitude_bands",
+    "noise_degradation",
+    "residual_maps",
+    "spectral_likelihood",
+    "superpixels",
+]

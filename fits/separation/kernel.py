@@ -1,0 +1,212 @@
+"""Amplitudes of components in many pixels at once, and what they leave of the data.
+
+In each pixel d = M s + n, with M the same for all pixels of a call, and inverse noise covariance
+W. Generalised least squares gives s = (M^T W M)^-1 M^T W d (Stompor et al. 2009) and leaves
+chi^2 = r^T W r with r = d - M s. Sums over bands are products of matrices; the small systems are
+factorised element by element, each element an array over pixels.
+
+chi^2 has a closed derivative: s is where it is stationary, so only explicit dependences count.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+__all__ = ["Pixels", "chi2", "explained", "inverse_gram", "residuals", "solve"]
+
+
+class Pixels(NamedTuple):
+    """Data in pixels that are treated in the same way.
+
+    Parameters
+    ----------
+    data : a row for each band, or for Q of each band and then U of each band
+    weights : inverse noise variance, or the diagonal of the inverse covariance; one value a row
+        if it is the same in all pixels
+    cross : element QU of the inverse covariance in each band; None where there is none
+    """
+
+    data: Float[Array, "*batch group row pix"]
+    weights: Float[Array, "*batch group row #pix"]
+    cross: Float[Array, "*batch group band #pix"] | None = None
+
+
+def _weighted(pixels: Pixels, maps: Array) -> Array:
+    """W times maps (group, row, pix)."""
+    result = pixels.weights * maps
+    if pixels.cross is None:
+        return result
+    half = maps.shape[1] // 2
+    return result + jnp.concatenate(
+        [pixels.cross * maps[:, half:], pixels.cross * maps[:, :half]], axis=1
+    )
+
+
+def _gram(mixing: Float[Array, "row unknown"], pixels: Pixels) -> list[list[Array]]:
+    """Lower triangle of M^T W M, each element an array (group, pix)."""
+    size = mixing.shape[1]
+    i, j = np.tril_indices(size)
+    products = mixing[:, i] * mixing[:, j]
+    elements = jnp.einsum("rq,krn->qkn", products, pixels.weights)
+    if pixels.cross is not None:
+        half = len(mixing) // 2
+        Q, U = mixing[:half], mixing[half:]
+        products = Q[:, i] * U[:, j] + U[:, i] * Q[:, j]
+        elements = elements + jnp.einsum("bq,kbn->qkn", products, pixels.cross)
+    rows = iter(elements)
+    return [[next(rows) for _ in range(i + 1)] for i in range(size)]
+
+
+def _cholesky(matrix: list[list[Array]]) -> list[list[Array]]:
+    """Lower factor with the inverses of its diagonal on the diagonal."""
+    lower: list[list[Array]] = []
+    for i, row in enumerate(matrix):
+        lower.append([])
+        for j in range(i + 1):
+            rest = row[j] - sum(lower[i][k] * lower[j][k] for k in range(j))
+            lower[i].append(jax.lax.rsqrt(rest) if i == j else rest * lower[j][j])
+    return lower
+
+
+def _back_substitute(lower: list[list[Array]], right: list[Array]) -> list[Array]:
+    """The solution of L L^T x = right."""
+    size = len(lower)
+    y: list[Array] = []
+    for i in range(size):
+        y.append((right[i] - sum(lower[i][k] * y[k] for k in range(i))) * lower[i][i])
+    x: list[Any] = [None] * size
+    for i in reversed(range(size)):
+        x[i] = (y[i] - sum(lower[k][i] * x[k] for k in range(i + 1, size))) * lower[i][i]
+    return x
+
+
+def _projected(mixing: Array, maps: Array) -> Array:
+    """M^T times maps (group, row, pix)."""
+    return jnp.einsum("ru,krn->kun", mixing, maps)
+
+
+def _model(mixing: Array, amplitudes: Array) -> Array:
+    return jnp.einsum("ru,kun->krn", mixing, amplitudes)
+
+
+def _solved(mixing: Array, pixels: Pixels, right: Array) -> tuple[Array, list[list[Array]]]:
+    """The solution of M^T W M x = right (group, unknown, pix), and the factors of the matrix."""
+    lower = _cholesky(_gram(mixing, pixels))
+    return _stacked(lower, right), lower
+
+
+def _stacked(lower: list[list[Array]], right: Array) -> Array:
+    return jnp.stack(_back_substitute(lower, list(jnp.moveaxis(right, 1, 0))), axis=1)
+
+
+@jax.custom_jvp
+def solve(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, "group unknown pix"]:
+    """Amplitudes s = (M^T W M)^-1 M^T W d; NaN where a system is singular."""
+    return _solved(mixing, pixels, _projected(mixing, _weighted(pixels, pixels.data)))[0]
+
+
+def _solve_jvp(primals, tangents):
+    """From M^T W (d - M s) = 0: one more solution, and no derivative of the factors."""
+    mixing, pixels = primals
+    d_mixing, d_pixels = tangents
+    right = _projected(mixing, _weighted(pixels, pixels.data))
+    amplitudes, lower = _solved(mixing, pixels, right)
+    rest = pixels.data - _model(mixing, amplitudes)
+    right = jnp.zeros_like(amplitudes)
+    if not isinstance(d_mixing, SymbolicZero):
+        right += _projected(d_mixing, _weighted(pixels, rest))
+        right -= _projected(mixing, _weighted(pixels, _model(d_mixing, amplitudes)))
+    if not isinstance(d_pixels.data, SymbolicZero):
+        right += _projected(mixing, _weighted(pixels, d_pixels.data))
+    if not isinstance(d_pixels.weights, SymbolicZero):
+        right += _projected(mixing, d_pixels.weights * rest)
+    if pixels.cross is not None and not isinstance(d_pixels.cross, SymbolicZero):
+        moved = Pixels(rest, jnp.zeros_like(pixels.weights), d_pixels.cross)
+        right += _projected(mixing, _weighted(moved, rest))
+    return amplitudes, _stacked(lower, right)
+
+
+solve.defjvp(_solve_jvp, symbolic_zeros=True)
+
+
+def inverse_gram(
+    mixing: Float[Array, "row unknown"], pixels: Pixels
+) -> Float[Array, "group unknown unknown pix"]:
+    """Covariance (M^T W M)^-1 of the amplitudes; one pixel if the weights are uniform."""
+    lower = _cholesky(_gram(mixing, pixels))
+    one, zero = jnp.ones_like(lower[0][0]), jnp.zeros_like(lower[0][0])
+    size = len(lower)
+    columns = [
+        _back_substitute(lower, [one if i == j else zero for i in range(size)]) for j in range(size)
+    ]
+    return jnp.stack([jnp.stack(column, axis=1) for column in columns], axis=2)
+
+
+def residuals(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, "group row pix"]:
+    """Whitened residuals: their sum of squares is chi^2."""
+    rest = pixels.data - _model(mixing, solve(mixing, pixels))
+    if pixels.cross is None:
+        return jnp.sqrt(pixels.weights) * rest
+    half = rest.shape[1] // 2
+    QQ, UU = pixels.weights[:, :half], pixels.weights[:, half:]
+    root = jnp.sqrt(QQ)
+    first = root * rest[:, :half] + pixels.cross / root * rest[:, half:]
+    second = jnp.sqrt(UU - pixels.cross**2 / QQ) * rest[:, half:]
+    return jnp.concatenate([first, second], axis=1)
+
+
+def explained(
+    mixing: Float[Array, "row unknown"], pixels: Pixels
+) -> tuple[Float[Array, "group unknown pix"], Float[Array, " pix"]]:
+    """Amplitudes, and chi^2 of each pixel."""
+    amplitudes, rest, weighted = _parts(mixing, pixels)
+    return amplitudes, jnp.sum(rest * weighted, axis=(0, 1))
+
+
+def _parts(mixing, pixels):
+    """Amplitudes, residuals and weighted residuals."""
+    amplitudes = solve(mixing, pixels)
+    rest = pixels.data - _model(mixing, amplitudes)
+    return amplitudes, rest, _weighted(pixels, rest)
+
+
+@jax.custom_jvp
+def chi2(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, ""]:
+    """Sum over pixels of r^T W r = d^T W d - (M^T W d)^T (M^T W M)^-1 (M^T W d).
+
+    Formed from the residuals, so nothing cancels where signals are far above the noise.
+
+    Parameters
+    ----------
+    mixing : the matrix M
+    pixels : data and weights
+    """
+    _, rest, weighted = _parts(mixing, pixels)
+    return jnp.sum(rest * weighted)
+
+
+def _chi2_jvp(primals, tangents):
+    mixing, pixels = primals
+    d_mixing, d_pixels = tangents
+    amplitudes, rest, weighted = _parts(mixing, pixels)
+    value = jnp.sum(rest * weighted)
+
+    def along(gradient, tangent):
+        if isinstance(tangent, SymbolicZero):
+            return 0.0
+        return jnp.sum(gradient() * tangent)
+
+    slope = along(lambda: -2 * jnp.einsum("krn,kun->ru", weighted, amplitudes), d_mixing)
+    slope += along(lambda: 2 * weighted, d_pixels.data)
+    slope += along(lambda: rest**2, d_pixels.weights)
+    if pixels.cross is not None:
+        half = rest.shape[1] // 2
+        slope += along(lambda: 2 * rest[:, :half] * rest[:, half:], d_pixels.cross)
+    return value, jnp.asarray(slope, value.dtype)
+
+
+chi2.defjvp(_chi2_jvp, symbolic_zeros=True)

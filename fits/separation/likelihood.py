@@ -1,0 +1,373 @@
+"""The spectral likelihood: laws of components, with their amplitudes profiled out.
+
+With A (band, component) the band-averaged laws and any amplitudes in each pixel (Stompor et al.
+2009, MNRAS 392, 216),
+
+    -2 ln L = sum_p [d^T N^-1 d - (A^T N^-1 d)^T (A^T N^-1 A)^-1 (A^T N^-1 d)].
+
+Parameters are numbers, or arrays with a value for each region of a map of labels; a cell is an
+intersection of regions. Where noise is separable and cells are large, a few vectors take the
+place of the pixels (`fits.separation.compress`) and nothing depends on nside.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from fits.likelihood import Likelihood, named_bands
+from fits.separation import kernel
+from fits.separation.compress import Layout, compressed, gathered, layouts, used_pixels
+from fits.separation.kernel import Pixels
+from fits.separation.mixing import Mixing, SpectralBands, spectral_names
+from fits.separation.noise import Noise, as_noise, bare
+from fits.separation.regions import Cells, check_labels, intersections
+from jaxsky import Bandpass, Component, Sky, get_parameters, set_parameters
+from jaxsky.bandpass import Samples, stack_bands
+from jaxsky.checks import as_array, check_double, check_finite
+from jaxsky.parameters import unknown_parameter
+from jaxsky.types import Numeric
+from jaxsky.units import parse_unit
+
+__all__ = ["SpectralLikelihood", "spectral_likelihood"]
+
+#: Pixels that are treated at once.
+PASS = 4096
+
+
+class SpectralLikelihood(Likelihood):
+    """See `spectral_likelihood`; also a `fits.likelihood.Likelihood`, for grids and chains.
+
+    Parameters
+    ----------
+    sky : the laws, on a single pixel
+    bands, samples : the bands, and their frequencies and weights
+    start : values of the free parameters
+    fixed : parameters that are maps and not free, in each cell
+    index : position of each free parameter of each cell in the vector of all
+    pixels : data and weights, for each of `layout`
+    block_cell : cell of each block of pixels; None if they are in order
+    of_pixel : cell of each pixel, -1 where masked; None if there is only one
+    layout : Stokes parameters of `pixels`
+    unit : of the data
+    values : number of data less that of amplitudes
+    """
+
+    samples: Samples
+    start: dict[str, Array]
+    fixed: dict[str, Float[Array, " cell"]]
+    index: Int[Array, "cell free"]
+    pixels: tuple[Pixels, ...]
+    block_cell: Int[Array, " block"] | None
+    of_pixel: Int[Array, " pix"] | None
+    layout: tuple[Layout, ...] = eqx.field(static=True)
+    unit: str = eqx.field(static=True)
+    values: int = eqx.field(static=True)
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the free parameters, in the order of the vector of all."""
+        return tuple(sorted(self.start))
+
+    @property
+    def mixing(self) -> Mixing:
+        """The mixing matrix as a function of parameters."""
+        return Mixing(self.sky, self.bands, self.samples, self.unit)  # type: ignore[arg-type]
+
+    def check(self, params):
+        known = (*spectral_names(self.sky), *self.bands.parameter_names())
+        for name, value in params.items():
+            if name not in known:
+                raise unknown_parameter(name, known)
+            if name not in self.start:
+                raise ValueError(
+                    f"Parameter {name!r} is not free; name it in `start` of the likelihood."
+                )
+            if jnp.shape(value) not in ((), self.start[name].shape):
+                raise ValueError(
+                    f"Parameter {name!r} must be a number or have shape "
+                    f"{self.start[name].shape}, a value for each region, but has shape "
+                    f"{jnp.shape(value)}."
+                )
+        if not self.start:
+            raise ValueError("Argument `start` must name at least one free parameter.")
+        seen = np.zeros(sum(value.size for value in self.start.values()), bool)
+        seen[np.asarray(self.index)] = True
+        result = {}
+        for name, has_pixels in self.named(jnp.asarray(seen)).items():
+            default = self.start[name]
+            value = as_array(name, params.get(name, default))
+            # What fits return for regions without a pixel is not a number.
+            result[name] = jnp.where(has_pixels, value, default)
+            check_finite(name, result[name])
+        return result
+
+    def flat(self, params: Mapping[str, Numeric]) -> Float[Array, " par"]:
+        """The vector of all free parameters; those not given are at their start."""
+        rows = [
+            jnp.broadcast_to(params.get(name, self.start[name]), self.start[name].shape).ravel()
+            for name in self.free
+        ]
+        return jnp.concatenate(rows) if rows else jnp.zeros(0)
+
+    def named(self, theta: Float[Array, " par"]) -> dict[str, Array]:
+        """The inverse of `flat`."""
+        ends = np.cumsum([self.start[name].size for name in self.free])
+        parts = jnp.split(jnp.asarray(theta), ends[:-1]) if len(ends) else []
+        shapes = [self.start[name].shape for name in self.free]
+        return {n: p.reshape(s) for n, p, s in zip(self.free, parts, shapes, strict=True)}
+
+    def matrices(self, local: Float[Array, "cell free"]) -> tuple[Array, ...]:
+        """Mixing matrices (cell, row, unknown), for each of `layout`."""
+        values = {name: local[:, k] for k, name in enumerate(self.free)} | self.fixed
+        matrix = self.mixing(values, len(local))
+        return tuple(
+            self.mixing.rotated(matrix, values) if each.joint else matrix for each in self.layout
+        )
+
+    def _mapped(self, function, local):
+        """A function of (matrix, pixels) in all blocks, for each of `layout`."""
+        results = []
+        for matrix, pixels in zip(self.matrices(local), self.pixels, strict=True):
+            blocks, *_, size = pixels.data.shape
+            of_block = matrix if self.block_cell is None else matrix[self.block_cell]
+            if blocks * size <= PASS:
+                results.append(jax.vmap(function)(of_block, pixels))
+                continue
+            at_once = max(1, PASS // size)
+            results.append(
+                jax.lax.map(lambda x: function(*x), (of_block, pixels), batch_size=at_once)
+            )
+        return tuple(results)
+
+    def total(self, local: Float[Array, "cell free"]) -> Float[Array, ""]:
+        """-2 ln L for parameters of each cell."""
+        parts = self._mapped(kernel.chi2, local)
+        return sum((jnp.sum(part) for part in parts), jnp.zeros(()))
+
+    def predicted(self, local: Float[Array, "cell free"]) -> "SpectralLikelihood":
+        """The same likelihood with data that are exactly what the parameters predict."""
+
+        def model(matrix, pixels):
+            return jnp.einsum("ru,kun->krn", matrix, kernel.solve(matrix, pixels))
+
+        pixels = tuple(
+            part._replace(data=data)
+            for part, data in zip(self.pixels, self._mapped(model, local), strict=True)
+        )
+        return eqx.tree_at(lambda like: like.pixels, self, pixels)
+
+    def residuals(self, params):
+        local = self.flat(params)[self.index]
+        parts = self._mapped(kernel.residuals, local)
+        return jnp.concatenate([part.ravel() for part in parts])
+
+
+def _unit_sky(sky: Sky) -> tuple[Sky, dict[str, np.ndarray]]:
+    """The laws on a single pixel, with numbers in the place of maps; and those maps."""
+    names = spectral_names(sky)
+    maps = {n: np.asarray(v) for n, v in get_parameters(sky, names).items() if v.ndim}
+    numbers = set_parameters(sky, {name: float(np.mean(v)) for name, v in maps.items()})
+
+    def reduced(leaf):
+        return jnp.ones((2, 1)) if leaf.ndim == 2 else leaf.astype(float).ravel()[:1].reshape(())
+
+    return jax.tree.map(reduced, numbers), maps
+
+
+def _check_start(
+    sky: Sky, bands: SpectralBands, start: Mapping[str, Numeric], labels: Mapping[str, Numeric]
+) -> None:
+    known = (*spectral_names(sky), *bands.parameter_names())
+    for name in (*start, *labels):
+        if name not in known:
+            raise unknown_parameter(name, known)
+    for name in labels:
+        if name not in start:
+            raise ValueError(f"There are labels for {name!r}, which is not in `start`.")
+        if name in bands.parameter_names():
+            raise ValueError(f"Parameter {name!r} of a band cannot vary between regions.")
+
+
+def _start_values(
+    start: Mapping[str, Numeric], labels: Mapping[str, np.ndarray]
+) -> dict[str, Array]:
+    values = {}
+    for name in sorted(start):
+        value = as_array(name, start[name])
+        check_finite(name, value)
+        wanted: tuple[int, ...] = ()
+        if name in labels:
+            wanted = value.shape if value.ndim == 1 else (int(labels[name].max()) + 1,)
+            if int(labels[name].max()) >= wanted[0]:
+                raise ValueError(
+                    f"Start of {name!r} has {wanted[0]} values, but its labels go up to "
+                    f"{int(labels[name].max())}."
+                )
+        if value.shape not in ((), wanted):
+            raise ValueError(
+                f"Start of {name!r} must be a number, or an array with a value for each of its "
+                f"labels, but has shape {value.shape}."
+            )
+        values[name] = jnp.broadcast_to(value.astype(float), wanted)
+    return values
+
+
+def spectral_likelihood(
+    sky: Sky | Mapping[str, Component],
+    bands: Mapping[str, Bandpass] | Sequence[Bandpass],
+    data: Numeric,
+    noise: Noise | Numeric,
+    start: Mapping[str, Numeric],
+    *,
+    labels: Mapping[str, Int[np.ndarray, " pix"]] | None = None,
+    unit: str = "uK_RJ",
+    compress: bool | None = None,
+) -> SpectralLikelihood:
+    """The likelihood of the spectral parameters named in `start`.
+
+    Parameters
+    ----------
+    sky : components by name. Their laws count, not their amplitudes; parameters that are not
+        free keep their values, maps of the data's pixels among them.
+    bands : the bands by name, or as a list
+    data : observed maps, shape (band, stokes, pix) with Stokes Q, U or I, Q, U
+    noise : standard deviations or covariances in the unit of the data; see
+        `fits.separation.as_noise`
+    start : start values of the free parameters by name: of the laws ("dust.beta_dust"), or of
+        bands ("shift.<band>", "width.<band>", "gain.<band>", "angle.<band>"; see
+        `fits.separation.mixing`)
+    labels : maps of region numbers from 0 for parameters that vary, by name; start values are
+        then arrays with one value for each region, or a number for all
+    unit : of the data, "uK_RJ", "K_CMB" or the like; amplitudes are uK in any case (CMB: uK_CMB)
+    compress : whether vectors take the place of pixels, where noise is separable; by default
+        where they are fewer
+
+    Returns
+    -------
+    The likelihood, for `fits.separation.fit_spectra`.
+
+    Raises
+    ------
+    RuntimeError
+        If JAX is not in double precision.
+    KeyError
+        For unknown parameters.
+    TypeError, ValueError
+        For shapes that do not match, units, noise that is not positive, data that are not
+        finite, too few bands, components that cannot be told apart, and labels that are no
+        labels.
+    """
+    check_double("fits.separation")
+    sky = sky if isinstance(sky, Sky) else Sky(sky)
+    bands = named_bands(bands)
+    data = bare("data", data)
+    components = len(sky.components)
+    if parse_unit(unit)[1] not in ("K_RJ", "K_CMB"):
+        raise ValueError(f"Argument `unit` must be one of K_RJ or K_CMB, not {unit!r}.")
+    if data.ndim != 3 or len(data) != len(bands) or data.shape[1] not in (2, 3):
+        raise ValueError(
+            f"Argument `data` must have shape (band, stokes, pix) with {len(bands)} bands and "
+            f"Stokes Q, U or I, Q, U, but has shape {data.shape}."
+        )
+    if len(bands) < components + bool(start):
+        raise ValueError(
+            f"{len(bands)} bands are too few: amplitudes of {components} components take as many, "
+            "and their laws one more."
+        )
+    own = SpectralBands(tuple(bands.values()), tuple(bands), "QU" if data.shape[1] == 2 else "IQU")
+    _check_start(sky, own, start, labels or {})
+    noise = as_noise(noise, data.shape)
+    used = used_pixels(noise, data.shape[-1], components)
+    maps = {n: check_labels(n, v, used.size, used) for n, v in (labels or {}).items()}
+    values = _start_values(start, maps)
+
+    unit_sky, fixed = _unit_sky(sky)
+    fixed = {name: value for name, value in fixed.items() if name not in start}
+    varying = dict(maps)
+    for name, value in fixed.items():
+        if value.shape != used.shape:
+            raise ValueError(
+                f"Parameter {name!r} is a map of {value.size} pixels, but the data have "
+                f"{used.size}."
+            )
+        varying[name] = np.unique(value, return_inverse=True)[1]
+    cells = intersections(varying, used)
+    first = _first_pixels(cells, used)
+    angles = any(name.startswith("angle.") for name in start)
+    like = SpectralLikelihood(
+        unit_sky,
+        own,
+        stack_bands(own.bandpasses),
+        values,
+        {name: jnp.asarray(value[first]) for name, value in fixed.items()},
+        _index(values, cells),
+        (),
+        None,
+        None if cells.of_pixel is None else jnp.asarray(cells.of_pixel),
+        layouts(data.shape[1], angles or noise.covariance is not None),
+        unit,
+        _count(noise, used, data.shape) - components * data.shape[1] * int(used.sum()),
+    )
+    _check_matrices(like)
+    rows = [len(data) * len(layout.groups[0]) for layout in like.layout]
+    fewer = cells.number * max(rows) < used.sum()
+    if compress and not noise.separable:
+        raise ValueError("Only noise that is separable into bands and pixels can be compressed.")
+    block_cell = None
+    parts = []
+    for layout in like.layout:
+        if noise.separable and (fewer if compress is None else compress):
+            parts.append(compressed(data, noise, cells, used, layout))
+        else:
+            pixels, block_cell = gathered(data, noise, cells, used, layout)
+            parts.append(pixels)
+    return dataclasses.replace(like, pixels=tuple(parts), block_cell=block_cell)
+
+
+def _first_pixels(cells: Cells, used: np.ndarray) -> np.ndarray:
+    """A pixel of each cell."""
+    if cells.of_pixel is None:
+        return np.flatnonzero(used)[:1]
+    found, first = np.unique(cells.of_pixel, return_index=True)
+    return first[found >= 0]
+
+
+def _index(values: Mapping[str, Array], cells: Cells) -> Array:
+    columns, offset = [], 0
+    for name in sorted(values):
+        label = cells.labels.get(name, np.zeros(cells.number, int))
+        columns.append(offset + (label if values[name].ndim else 0 * label))
+        offset += values[name].size
+    return jnp.asarray(np.stack(columns, axis=1) if columns else np.zeros((cells.number, 0), int))
+
+
+def _count(noise: Noise, used: np.ndarray, shape: tuple[int, ...]) -> int:
+    """Number of data that are used."""
+    if noise.separable:
+        return int(used.sum()) * shape[0] * shape[1]
+    if noise.covariance is not None:
+        return 2 * int(np.isfinite(noise.covariance[:, 0, 0]).sum())
+    return int(np.isfinite(noise.sigma).sum())  # type: ignore[arg-type]
+
+
+@jax.jit
+def _start_matrices(like):
+    return like.matrices(like.flat({})[like.index])[0]
+
+
+def _check_matrices(like: SpectralLikelihood) -> None:
+    """Raise ValueError if two components have the same law at the start values."""
+    matrix = np.asarray(_start_matrices(like))
+    matrix = matrix / np.linalg.norm(matrix, axis=1, keepdims=True)
+    if not np.isfinite(matrix).all():
+        raise ValueError("The laws are not finite at the start values.")
+    if np.linalg.svd(matrix, compute_uv=False)[:, -1].min() < 1e-7:
+        raise ValueError(
+            f"The components {', '.join(like.sky)} cannot be told apart at the start values: "
+            "their laws are the same in these bands."
+        )

@@ -1,0 +1,274 @@
+"""Maps of the components for given spectral parameters, and how well they describe the data."""
+
+from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+from jaxtyping import Array, Float
+
+from fits.separation import kernel
+from fits.separation.compress import Layout, used_pixels
+from fits.separation.kernel import Pixels
+from fits.separation.likelihood import SpectralLikelihood
+from fits.separation.noise import Noise, as_noise, bare, chunks
+from jaxsky.types import Numeric
+
+__all__ = ["ComponentMaps", "component_maps", "noise_degradation", "residual_maps"]
+
+
+class ComponentMaps(NamedTuple):
+    """Maps of the components; NaN in masked pixels.
+
+    Attributes
+    ----------
+    components : their names
+    amplitude : generalised least-squares estimates, uK at the reference frequency of each law;
+        CMB in uK_CMB
+    covariance : of the components in each pixel for each Stokes parameter; a single pixel if it
+        is the same in all; None if not asked for
+    chi2, dof : sum over bands and Stokes parameters of the weighted residuals squared, and their
+        number less that of amplitudes
+    probability : to exceed chi2, the spectral parameters taken as known
+    """
+
+    components: tuple[str, ...]
+    amplitude: Float[np.ndarray, "component stokes pix"]
+    covariance: Float[np.ndarray, "component component stokes #pix"] | None
+    chi2: Float[np.ndarray, " pix"]
+    dof: Float[np.ndarray, " pix"]
+    probability: Float[np.ndarray, " pix"]
+
+    def map(self, name: str) -> Float[np.ndarray, "stokes pix"]:
+        """Amplitude of a component."""
+        return self.amplitude[self.components.index(name)]
+
+    def sigma(self, name: str) -> Float[np.ndarray, "stokes ..."]:
+        """Standard deviation of the amplitude of a component."""
+        if self.covariance is None:
+            raise ValueError("The covariance of the maps was not asked for.")
+        i = self.components.index(name)
+        return np.sqrt(self.covariance[i, i])
+
+
+@jax.jit
+def _matrices(like, params):
+    return like.matrices(like.flat(params)[like.index])
+
+
+def _of_pixel(like: SpectralLikelihood, matrix: Array, part: slice) -> Array:
+    """The matrix of all pixels, (1, row, unknown), or of each."""
+    if like.of_pixel is None:
+        return matrix
+    return matrix[jnp.maximum(like.of_pixel[part], 0)]
+
+
+def _by_pixel(function, matrix, pixels):
+    """A function of (matrix, pixels) whose results end in pixels, with a matrix for each."""
+    if len(matrix) == 1:
+        return function(matrix[0], pixels)
+    npix = len(matrix)
+    wide = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], npix)), pixels)
+    alone = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0)[..., None], wide)
+    results = jax.vmap(function)(matrix, alone)
+    return jax.tree.map(lambda x: jnp.moveaxis(x[..., 0], 0, -1), results)
+
+
+@jax.jit
+def _explained(matrix, pixels):
+    return _by_pixel(kernel.explained, matrix, pixels)
+
+
+@jax.jit
+def _inverse(matrix, pixels):
+    return _by_pixel(kernel.inverse_gram, matrix, pixels)
+
+
+@partial(jax.jit, static_argnames="unknowns")
+def _alone(matrix, pixels, unknowns):
+    """Variance of one component if there were no other."""
+
+    def variances(m, p):
+        single = [kernel.inverse_gram(m[:, u : u + 1], p)[:, 0, 0] for u in unknowns]
+        return jnp.stack(single, axis=1)
+
+    return _by_pixel(variances, matrix, pixels)
+
+
+def _pixels(
+    layout: Layout, noise: Noise, used: np.ndarray, part: slice, data: np.ndarray | None = None
+) -> Pixels:
+    """Data and weights of some pixels; masked ones are zero and have unit weight."""
+    mask = used[part]
+    weights = noise.weights(part)
+    if weights.shape[-1] > 1 or not mask.all():
+        weights = np.where(mask, weights, 1.0)
+    values = np.zeros((weights.shape[1], weights.shape[0], 1))
+    if data is not None:
+        values = np.asarray(data[..., part], float)
+        values = np.where(mask & (weights.swapaxes(0, 1) > 0), values, 0.0)
+    cross = noise.cross(part) if layout.joint else None
+    return Pixels(
+        jnp.asarray(layout.rows(values)),
+        jnp.asarray(layout.rows(weights.swapaxes(0, 1))),
+        None if cross is None else jnp.asarray(np.where(mask, cross, 0.0))[None],
+    )
+
+
+def _passes(like: SpectralLikelihood, params: Mapping[str, Numeric], npix: int) -> Iterator:
+    """(layout, slice of pixels, matrices) for all maps."""
+    known = _matrices(like, like.check(params)) if like.start else _matrices(like, {})
+    for layout, matrix in zip(like.layout, known, strict=True):
+        for part in chunks(npix):
+            yield layout, part, _of_pixel(like, matrix, part)
+
+
+def _checked(like: SpectralLikelihood, noise, shape) -> tuple[Noise, np.ndarray]:
+    noise = as_noise(noise, shape)
+    return noise, used_pixels(noise, shape[-1], len(like.sky.components))
+
+
+def _check_data(like: SpectralLikelihood, data: Numeric) -> np.ndarray:
+    data = bare("data", data)
+    wanted = (len(like.bands.names), len(like.bands.stokes))
+    if data.ndim != 3 or data.shape[:2] != wanted:
+        raise ValueError(
+            f"Argument `data` must have shape (band, stokes, pix) = {(*wanted, 'pix')}, "
+            f"but has shape {data.shape}."
+        )
+    return data
+
+
+def component_maps(
+    like: SpectralLikelihood,
+    params: Mapping[str, Numeric],
+    data: Numeric,
+    noise: Noise | Numeric,
+    *,
+    covariance: bool = True,
+) -> ComponentMaps:
+    """Maps of the components, pixel by pixel, for spectral parameters that are known.
+
+    Parameters
+    ----------
+    like : from `spectral_likelihood`, for its laws, bands and regions
+    params : spectral parameters, such as `SpectralFit.best_fit`
+    data, noise : as they were given to `spectral_likelihood`
+    covariance : whether to make the covariance of the amplitudes
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        For unknown parameters, and what `spectral_likelihood` refuses.
+    """
+    data = _check_data(like, data)
+    noise, used = _checked(like, noise, data.shape)
+    names = tuple(like.sky)
+    stokes, npix = data.shape[1:]
+    amplitude = np.full((len(names), stokes, npix), np.nan)
+    square, count = np.zeros(npix), np.zeros(npix)
+    uniform = noise.separable and noise.pixel_sigma is None and like.of_pixel is None
+    blocks = np.full((len(names), len(names), stokes, 1 if uniform else npix), np.nan)
+    for layout, part, matrix in _passes(like, params, npix):
+        own = list(layout.stokes)
+        pixels = _pixels(layout, noise, used, part, data)
+        solved, squares = map(np.asarray, _explained(matrix, pixels))
+        found = layout.maps(solved)
+        amplitude[:, own, part] = np.where(used[part], found, np.nan)
+        square[part] += squares
+        count[part] += (noise.weights(part) > 0)[own].sum(axis=(0, 1)) - len(names) * len(own)
+        if covariance and not (uniform and part.start):
+            inverse = np.asarray(_inverse(matrix, pixels._replace(data=pixels.weights)))
+            where = slice(0, 1) if uniform else part
+            for k, s in enumerate(own):
+                inner = inverse[0] if layout.joint else inverse[k]
+                first = k * len(names) if layout.joint else 0
+                rows = slice(first, first + len(names))
+                block = inner[rows, rows]
+                blocks[:, :, s, where] = block if uniform else np.where(used[part], block, np.nan)
+    square, count = np.where(used, square, np.nan), np.where(used, count, np.nan)
+    return ComponentMaps(
+        names,
+        amplitude,
+        blocks if covariance else None,
+        square,
+        count,
+        scipy.special.chdtrc(count, square),
+    )
+
+
+def residual_maps(
+    like: SpectralLikelihood,
+    params: Mapping[str, Numeric],
+    data: Numeric,
+    amplitude: Float[np.ndarray, "component stokes pix"],
+) -> Float[np.ndarray, "band stokes pix"]:
+    """Data less the sum of the components, in the unit of the data; NaN in masked pixels.
+
+    Parameters
+    ----------
+    like, params : as for `component_maps`
+    data : observed maps
+    amplitude : from `component_maps`
+    """
+    data = _check_data(like, data)
+    result = np.empty(data.shape)
+    for layout, part, matrix in _passes(like, params, data.shape[-1]):
+        own = list(layout.stokes)
+        rows = np.stack([np.concatenate([amplitude[:, s, part] for s in g]) for g in layout.groups])
+        if len(matrix) == 1:
+            model = np.einsum("ru,kup->krp", np.asarray(matrix[0]), rows, optimize=True)
+        else:
+            model = np.einsum("pru,kup->krp", np.asarray(matrix), rows)
+        result[:, own, part] = data[:, own, part] - layout.maps(model)
+    return result
+
+
+def noise_degradation(
+    like: SpectralLikelihood,
+    params: Mapping[str, Numeric],
+    noise: Noise | Numeric,
+    npix: int,
+    component: str = "cmb",
+) -> Float[np.ndarray, "stokes ..."]:
+    """Noise of a component's map over that of a sky without other components; at least 1.
+
+    Parameters
+    ----------
+    like, params : as for `component_maps`
+    noise : as it was given to `spectral_likelihood`
+    npix : number of pixels of the maps
+    component : name of the component
+
+    Returns
+    -------
+    Ratio of standard deviations; a single pixel if it is the same in all.
+
+    Raises
+    ------
+    KeyError
+        If there is no such component.
+    """
+    names = tuple(like.sky)
+    if component not in names:
+        raise KeyError(f"Unknown component {component!r}; known are {', '.join(names)}.")
+    c, stokes = names.index(component), len(like.bands.stokes)
+    noise, used = _checked(like, noise, (len(like.bands.names), stokes, npix))
+    uniform = noise.separable and like.of_pixel is None
+    result = np.full((stokes, 1 if uniform else npix), np.nan)
+    for layout, part, matrix in _passes(like, params, npix):
+        if uniform and part.start:
+            continue
+        pixels = _pixels(layout, noise._replace(pixel_sigma=None) if uniform else noise, used, part)
+        pixels = pixels._replace(data=pixels.weights)
+        inverse = np.asarray(_inverse(matrix, pixels))
+        own = [c + k * len(names) for k in range(len(layout.groups[0]))]
+        alone = np.asarray(_alone(matrix, pixels, tuple(own)))
+        ratio = np.sqrt(np.stack([inverse[:, u, u] for u in own], axis=1) / alone)
+        where = slice(0, 1) if uniform else part
+        flat = ratio.reshape(len(layout.stokes), -1)
+        result[list(layout.stokes), where] = flat[:, :1] if uniform else flat
+    return result if uniform else np.where(used, result, np.nan)

@@ -1,0 +1,374 @@
+"""The spectral likelihood against dense linear algebra, finite differences and itself."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+import scipy.optimize
+
+from fits.grid import grid_fit
+from fits.likelihood import chi2
+from fits.optimize import best_fit
+from fits.priors import Gaussian, Uniform
+from fits.results import FitError
+from fits.separation import (
+    as_noise,
+    component_maps,
+    fisher,
+    fit_spectra,
+    hessian,
+    noise_degradation,
+    residual_maps,
+    spectral_likelihood,
+)
+from jaxsky import AME, CMB, Bandpass, Dust, Sky, Synchrotron, observe
+from jaxsky.constants import H_OVER_K, T_CMB
+
+NPIX = 48
+CENTERS = [23.0, 35.0, 60.0, 95.0, 145.0, 220.0, 280.0, 353.0]
+BANDS = {f"{c:g}": Bandpass.top_hat(c, 0.25 * c, samples=5) for c in CENTERS}
+TRUTH = {"dust.beta_dust": 1.55, "dust.T_dust": 19.5, "synchrotron.beta_syn": 3.05}
+START = {"dust.beta_dust": 1.5, "dust.T_dust": 21.0, "synchrotron.beta_syn": 3.0}
+
+
+def random_sky(stokes: int = 2, npix: int = NPIX, size: float = 30.0, seed: int = 0) -> Sky:
+    rng = np.random.default_rng(seed)
+    maps = rng.normal(size=(3, stokes, npix)) * size
+    return Sky(
+        {
+            "cmb": CMB(maps[0]),
+            "dust": Dust(maps[1], TRUTH["dust.beta_dust"], TRUTH["dust.T_dust"]),
+            "synchrotron": Synchrotron(maps[2], TRUTH["synchrotron.beta_syn"]),
+        }
+    )
+
+
+def problem(kind: str = "band", stokes: int = 2, sky: Sky | None = None, seed: int = 0):
+    """A sky, data, noise as it is given, and the covariance of all values of each pixel."""
+    sky = sky or random_sky(stokes)
+    rng = np.random.default_rng(seed)
+    npix = sky.shape[1]
+    shape = (len(BANDS), stokes, npix)
+    sigma = np.broadcast_to(rng.uniform(0.5, 1.5, len(BANDS))[:, None, None], shape)
+    given = sigma[:, 0, 0]
+    if kind == "stokes":
+        given = rng.uniform(0.5, 1.5, shape[:2])
+        sigma = np.broadcast_to(given[..., None], shape)
+    if kind == "separable":
+        given = sigma = sigma * rng.uniform(0.5, 1.5, npix)
+    if kind in ("full", "covariance"):
+        given = sigma = rng.uniform(0.5, 1.5, shape)
+    dense = np.zeros((npix, *shape[:2], *shape[:2]))
+    for b in range(len(BANDS)):
+        for s in range(stokes):
+            dense[:, b, s, b, s] = sigma[b, s] ** 2
+    if kind == "covariance":
+        QU = rng.uniform(-0.8, 0.8, (len(BANDS), npix)) * sigma[:, 0] * sigma[:, 1]
+        for b in range(len(BANDS)):
+            dense[:, b, 0, b, 1] = dense[:, b, 1, b, 0] = QU[b]
+        given = np.stack([np.stack([sigma[:, 0] ** 2, QU], 1), np.stack([QU, sigma[:, 1] ** 2], 1)])
+        given = given.transpose(1, 0, 2, 3)
+    dense = dense.reshape(npix, shape[0] * stokes, -1)
+    noise = np.einsum("pij,pj->pi", np.linalg.cholesky(dense), rng.normal(size=dense.shape[:2]))
+    data = np.asarray(observe(sky, list(BANDS.values())))
+    return sky, data + noise.T.reshape(shape), given, dense
+
+
+def law(name, nu, params):
+    """The laws once more, in a form that complex arguments go through."""
+    if name == "cmb":
+        x = H_OVER_K * nu / T_CMB
+        return x**2 * np.exp(x) / np.expm1(x) ** 2
+    if name == "synchrotron":
+        return (nu / 30.0) ** -params["synchrotron.beta_syn"]
+    beta, T = params["dust.beta_dust"], params["dust.T_dust"]
+    planck = [np.exp(H_OVER_K * f / T) - 1 for f in (nu, 353.0)]
+    return (nu / 353.0) ** (beta + 1) * planck[1] / planck[0]
+
+
+def dense_matrix(params, stokes=2):
+    """(band stokes, component stokes), with the rotation of bands."""
+    full = START | params
+    total = np.zeros((len(BANDS), stokes, 3, stokes), complex)
+    for b, (label, band) in enumerate(BANDS.items()):
+        nu = np.asarray(band.nu)
+        center = np.dot(band.quadrature, nu)
+        nu = center + full.get(f"width.{label}", 1.0) * (nu - center)
+        nu = nu + full.get(f"shift.{label}", 0.0) * center
+        steps = np.array([1, 2, 2, 2, 1]) / 8
+        turn = np.eye(stokes, dtype=complex)
+        angle = full.get(f"angle.{label}", 0.0) * np.pi / 90
+        turn[-2:, -2:] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        for c, name in enumerate(("cmb", "dust", "synchrotron")):
+            value = np.sum(steps * law(name, nu, full)) * full.get(f"gain.{label}", 1.0)
+            total[b, :, c] = value * turn
+    return total.reshape(len(BANDS) * stokes, -1)
+
+
+def dense(data, covariance, params):
+    """-2 ln L, amplitudes and their covariance, pixel by pixel."""
+    value, amplitudes, errors = 0.0, [], []
+    M = dense_matrix(params, data.shape[1]).real
+    for p in range(data.shape[-1]):
+        d, W = data[..., p].ravel(), np.linalg.inv(covariance[p])
+        inverse = np.linalg.inv(M.T @ W @ M)
+        amplitudes.append(inverse @ M.T @ W @ d)
+        errors.append(inverse)
+        value += d @ W @ d - (M.T @ W @ d) @ amplitudes[-1]
+    return value, np.array(amplitudes), np.array(errors)
+
+
+def dense_fisher(data, covariance, params):
+    _, amplitudes, _ = dense(data, covariance, params)
+    M = dense_matrix(params, data.shape[1]).real
+    slopes = []
+    for name in sorted(params):
+        step = params | {name: params[name] + 1e-30j}
+        slopes.append(dense_matrix(step, data.shape[1]).imag / 1e-30)
+    total = 0.0
+    for s, N in zip(amplitudes, covariance, strict=True):
+        W = np.linalg.inv(N)
+        Q = W - W @ M @ np.linalg.inv(M.T @ W @ M) @ M.T @ W
+        v = np.array([slope @ s for slope in slopes])
+        total = total + v @ Q @ v.T
+    return total
+
+
+TURNED = START | {"angle.95": 1.5, "gain.145": 1.02, "shift.220": 0.01, "width.220": 1.1}
+
+
+@pytest.mark.parametrize(
+    ("kind", "stokes", "params"),
+    [
+        ("stokes", 3, START),
+        ("separable", 3, TURNED),
+        ("covariance", 2, TURNED),
+    ],
+)
+def test_value_amplitudes_and_fisher_are_the_dense_ones(kind, stokes, params):
+    _, data, given, covariance = problem(kind, stokes)
+    like = spectral_likelihood(random_sky(stokes), BANDS, data, given, params)
+    assert like.pixels[0].data.shape[-1] < NPIX or kind in ("full", "covariance")
+    value, amplitudes, errors = dense(data, covariance, params)
+    assert float(chi2(like, params)) == pytest.approx(value, rel=1e-8)
+    expected = dense_fisher(data, covariance, params)
+    scale = np.sqrt(np.diag(expected))
+    scale = np.outer(scale, scale)
+    np.testing.assert_allclose(fisher(like, params) / scale, expected / scale, atol=1e-8)
+    maps = component_maps(like, params, data, given)
+    found = amplitudes.reshape(NPIX, 3, stokes).transpose(1, 2, 0)
+    np.testing.assert_allclose(maps.amplitude, found, rtol=1e-8, atol=1e-8)
+    variances = np.einsum("pii->ip", errors).reshape(3, stokes, NPIX)
+    spread = np.stack([np.broadcast_to(maps.sigma(c), (stokes, NPIX)) for c in maps.components])
+    np.testing.assert_allclose(spread**2, variances, rtol=1e-8)
+    assert maps.chi2.sum() == pytest.approx(value, rel=1e-8)
+    assert np.all(maps.dof == (len(BANDS) - 3) * stokes)
+    rest = residual_maps(like, params, data, maps.amplitude)
+    M = dense_matrix(params, stokes).real
+    expected = data.reshape(-1, NPIX) - M @ amplitudes.T
+    np.testing.assert_allclose(rest.reshape(-1, NPIX), expected, atol=1e-9)
+    W = np.linalg.inv(covariance)
+    for s in range(stokes):
+        alone = 1 / np.einsum("i,pij,j->p", M[:, s], W, M[:, s])
+        ratio = noise_degradation(like, params, given, NPIX)[s]
+        np.testing.assert_allclose(ratio**2, (variances[0, s] / alone)[: ratio.size], rtol=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["band", "full"])
+def test_the_maximum_is_that_of_the_dense_likelihood(kind):
+    _, data, given, covariance = problem(kind)
+    like = spectral_likelihood(random_sky(), BANDS, data, given, START)
+    fit = fit_spectra(like)
+
+    def objective(theta):
+        return dense(data, covariance, dict(zip(sorted(START), theta, strict=True)))[0]
+
+    # The gradient of the dense value, by extrapolated differences, vanishes at the fit.
+    for i, name in enumerate(fit.free):
+        theta = np.array([fit.best_fit[n] for n in fit.free])
+        step = np.zeros(3)
+        step[i] = 0.02 * fit.sigma[name]
+        slopes = [(objective(theta + h * step) - objective(theta - h * step)) / h for h in (1, 2)]
+        assert abs((4 * slopes[0] - slopes[1]) / 3) < 1e-5
+    assert objective(theta) == pytest.approx(fit.chi2, rel=1e-8)
+    other = scipy.optimize.minimize(objective, list(fit.best_fit.values()), method="Nelder-Mead")
+    assert other.fun >= fit.chi2 * (1 - 1e-10)
+    for name, value in TRUTH.items():
+        assert abs(fit.best_fit[name] - value) < 4 * fit.sigma[name]
+
+
+EVERY_LAW = {
+    "ame": AME(np.ones((2, 1)), m60=4.0, nu_max=25.0),
+    "cmb": CMB(np.ones((2, 1))),
+    "dust": Dust(np.ones((2, 1)), (1.6, 2.4), (12.0, 19.0), (0.4, 1.0)),
+    "synchrotron": Synchrotron(np.ones((2, 1)), 3.0, -0.05),
+}
+LAW_PARAMETERS = {
+    "ame.m60": 4.0,
+    "ame.nu_max": 25.0,
+    "cmb.T_cmb": 2.7,
+    "dust.beta_dust.0": 1.6,
+    "dust.T_dust.1": 19.0,
+    "dust.E_dust.1": 1.0,
+    "dust.nu_pivot": 3000.0,
+    "synchrotron.beta_syn": 3.0,
+    "synchrotron.curvature": -0.05,
+    "synchrotron.nu_piv": 23.0,
+    "shift.145": 0.01,
+    "width.220": 1.05,
+    "gain.95": 1.01,
+}
+BAND_PARAMETERS = {"dust.beta_dust.0": 1.6, "gain.95": 1.1, "angle.60": 0.7, "shift.145": 0.01}
+
+
+@pytest.mark.parametrize(
+    ("kind", "names", "params", "unit"),
+    [
+        ("band", list(EVERY_LAW), LAW_PARAMETERS, "uK_CMB"),
+        ("covariance", ["cmb", "dust"], BAND_PARAMETERS, "uK_CMB"),
+    ],
+)
+def test_derivatives_in_every_parameter_are_finite_differences(kind, names, params, unit):
+    _, data, given, _ = problem(kind)
+    sky = {name: EVERY_LAW[name] for name in names}
+    like = spectral_likelihood(sky, BANDS, data, given, params, unit=unit)
+    value = jax.jit(lambda theta: like.total(theta[like.index]))
+    gradient = jax.jit(jax.grad(value))
+    theta = np.array(like.flat({}))
+    curvature = 2 * hessian(like, {})
+    for i, name in enumerate(like.free):
+        step = np.zeros(theta.size)
+        step[i] = 1e-4 * max(abs(theta[i]), 0.1)
+        values, slopes = ([f(theta + k * step) for k in (-2, -1, 1, 2)] for f in (value, gradient))
+        weights = np.array([1, -8, 8, -1]) / 12
+        found = float(gradient(theta)[i] * step[i])
+        assert found != 0
+        assert found == pytest.approx(weights @ np.array(values), rel=1e-6, abs=1e-6), name
+        second = weights @ np.array(slopes)
+        scale = np.sqrt(np.abs(np.diag(curvature)))
+        np.testing.assert_allclose(
+            curvature[i] * step[i] / scale, second / scale, atol=1e-5 * np.abs(second / scale).max()
+        )
+
+
+slope = jax.jit(jax.grad(lambda theta, like: like.total(theta[like.index])))
+chi2_slope = jax.jit(jax.grad(lambda params, like: chi2(like, params)))
+
+
+@pytest.mark.parametrize(("kind", "params"), [("band", START), ("separable", TURNED)])
+def test_compressed_and_pixel_likelihoods_are_one(kind, params):
+    _, data, given, _ = problem(kind, 3)
+    mask = np.ones(NPIX)
+    mask[:9] = np.inf
+    noise = as_noise(given, data.shape, mask) if kind == "band" else given
+    small, large = (
+        spectral_likelihood(random_sky(3), BANDS, data, noise, params, compress=c)
+        for c in (True, False)
+    )
+    for shift in (0.0, 0.02):
+        moved = {name: value + shift for name, value in params.items()}
+        assert float(chi2(small, moved)) == pytest.approx(float(chi2(large, moved)), rel=1e-11)
+        slopes = [slope(like.flat(moved), like) for like in (small, large)]
+        np.testing.assert_allclose(*slopes, rtol=1e-8)
+    if kind == "band":
+        # What the residuals' own derivative says, through all of the algebra.
+        other = chi2_slope(large.check(moved), large)
+        np.testing.assert_allclose(large.flat(other), slopes[1], rtol=1e-8)
+    assert small.values == large.values
+    assert small.values == (NPIX - 9 * (kind == "band")) * 3 * 5
+
+
+def test_derivatives_in_data_and_weights():
+    _, data, given, _ = problem("covariance")
+    like = spectral_likelihood(random_sky(), BANDS, data, given, START)
+
+    @jax.jit
+    def value(factor):
+        pixels = tuple(jax.tree.map(lambda x: x * factor, p) for p in like.pixels)
+        return dataclasses.replace(like, pixels=pixels).total(like.flat({})[like.index])
+
+    assert float(jax.grad(value)(1.0)) == pytest.approx(3 * float(value(1.0)), rel=1e-10)
+
+
+@pytest.mark.parametrize("kind", ["band", "full"])
+def test_order_of_pixels_bands_and_components_does_not_matter(kind):
+    sky, data, given, _ = problem(kind)
+    fit = fit_spectra(spectral_likelihood(sky, BANDS, data, given, START))
+    rng = np.random.default_rng(4)
+    pixels, order = rng.permutation(NPIX), rng.permutation(len(BANDS))
+    noise = given[order] if kind == "band" else given[order][..., pixels]
+    bands = {list(BANDS)[i]: BANDS[list(BANDS)[i]] for i in order}
+    renamed = {"z": sky["cmb"], "b": sky["synchrotron"], "a": sky["dust"]}
+    start = {"a.beta_dust": 1.5, "a.T_dust": 21.0, "b.beta_syn": 3.0}
+    again = fit_spectra(spectral_likelihood(renamed, bands, data[order][..., pixels], noise, start))
+    for one, other in zip(fit.free, ("a.T_dust", "a.beta_dust", "b.beta_syn"), strict=True):
+        assert again.best_fit[other] == pytest.approx(fit.best_fit[one], rel=1e-8)
+        assert again.sigma[other] == pytest.approx(fit.sigma[one], rel=1e-6)
+
+
+@pytest.mark.parametrize("unit", ["K_RJ", "mK_CMB"])
+def test_units_of_the_maps_do_not_matter(unit):
+    sky, data, given, _ = problem()
+    fit = fit_spectra(spectral_likelihood(sky, BANDS, data, given, START))
+    factors = np.array([float(b.conversion("uK_RJ", unit)) for b in BANDS.values()])
+    data, given = data * factors[:, None, None], given * factors
+    like = spectral_likelihood(sky, BANDS, data, given, START, unit=unit)
+    again = fit_spectra(like)
+    np.testing.assert_allclose(like.flat(again.best_fit), like.flat(fit.best_fit), rtol=1e-8)
+    np.testing.assert_allclose(again.covariance, fit.covariance, rtol=1e-6, atol=1e-12)
+    maps = component_maps(like, again.best_fit, data, given)
+    expected = np.asarray(sky["cmb"].amplitude)
+    assert np.abs(maps.map("cmb") - expected).max() < 6 * maps.sigma("cmb").max()
+
+
+def test_a_band_in_K_CMB_is_calibrated_on_the_CMB():
+    sky, data, given, _ = problem()
+    moved = START | {"shift.220": 0.03, "width.145": 1.2}
+    in_cmb, in_rj = (
+        np.asarray(like.mixing.one(like.check({})))
+        for unit in ("uK_CMB", "uK_RJ")
+        for like in [spectral_likelihood(sky, BANDS, data, given, moved, unit=unit)]
+    )
+    np.testing.assert_allclose(in_cmb[:, 0], 1, rtol=1e-12)
+    np.testing.assert_allclose(in_cmb, in_rj / in_rj[:, :1], rtol=1e-12)
+
+
+def test_other_ways_to_fit_give_the_same():
+    sky, data, given, _ = problem()
+    like = spectral_likelihood(sky, BANDS, data, given, START)
+    priors = {"dust.T_dust": Gaussian(19.6, 0.05)}
+    fit = fit_spectra(like, priors=priors)
+    other = best_fit(like, START, priors=priors)
+    np.testing.assert_allclose(like.flat(other.best_fit), like.flat(fit.best_fit), rtol=1e-7)
+    # The curvature of residuals with the noise of the amplitudes is that of the sum.
+    np.testing.assert_allclose(other.covariance, np.linalg.inv(fit.hessian), rtol=1e-6)
+    one = spectral_likelihood(sky, BANDS, data, given, {"dust.beta_dust": 1.5})
+    grid = grid_fit(one, {"dust.beta_dust": 1.5}, priors={"dust.beta_dust": Uniform(1.0, 2.0)})
+    fit = fit_spectra(one, priors={"dust.beta_dust": Uniform(1.0, 2.0)})
+    assert grid.best_fit["dust.beta_dust"] == pytest.approx(
+        fit.best_fit["dust.beta_dust"], abs=0.1 * fit.sigma["dust.beta_dust"]
+    )
+
+
+def test_uniform_priors_bound_the_fit_and_edges_are_reported():
+    sky, data, given, _ = problem()
+    like = spectral_likelihood(sky, BANDS, data, given, START)
+    T = fit_spectra(like).best_fit["dust.T_dust"]
+    wide = fit_spectra(like, priors={"dust.T_dust": Uniform(10.0, 40.0)})
+    assert wide.best_fit["dust.T_dust"] == pytest.approx(T, rel=1e-8)
+    above_start = {"dust.T_dust": T + 2}
+    above = {"dust.T_dust": Uniform(T + 0.05, 40.0)}
+    with pytest.raises(FitError, match=r"'dust.T_dust' lies at the edge of its uniform prior"):
+        fit_spectra(like, above_start, priors=above)
+    kept = fit_spectra(like, above_start, priors=above, throw=False)
+    assert kept.best_fit["dust.T_dust"] == pytest.approx(T + 0.05, rel=1e-12)
+    cold = {name: sky[name] for name in sky} | {"dust": Dust(sky["dust"].amplitude, 1.5, T + 0.05)}
+    free = {n: START[n] for n in ("dust.beta_dust", "synchrotron.beta_syn")}
+    fixed = fit_spectra(spectral_likelihood(cold, BANDS, data, given, free))
+    assert kept.best_fit["dust.beta_dust"] == pytest.approx(
+        fixed.best_fit["dust.beta_dust"], rel=1e-8
+    )
+    assert kept.sigma["dust.beta_dust"] == pytest.approx(fixed.sigma["dust.beta_dust"], rel=1e-6)
+    with pytest.raises(ValueError, match=r"Start value 21 of 'dust.T_dust' is not inside"):
+        fit_spectra(like, priors={"dust.T_dust": Uniform(30.0, 40.0)})

@@ -116,6 +116,8 @@ def test_products_are_found_by_group_name_and_part():
     assert [p.what for p in find(["wmap_band_iqumap_r9_9yr_K_v5.fits"])] == ["K, 23 GHz"]
     assert {p.name[:7] for p in find(["rimo"])} == {"LFI_RIM", "HFI_RIM"}
     assert len(find(["wmap9", "wmap_band_iqumap_r9_9yr_K_v5.fits"])) == 5
+    assert {p.group[:6] for p in find(["planck"])} == {"planck"}
+    assert len(find(["planck"])) > 20
     assert find() == list(catalogue().values())
     with pytest.raises(ValueError, match=r"no product 'cobe'; give the name .* wmap9, wmap9-masks"):
         find(["cobe"])

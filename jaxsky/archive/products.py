@@ -63,7 +63,7 @@ def catalogue() -> dict[str, Product]:
 
 
 def find(words: Sequence[str] = ()) -> list[Product]:
-    """Products by name, group, or a part of the name; all without any.
+    """Products by name, group, or a part of either; all without any.
 
     Raises
     ------
@@ -76,7 +76,8 @@ def find(words: Sequence[str] = ()) -> list[Product]:
     found: dict[str, Product] = {}
     for word in words:
         exact = [p for p in products if word in (p.name, p.group)]
-        these = exact or [p for p in products if word.lower() in p.name.lower()]
+        part = word.lower()
+        these = exact or [p for p in products if part in p.name.lower() or part in p.group]
         if not these:
             groups = ", ".join(dict.fromkeys(p.group for p in products))
             raise ValueError(

@@ -16,7 +16,7 @@ def paper(
     settings_file: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[ANALYSIS.toml]", help="Settings; without, the embedded sky is shown."
+            metavar="[PAPER.toml]", help="Settings; without, the embedded sky is shown."
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/paper"),

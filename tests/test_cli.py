@@ -330,7 +330,7 @@ def test_mistakes_in_settings_are_one_sentence(
         ("{ rms = 1.0, estimate_above = 30 }", "noise as exactly one of"),
         ("{ rms = -1.0 }", "bands.0.noise.rms: input should be greater than 0, not -1.0"),
         ("{ covariance = ['QQ_COV', 'XX', 'UU_COV'] }", "XX"),
-        ("{ covariance = ['QU_COV', 'QQ_COV', 'UU_COV'] }", "not positive definite"),
+        ("{ covariance = ['QU_COV', 'QQ_COV', 'UU_COV'] }", "are not QQ, QU, UU by their names"),
         ("{ rms = 1e-6, correlated = true }", "correlated goes with estimate_above only"),
     ],
 )

@@ -80,7 +80,7 @@ def _set_up(settings: PaperSettings, bands: Sequence[str], wanted: Sequence[str]
     if analysis.nside != 64:
         found.append(f"nside is {analysis.nside} rather than 64")
     if analysis.fwhm != 60:
-        found.append(f"maps are {_beam(settings)} rather than to 60 arcmin")
+        found.append(f"maps are {_beam(settings)} (the paper: to 60 arcmin)")
     return f"Here, {listed(found)}." if found else ""
 
 
@@ -193,7 +193,7 @@ def _spectra_set_up(settings: PaperSettings, bands: Sequence[str], wanted: Seque
     if set(wanted) - set(bands):
         found.append(f"the bands are {listed(bands)}")
     if settings.analysis.fwhm != 60:
-        found.append(f"maps are {_beam(settings)} rather than to 60 arcmin")
+        found.append(f"maps are {_beam(settings)} (the paper: to 60 arcmin)")
     if lmax != 100:
         found.append(f"they end at l = {lmax} rather than 100")
     if not settings.cmb.include or r != 0.1:

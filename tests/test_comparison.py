@@ -248,6 +248,15 @@ def test_realisations_are_kept(prepared, model, regions, tmp_path):
     np.testing.assert_array_equal(more.chi2[:2], first.chi2)
     fresh = simulate(prepared, model, regions, 20, 3, 0)
     np.testing.assert_allclose(more.spectra, fresh.spectra, rtol=1e-12)
+
+    def stop(done):
+        if done == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(prepared, model, regions, 20, 9, 0, path, "a", stop)
+    simulate(prepared, model, regions, 20, 5, 0, path, "a", counts.append)
+    assert counts == [2, 3, 4, 5]
     with pytest.raises(InputError, match="holds realisations of other data or settings"):
         simulate(prepared, model, regions, 20, 3, 0, path, "b")
     path.write_bytes(path.read_bytes()[:200])
@@ -267,6 +276,10 @@ def test_what_cannot_be_compared_is_refused(settings, prepared, regions):
     how = settings.compare.model_copy(update={"patches": "K"})
     with pytest.raises(SettingsError, match=r"patches_nside: 256 is finer than that of .*, 32"):
         compare(settings.model_copy(update={"compare": how}), prepared, regions)
+    # Of the other bands it does not matter.
+    coarse = prepared._replace(sources=prepared.sources | {"band '44'": 16})
+    with pytest.raises(SettingsError, match=r"256 is finer than that of template .*, 32"):
+        compare(settings.model_copy(update={"compare": how}), coarse, regions)
     how = how.model_copy(update={"patches_nside": 32})
     with pytest.raises(SettingsError, match=r"patches_nside: 32 resolves l = 64, .* take 100"):
         compare(settings.model_copy(update={"compare": how}), prepared, regions)

@@ -92,7 +92,7 @@ def test_without_bands_of_the_paper(data_dir, monkeypatch, tmp_path):
     assert items["Figure 9"].differs.startswith("Not made: No band has a map of leakage")
     shown = numbers(items)
     assert {"slope, V, Q and U", "slope, W, Q and U"} <= set(shown)
-    # Planck finds half as much power in B as in E (intermediate results XXX).
+    # Planck finds half as much power in B as in E (intermediate results 30).
     assert 0.4 < float(shown["median A of BB / EE"].ours) < 0.65
 
 

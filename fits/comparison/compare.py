@@ -77,12 +77,13 @@ def check_comparison(
         )
     if how.patches is None:
         return
-    sources = prepared.sources
-    finest = min(sources, key=sources.__getitem__)
-    if how.patches_nside > sources[finest]:
+    others = tuple(f"band {band!r}" for band in prepared.bands if band != how.patches)
+    sources = {what: n for what, n in prepared.sources.items() if not what.endswith(others)}
+    coarsest = min(sources, key=sources.__getitem__)
+    if how.patches_nside > sources[coarsest]:
         raise SettingsError(
-            f"compare.patches_nside: {how.patches_nside} is finer than that of {finest}, "
-            f"{sources[finest]}."
+            f"compare.patches_nside: {how.patches_nside} is finer than that of {coarsest}, "
+            f"{sources[coarsest]}."
         )
     if 2 * how.patches_nside < EDGES[-1] - 1:
         raise SettingsError(

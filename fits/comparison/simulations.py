@@ -1,5 +1,7 @@
 """Simulated noise and CMB: how far from the model the maps may be by chance."""
 
+import time
+import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +16,9 @@ from jaxsky.harmonics import analysis, lmax_of, power_spectrum
 from jaxsky.io import InputError, whole
 
 __all__ = ["Simulated", "full_sky_spectra", "simulate", "sums_of_squares"]
+
+#: Realisations are written to their file after so many seconds, and when they are stopped.
+SAVED_EVERY = 10.0
 
 
 class Simulated(NamedTuple):
@@ -104,11 +109,17 @@ def simulate(
     done = [] if path is None else _load(path, mark)
     foregrounds = _alms(model, lmax)
     inside = jnp.asarray(np.stack(list(regions.values())))
-    for i in range(len(done), nsims):
-        report(i)
-        key = jax.random.fold_in(jax.random.key(seed), i)
-        done.append([np.asarray(x) for x in _realisation(prepared, foregrounds, inside, key)])
-        if path is not None:
+    held, saved = len(done), time.monotonic()
+    try:
+        for i in range(held, nsims):
+            report(i)
+            key = jax.random.fold_in(jax.random.key(seed), i)
+            done.append([np.asarray(x) for x in _realisation(prepared, foregrounds, inside, key)])
+            if path is not None and time.monotonic() - saved > SAVED_EVERY:
+                _save(path, mark, done)
+                held, saved = len(done), time.monotonic()
+    finally:
+        if path is not None and len(done) > held:
             _save(path, mark, done)
     report(nsims)
     return Simulated(*map(np.stack, zip(*done[:nsims], strict=True)))
@@ -127,7 +138,7 @@ def _load(path: Path, mark: str) -> list[list[np.ndarray]]:
         with np.load(path) as archive:
             found = str(archive["mark"])
             arrays = [archive[name] for name in Simulated._fields]
-    except Exception as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: is damaged ({error}); start again with --overwrite.") from None
     if found != mark:
         raise InputError(

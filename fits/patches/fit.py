@@ -22,7 +22,8 @@ from jaxsky.harmonics import analysis, power_spectrum
 
 __all__ = ["PatchFits", "fit_patches", "fit_powers"]
 
-#: Mean and standard deviation of the Gaussian prior of alpha: dust has -2.4 (Planck XXX, 2016).
+#: Mean and standard deviation of the Gaussian prior of alpha. Dust has -2.4 (Planck intermediate
+#: results 30, 2016).
 SLOPE = (-2.4, 3.0)
 #: An amplitude of fewer standard deviations than this is not called detected.
 DETECTION = 2.0

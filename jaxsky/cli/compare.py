@@ -6,9 +6,8 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from jaxsky.cli.console import check_out, claim, console, write_example
+from jaxsky.cli.console import check_out, claim, console, progress_bar, write_example
 
 __all__ = ["compare"]
 
@@ -69,14 +68,7 @@ def compare(
         {"nsims": nsims},
     )
     check_out(out, RESULTS, resume, overwrite)
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-    ) as progress:
+    with progress_bar() as progress:
         task = progress.add_task("reading and preparing maps", total=None)
 
         import matplotlib as mpl

@@ -1,13 +1,32 @@
-"""What commands share: the console, the example of the settings, the folder of results."""
+"""What commands share: console and progress, the example of the settings, results' folder."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+)
 
-__all__ = ["check_out", "claim", "console", "write_example"]
+__all__ = ["check_out", "claim", "console", "progress_bar", "write_example"]
 
 console = Console(stderr=True)
+
+
+def progress_bar() -> Progress:
+    """What is being done, how much of it, and how long it will take; gone when it is done."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+    )
 
 
 def write_example(path: Path, example: Path) -> None:

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from jaxsky.cli.console import console, write_example
+from jaxsky.cli.console import console, progress_bar, write_example
 
 __all__ = ["paper"]
 
@@ -42,14 +41,7 @@ def paper(
         write_example(settings_file or Path("paper.toml"), paper_settings.EXAMPLE)
         return
     settings = paper_settings.load_paper(settings_file or paper_settings.EMBEDDED)
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=console,
-        transient=True,
-    ) as progress:
+    with progress_bar() as progress:
         task = progress.add_task("starting", total=None)
         import matplotlib as mpl
 

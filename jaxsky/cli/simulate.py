@@ -7,15 +7,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeRemainingColumn,
-)
 
-from jaxsky.cli.console import console, write_example
+from jaxsky.cli.console import console, progress_bar, write_example
 
 __all__ = ["simulate"]
 
@@ -73,14 +66,7 @@ def simulate(
             update={"experiment": settings.experiment.model_copy(update=main)}
         )
     started = time.perf_counter()
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-    ) as progress:
+    with progress_bar() as progress:
         task = progress.add_task("reading templates", total=None)
 
         def report(message: str) -> None:

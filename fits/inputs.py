@@ -42,7 +42,16 @@ from jaxsky.noise import (
     uniform_covariance,
 )
 
-__all__ = ["Band", "Inputs", "Leakage", "embedded_inputs", "inputs_of", "leak", "read_inputs"]
+__all__ = [
+    "Band",
+    "Inputs",
+    "Leakage",
+    "embedded_inputs",
+    "inputs_of",
+    "leak",
+    "read_band",
+    "read_inputs",
+]
 
 
 class Leakage(NamedTuple):
@@ -159,13 +168,20 @@ def read_inputs(settings: Settings) -> Inputs:
     """
     folder = Path(settings.data_dir)
     sky = set_parameters_of(read_templates(folder, settings.templates), settings.fixed)
-    bands = {spec.name: _read_band(folder, spec) for spec in settings.bands}
+    bands = {spec.name: read_band(folder, spec) for spec in settings.bands}
     nside = max(healpy.npix2nside(band.maps.shape[-1]) for band in bands.values())
     spectra = camb_spectra(4 * nside, settings.cmb.r) if settings.cmb.include else None
     return Inputs(sky, bands, spectra, None, settings.title)
 
 
-def _read_band(folder: Path, spec: BandSettings) -> Band:
+def read_band(folder: Path, spec: BandSettings) -> Band:
+    """Map, bandpass and noise of a band from the files that its settings name.
+
+    Raises
+    ------
+    jaxsky.io.InputError, SettingsError
+        For files that cannot be read as what they should be.
+    """
     found = read(folder, spec)
     check_stokes(f"bands.{spec.name}", found.names, "QU")
     bandpass = read_bandpass_spec(folder, spec.bandpass)

@@ -12,7 +12,7 @@ from fits.covariance import Fluctuations
 from fits.inputs import Inputs
 from fits.likelihood import Likelihood, likelihood
 from fits.preparation import Preparation, prepare_component
-from jaxsky import Bandpass, Sky
+from jaxsky import Bandpass, Sky, observe
 from jaxsky.harmonics import gaussian_beam, pixel_window
 from jaxsky.types import Numeric
 
@@ -25,11 +25,11 @@ MISSING = 0.01
 class Prepared(NamedTuple):
     """Templates and maps at the common resolution.
 
-    `leakage` is what was subtracted from the data, by band, and `sources` the nside of each
-    template and map as they were given.
+    `sky` is None where there are no templates. `leakage` is what was subtracted from the data, by
+    band, and `sources` the nside of each template and map as they were given.
     """
 
-    sky: Sky
+    sky: Sky | None
     bands: dict[str, Bandpass]
     data: Float[Array, "band stokes pix"]
     sigma: Float[Array, "band stokes pix"]
@@ -37,6 +37,11 @@ class Prepared(NamedTuple):
     fluctuations: Fluctuations
     leakage: dict[str, Float[Array, "stokes pix"]]
     sources: dict[str, int]
+
+    def model(self) -> Float[Array, "band stokes pix"]:
+        """What the templates show in the bands [uK_RJ]."""
+        assert self.sky is not None  # there are templates
+        return observe(self.sky, list(self.bands.values()))
 
     def likelihood(
         self,
@@ -63,6 +68,7 @@ class Prepared(NamedTuple):
         if kind not in ("exact", "diagonal"):
             raise ValueError(f"Argument `kind` must be 'exact' or 'diagonal', not {kind!r}.")
         used = self.used if region is None else self.used & region
+        assert self.sky is not None  # there are templates
         return likelihood(
             self.sky,
             self.bands,
@@ -118,16 +124,14 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
                 own_used = holes[nsides[name]]
             kept = spread(jnp.asarray(own_used[None], float))[0]
             used &= np.asarray(kept) > 1 - MISSING
-    sky = Sky(
-        {
-            name: prepare_component(
-                template.component,
-                operators[f"template {name!r}"],
-                holes.get(nsides[f"template {name!r}"]),
-            )
-            for name, template in inputs.templates.items()
-        }
-    )
+    sky = {
+        name: prepare_component(
+            template.component,
+            operators[f"template {name!r}"],
+            holes.get(nsides[f"template {name!r}"]),
+        )
+        for name, template in inputs.templates.items()
+    }
     preparations = tuple(operators[f"band {name!r}"] for name in inputs.bands)
     whole = [holes.get(op.nside_in, np.ones(1, bool)) for op in preparations]
     leakage = {
@@ -167,7 +171,7 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
     sigma = fluctuations.sigma()
     known = np.asarray(jnp.isfinite(sigma).all(axis=(0, 1)))
     return Prepared(
-        sky,
+        Sky(sky) if sky else None,
         bandpasses,
         data,
         jnp.where(known, sigma, jnp.inf),

@@ -20,7 +20,7 @@ from fits.comparison.spectra import compare_spectra, cosmic_error, hotelling
 from fits.inputs import inputs_of
 from fits.regions import region_masks
 from fits.resolution import prepare
-from jaxsky import cli, observe
+from jaxsky import cli
 from jaxsky.io import InputError
 from jaxsky.settings import SettingsError
 
@@ -58,7 +58,7 @@ def prepared(settings):
 
 @pytest.fixture(scope="module")
 def model(prepared):
-    return observe(prepared.sky, list(prepared.bands.values()))
+    return prepared.model()
 
 
 @pytest.fixture(scope="module")

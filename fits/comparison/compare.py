@@ -15,7 +15,6 @@ from fits.pseudo_cl import bin_edges
 from fits.record import fingerprint
 from fits.resolution import Prepared
 from fits.settings import Settings
-from jaxsky import observe
 from jaxsky.settings import SettingsError
 
 __all__ = ["Comparison", "check_comparison", "compare"]
@@ -118,7 +117,7 @@ def compare(
     check_comparison(settings, prepared, regions)
     how = settings.compare
     used = {name: inside & prepared.used for name, inside in regions.items()}
-    model = observe(prepared.sky, list(prepared.bands.values()))
+    model = prepared.model()
     simulated = simulate(
         prepared,
         model,

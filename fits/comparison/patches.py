@@ -13,7 +13,6 @@ from fits.inputs import Band, Inputs
 from fits.patches import PatchFits, PreparedPatches, fit_patches, prepare_patches
 from fits.resolution import Prepared, prepare
 from fits.settings import Settings
-from jaxsky import observe
 from jaxsky.harmonics import average_pixels, gaussian_beam, pixel_window
 from jaxsky.streams import stream
 
@@ -137,7 +136,7 @@ def compare_patches(settings: Settings, inputs: Inputs) -> PatchComparison:
     noise = _noise(band, prepared, patches)
     # Realisations of their own: those of the embedded observation come from another key.
     key = stream(jax.random.key(settings.analysis.seed), "patches")
-    model = observe(prepared.sky, list(prepared.bands.values()))[0]
+    model = prepared.model()[0]
     fluctuations = prepared.fluctuations
     model = model + fluctuations.noise_realisation(key)[0] + fluctuations.cmb_realisation(key)[0]
     return PatchComparison(

@@ -1,7 +1,5 @@
 """Simulated noise and CMB: how far from the model the maps may be by chance."""
 
-import time
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -11,14 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from fits.realisations import realisations
 from fits.resolution import Prepared
 from jaxsky.harmonics import analysis, lmax_of, power_spectrum
-from jaxsky.io import InputError, whole
 
 __all__ = ["Simulated", "full_sky_spectra", "simulate", "sums_of_squares"]
-
-#: Realisations are written to their file after so many seconds, and when they are stopped.
-SAVED_EVERY = 10.0
 
 
 class Simulated(NamedTuple):
@@ -106,43 +101,10 @@ def simulate(
     jaxsky.io.InputError
         If the file is damaged, or holds realisations of other data or settings.
     """
-    done = [] if path is None else _load(path, mark)
     foregrounds = _alms(model, lmax)
     inside = jnp.asarray(np.stack(list(regions.values())))
-    held, saved = len(done), time.monotonic()
-    try:
-        for i in range(held, nsims):
-            report(i)
-            key = jax.random.fold_in(jax.random.key(seed), i)
-            done.append([np.asarray(x) for x in _realisation(prepared, foregrounds, inside, key)])
-            if path is not None and time.monotonic() - saved > SAVED_EVERY:
-                _save(path, mark, done)
-                held, saved = len(done), time.monotonic()
-    finally:
-        if path is not None and len(done) > held:
-            _save(path, mark, done)
-    report(nsims)
-    return Simulated(*map(np.stack, zip(*done[:nsims], strict=True)))
 
+    def make(key):
+        return _realisation(prepared, foregrounds, inside, key)
 
-def _save(path: Path, mark: str, done: list[list[np.ndarray]]) -> None:
-    stacked = dict(zip(Simulated._fields, map(np.stack, zip(*done, strict=True)), strict=True))
-    with whole(path) as beside, beside.open("wb") as file:
-        np.savez(file, mark=mark, **stacked)  # type: ignore[arg-type]
-
-
-def _load(path: Path, mark: str) -> list[list[np.ndarray]]:
-    if not path.exists():
-        return []
-    try:
-        with np.load(path) as archive:
-            found = str(archive["mark"])
-            arrays = [archive[name] for name in Simulated._fields]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: is damaged ({error}); start again with --overwrite.") from None
-    if found != mark:
-        raise InputError(
-            f"{path}: holds realisations of other data or settings; choose another --out, or "
-            "start again with --overwrite."
-        )
-    return [list(row) for row in zip(*arrays, strict=True)]
+    return Simulated(*realisations(make, Simulated._fields, nsims, seed, path, mark, report))

@@ -1,0 +1,82 @@
+"""Realisations of a Monte Carlo that are kept in a file, so that a stopped run goes on."""
+
+import time
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from jaxsky.io import InputError, whole
+
+__all__ = ["realisations"]
+
+#: They are written to their file after so many seconds, and when they are stopped.
+SAVED_EVERY = 10.0
+
+
+def realisations(
+    make: Callable[[Array], Sequence[Array | np.ndarray]],
+    names: Sequence[str],
+    count: int,
+    seed: int,
+    path: Path | None = None,
+    mark: str = "",
+    report: Callable[[int], None] = lambda done: None,
+) -> list[np.ndarray]:
+    """Results of a function of a random key, stacked over realisations.
+
+    Parameters
+    ----------
+    make : the function; a realisation depends on the seed and its own number only
+    names : of its results
+    count, seed : number of realisations, and what their keys are made of
+    path : file that keeps what is done; what it holds already is not made again
+    mark : of all that the results depend on; a file with another one is refused
+    report : called with the number of realisations done
+
+    Raises
+    ------
+    jaxsky.io.InputError
+        If the file is damaged, or holds realisations of other data or settings.
+    """
+    done = [] if path is None else _load(path, mark, names)
+    held, saved = len(done), time.monotonic()
+    try:
+        for i in range(held, count):
+            report(i)
+            key = jax.random.fold_in(jax.random.key(seed), i)
+            done.append([np.asarray(x) for x in make(key)])
+            if path is not None and time.monotonic() - saved > SAVED_EVERY:
+                _save(path, mark, names, done)
+                held, saved = len(done), time.monotonic()
+    finally:
+        if path is not None and len(done) > held:
+            _save(path, mark, names, done)
+    report(count)
+    return list(map(np.stack, zip(*done[:count], strict=True)))
+
+
+def _save(path: Path, mark: str, names: Sequence[str], done: list[list[np.ndarray]]) -> None:
+    stacked = dict(zip(names, map(np.stack, zip(*done, strict=True)), strict=True))
+    with whole(path) as beside, beside.open("wb") as file:
+        np.savez(file, mark=mark, **stacked)  # type: ignore[arg-type]
+
+
+def _load(path: Path, mark: str, names: Sequence[str]) -> list[list[np.ndarray]]:
+    if not path.exists():
+        return []
+    try:
+        with np.load(path) as archive:
+            found = str(archive["mark"])
+            arrays = [archive[name] for name in names]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: is damaged ({error}); start again with --overwrite.") from None
+    if found != mark:
+        raise InputError(
+            f"{path}: holds realisations of other data or settings; choose another --out, or "
+            "start again with --overwrite."
+        )
+    return [list(row) for row in zip(*arrays, strict=True)]

@@ -1,6 +1,13 @@
 """Component separation with parametric laws: spectra first, then maps of the components."""
 
 from fits.separation.fit import fisher, fit_spectra, hessian
+from fits.separation.harmonic import (
+    HarmonicMaps,
+    harmonic_coefficients,
+    harmonic_component_maps,
+    harmonic_likelihood,
+    white_spectrum,
+)
 from fits.separation.likelihood import SpectralLikelihood, spectral_likelihood
 from fits.separation.maps import (
     ComponentMaps,
@@ -14,6 +21,7 @@ from fits.separation.results import SpectralFit
 
 __all__ = [
     "ComponentMaps",
+    "HarmonicMaps",
     "Noise",
     "SpectralFit",
     "SpectralLikelihood",
@@ -22,10 +30,14 @@ __all__ = [
     "component_maps",
     "fisher",
     "fit_spectra",
+    "harmonic_coefficients",
+    "harmonic_component_maps",
+    "harmonic_likelihood",
     "hessian",
     "latitude_bands",
     "noise_degradation",
     "residual_maps",
     "spectral_likelihood",
     "superpixels",
+    "white_spectrum",
 ]

@@ -12,7 +12,7 @@ from fits.results import FitResult
 from fits.spectral_index import Fit, all_free
 from jaxsky.plots import STYLE, save
 
-__all__ = ["label", "plot_grids", "plot_marginals", "plot_posterior"]
+__all__ = ["label", "plot_chains", "plot_grids", "plot_marginals", "plot_posterior"]
 
 chains.print_load_details = False  # getdist otherwise prints about burn-in
 
@@ -34,13 +34,25 @@ SYMBOLS = {
     "m60": r"m_{60}",
     "nu_max": r"\nu_{\rm max}\ [{\rm GHz}]",
 }
+#: Those of bands, with their unit.
+BAND_SYMBOLS = {
+    "calibration": ("g", ""),
+    "gain": ("g", ""),
+    "shift": (r"\Delta\nu/\nu", ""),
+    "width": ("w", ""),
+    "angle": (r"\psi", r"\ [^\circ]"),
+}
 
 
 def label(name: str) -> str:
     """TeX for a parameter's name, without dollar signs."""
+    name, _, region = name.partition("[")
     parts = name.split(".")
-    if parts[0] == "calibration":
-        return rf"g_{{\rm {parts[1]}}}"
+    if region:
+        return rf"{label(name)}\ [{region}"
+    if parts[0] in BAND_SYMBOLS:
+        symbol, unit = BAND_SYMBOLS[parts[0]]
+        return rf"{symbol}_{{\rm {parts[1]}}}{unit}"
     if parts[0] == "offset":
         return rf"o_{{\rm {parts[1]}}}^{parts[2]}\ [\mu{{\rm K}}_{{\rm RJ}}]"
     shift = r"\Delta " if parts[-1] == "offset" else ""
@@ -217,8 +229,17 @@ def plot_posterior(
         return False
     most = max(with_chain, key=lambda f: len(f.stokes)).stokes
     shown = [f for f in with_chain if f.stokes == most]
-    samples = [_samples(f.results["mcmc"], f"{f.region}, {' + '.join(most)}") for f in shown]
-    free = shown[0].results["mcmc"].free
+    results = {f"{f.region}, {' + '.join(most)}": f.results["mcmc"] for f in shown}
+    plot_chains(path, results, truth, title)
+    return True
+
+
+def plot_chains(
+    path: Path, results: Mapping[str, FitResult], truth: Mapping[str, float] | None, title: str
+) -> None:
+    """The posterior of chains of the same parameters by what they are of, a colour for each."""
+    samples = [_samples(result, name) for name, result in results.items()]
+    free = next(iter(results.values())).free
     plotter = plots.get_subplot_plotter(width_inch=max(4.0, 1.6 * len(free)))
     plotter.settings.axes_fontsize = 9
     plotter.settings.axes_labelsize = 11
@@ -234,10 +255,9 @@ def plot_posterior(
         marker_args={"color": TRUTH["color"], "lw": TRUTH["linewidth"], "ls": "-"},
     )
     for i, name in enumerate(free):
-        for fit, color in zip(shown, REGION_COLORS, strict=False):
-            interval = fit.results["mcmc"].interval_68[name]
+        for result, color in zip(results.values(), REGION_COLORS, strict=False):
+            interval = result.interval_68[name]
             plotter.subplots[i, i].axvspan(*interval, color=color, alpha=0.15, linewidth=0)
     plotter.fig.suptitle(f"{title}; 68 % shaded", fontsize=8, y=1.03)
     with mpl.rc_context(STYLE | {"savefig.dpi": 200}):
         save(plotter.fig, path)
-    return True

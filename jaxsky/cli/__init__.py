@@ -1,4 +1,4 @@
-"""The command line: `jaxsky simulate`, `fit`, `compare`, `forecast`, `paper`, `data`."""
+"""The command line: `jaxsky simulate`, `fit`, `compare`, `separate`, `forecast` and others."""
 
 import contextlib
 import ctypes
@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 
 import jaxsky
-from jaxsky.cli import compare, data, fit, forecast, paper, simulate
+from jaxsky.cli import compare, data, fit, forecast, paper, separate, simulate
 from jaxsky.cli.console import console
 
 __all__ = ["app", "main"]
@@ -26,6 +26,7 @@ app = typer.Typer(
 app.command()(simulate.simulate)
 app.command()(fit.fit)
 app.command()(compare.compare)
+app.command()(separate.separate)
 app.command()(forecast.forecast)
 app.command()(paper.paper)
 app.add_typer(data.data, name="data")

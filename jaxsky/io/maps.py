@@ -273,9 +273,10 @@ def _check_written(
         raise ValueError(
             f"Argument `mask` must have shape {maps.shape[-1:]}, but has shape {mask.shape}."
         )
-    if bad := int(np.sum(~np.isfinite(maps))):
+    used = maps if mask is None else maps[:, mask]
+    if bad := int(np.sum(~np.isfinite(used))):
         raise ValueError(
-            f"Argument `maps` has {bad} of {maps.size} values that are not finite; "
+            f"Argument `maps` has {bad} of {used.size} values that are not finite; "
             "leave pixels out with `mask`."
         )
 

@@ -1,0 +1,1 @@
+"""The command `jaxsky separate`: from settings to components, spectra and r."""

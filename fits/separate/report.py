@@ -1,0 +1,235 @@
+"""What a separation leaves behind: a table, result.json, maps, pictures and a log, each whole."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from fits.plots import plot_chains
+from fits.record import probability, with_error, write_json, write_log
+from fits.separate import plots
+from fits.separate.separate import Separation
+from fits.separate.settings import SeparateSettings
+from fits.separation.maps import ComponentMaps
+from jaxsky.io import write_maps
+
+__all__ = ["RESULTS", "result_json", "tables", "warnings", "write_report"]
+
+#: What a separation leaves in its folder.
+RESULTS = (
+    "result.json",
+    "log.json",
+    "components.fits",
+    "residuals.fits",
+    "parameters.fits",
+    "components.png",
+    "residuals.png",
+    "parameters.png",
+    "spectra.png",
+    "r.png",
+    "posterior.png",
+    "simulations.npz",
+    "chain.h5",
+)
+#: Probabilities below this are worth a word.
+UNLIKELY = 1e-3
+#: As is E in B above this fraction of a power's standard deviation.
+LEAKED = 0.5
+#: Parameters that a table lists and a triangle shows, at most.
+LISTED, DRAWN = 12, 8
+
+
+def _pixel_probability(found: Separation) -> dict[str, float] | None:
+    """How many pixels have a chi^2 that is too large."""
+    if not isinstance(found.found, ComponentMaps):
+        return None
+    values = found.found.probability[np.isfinite(found.found.probability)]
+    return {f"below_{p:g}": float(np.mean(values < p)) for p in (0.05, 0.01, 0.001)}
+
+
+def result_json(found: Separation, settings: SeparateSettings) -> dict[str, Any]:
+    """All numbers; band powers are D_l of BB in uK_CMB^2."""
+    fit, ratio, spectra = found.fit, found.tensors, found.spectra
+    bands = list(found.setup.domain.bands)
+    results: dict[str, Any] = {
+        "description": found.setup.description,
+        "domain": settings.separation.domain,
+        "components": found.components,
+        "bands": bands,
+        "parameters": {
+            name: {
+                "best_fit": fit.best_fit[name],
+                "sigma": found.sigma[name],
+                "sigma_of_likelihood": fit.sigma[name],
+                "truth": (found.setup.truth or {}).get(name),
+            }
+            for name in fit.free
+        },
+        "labels": fit.labels,
+        "covariance": found.covariance,
+        "chi2": fit.chi2,
+        "dof": fit.dof,
+        "converged": fit.converged,
+        "message": fit.message,
+        "solver": fit.details,
+        "pixels_with_small_probability": _pixel_probability(found),
+        "cmb_noise_degradation": _mean(found.degradation),
+        "residual_rms": dict(zip(bands, np.nanstd(found.residuals, axis=(1, 2)), strict=True)),
+        "r": {
+            "best_fit": ratio.r,
+            "sigma": ratio.sigma,
+            "upper_95": ratio.upper_95,
+            "truth": found.setup.r,
+            "shift_by_foregrounds_left": None if found.left is None else ratio.shift(found.left),
+            "shift_by_errors_of_laws": ratio.shift(found.simulated.residual.mean(axis=0)),
+            "chi2": ratio.chi2,
+            "dof": ratio.dof,
+            "pte": ratio.probability,
+        },
+        "BB": {
+            "first": spectra.edges[:-1],
+            "last": [edge - 1 for edge in spectra.edges[1:]],
+            "cleaned": ratio.powers,
+            "covariance": ratio.covariance,
+            "noise": found.simulated.noise.mean(axis=0),
+            "residual_from_errors_of_laws": found.simulated.residual.mean(axis=0),
+            "foregrounds_left": found.left,
+            "lensing": ratio.model.lensing,
+            "tensors_r_1": ratio.model.tensors,
+        },
+        "simulations": len(found.simulated.theta),
+    }
+    if found.chain is not None:
+        chain = found.chain
+        results["posterior"] = {
+            "sampler": chain.method,
+            "interval_68": {name: list(pair) for name, pair in chain.interval_68.items()},
+            "converged": chain.converged,
+            "message": chain.message,
+        }
+    return results
+
+
+def _mean(degradation: np.ndarray) -> float:
+    return float(np.nanmean(degradation))
+
+
+def tables(found: Separation) -> list[Table]:
+    """Parameters and r for the terminal."""
+    fit, truth = found.fit, found.setup.truth or {}
+    table = Table(caption=f"standard deviations; chi2/dof {fit.chi2 / fit.dof:.4f}")
+    table.add_column("parameter")
+    for column in ("best fit", *(["truth"] if truth else [])):
+        table.add_column(column, justify="right")
+    for name in fit.free:
+        value, sigma = np.asarray(fit.best_fit[name]), np.asarray(found.sigma[name])
+        known = [f"{truth[name]:g}"] if name in truth else [""] * bool(truth)
+        if not value.ndim:
+            table.add_row(name, with_error(float(value), float(sigma)), *known)
+            continue
+        typical = with_error(float(np.nanmedian(value)), float(np.nanmedian(sigma)))
+        table.add_row(f"{name}, median of {int(np.isfinite(value).sum())} regions", typical, *known)
+    ratio = found.tensors
+    table.add_section()
+    shown = [] if not truth else [f"{found.setup.r:g}"]
+    table.add_row("r", with_error(ratio.r, ratio.sigma), *shown)
+    table.add_row("r, 95 % below", f"{ratio.upper_95:.2g}", *([""] * bool(truth)))
+    if found.left is not None:
+        shift = f"{ratio.shift(found.left):+.1e}"
+        table.add_row("r, shift by foregrounds left", shift, "")
+    table.add_row(
+        "noise of CMB, times that without foregrounds",
+        f"{_mean(found.degradation):.2f}",
+        *([""] * bool(truth)),
+    )
+    return [table]
+
+
+def warnings(found: Separation, settings: SeparateSettings) -> list[str]:
+    """What a user should know before using the numbers, a sentence each."""
+    sentences = []
+    fit, ratio, simulated = found.fit, found.tensors, found.simulated
+    if fit.dof > 0 and abs(fit.chi2 / fit.dof - 1) > 0.1:
+        sentences.append(
+            f"chi2 / dof is {fit.chi2 / fit.dof:.3g}: the laws do not describe the maps, or the "
+            "noise is not what it is said to be."
+        )
+    if ratio.probability < UNLIKELY:
+        sentences.append(
+            f"BB of the cleaned CMB is not that of tensors, lensing, noise and errors of laws "
+            f"(probability {probability(ratio.probability)}); foregrounds may be left in it."
+        )
+    share = simulated.leaked.mean(axis=0) / simulated.total.std(axis=0, ddof=1)
+    if (share > LEAKED).any():
+        sentences.append(
+            f"E that leaks into B at the edge of the mask is up to {share.max():.1f} standard "
+            "deviations of BB in a bin. It is part of the model, but a larger "
+            "tensors.apodization makes it and the errors smaller."
+        )
+    if found.chain is not None and not found.chain.converged:
+        sentences.append(f"posterior: {found.chain.message}")
+    if settings.tensors.A_lens != 1:
+        A_lens = settings.tensors.A_lens
+        sentences.append(f"The lensing B modes are taken as known, A_lens = {A_lens:g}.")
+    return sentences
+
+
+def _write_maps(out: Path, found: Separation, settings: SeparateSettings) -> list[Path]:
+    """Maps of components, residuals, and parameters that have regions."""
+    domain, mask = found.setup.domain, np.isfinite(found.maps).all(axis=(0, 1))
+    names, units, columns = [], [], []
+    for name, maps in zip(found.components, found.maps, strict=True):
+        unit = "uK_CMB" if name == settings.cmb else "uK_RJ"
+        for stokes, values in zip("QU", maps[-2:], strict=True):
+            names.append(f"{name.upper()}_{stokes}")
+            units.append(unit)
+            columns.append(values)
+        if isinstance(found.found, ComponentMaps):
+            for stokes, values in zip("QU", found.found.sigma(name)[-2:], strict=True):
+                names.append(f"{name.upper()}_SIGMA_{stokes}")
+                units.append(unit)
+                columns.append(np.broadcast_to(values, mask.shape))
+    if isinstance(found.found, ComponentMaps):
+        names += ["CHI2", "PROBABILITY"]
+        units += ["", ""]
+        columns += [found.found.chi2, found.found.probability]
+    written = [out / "components.fits", out / "residuals.fits"]
+    header = {"FWHM": (settings.separation.fwhm, "[arcmin]")}
+    options: dict[str, Any] = {"mask": mask, "overwrite": True, "single": True}
+    write_maps(
+        written[0], np.stack(columns), names=names, unit=units, extra_header=header, **options
+    )
+    labels = [f"{band}_{stokes}" for band in domain.bands for stokes in "QU"]
+    rest = found.residuals[:, -2:].reshape(len(labels), -1)
+    write_maps(written[1], rest, names=labels, unit=settings.separation.unit, **options)
+    varying = [name for name in found.fit.free if np.ndim(found.fit.best_fit[name])]
+    if varying:
+        written.append(out / "parameters.fits")
+        both = (found.fit.best_fit, found.sigma)
+        rows = [found.of_pixel(name, values) for name in varying for values in both]
+        titles = [t for n in varying for t in (n.upper(), f"{n.upper()}_SIGMA")]
+        write_maps(written[-1], np.stack(rows), names=titles, unit="", **options)
+    return written
+
+
+def write_report(
+    out: Path, found: Separation, settings: SeparateSettings, seconds: float
+) -> list[Path]:
+    """Write result.json, maps, pictures and log.json to a folder; returns what was written."""
+    title, unit = settings.title, settings.separation.unit
+    write_json(out / "result.json", result_json(found, settings))
+    written = [out / "result.json", *_write_maps(out, found, settings)]
+    plots.plot_components(out / "components.png", found, title)
+    plots.plot_residuals(out / "residuals.png", found, unit, title)
+    plots.plot_spectra(out / "spectra.png", found, title)
+    plots.plot_ratio(out / "r.png", found, title)
+    written += [out / f"{name}.png" for name in ("components", "residuals", "spectra", "r")]
+    if plots.plot_parameters(out / "parameters.png", found, title):
+        written.append(out / "parameters.png")
+    if found.chain is not None:
+        shown = found.chain
+        plot_chains(out / "posterior.png", {shown.method: shown}, found.setup.truth, title)
+        written.append(out / "posterior.png")
+    write_log(out / "log.json", settings, seconds)
+    return [*written, out / "log.json"]

@@ -1,0 +1,219 @@
+"""A component separation, from its settings to the tensor-to-scalar ratio."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra
+from fits.record import fingerprint
+from fits.results import FitResult
+from fits.separate.domains import PixelDomain
+from fits.separate.settings import SeparateSettings, Tensors
+from fits.separate.setup import Setup
+from fits.separate.simulations import Simulated, simulate
+from fits.separation.fit import fit_spectra
+from fits.separation.likelihood import SpectralLikelihood
+from fits.separation.response import Response
+from fits.separation.results import SpectralFit
+from fits.separation.tensor_ratio import TensorFit, fit_tensors, power_model
+from jaxsky.checks import check_double
+from jaxsky.cmb import camb_spectra, tensor_spectra
+from jaxsky.harmonics import gaussian_beam
+from jaxsky.settings import SettingsError
+
+__all__ = ["Separation", "separate"]
+
+#: Spectra are corrected for the beam down to this window.
+LEAST_WINDOW = 0.05
+
+
+class Separation(NamedTuple):
+    """What a separation finds; spectra are of the cleaned CMB [uK_CMB^2].
+
+    Parameters
+    ----------
+    setup : what was separated
+    like : the likelihood of the spectral parameters
+    fit : the most probable ones, with the errors that the likelihood gives
+    sigma : their standard deviations, by name: in pixels those of the simulations, since the
+        likelihood takes smoothed noise as independent between pixels
+    covariance : likewise, in the order of `fit.labels`; None for too many parameters
+    found : the components with all that is known of them
+    maps : the components (component, stokes, pix) at one beam
+    degradation : noise of the CMB over that of a sky without foregrounds
+    residuals : data less components, maps (band, stokes, pix)
+    simulated : noise through the same separation
+    spectra : how band powers were taken
+    tensors : the tensor-to-scalar ratio
+    left : band powers of the foregrounds that are left in the CMB; None where they are not known
+    chain : samples of the posterior, None if none were asked for
+    """
+
+    setup: Setup
+    like: SpectralLikelihood
+    fit: SpectralFit
+    sigma: dict[str, Any]
+    covariance: Float[np.ndarray, "par par"] | None
+    found: Any
+    maps: Float[np.ndarray, "component stokes pix"]
+    degradation: Float[np.ndarray, "stokes _"]
+    residuals: Float[np.ndarray, "band stokes pix"]
+    simulated: Simulated
+    spectra: MaskedSpectra
+    tensors: TensorFit
+    left: Float[np.ndarray, " bin"] | None
+    chain: FitResult | None
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Their names, in order."""
+        return tuple(self.like.sky)
+
+    def of_pixel(self, name: str, values: Mapping[str, Any]) -> Float[np.ndarray, " pix"]:
+        """The map of a parameter with regions, from its values; NaN where masked."""
+        domain = self.setup.domain
+        assert isinstance(domain, PixelDomain)  # the one with regions
+        return np.where(domain.used, np.asarray(values[name])[domain.labels[name]], np.nan)
+
+
+def separate(
+    settings: SeparateSettings,
+    setup: Setup,
+    out: Path | None = None,
+    report: Callable[[str], None] = lambda message: None,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Separation:
+    """Fit the laws, separate the components, and measure r.
+
+    Parameters
+    ----------
+    settings : how
+    setup : what is separated, from `fits.separate.setup.build`
+    out : folder that keeps simulations and chains; what it holds is not made again
+    report : told what is being done
+    progress : told the number of simulations done
+
+    Raises
+    ------
+    RuntimeError
+        Without double precision.
+    fits.results.FitError
+        If the data do not determine the parameters.
+    KeyError, ValueError
+        For parameters that do not exist and settings that cannot work.
+    """
+    check_double("A separation")
+    main, domain, priors = settings.separation, setup.domain, settings.priors()
+    cmb = settings.cmb
+    assert cmb is not None  # as the settings see to
+    report("spectral parameters")
+    like = domain.likelihood(setup.data)
+    fit = fit_spectra(like, priors=priors)
+    response = Response(like, fit.best_fit, priors)
+    report("components")
+    best = like.named(jnp.asarray(response.theta))
+    found = domain.components(like, best, setup.data)
+    maps = domain.maps(found)
+    row = tuple(like.sky).index(cmb)
+
+    report("spectra")
+    window, spectra = _spectra(settings.tensors, setup.mask, main.nside, main.fwhm)
+    lensed, tensors = (f(spectra.lmax) for f in (camb_spectra, tensor_spectra))
+    simulated = simulate(
+        setup,
+        like,
+        best,
+        response,
+        found,
+        cmb,
+        spectra,
+        window,
+        lensed,
+        main.nsims,
+        main.seed,
+        None if out is None else out / "simulations.npz",
+        _mark(settings, setup),
+        progress,
+    )
+    report("tensor-to-scalar ratio")
+    # What the spectra know of E in B is part of the model.
+    EE = lensed[1, : spectra.lmax + 1]
+    leaked = simulated.leaked.mean(axis=0) - spectra.windows[1, :, 0] @ EE
+    model = power_model(
+        spectra,
+        window,
+        lensed,
+        tensors,
+        simulated.both.mean(axis=0) + leaked,
+        simulated.spectrum.mean(axis=0),
+        A_lens=settings.tensors.A_lens,
+        simulated=simulated.total,
+    )
+    ratio = fit_tensors(model, band_powers(spectra, maps[row])[1])
+    left = None
+    if setup.foregrounds is not None:
+        alone = domain.maps(domain.components(like, best, setup.foregrounds, covariance=False))
+        left = band_powers(spectra, alone[row])[1]
+    sigma, covariance = _errors(settings, like, fit, simulated)
+    return Separation(
+        setup,
+        like,
+        fit,
+        sigma,
+        covariance,
+        found,
+        maps,
+        domain.degradation(like, best, cmb),
+        domain.residuals(like, best, setup.data, found),
+        simulated,
+        spectra,
+        ratio,
+        left,
+        None,
+    )
+
+
+def _spectra(
+    how: Tensors, mask: np.ndarray, nside: int, fwhm: float
+) -> tuple[Float[np.ndarray, " ell"], MaskedSpectra]:
+    """The beam of the maps, and how their spectra are taken."""
+    highest = 2 * nside
+    window = np.asarray(gaussian_beam(fwhm, highest))
+    reach = int(np.flatnonzero(window > LEAST_WINDOW).max())
+    # Bins next to the last multipole are needed for what the mask mixes into those below.
+    lmax = min(reach, highest - how.width) if how.lmax is None else how.lmax
+    if lmax > min(reach, highest - 1):
+        raise SettingsError(
+            f"tensors.lmax: {lmax} is beyond what nside {nside} and a beam of {fwhm:g} arcmin "
+            f"resolve, {min(reach, highest - 1)}."
+        )
+    if how.lmin + how.width > lmax:
+        raise SettingsError(
+            f"tensors: no bin of {how.width} multipoles fits between lmin, {how.lmin}, and {lmax}."
+        )
+    pure = how.purify and not np.all(mask == 1)
+    edges = bin_edges(how.lmin, lmax, how.width)
+    return window, masked_spectra(mask, edges, window=window, pure=pure)
+
+
+def _mark(settings: SeparateSettings, setup: Setup) -> str:
+    """What the simulations depend on."""
+    left_out = {"separation": {"nsims", "sampler", "nsteps"}}
+    said = settings.model_dump_json(exclude=left_out)
+    return f"{fingerprint((setup.data, setup.mask))} {said}"
+
+
+def _errors(settings, like, fit, simulated):
+    """Standard deviations by name, and the covariance."""
+    if settings.separation.domain == "harmonic":
+        return fit.sigma, fit.covariance
+    sigma = simulated.theta.std(axis=0, ddof=1)
+    determined = np.isfinite(like.flat(fit.best_fit)) & (sigma > 0)
+    named = like.named(np.where(determined, sigma, np.nan))
+    sizes = {n: float(v) if v.ndim == 0 else np.asarray(v) for n, v in named.items()}
+    covariance = None if fit.covariance is None else np.cov(simulated.theta.T)
+    return sizes, None if covariance is None else np.atleast_2d(covariance)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-__all__ = ["coefficients", "evaluate", "nodes"]
+__all__ = ["coefficients", "evaluate", "nodes", "polynomials"]
 
 
 def nodes(n: int) -> Float[np.ndarray, " n"]:
@@ -20,6 +20,14 @@ def coefficients(values: Float[Array, "..."]) -> Float[Array, "..."]:
         moved = jnp.tensordot(jnp.asarray(inverse, values.dtype), values, axes=(1, axis))
         values = jnp.moveaxis(moved, 0, axis)
     return values
+
+
+def polynomials(n: int, point: Float[Array, "..."]) -> Float[Array, "n ..."]:
+    """The first n Chebyshev polynomials at points in [-1, 1]."""
+    rows = [jnp.ones_like(point), point]
+    for _ in range(n - 2):
+        rows.append(2 * point * rows[-1] - rows[-2])
+    return jnp.stack(rows[:n])
 
 
 def evaluate(coefs: Float[Array, "..."], *points: Float[Array, " pix"]) -> Float[Array, " pix"]:

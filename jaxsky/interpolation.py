@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxsky import chebyshev
 from jaxsky.bandpass import Bandpass, Samples, average, stack_bands
@@ -26,6 +26,7 @@ __all__ = [
     "Nodes",
     "Terms",
     "band_sed",
+    "band_seds",
     "choose_nodes",
     "choose_terms",
     "term",
@@ -51,6 +52,8 @@ MAX_NODES = 33
 #: Nodes tried when the range of a map is not known because it is being traced by JAX: 1e-10 for
 #: indices within +-0.7 and temperatures within 15-30 K, over any band from 20 to 900 GHz.
 TRACED_NODES = 16
+#: Pixels interpolated at once in many bands.
+AT_ONCE = 4096
 #: With more maps than this in one component, a tensor of nodes would cost more than the sum.
 MAX_DIMENSIONS = 2
 
@@ -262,12 +265,57 @@ def band_sed(
     points = _points(component)
     if nodes.tolerance is None:
         return chebyshev.evaluate(coefs, *points)
-    # What the last two orders along each axis add bounds what the orders left out would.
-    size = jnp.abs(coefs)
-    tail = sum(jnp.moveaxis(size, axis, 0)[-2:].sum() for axis in range(size.ndim))
-    limit = max(nodes.tolerance, 8 * float(jnp.finfo(values.dtype).eps))
     return jax.lax.cond(
-        tail <= limit * jnp.abs(values).min(),
+        _resolved(coefs, values, nodes.tolerance),
         lambda: chebyshev.evaluate(coefs, *points),
         lambda: average(component.sed, band),
     )
+
+
+def _resolved(
+    coefs: Float[Array, "..."], values: Float[Array, "..."], tolerance: float
+) -> Bool[Array, ""]:
+    """Whether a series is long enough; `values` are those at its nodes."""
+    # What the last two orders along each axis add bounds what the orders left out would.
+    size = jnp.abs(coefs)
+    tail = sum(jnp.moveaxis(size, axis, 0)[-2:].sum() for axis in range(size.ndim))
+    limit = max(tolerance, 8 * float(jnp.finfo(values.dtype).eps))
+    return tail <= limit * jnp.abs(values).min()
+
+
+def band_seds(
+    component: Component, samples: Samples, nodes: Nodes
+) -> Float[Array, " band"] | Float[Array, "pix band"]:
+    """`band_sed` in many bands, as products of matrices: one small program for all of them.
+
+    Parameters
+    ----------
+    component : what is observed
+    samples : the bands, from `jaxsky.bandpass.stack_bands`
+    nodes : from `choose_nodes`; None sums directly over the bands in every pixel
+    """
+    maps, _ = _split(component)
+    if not maps:
+        return jax.vmap(lambda band: average(component.sed, band))(samples)
+
+    def direct():
+        return jax.lax.map(lambda band: average(component.sed, band), samples).T
+
+    if nodes is None:
+        return direct()
+    coefs, values = jax.vmap(lambda band: _series(component, band, nodes.counts))(samples)
+
+    @jax.checkpoint
+    def pixel(points):
+        product = coefs
+        for n, point in zip(nodes.counts[::-1], points[::-1], strict=True):
+            product = product @ chebyshev.polynomials(n, point)
+        return product
+
+    def interpolated():
+        return jax.lax.map(pixel, _points(component), batch_size=AT_ONCE)
+
+    if nodes.tolerance is None:
+        return interpolated()
+    enough = jax.vmap(partial(_resolved, tolerance=nodes.tolerance))(coefs, values).all()
+    return jax.lax.cond(enough, interpolated, direct)

@@ -7,10 +7,12 @@ import pytest
 
 import systems
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe
+from jaxsky.bandpass import average, stack_bands
 from jaxsky.chebyshev import coefficients, evaluate, nodes
 from jaxsky.interpolation import (
     TRACED_NODES,
     band_sed,
+    band_seds,
     choose_nodes,
     choose_terms,
     term,
@@ -203,3 +205,32 @@ def test_derivatives_of_weights_are_those_of_the_law():
     exact = jax.jacfwd(lambda nu: law(component, (Bandpass.delta(nu),))[0])(200.0)
     # 200 GHz is none of the bands, between which the law goes smoothly.
     np.testing.assert_allclose(jax.jacfwd(by_terms)(200.0), exact, rtol=1e-5)
+
+
+@pytest.mark.parametrize("case", ["beta_dust and T_dust", "beta_syn", "both of two bodies", "wide"])
+def test_all_bands_at_once_are_each_alone(case):
+    """Outside of jit, and inside, where a range that is too wide is summed directly."""
+    wide = Dust(MAPS, systems.spread(1.5, 3.0), systems.spread(40.0, 35.0))
+    component = SKIES.get(case, wide)
+    direct = jnp.stack([average(component.sed, band) for band in BANDS], axis=1)
+    samples, bands = stack_bands(BANDS), tuple(BANDS)
+
+    @jax.jit
+    def traced(component):
+        return band_seds(component, samples, choose_nodes(component, bands, 1e-11))
+
+    eager = band_seds(component, samples, choose_nodes(component, bands, 1e-11))
+    for found in (eager, traced(component)):
+        np.testing.assert_allclose(found, direct, rtol=1e-10)
+
+    def total(function):
+        return jax.grad(lambda c: jnp.sum(function(c) ** 2))(component)
+
+    slopes = [total(f) for f in (traced, lambda c: jnp.stack([average(c.sed, b) for b in BANDS]))]
+    for one, other in zip(*map(jax.tree.leaves, slopes), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-9 * float(jnp.abs(other).max()))
+
+
+def test_a_law_without_maps_is_a_number_in_each_band():
+    law = band_seds(Dust(MAPS), stack_bands(BANDS), None)
+    np.testing.assert_allclose(law, [average(Dust(MAPS).sed, band) for band in BANDS], rtol=1e-14)

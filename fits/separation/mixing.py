@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from fits.likelihood import Bands
 from jaxsky import Sky, parameter_names, set_parameters
 from jaxsky.bandpass import Samples, average
-from jaxsky.interpolation import band_sed, choose_nodes
+from jaxsky.interpolation import band_seds, choose_nodes
 from jaxsky.sed import cmb_derivative
 from jaxsky.types import Numeric
 from jaxsky.units import parse_unit
@@ -120,10 +120,10 @@ class Mixing(eqx.Module):
         columns = []
         for component in wide.components.values():
             nodes = choose_nodes(component, self.bands.bandpasses, TOLERANCE)
-            laws = [band_sed(component, band, nodes) for band in self.bands.bandpasses]
-            columns.append(jnp.stack([jnp.broadcast_to(law, (cells,)) for law in laws]))
+            laws = band_seds(component, self.samples, nodes)
+            columns.append(jnp.broadcast_to(laws, (cells, len(self.bands.names))))
         stacked = jnp.stack(columns, axis=-1)
-        matrix = jax.vmap(lambda m: self._calibrated(m, self.samples), in_axes=1)(stacked)
+        matrix = jax.vmap(lambda m: self._calibrated(m, self.samples))(stacked)
         gain = self.bands.values("gain", params)
         return matrix * jnp.broadcast_to(gain.T, (cells, len(gain)))[..., None]
 

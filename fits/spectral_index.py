@@ -8,18 +8,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import h5py
 import numpy as np
 import scipy.stats
 from jaxtyping import Bool
 
 from fits.grid import grid_fit, grid_is_possible
-from fits.likelihood import Likelihood, chi2
+from fits.likelihood import chi2
 from fits.optimize import best_fit
 from fits.record import fingerprint
 from fits.resolution import Prepared
 from fits.results import FitResult
-from fits.sample import ChainFile, sample
+from fits.sample import kept_chain, sample
 from fits.settings import Settings
 from jaxsky.settings import SettingsError
 
@@ -51,27 +50,6 @@ class Fit(NamedTuple):
 def all_free(fits: Sequence[Fit]) -> tuple[str, ...]:
     """Names of the parameters that are free in any of the fits."""
     return tuple(sorted({name for f in fits for r in f.results.values() for name in r.free}))
-
-
-def _chain(path: Path, name: str, like: Likelihood, settings: Settings, free: int) -> ChainFile:
-    """The chain's place in its file; a chain of other data or settings is refused."""
-    if path.exists() and not h5py.is_hdf5(path):
-        raise SettingsError(f"{path}: is damaged; start again with --overwrite.")
-    backend = ChainFile(path, name)
-    size = (settings.mcmc.nwalkers, free)
-    mark = f"{fingerprint(like)} {settings.free} {settings.analysis.seed} {size}"
-    if not backend.initialized:
-        backend.reset(*size)
-        with backend.open("a") as file:
-            file[name].attrs["fingerprint"] = mark
-        return backend
-    with backend.open() as file:
-        if file[name].attrs.get("fingerprint") != mark:
-            raise SettingsError(
-                f"{path}: holds a chain of other data or settings; choose another --out, or "
-                "start again with --overwrite."
-            )
-    return backend
 
 
 def fit_pixels(
@@ -111,7 +89,9 @@ def fit_pixels(
         else:
             chain = None
             if chains is not None:
-                chain = _chain(chains, f"{region}_{stokes}", like, settings, len(start))
+                mark = f"{fingerprint(like)} {settings.free} {settings.analysis.seed}"
+                size = (settings.mcmc.nwalkers, len(start))
+                chain = kept_chain(chains, f"{region}_{stokes}", size, mark)
             results[method] = sample(
                 like,
                 start,

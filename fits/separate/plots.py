@@ -1,6 +1,7 @@
 """Pictures of a separation: components, residuals, parameters, spectra, r."""
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -28,7 +29,7 @@ def _unit(found: Separation, name: str) -> str:
 
 
 def _title(found: Separation, name: str) -> str:
-    component = found.like.sky[name]
+    component: Any = found.like.sky[name]
     if isinstance(component, CMB):
         return name.upper() if name == "cmb" else name
     return f"{name}, {float(component.nu_ref):g} GHz"

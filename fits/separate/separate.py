@@ -11,14 +11,16 @@ from jaxtyping import Float
 from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra
 from fits.record import fingerprint
 from fits.results import FitResult
+from fits.sample import kept_chain
 from fits.separate.domains import PixelDomain
 from fits.separate.settings import SeparateSettings, Tensors
 from fits.separate.setup import Setup
 from fits.separate.simulations import Simulated, simulate
 from fits.separation.fit import fit_spectra
 from fits.separation.likelihood import SpectralLikelihood
-from fits.separation.response import Response
+from fits.separation.response import Response, widened
 from fits.separation.results import SpectralFit
+from fits.separation.sample import sample_spectra
 from fits.separation.tensor_ratio import TensorFit, fit_tensors, power_model
 from jaxsky.checks import check_double
 from jaxsky.cmb import camb_spectra, tensor_spectra
@@ -27,6 +29,10 @@ from jaxsky.settings import SettingsError
 
 __all__ = ["Separation", "separate"]
 
+#: Walkers of emcee, if they are enough.
+WALKERS = 32
+#: The posterior of more parameters is not sampled.
+SAMPLED = 500
 #: Spectra are corrected for the beam down to this window.
 LEAST_WINDOW = 0.05
 
@@ -159,6 +165,10 @@ def separate(
         alone = domain.maps(domain.components(like, best, setup.foregrounds, covariance=False))
         left = band_powers(spectra, alone[row])[1]
     sigma, covariance = _errors(settings, like, fit, simulated)
+    chain = None
+    if main.sampler != "none" and np.isfinite(response.theta).sum() <= SAMPLED:
+        report("posterior")
+        chain = _chain(settings, setup, like, fit, simulated, out)
     return Separation(
         setup,
         like,
@@ -173,7 +183,7 @@ def separate(
         spectra,
         ratio,
         left,
-        None,
+        chain,
     )
 
 
@@ -217,3 +227,30 @@ def _errors(settings, like, fit, simulated):
     sizes = {n: float(v) if v.ndim == 0 else np.asarray(v) for n, v in named.items()}
     covariance = None if fit.covariance is None else np.cov(simulated.theta.T)
     return sizes, None if covariance is None else np.atleast_2d(covariance)
+
+
+def _chain(settings, setup, like, fit, simulated, out):
+    """Samples of the posterior; in pixels with the errors of the simulations."""
+    main = settings.separation
+    size = int(np.isfinite(np.asarray(like.flat(fit.best_fit))).sum())
+    nwalkers = max(WALKERS, 2 * size + 2)
+    backend = None
+    if main.sampler == "emcee" and out is not None:
+        backend = kept_chain(out / "chain.h5", "mcmc", (nwalkers, size), _mark(settings, setup))
+    samples = sample_spectra(
+        like,
+        fit.best_fit,
+        priors=settings.priors(),
+        sampler=main.sampler,
+        nsteps=main.nsteps,
+        nwalkers=nwalkers if main.sampler == "emcee" else None,
+        seed=main.seed,
+        backend=backend,
+        progress=False,
+        throw=False,
+    )
+    if main.domain == "harmonic" or not samples.details:
+        return samples
+    at = [fit.labels.index(name) for name in samples.free]
+    center = np.asarray(like.flat(fit.best_fit))[at]
+    return widened(samples, center, fit.hessian[np.ix_(at, at)], simulated.theta[:, at])

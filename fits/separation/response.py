@@ -7,12 +7,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits.priors import Gaussian, Prior
+from fits.results import FitResult
 from fits.separation.algebra import Factor
 from fits.separation.likelihood import SpectralLikelihood
 from fits.separation.problem import Problem, value_and_gradient
 from jaxsky.types import Numeric
 
-__all__ = ["Response"]
+__all__ = ["Response", "widened"]
 
 
 class Response:
@@ -61,3 +62,40 @@ class Response:
         theta = self.theta.copy()
         theta[self._keep] -= self._factor.solve(gradient[self._keep])
         return np.clip(theta, self._problem.low, self._problem.high)
+
+
+def widened(
+    samples: FitResult,
+    center: Float[np.ndarray, " par"],
+    hessian: Float[np.ndarray, "par par"],
+    errors: Float[np.ndarray, "sim par"],
+) -> FitResult:
+    """Samples of a posterior whose likelihood has wrong errors, stretched to the right ones.
+
+    About the best fit by S L^-1, with L L^T = H^-1 and S S^T the covariance of the estimates: the
+    open-faced sandwich of Shaby (2014, J. Comput. Graph. Stat. 23, 853). With too few simulations
+    for the covariance, each parameter by the ratio of its standard deviations.
+
+    Parameters
+    ----------
+    samples : of chains
+    center : the best fit, in their order
+    hessian : curvature of -log posterior there
+    errors : of estimates from simulations
+    """
+    inverse = np.linalg.inv(hessian)
+    if len(errors) > 4 * len(center):
+        wanted = np.atleast_2d(np.cov(errors.T))
+        turn = np.linalg.cholesky(wanted) @ np.linalg.inv(np.linalg.cholesky(inverse))
+    else:
+        turn = np.diag(errors.std(axis=0, ddof=1) / np.sqrt(np.diagonal(inverse)))
+    details = dict(samples.details)
+    details["chain"] = center + (details["chain"] - center) @ turn.T
+    flat = details["chain"][details["discard"] :].reshape(-1, len(center))
+    low, high = np.percentile(flat, [15.865525, 84.134475], axis=0)
+    ends = zip(low.tolist(), high.tolist(), strict=True)
+    return samples._replace(
+        interval_68=dict(zip(samples.free, ends, strict=True)),
+        covariance=np.atleast_2d(np.cov(flat.T)),
+        details=details,
+    )

@@ -1,0 +1,303 @@
+"""Separation from settings: pulls of laws and r, a wrong law, both domains, bad settings."""
+
+import functools
+
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fits.pseudo_cl import band_powers
+from fits.separate.report import tables, warnings
+from fits.separate.separate import separate
+from fits.separate.settings import EMBEDDED, EXAMPLE, SeparateSettings, load_separate
+from fits.separate.setup import build
+from fits.separation import fit_spectra
+from fits.separation.response import Response, widened
+from fits.separation.tensor_ratio import fit_tensors
+from jaxsky.cmb import camb_spectra, realisation
+from jaxsky.harmonics import expand, gaussian_beam, synthesis
+from jaxsky.io import InputError
+from jaxsky.settings import SettingsError
+
+NSIDE, FWHM = 16, 360.0
+CHANNELS = ["40", "68", "100", "140", "195", "280", "402"]
+LAWS = {
+    "cmb": {"law": "cmb"},
+    "dust": {"law": "dust", "nu_ref": 353.0},
+    "synchrotron": {"law": "synchrotron", "nu_ref": 30.0},
+}
+FREE = {
+    "dust.beta_dust": {"start": 1.6, "uniform": [0.5, 2.5]},
+    "dust.T_dust": {"start": 19.0, "gaussian": [21.0, 2.0]},
+    "synchrotron.beta_syn": {"start": 3.0},
+}
+OF = [{"file": "beta.fits"}]
+
+
+def settings(**changes):
+    tables = {
+        "title": "small",
+        "separation": {"nside": NSIDE, "fwhm": FWHM, "latitude": 20.0, "nsims": 20, "seed": 2},
+        "embedded": {"channels": CHANNELS, "nside": NSIDE},
+        "components": LAWS,
+        "free": FREE,
+        "tensors": {"width": 4, "apodization": 20.0},
+    }
+    for name, value in changes.items():
+        both = isinstance(value, dict) and name in ("separation", "embedded", "tensors")
+        tables[name] = tables[name] | value if both else value
+    tables = {name: value for name, value in tables.items() if value is not None}
+    return SeparateSettings.model_validate(tables)
+
+
+@functools.cache
+def separated(domain: str = "pixel", nsims: int = 20, sampler: str = "none"):
+    how = settings(separation={"domain": domain, "nsims": nsims, "sampler": sampler})
+    setup = build(how)
+    return how, setup, separate(how, setup)
+
+
+def test_pulls_of_laws_and_r():
+    """In pixels outside a mask, where smoothed noise is correlated and E leaks into B."""
+    how, setup, found = separated("pixel", 250)
+    domain, lmax, count = setup.domain, 2 * NSIDE, 200
+    spectra = camb_spectra(lmax)
+    window = expand(gaussian_beam(FWHM, lmax))
+
+    @jax.jit
+    def cmb(key):
+        return synthesis(realisation(key, jnp.asarray(spectra)) * window, NSIDE)
+
+    model = found.tensors.model
+    # The error at the truth: those at estimates grow with them where few modes decide.
+    sigma = 1 / np.sqrt(model.tensors @ np.linalg.solve(model.covariance(0.0), model.tensors))
+    pulls, ratios = [], []
+    for key in jax.random.split(jax.random.key(78), count):
+        noise = domain.noise_realisation(jax.random.fold_in(key, 1))
+        data = np.where(domain.used, setup.foregrounds + np.asarray(cmb(key)) + noise, 0.0)
+        like = domain.likelihood(data)
+        # A prior's mean is measured, too.
+        prior = how.priors()
+        mean = 21.0 + 2.0 * float(jax.random.normal(jax.random.fold_in(key, 2)))
+        prior["dust.T_dust"] = type(prior["dust.T_dust"])(mean, 2.0)
+        fit = fit_spectra(like, found.fit.best_fit, priors=prior)
+        pulls.append([(fit.best_fit[n] - setup.truth[n]) / found.sigma[n] for n in fit.free])
+        maps = domain.components(like, fit.best_fit, data, covariance=False).amplitude
+        powers = band_powers(found.spectra, maps[found.components.index("cmb")])[1]
+        ratios.append(fit_tensors(model, powers).r / sigma)
+    every = np.column_stack([pulls, ratios])
+    # 0.15 and 0.1, and the statistical errors of 200 skies and 250 simulations, 0.09 and 0.07.
+    assert np.all(np.abs(every.mean(axis=0)) < 0.15 + 0.09)
+    assert np.all(np.abs(every.std(axis=0) - 1) < 0.1 + 0.07)
+    # The likelihood alone takes pixels as independent, which smoothed noise is not.
+    assert min(found.sigma[n] / found.fit.sigma[n] for n in found.fit.free) > 1.5
+
+
+@pytest.mark.parametrize("domain", ["pixel", "harmonic"])
+def test_both_domains_find_the_sky(domain):
+    _, setup, found = separated(domain)
+    for name, value in setup.truth.items():
+        assert abs(found.fit.best_fit[name] - value) < 4 * found.sigma[name]
+    assert abs(found.tensors.r - setup.r) < 4 * found.tensors.sigma
+    assert found.tensors.probability > 1e-3
+    assert abs(found.tensors.shift(found.left)) < 0.5 * found.tensors.sigma
+    assert np.nanmin(found.degradation) > 1
+    # What is left of the data is noise, less what the amplitudes have taken up.
+    noise = setup.domain.noise_realisation(jax.random.key(0))
+    if domain == "pixel":
+        share = np.nanstd(found.residuals, axis=(1, 2)) / noise.std(axis=(1, 2))
+        assert np.all((share > 0.2) & (share < 1.05))
+    amplitude = np.array(found.found.amplitude)
+    shown = setup.domain.emission(found.like, found.fit.best_fit, amplitude)
+    rest = setup.data - shown
+    np.testing.assert_array_less(rest.std(axis=(1, 2)), 1.2 * noise.std(axis=(1, 2)))
+    assert len(tables(found)) == 1
+
+
+def test_errors_of_multipoles_are_those_of_simulations():
+    """There the likelihood is exact; 60 simulations measure to 9 %."""
+    _, _, found = separated("harmonic", 60)
+    for i, name in enumerate(found.fit.free):
+        assert found.simulated.theta[:, i].std() == pytest.approx(found.fit.sigma[name], rel=0.3)
+
+
+def test_a_law_that_is_wrong_shows_in_r():
+    """Synchrotron with a curvature that the fit does not know."""
+    how = settings(
+        embedded={"truth": {"synchrotron.curvature": -0.5}},
+        separation={"sampler": "none", "latitude": 10.0},
+    )
+    found = separate(how, build(how))
+    _, _, right = separated()
+    assert abs(found.tensors.shift(found.left)) > 10 * abs(right.tensors.shift(right.left))
+    assert found.left.sum() > 10 * right.left.sum()
+    said = " ".join(warnings(found, how))
+    assert "the laws do not describe the maps" in said
+
+
+def test_regions_have_values_of_their_own():
+    regions = {"dust.beta_dust": {"latitudes": [40.0]}, "synchrotron.beta_syn": {"clusters": 3}}
+    free = {name: value | {"regions": regions.get(name)} for name, value in FREE.items()}
+    how = settings(free=free, separation={"latitude": 15.0})
+    setup = build(how)
+    found = separate(how, setup)
+    assert np.shape(found.fit.best_fit["dust.beta_dust"]) == (2,)
+    assert np.shape(found.sigma["synchrotron.beta_syn"]) == (3,)
+    assert found.chain.free == found.fit.labels
+    for name, value in setup.truth.items():
+        off = np.abs(np.asarray(found.fit.best_fit[name]) - value)
+        assert np.all(off < 4.5 * np.asarray(found.sigma[name]))
+    shown = found.of_pixel("dust.beta_dust", found.fit.best_fit)
+    latitude = np.abs(healpy.pix2ang(NSIDE, np.arange(shown.size), lonlat=True)[1])
+    assert np.isnan(shown[latitude < 15]).all()
+    assert set(shown[latitude > 45]) == {found.fit.best_fit["dust.beta_dust"][1]}
+
+
+def test_the_response_is_that_of_a_new_fit():
+    """To first order in the noise; Gaussian priors draw their mean anew."""
+    how, setup, found = separated()
+    domain, priors = setup.domain, how.priors()
+    response = Response(found.like, found.fit.best_fit, {})
+    amplitude = np.array(found.found.amplitude)
+    data = domain.emission(found.like, found.fit.best_fit, amplitude)
+    noise = 0.1 * domain.noise_realisation(jax.random.key(8))
+    like = domain.likelihood(data + noise)
+    moved = response.moved(like, jax.random.key(0))
+    again = fit_spectra(like, found.fit.best_fit)
+    change = like.flat(again.best_fit) - response.theta
+    np.testing.assert_allclose(moved - response.theta, change, rtol=0.05, atol=1e-6)
+    silent = domain.likelihood(data)
+    with_priors = Response(found.like, found.fit.best_fit, priors)
+    steps = [with_priors.moved(silent, k) for k in jax.random.split(jax.random.key(1), 300)]
+    scatter = np.cov((np.array(steps) - with_priors.theta).T)
+    # H^-1 P H^-1, with P the inverse variance of the prior's mean.
+    at = found.fit.labels.index("dust.T_dust")
+    inverse = np.linalg.inv(found.fit.hessian)
+    expected = inverse[at, at] / 2.0
+    assert np.sqrt(scatter[at, at]) == pytest.approx(expected, rel=0.15)
+
+
+def test_widened_samples_have_the_errors_of_simulations():
+    _, _, found = separated("pixel", 20, "nuts")
+    chain = found.chain
+    assert chain.converged
+    at = [found.fit.labels.index(name) for name in chain.free]
+    sigma = np.sqrt(np.diagonal(chain.covariance))
+    expected = found.simulated.theta[:, at].std(axis=0, ddof=1)
+    np.testing.assert_allclose(sigma, expected, rtol=0.1)
+    for name, s in zip(chain.free, sigma, strict=True):
+        low, high = chain.interval_68[name]
+        assert high - low == pytest.approx(2 * s, rel=0.1)
+    # With too few simulations for a covariance, each by itself.
+    few = widened(chain, np.zeros(3), np.eye(3), found.simulated.theta[:8])
+    assert few.covariance.shape == (3, 3)
+
+
+def test_simulations_are_kept_and_gone_on_with(tmp_path):
+    how, setup, _ = separated()
+    counts = []
+    again = separate(how, setup, tmp_path, progress=counts.append)
+    assert counts == list(range(21))
+    counts.clear()
+    more = how.model_copy(update={"separation": how.separation.model_copy(update={"nsims": 22})})
+    found = separate(more, setup, tmp_path, progress=counts.append)
+    assert counts == [20, 21, 22]
+    np.testing.assert_array_equal(found.simulated.total[:20], again.simulated.total)
+    other = settings(tensors={"A_lens": 0.5}, separation={"sampler": "none"})
+    with pytest.raises(InputError, match="holds realisations of other data or settings"):
+        separate(other, setup, tmp_path)
+
+
+def test_the_settings_that_come_along_are_valid():
+    assert load_separate(EMBEDDED).embedded.instrument == "litebird"
+    assert [band.name for band in load_separate(EXAMPLE).bands] == ["30", "70", "143", "353"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"embedded": None}, "give either bands or the table embedded"),
+        ({"components": {"dust": LAWS["dust"], "s": LAWS["synchrotron"]}}, "must have the law"),
+        (
+            {"components": LAWS | {"cmb": {"law": "cmb", "nu_ref": 100.0}}},
+            "the law 'cmb' has no nu_ref",
+        ),
+        ({"free": {}}, "at least 1 item"),
+        (
+            {"free": {"dust.beta_dust": {"start": 3.0, "uniform": [1.0, 2.0]}}},
+            "start 3 is not inside the uniform prior",
+        ),
+        (
+            {"free": {"dust.beta_dust": {"start": 1.5, "regions": {"nside": 4, "clusters": 3}}}},
+            "exactly one of nside, latitudes, clusters, file, not nside, clusters",
+        ),
+        (
+            {"free": {"dust.beta_dust": {"start": 1.5, "regions": {}}}},
+            "exactly one of .*, not none",
+        ),
+        (
+            {
+                "free": {
+                    "dust.beta_dust": {"start": 1.5, "regions": {"nside": 2, "of": [{"file": "a"}]}}
+                }
+            },
+            "of goes with clusters only",
+        ),
+        (
+            {
+                "separation": {"domain": "harmonic"},
+                "free": {"dust.beta_dust": {"start": 1.5, "regions": {"nside": 2}}},
+            },
+            "free.dust.beta_dust: regions are those of pixels",
+        ),
+        ({"separation": {"nsims": 3}}, "greater than or equal to 20"),
+    ],
+)
+def test_settings_that_contradict_themselves_are_refused(changes, words):
+    with pytest.raises(ValueError, match=words):
+        settings(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"separation": {"fwhm": 30.0}}, ValueError, "target beam of 30 arcmin is finer than"),
+        ({"separation": {"nside": 32}}, ValueError, "common nside 32 is larger than that of"),
+        ({"embedded": {"channels": ["40", "41"]}}, KeyError, "has no channel '41'"),
+        ({"embedded": {"truth": {"dust.beta": 1.0}}}, KeyError, "Unknown parameter 'dust.beta'"),
+        (
+            {"components": LAWS | {"dust": {"law": "dust", "parameters": {"beta": 1.5}}}},
+            SettingsError,
+            "components.dust: .*beta",
+        ),
+        (
+            {"free": {"dust.beta_dust": {"start": 1.5, "regions": {"nside": 64}}}},
+            SettingsError,
+            "free.dust.beta_dust.regions: .* at most that of the map, 16",
+        ),
+        (
+            {"free": {"dust.beta_dust": {"start": 1.5, "regions": {"latitudes": [50.0, 40.0]}}}},
+            SettingsError,
+            "free.dust.beta_dust.regions: Argument `edges` must increase",
+        ),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(changes, error, words):
+    with pytest.raises(error, match=words):
+        build(settings(**changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"tensors": {"lmax": 40}}, "tensors.lmax: 40 is beyond what nside 16"),
+        ({"tensors": {"lmin": 20, "width": 30}}, "no bin of 30 multipoles fits"),
+    ],
+)
+def test_spectra_that_cannot_be_taken_are_refused(changes, words):
+    _, setup, _ = separated()
+    how = settings(**changes)
+    with pytest.raises(SettingsError, match=words):
+        separate(how, setup)

@@ -166,7 +166,7 @@ def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
         tmp_path / "out",
     )
     monkeypatch.setattr(sys, "argv", ["jaxsky"])
-    simulate, progress = module.simulate, []
+    realisations, progress = module.realisations, []
 
     def stopped(*arguments):
         def report(done):
@@ -174,9 +174,9 @@ def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
             if len(progress) == 8:
                 raise KeyboardInterrupt
 
-        return simulate(*arguments[:-1], report)
+        return realisations(*arguments[:-1], report)
 
-    monkeypatch.setattr(module, "simulate", stopped)
+    monkeypatch.setattr(module, "realisations", stopped)
     assert separate(monkeypatch, path, "--out", out) == 130
     assert "go on with --resume" in capsys.readouterr().err
     monkeypatch.undo()

@@ -9,13 +9,14 @@ import numpy as np
 from jaxtyping import Float
 
 from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra
+from fits.realisations import realisations
 from fits.record import fingerprint
 from fits.results import FitResult
 from fits.sample import kept_chain
 from fits.separate.domains import PixelDomain
 from fits.separate.settings import SeparateSettings, Tensors
 from fits.separate.setup import Setup
-from fits.separate.simulations import Simulated, simulate
+from fits.separate.simulations import Realisation, Simulated
 from fits.separation.fit import fit_spectra
 from fits.separation.likelihood import SpectralLikelihood
 from fits.separation.response import Response, widened
@@ -128,22 +129,18 @@ def separate(
 
     report("spectra")
     window, spectra = _spectra(settings.tensors, setup.mask, main.nside, main.fwhm)
-    lensed, tensors = (f(spectra.lmax) for f in (camb_spectra, tensor_spectra))
-    simulated = simulate(
-        setup,
-        like,
-        best,
-        response,
-        found,
-        cmb,
-        spectra,
-        window,
-        lensed,
-        main.nsims,
-        main.seed,
-        None if out is None else out / "simulations.npz",
-        _mark(settings, setup),
-        progress,
+    lensed, tensors = (f(window.size - 1) for f in (camb_spectra, tensor_spectra))
+    emission = domain.emission(like, best, _without(found.amplitude, row))
+    simulated = Simulated(
+        *realisations(
+            Realisation(domain, like, best, response, emission, row, spectra, window, lensed),
+            Simulated._fields,
+            main.nsims,
+            main.seed,
+            None if out is None else out / "simulations.npz",
+            _mark(settings, setup),
+            progress,
+        )
     )
     report("tensor-to-scalar ratio")
     # What the spectra know of E in B is part of the model.
@@ -185,6 +182,13 @@ def separate(
         left,
         chain,
     )
+
+
+def _without(amplitude: np.ndarray, row: int) -> np.ndarray:
+    """Amplitudes of all components but one."""
+    others = np.array(amplitude)
+    others[row] = 0.0
+    return others
 
 
 def _spectra(

@@ -6,25 +6,25 @@ the parameters move by -H^-1 times the gradient of -ln L; the components are the
 those parameters, so that residual foregrounds appear with the noise that caused them.
 """
 
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
+import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from fits.pseudo_cl import MaskedSpectra, band_powers
-from fits.realisations import realisations
-from fits.separate.setup import Setup
+from fits.separate.domains import Domain
 from fits.separation.likelihood import SpectralLikelihood
 from fits.separation.response import Response
 from jaxsky.cmb import realisation
 from jaxsky.harmonics import analysis, expand, power_spectrum, synthesis
 from jaxsky.streams import stream
 
-__all__ = ["Simulated", "simulate"]
+__all__ = ["Realisation", "Simulated"]
 
 
 class Simulated(NamedTuple):
@@ -50,66 +50,52 @@ class Simulated(NamedTuple):
     spectrum: Float[np.ndarray, "sim ell"]
 
 
-@jax.jit
-def _mean_spectrum(mask, maps, like_ell):
+@partial(jax.jit, static_argnames="lmax")
+def _mean_spectrum(mask, maps, lmax):
     """C_l of a masked map, the mean of EE and BB."""
-    maps = jnp.where(mask > 0, maps, 0.0)
-    power = power_spectrum(analysis(mask * maps, like_ell.size - 1, 0))
+    power = power_spectrum(analysis(mask * jnp.where(mask > 0, maps, 0.0), lmax, 0))
     return power.mean(axis=0) / jnp.mean(mask**2)
 
 
-def simulate(
-    setup: Setup,
-    like: SpectralLikelihood,
-    best: Mapping[str, Array],
-    response: Response,
-    found,
-    cmb: str,
-    spectra: MaskedSpectra,
-    window: Float[np.ndarray, " ell"],
-    lensed: Float[np.ndarray, "4 ell"],
-    nsims: int,
-    seed: int,
-    path: Path | None = None,
-    mark: str = "",
-    report: Callable[[int], None] = lambda done: None,
-) -> Simulated:
-    """Separate simulated noise on top of the foregrounds that were found.
+class Realisation(NamedTuple):
+    """A function of a random key: simulated noise on top of the foregrounds that were found.
 
     Parameters
     ----------
-    setup : what was separated
-    like, best, response, found : the likelihood, the best fit, what noise does to it, and the
-        components with it
-    cmb : name of the CMB among them
+    domain : how maps are separated
+    like, best, response : the likelihood, the best fit by name, and what noise does to it
+    emission : foregrounds in the bands, as they were found
+    row : position of the CMB among the components
     spectra, window : how BB is taken, and the beam of the maps
-    lensed : spectra of the CMB without tensors [uK_CMB^2]
-    nsims, seed, path, mark, report : see `fits.realisations.realisations`
+    lensed : spectra of a CMB without tensors, up to the end of the window [uK_CMB^2]
     """
-    domain = setup.domain
-    names = tuple(like.sky)
-    row = names.index(cmb)
-    amplitude = np.array(found.amplitude)
-    amplitude[row] = 0.0
-    emission = domain.emission(like, best, amplitude)
-    nside = int(np.sqrt(setup.mask.size / 12))
-    lmax = len(window) - 1
-    ell = jnp.arange(spectra.lmax + 1)
 
-    def cleaned(params, data):
-        return domain.maps(domain.components(like, params, data, covariance=False))[row]
+    domain: Domain
+    like: SpectralLikelihood
+    best: Mapping[str, Array]
+    response: Response
+    emission: Float[np.ndarray, "band stokes _"]
+    row: int
+    spectra: MaskedSpectra
+    window: Float[np.ndarray, " ell"]
+    lensed: Float[np.ndarray, "4 ell"]
 
-    def make(key):
-        noise = domain.noise_realisation(key)
-        moved = response.moved(domain.likelihood(emission + noise), stream(key, "priors"))
-        alone = cleaned(best, noise)
-        both = cleaned(like.named(jnp.asarray(moved)), emission + noise)
-        alm = realisation(stream(key, "cmb"), jnp.asarray(lensed)[:, : lmax + 1])
-        seen = alm * expand(jnp.asarray(window))
-        sky, E = synthesis(seen, nside), synthesis(seen.at[1].set(0.0), nside)
+    def cleaned(self, params: Mapping[str, Array], data: np.ndarray) -> np.ndarray:
+        """The map of the CMB with these parameters."""
+        found = self.domain.components(self.like, params, data, covariance=False)
+        return self.domain.maps(found)[self.row]
+
+    def __call__(self, key: Array) -> Sequence[Array | np.ndarray]:
+        """What `Simulated` holds of one realisation."""
+        noise = self.domain.noise_realisation(key)
+        observed = self.emission + noise
+        moved = self.response.moved(self.domain.likelihood(observed), stream(key, "priors"))
+        alone = self.cleaned(self.best, noise)
+        both = self.cleaned(self.like.named(jnp.asarray(moved)), observed)
+        nside = healpy.npix2nside(both.shape[-1])
+        alm = realisation(stream(key, "cmb"), self.lensed) * expand(jnp.asarray(self.window))
+        sky, E = synthesis(alm, nside), synthesis(alm.at[1].set(0.0), nside)
         every = (alone, both - alone, both, both + sky, E)
-        powers = [band_powers(spectra, maps)[1] for maps in every]
-        spectrum = _mean_spectrum(spectra.mask, both, ell)
-        return [moved - response.theta, *powers, spectrum]
-
-    return Simulated(*realisations(make, Simulated._fields, nsims, seed, path, mark, report))
+        powers = [band_powers(self.spectra, jnp.asarray(maps))[1] for maps in every]
+        spectrum = _mean_spectrum(self.spectra.mask, both, self.spectra.lmax)
+        return [moved - self.response.theta, *powers, spectrum]

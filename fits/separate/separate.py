@@ -131,15 +131,12 @@ def separate(
     window, spectra = _spectra(settings.tensors, setup.mask, main.nside, main.fwhm)
     lensed, tensors = (f(window.size - 1) for f in (camb_spectra, tensor_spectra))
     emission = domain.emission(like, best, _without(found.amplitude, row))
+    realisation = Realisation(domain, like, best, response, emission, row, spectra, window, lensed)
+    kept = None if out is None else out / "simulations.npz"
+    mark = _mark(settings, setup)
     simulated = Simulated(
         *realisations(
-            Realisation(domain, like, best, response, emission, row, spectra, window, lensed),
-            Simulated._fields,
-            main.nsims,
-            main.seed,
-            None if out is None else out / "simulations.npz",
-            _mark(settings, setup),
-            progress,
+            realisation.of, Simulated._fields, main.nsims, main.seed, kept, mark, progress
         )
     )
     report("tensor-to-scalar ratio")

@@ -58,7 +58,7 @@ def _mean_spectrum(mask, maps, lmax):
 
 
 class Realisation(NamedTuple):
-    """A function of a random key: simulated noise on top of the foregrounds that were found.
+    """What a realisation is made of: simulated noise on top of the foregrounds that were found.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class Realisation(NamedTuple):
         found = self.domain.components(self.like, params, data, covariance=False)
         return self.domain.maps(found)[self.row]
 
-    def __call__(self, key: Array) -> Sequence[Array | np.ndarray]:
+    def of(self, key: Array) -> Sequence[Array | np.ndarray]:
         """What `Simulated` holds of one realisation."""
         noise = self.domain.noise_realisation(key)
         observed = self.emission + noise

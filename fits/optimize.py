@@ -1,6 +1,7 @@
 """Fits by gradient: least squares with optimistix, covariance from the Hessian."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from fits.likelihood import Likelihood, chi2
 from fits.priors import (
     Prior,
+    at_edge,
     bounds,
     check_priors,
     from_unbounded,
@@ -21,15 +23,67 @@ from fits.priors import (
 from fits.results import FitResult
 from jaxsky.types import Numeric
 
-__all__ = ["best_fit"]
+__all__ = ["MAX_STEPS", "Solver", "best_fit", "search"]
 
-#: An optimum this close to the edge of a uniform prior, in units of its width, is at the edge.
-EDGE = 1e-4
+#: What finds an optimum: by residuals, or by a function alone.
+Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
+#: Steps of a search, by default.
+MAX_STEPS = 500
 
 
-def _residuals(unbounded, args):
-    like, priors, scale = args
-    params = from_unbounded({k: v * scale[k] for k, v in unbounded.items()}, priors)
+def _unscaled(unbounded, priors, scale):
+    return from_unbounded({name: v * scale[name] for name, v in unbounded.items()}, priors)
+
+
+def _scaled(unbounded, everything):
+    function, args, priors, scale = everything
+    return function(_unscaled(unbounded, priors, scale), args)
+
+
+def search(
+    function: Callable[[dict[str, Any], Any], Any],
+    args: Any,
+    start: Mapping[str, Numeric],
+    *,
+    priors: Mapping[str, Prior],
+    scale: Mapping[str, Numeric],
+    solver: Solver,
+    max_steps: int = MAX_STEPS,
+    run: Callable[..., optx.Solution] = optx.least_squares,
+) -> tuple[dict[str, Any], optx.Solution]:
+    """The values that a solver of optimistix finds, within uniform priors.
+
+    Parameters
+    ----------
+    function : of values by name and `args`: residuals, whose sum of squares is to be small
+    args : data of the function
+    start : start values by name, numbers or arrays
+    priors : by name; uniform ones are bounds, others are left to the function
+    scale : by name, size of the unbounded numbers (see `fits.priors.to_unbounded`): the solver
+        sees them divided by it, so that its tolerances and first steps do not depend on units
+    solver, max_steps : of optimistix
+    run : `optx.minimise` if the function is itself the number that is to be small
+    """
+    unbounded = to_unbounded(start, priors)
+    scaled = {name: value / scale[name] for name, value in unbounded.items()}
+
+    def solve(scaled):
+        everything = (function, args, priors, dict(scale))
+        solution = run(_scaled, solver, scaled, args=everything, max_steps=max_steps, throw=False)
+        return solution, _unscaled(solution.value, priors, scale)
+
+    solution, found = solve(scaled)
+    edges = {name: at_edge(value, *bounds(name, priors)) for name, value in found.items()}
+    if any(edge.any() for edge in edges.values()):
+        # The range is flat at its edge, so a step that reached it too early has stuck there.
+        solution, found = solve(
+            {name: jnp.where(edges[name], 0.0, value) for name, value in solution.value.items()}
+        )
+    return found, solution
+
+
+def _residuals(params, args):
+    like, priors = args
     return jnp.concatenate([like.residuals(params), prior_residuals(params, priors)])
 
 
@@ -49,7 +103,7 @@ def best_fit(
     start: Mapping[str, Numeric],
     *,
     priors: Mapping[str, Prior] | None = None,
-    solver: optx.AbstractLeastSquaresSolver | None = None,
+    solver: Solver | None = None,
     throw: bool = True,
 ) -> FitResult:
     """The most probable parameters, by gradient.
@@ -78,25 +132,17 @@ def best_fit(
     priors = check_priors(priors, params)
     solver = solver or optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)
     free = tuple(sorted(params))
-    unbounded = to_unbounded(params, priors)
-    # Parameters of any size become numbers of order one, so that the solver's tolerances and
-    # first steps do not depend on units.
-    scale = {name: jnp.maximum(jnp.abs(value), 1e-3) for name, value in unbounded.items()}
-    scaled = {name: value / scale[name] for name, value in unbounded.items()}
-
-    def solve(start):
-        args = (like, priors, scale)
-        solution: optx.Solution = optx.least_squares(
-            _residuals, solver, start, args=args, max_steps=500, throw=False
-        )
-        found = from_unbounded({k: v * scale[k] for k, v in solution.value.items()}, priors)
-        return solution, found, {name: float(found[name]) for name in free}
-
-    solution, found, values = solve(scaled)
-    if edges := _at_edge(values, priors):
-        # The range is flat at its edge, so a step that reached it too early has stuck there.
-        middle = solution.value | {name: jnp.zeros(()) for name in edges}
-        solution, found, values = solve(middle)
+    # Parameters of any size become numbers of order one.
+    sizes = to_unbounded(params, priors)
+    found, solution = search(
+        _residuals,
+        (like, priors),
+        params,
+        priors=priors,
+        scale={name: jnp.maximum(jnp.abs(value), 1e-3) for name, value in sizes.items()},
+        solver=solver,
+    )
+    values = {name: float(found[name]) for name in free}
 
     hessian = np.asarray(_half_hessian(like, found, priors))
     positive = bool(np.isfinite(hessian).all()) and np.linalg.eigvalsh(hessian)[0] > 0
@@ -110,9 +156,12 @@ def best_fit(
             "The Hessian at the optimum is not positive definite: the data do not constrain "
             + (", ".join(free) + ".")
         )
-    for name, edge in _at_edge(values, priors).items():
-        converged = False
-        message = f"The best fit of {name!r} lies at the edge {edge:g} of its uniform prior."
+    for name, value in values.items():
+        low, high = bounds(name, priors)
+        if at_edge(value, low, high):
+            converged = False
+            edge = low if value - low < high - value else high
+            message = f"The best fit of {name!r} lies at the edge {edge:g} of its uniform prior."
     return FitResult(
         method="gradient",
         free=free,
@@ -124,13 +173,3 @@ def best_fit(
         message=message,
         details={"steps": int(solution.stats["num_steps"])},
     ).checked(throw)
-
-
-def _at_edge(values: Mapping[str, float], priors: Mapping[str, Prior]) -> dict[str, float]:
-    edges = {}
-    for name, value in values.items():
-        low, high = bounds(name, priors)
-        for edge in (low, high):
-            if abs(value - edge) < EDGE * (high - low) < np.inf:
-                edges[name] = edge
-    return edges

@@ -5,11 +5,25 @@ from collections.abc import Iterable, Mapping
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxsky.types import Numeric
 
-__all__ = ["Gaussian", "Prior", "Uniform", "bounds", "from_unbounded", "log_prior", "to_unbounded"]
+__all__ = [
+    "Gaussian",
+    "Prior",
+    "Uniform",
+    "at_edge",
+    "bounds",
+    "check_priors",
+    "from_unbounded",
+    "log_prior",
+    "prior_residuals",
+    "to_unbounded",
+]
+
+#: A value this close to the edge of a uniform prior, in units of its width, is at the edge.
+EDGE = 1e-4
 
 
 class Prior(eqx.Module):
@@ -97,17 +111,37 @@ def check_priors(priors: Mapping[str, Prior] | None, free: Iterable[str]) -> dic
 def prior_residuals(
     params: Mapping[str, Numeric], priors: Mapping[str, Prior]
 ) -> Float[Array, " gaussian"]:
-    """(value - mean)/sigma of the Gaussian priors: their sum of squares is -2 log_prior."""
-    rows = [
-        (params[name] - p.mean) / p.sigma for name, p in priors.items() if isinstance(p, Gaussian)
-    ]
-    return jnp.stack(rows) if rows else jnp.zeros(0)
+    """(value - mean)/sigma of the Gaussian priors: their sum of squares is -2 log_prior.
+
+    Raises
+    ------
+    TypeError
+        If a prior is neither uniform nor Gaussian.
+    """
+    rows = []
+    for name, p in priors.items():
+        if isinstance(p, Gaussian):
+            rows.append(jnp.ravel((params[name] - p.mean) / p.sigma))
+        elif not isinstance(p, Uniform):
+            raise TypeError(
+                f"Least squares takes uniform and Gaussian priors, not the {type(p).__name__} of "
+                f"{name!r}."
+            )
+    return jnp.concatenate(rows) if rows else jnp.zeros(0)
 
 
 def bounds(name: str, priors: Mapping[str, Prior]) -> tuple[float, float]:
     """Range of a parameter; infinite without a uniform prior."""
     prior = priors.get(name)
     return (prior.low, prior.high) if isinstance(prior, Uniform) else (-np.inf, np.inf)
+
+
+def at_edge(value: Numeric, low: Numeric, high: Numeric) -> Bool[np.ndarray, "*shape"]:
+    """Whether values lie at an edge of their range; never if that is infinite."""
+    low, high = np.asarray(low), np.asarray(high)
+    width = np.where(np.isfinite(low) & np.isfinite(high), high - low, 0.0)
+    value = np.asarray(value)
+    return np.minimum(np.abs(value - low), np.abs(value - high)) < EDGE * width
 
 
 def from_unbounded(
@@ -135,9 +169,11 @@ def to_unbounded(params: Mapping[str, Numeric], priors: Mapping[str, Prior]) -> 
     result = dict(params)
     for name, p in priors.items():
         if isinstance(p, Uniform) and name in result:
-            if not p.low < float(result[name]) < p.high:
+            value = np.asarray(result[name])
+            outside = ~((p.low < value) & (value < p.high))
+            if outside.any():
                 raise ValueError(
-                    f"Start value {float(result[name]):g} of {name!r} is not inside its uniform "
+                    f"Start value {value[outside].flat[0]:g} of {name!r} is not inside its uniform "
                     f"prior {p.low:g} ... {p.high:g}."
                 )
             unit = 2 * (jnp.asarray(result[name]) - p.low) / (p.high - p.low) - 1

@@ -27,7 +27,8 @@ class SpectralFit(NamedTuple):
     chi2 : -2 ln L at the best fit, priors left out
     dof : number of data less that of amplitudes and parameters
     converged, message : whether the numbers can be relied on, and in words
-    details : "steps", and "distance" to the optimum that remained, in standard deviations
+    details : "solver" by name, its "steps", and "distance" to the optimum that remained, in
+        standard deviations
     """
 
     free: tuple[str, ...]

@@ -1,0 +1,175 @@
+"""Solvers of optimistix for spectral parameters: the same optimum, and honest failures."""
+
+from functools import cache
+
+import numpy as np
+import optimistix as optx
+import pytest
+
+from fits.priors import Gaussian, Prior, Uniform, at_edge, prior_residuals, to_unbounded
+from fits.results import FitError
+from fits.separation import fit as fit_module
+from fits.separation import fit_spectra, spectral_likelihood
+from test_separation import BANDS, NPIX, START, problem, random_sky
+from test_separation_regions import LABELS
+
+TOLERANCES = {"rtol": 1e-10, "atol": 1e-8}
+SOLVERS = {
+    "LevenbergMarquardt": optx.LevenbergMarquardt(**TOLERANCES),
+    "Dogleg": optx.Dogleg(**TOLERANCES),
+    "BFGS": optx.BFGS(**TOLERANCES),
+}
+FAR = {"dust.beta_dust": 0.8, "dust.T_dust": 35.0, "synchrotron.beta_syn": 4.2}
+BOTH = {"dust.T_dust": Uniform(10.0, 40.0), "synchrotron.beta_syn": Gaussian(3.0, 0.02)}
+
+
+@cache
+def constant(unit: str = "uK_RJ"):
+    _, data, given, _ = problem()
+    factors = np.array([float(b.conversion("uK_RJ", unit)) for b in BANDS.values()])
+    data, given = data * factors[:, None, None], given * factors
+    return spectral_likelihood(random_sky(), BANDS, data, given, START, unit=unit)
+
+
+@cache
+def regions():
+    """With a region without pixels, and one with masked ones alone."""
+    _, data, given, _ = problem("separable")
+    data[..., :4] = np.nan
+    given[..., :4] = np.inf
+    labels = LABELS | {"dust.T_dust": np.where(np.arange(NPIX) < 4, 1, 2)}
+    return spectral_likelihood(random_sky(), BANDS, data, given, START, labels=labels)
+
+
+def deviation(fit, reference) -> float:
+    """The largest difference in standard deviations."""
+    return max(
+        np.nanmax(np.abs(np.asarray(fit.best_fit[n]) - reference.best_fit[n]) / reference.sigma[n])
+        for n in reference.free
+    )
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize(
+    ("make", "start", "priors"),
+    [(constant, FAR, {}), (regions, None, BOTH)],
+    ids=["far", "regions"],
+)
+def test_every_solver_finds_the_same_optimum(make, start, priors, solver):
+    like = make()
+    default = fit_spectra(like, start, priors=priors)
+    assert default.details["solver"] == "Newton"
+    fit = fit_spectra(like, start, priors=priors, solver=SOLVERS[solver])
+    assert fit.details["solver"] == solver
+    # The least-squares solvers square their last step; BFGS stops at the tolerance.
+    assert deviation(fit, default) < 1e-6
+    assert fit.details["distance"] < 1e-6
+    for name in fit.free:
+        np.testing.assert_allclose(fit.sigma[name], default.sigma[name], rtol=1e-6)
+    assert fit.chi2 == pytest.approx(default.chi2, rel=1e-8)
+
+
+def test_units_of_the_maps_and_of_parameters_do_not_matter():
+    """Maps in K; a shift near zero, and a gain of one."""
+    small, large = (
+        fit_spectra(constant(unit), FAR, solver=SOLVERS["BFGS"]) for unit in ("K_RJ", "uK_RJ")
+    )
+    assert deviation(small, large) < 1e-6
+    assert small.details["steps"] == pytest.approx(large.details["steps"], abs=20)
+    _, data, given, _ = problem()
+    start = {"dust.beta_dust": 1.5, "shift.220": 0.0, "gain.145": 1.0}
+    like = spectral_likelihood(random_sky(), BANDS, data, given, start)
+    fit = fit_spectra(like, solver=SOLVERS["BFGS"])
+    assert deviation(fit, fit_spectra(like)) < 1e-6
+
+
+def test_an_optimum_at_an_edge_is_reported_by_all():
+    like = constant()
+    T = fit_spectra(like).best_fit["dust.T_dust"]
+    start = {"dust.T_dust": T + 2}
+    priors = {"dust.T_dust": Uniform(T + 0.05, 40.0)}
+    default = fit_spectra(like, start, priors=priors, throw=False)
+    for solver in ("LevenbergMarquardt", "BFGS"):
+        fit = fit_spectra(like, start, priors=priors, solver=SOLVERS[solver], throw=False)
+        assert fit.message == default.message
+        assert "'dust.T_dust' lies at the edge" in fit.message
+        # Flat there, and residuals say nothing of how it curves.
+        assert fit.best_fit["dust.T_dust"] == pytest.approx(T + 0.05, abs=1e-6)
+        for name in ("dust.beta_dust", "synchrotron.beta_syn"):
+            assert abs(fit.best_fit[name] - default.best_fit[name]) < 1e-5 * default.sigma[name]
+            assert fit.sigma[name] == pytest.approx(default.sigma[name], rel=1e-6)
+
+
+class Wide(Prior):
+    def log_density(self, value):
+        return -(((value - 3.0) / 0.1) ** 4)
+
+
+class Flat(Prior):
+    def log_density(self, value):
+        return 0.0 * value
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        (
+            {"solver": SOLVERS["BFGS"], "max_steps": 3},
+            FitError,
+            r"The search stopped after 3 steps, .* sigma from the optimum",
+        ),
+        (
+            {"start": FAR | {"dust.T_dust": 60.0, "dust.beta_dust": 3.0}, "max_steps": 0},
+            FitError,
+            "The search stopped after 0 steps, and not at an optimum",
+        ),
+        ({"start": FAR, "max_steps": 0}, FitError, r"after 0 steps, 1\.3e\+02 sigma from"),
+        ({"solver": "BFGS"}, TypeError, "`solver` must be a least-squares solver.*, not str"),
+        ({"solver": optx.Newton(1e-8, 1e-8)}, TypeError, "`solver` must be .*, not Newton"),
+        (
+            {
+                "solver": SOLVERS["LevenbergMarquardt"],
+                "priors": {"synchrotron.beta_syn": Wide()},
+            },
+            TypeError,
+            "takes uniform and Gaussian priors, not the Wide of 'synchrotron.beta_syn'",
+        ),
+        (
+            {"solver": SOLVERS["BFGS"], "priors": {"gain.23": Flat()}},
+            KeyError,
+            "'gain.23', which is not free",
+        ),
+    ],
+)
+def test_failures_say_what_they_are(options, error, words):
+    with pytest.raises(error, match=words) as caught:
+        fit_spectra(constant(), **options)
+    if error is FitError:
+        result = caught.value.result
+        assert not result.converged
+        assert fit_spectra(constant(), throw=False, **options).message == result.message
+
+
+def test_a_search_that_leaves_the_finite_numbers_says_so(monkeypatch):
+    monkeypatch.setattr(
+        fit_module.newton, "minimise", lambda problem, theta, _: (theta * np.nan, 7)
+    )
+    with pytest.raises(FitError, match="left the finite numbers within 7 steps"):
+        fit_spectra(constant())
+
+
+def test_a_minimiser_takes_any_prior():
+    priors = {"synchrotron.beta_syn": Wide()}
+    fit = fit_spectra(constant(), priors=priors, solver=SOLVERS["BFGS"])
+    assert deviation(fit, fit_spectra(constant(), priors=priors)) < 1e-6
+
+
+def test_pieces_of_priors_take_arrays():
+    priors = {"a": Uniform(0.0, 2.0), "b": Gaussian(1.0, 0.5)}
+    values = {"a": np.array([0.5, 1.5]), "b": np.array([1.0, 2.0])}
+    np.testing.assert_allclose(prior_residuals(values, priors), [0.0, 2.0])
+    np.testing.assert_allclose(to_unbounded(values, priors)["a"], np.arcsin([-0.5, 0.5]))
+    with pytest.raises(ValueError, match="Start value 2 of 'a' is not inside"):
+        to_unbounded({"a": np.array([1.0, 2.0])}, priors)
+    edges = at_edge([0.0, 1.0, 2.0, 0.0], 0.0, [2.0, 2.0, 2.0, np.inf])
+    assert edges.tolist() == [True, False, True, False]

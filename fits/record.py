@@ -17,7 +17,18 @@ from jaxsky.io import write_text
 
 __all__ = ["fingerprint", "probability", "with_error", "write_json", "write_log"]
 
-PACKAGES = ("jaxsky", "jax", "numpy", "healpy", "optimistix", "emcee", "getdist", "camb", "ducc0")
+PACKAGES = (
+    "jaxsky",
+    "jax",
+    "numpy",
+    "healpy",
+    "optimistix",
+    "emcee",
+    "blackjax",
+    "getdist",
+    "camb",
+    "ducc0",
+)
 
 
 def fingerprint(tree: Any) -> str:

@@ -20,7 +20,7 @@ class FitResult(NamedTuple):
 
     Attributes
     ----------
-    method : "gradient", "grid" or "mcmc"
+    method : "gradient", "grid", "mcmc" or "nuts"
     free : names of the free parameters, in the order of the covariance
     best_fit : most probable values
     interval_68 : (low, high) of the central 68.27 % of each marginal distribution

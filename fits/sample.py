@@ -1,23 +1,33 @@
 """Posterior samples with emcee: vectorised, stored in HDF5, resumable."""
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import emcee
+import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from fits.likelihood import Likelihood, chi2
 from fits.optimize import best_fit
 from fits.priors import Prior, bounds, check_priors, log_prior
 from fits.results import FitResult
+from jaxsky.io import InputError
 from jaxsky.types import Numeric
 
-__all__ = ["ChainFile", "sample"]
+__all__ = [
+    "ChainFile",
+    "ensemble",
+    "ensemble_summary",
+    "kept_chain",
+    "sample",
+    "summary",
+]
 
 #: A chain shorter than this many autocorrelation times is reported as too short.
 ENOUGH = 50
@@ -60,6 +70,37 @@ class ChainFile(emcee.backends.HDFBackend):
         self._pending = []
 
 
+def kept_chain(path: Path, name: str, size: tuple[int, int], mark: str) -> ChainFile:
+    """The place of a chain in its file, to begin there or to go on.
+
+    Parameters
+    ----------
+    path, name : file, and name of the chain in it
+    size : number of walkers and of parameters
+    mark : of all that the chain depends on
+
+    Raises
+    ------
+    jaxsky.io.InputError
+        If the file is damaged, or holds a chain with another mark or size.
+    """
+    if path.exists() and not h5py.is_hdf5(path):
+        raise InputError(f"{path}: is damaged; start again with --overwrite.")
+    backend, mark = ChainFile(path, name), f"{mark} {size}"
+    if not backend.initialized:
+        backend.reset(*size)
+        with backend.open("a") as file:
+            file[name].attrs["fingerprint"] = mark
+        return backend
+    with backend.open() as file:
+        if file[name].attrs.get("fingerprint") != mark:
+            raise InputError(
+                f"{path}: holds a chain of other data or settings; choose another --out, or "
+                "start again with --overwrite."
+            )
+    return backend
+
+
 @partial(jax.jit, static_argnames="free")
 def _log_probs(theta, like, priors, free):
     def one(values):
@@ -91,6 +132,58 @@ def _walkers(result: FitResult, priors: Mapping[str, Prior], nwalkers: int, rng)
     high = np.where(np.isfinite(limits[:, 1]), limits[:, 1], center + 1)
     theta[outside] = rng.uniform(low, high, size=(outside.sum(), len(center)))
     return theta
+
+
+def ensemble(
+    log_probs: Callable[[np.ndarray], np.ndarray],
+    initial: Callable[[np.random.Generator], np.ndarray],
+    size: int,
+    *,
+    nwalkers: int,
+    nsteps: int,
+    seed: int,
+    backend: ChainFile | None = None,
+    progress: bool | str = True,
+) -> emcee.EnsembleSampler:
+    """Steps of emcee's ensemble; those that a file already holds are not made again.
+
+    Parameters
+    ----------
+    log_probs : log posterior of positions (walker, par)
+    initial : start positions (walker, par) from a generator of random numbers
+    size : number of parameters
+    nwalkers, nsteps, seed, backend, progress : see `sample`
+
+    Raises
+    ------
+    ValueError
+        For fewer than twice as many walkers as parameters, or no step.
+    """
+    if nwalkers < 2 * size or nsteps < 1:
+        raise ValueError(
+            f"MCMC needs at least {2 * size} walkers and a step for {size} parameters, "
+            f"not nwalkers={nwalkers}, nsteps={nsteps}."
+        )
+    rng = np.random.default_rng(seed)
+    sampler = emcee.EnsembleSampler(nwalkers, size, log_probs, vectorize=True, backend=backend)
+    # emcee's own wrapper prints a traceback when it is interrupted.
+    sampler.log_prob_fn = sampler.log_prob_fn.f
+    done = sampler.iteration
+    state = None
+    if not done:
+        state = emcee.State(
+            initial(rng),
+            random_state=np.random.RandomState(rng.integers(2**32)).get_state(),
+        )
+    try:
+        if done < nsteps:
+            sampler.run_mcmc(
+                state, nsteps - done, progress=progress, progress_kwargs={"leave": False}
+            )
+    finally:
+        if backend is not None:
+            backend.flush()
+    return sampler
 
 
 def sample(
@@ -135,67 +228,98 @@ def sample(
     """
     free = tuple(sorted(like.check(start)))
     priors = check_priors(priors, free)
-    if nwalkers < 2 * len(free) or nsteps < 1:
-        raise ValueError(
-            f"MCMC needs at least {2 * len(free)} walkers and a step for {len(free)} parameters, "
-            f"not nwalkers={nwalkers}, nsteps={nsteps}."
-        )
-    rng = np.random.default_rng(seed)
-    sampler = emcee.EnsembleSampler(
-        nwalkers,
-        len(free),
+    sampler = ensemble(
         lambda theta: np.asarray(_log_probs(theta, like, priors, free)),
-        vectorize=True,
+        lambda rng: _walkers(
+            best_fit(like, start, priors=priors, throw=False), priors, nwalkers, rng
+        ),
+        len(free),
+        nwalkers=nwalkers,
+        nsteps=nsteps,
+        seed=seed,
         backend=backend,
+        progress=progress,
     )
-    # emcee's own wrapper prints a traceback when it is interrupted.
-    sampler.log_prob_fn = sampler.log_prob_fn.f
-    done = sampler.iteration
-    initial = None
-    if not done:
-        fit = best_fit(like, start, priors=priors, throw=False)
-        initial = emcee.State(
-            _walkers(fit, priors, nwalkers, rng),
-            random_state=np.random.RandomState(rng.integers(2**32)).get_state(),
-        )
-    try:
-        if done < nsteps:
-            sampler.run_mcmc(
-                initial, nsteps - done, progress=progress, progress_kwargs={"leave": False}
-            )
-    finally:
-        if backend is not None:
-            backend.flush()
-    return _summary(sampler, like, free).checked(throw)
+    return ensemble_summary(sampler, free, lambda values: float(chi2(like, values))).checked(throw)
 
 
-def _summary(sampler: emcee.EnsembleSampler, like: Likelihood, free: tuple[str, ...]) -> FitResult:
-    chain, log_prob = sampler.get_chain(), sampler.get_log_prob()
+def ensemble_summary(
+    sampler: emcee.EnsembleSampler,
+    free: tuple[str, ...],
+    chi2_of: Callable[[dict[str, float]], float],
+) -> FitResult:
+    """The result of an ensemble, which has to be 50 autocorrelation times long.
+
+    Parameters
+    ----------
+    sampler : after its steps
+    free : names of the parameters
+    chi2_of : chi^2 of parameters by name
+    """
+    chain = sampler.get_chain()
     tau = emcee.autocorr.integrated_time(chain, tol=0)
     worst = float(np.nanmax(tau)) if np.isfinite(tau).any() else float(len(chain))
-    discard = min(int(np.ceil(2 * worst)), len(chain) // 2)
-    thin = max(1, int(worst / 2))
+    enough = len(chain) >= ENOUGH * worst
+    message = f"{len(chain)} steps are {len(chain) / worst:.0f} autocorrelation times ({worst:.0f})"
+    return summary(
+        "mcmc",
+        free,
+        chain,
+        sampler.get_log_prob(),
+        chi2_of,
+        tau=tau,
+        discard=min(int(np.ceil(2 * worst)), len(chain) // 2),
+        converged=enough,
+        message=message + ("" if enough else f", of which at least {ENOUGH} are needed") + ".",
+        thin=max(1, int(worst / 2)),
+        details={"acceptance": float(np.mean(sampler.acceptance_fraction))},
+    )
+
+
+def summary(
+    method: str,
+    free: tuple[str, ...],
+    chain: Float[np.ndarray, "step walker par"],
+    log_prob: Float[np.ndarray, "step walker"],
+    chi2_of: Callable[[dict[str, float]], float],
+    *,
+    tau: Float[np.ndarray, " par"],
+    discard: int,
+    thin: int,
+    converged: bool,
+    message: str,
+    details: dict[str, Any],
+) -> FitResult:
+    """The result of a chain.
+
+    Parameters
+    ----------
+    method, free, converged, message : see `FitResult`
+    chain, log_prob : all steps
+    chi2_of : chi^2 of parameters by name
+    tau : autocorrelation time of each parameter
+    discard, thin : steps at the beginning that are not used, and of which one is enough
+    details : what not all chains have
+    """
     flat = chain[discard:].reshape(-1, len(free))
     best = np.unravel_index(np.argmax(log_prob), log_prob.shape)
     values = {name: float(v) for name, v in zip(free, chain[best], strict=True)}
     low, high = np.percentile(flat, [15.865525, 84.134475], axis=0)
-    enough = len(chain) >= ENOUGH * worst
-    message = f"{len(chain)} steps are {len(chain) / worst:.0f} autocorrelation times ({worst:.0f})"
     return FitResult(
-        method="mcmc",
+        method=method,
         free=free,
         best_fit=values,
         interval_68={n: (float(low[i]), float(high[i])) for i, n in enumerate(free)},
         covariance=np.atleast_2d(np.cov(flat.T)),
-        chi2=float(chi2(like, values)),
-        converged=enough,
-        message=message + ("" if enough else f", of which at least {ENOUGH} are needed") + ".",
+        chi2=chi2_of(values),
+        converged=converged,
+        message=message,
         details={
             "chain": chain,
             "log_prob": log_prob,
             "tau": {name: float(t) for name, t in zip(free, tau, strict=True)},
-            "acceptance": float(np.mean(sampler.acceptance_fraction)),
             "discard": discard,
             "thin": thin,
-        },
+        }
+        | details,
     )

@@ -24,11 +24,10 @@ BOTH = {"dust.T_dust": Uniform(10.0, 40.0), "synchrotron.beta_syn": Gaussian(3.0
 
 
 @cache
-def constant(unit: str = "uK_RJ"):
+def constant(size: float = 1.0):
+    """With maps in a unit of this size."""
     _, data, given, _ = problem()
-    factors = np.array([float(b.conversion("uK_RJ", unit)) for b in BANDS.values()])
-    data, given = data * factors[:, None, None], given * factors
-    return spectral_likelihood(random_sky(), BANDS, data, given, START, unit=unit)
+    return spectral_likelihood(random_sky(), BANDS, data / size, given / size, START)
 
 
 @cache
@@ -69,13 +68,16 @@ def test_every_solver_finds_the_same_optimum(make, start, priors, solver):
     assert fit.chi2 == pytest.approx(default.chi2, rel=1e-8)
 
 
-def test_units_of_the_maps_and_of_parameters_do_not_matter():
-    """Maps in K; a shift near zero, and a gain of one."""
-    small, large = (
-        fit_spectra(constant(unit), FAR, solver=SOLVERS["BFGS"]) for unit in ("K_RJ", "uK_RJ")
-    )
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_units_of_the_maps_do_not_matter(solver):
+    small, large = (fit_spectra(constant(s), FAR, solver=SOLVERS[solver]) for s in (1e6, 1.0))
     assert deviation(small, large) < 1e-6
+    # Rounding differs, and with it where BFGS turns.
     assert small.details["steps"] == pytest.approx(large.details["steps"], abs=20)
+
+
+def test_units_of_parameters_do_not_matter():
+    """A shift near zero, and a gain of one."""
     _, data, given, _ = problem()
     start = {"dust.beta_dust": 1.5, "shift.220": 0.0, "gain.145": 1.0}
     like = spectral_likelihood(random_sky(), BANDS, data, given, start)

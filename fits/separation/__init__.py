@@ -18,6 +18,7 @@ from fits.separation.maps import (
 from fits.separation.noise import Noise, as_noise
 from fits.separation.regions import clusters, latitude_bands, superpixels
 from fits.separation.results import SpectralFit
+from fits.separation.sample import sample_spectra
 
 __all__ = [
     "ComponentMaps",
@@ -37,6 +38,7 @@ __all__ = [
     "latitude_bands",
     "noise_degradation",
     "residual_maps",
+    "sample_spectra",
     "spectral_likelihood",
     "superpixels",
     "white_spectrum",

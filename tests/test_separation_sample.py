@@ -1,0 +1,245 @@
+"""Samples of spectral parameters against each other, integrals on a grid, and known densities."""
+
+import inspect
+from functools import cache
+
+import blackjax
+import jax
+import numpy as np
+import pytest
+import scipy.special
+
+from fits.priors import Gaussian, Uniform
+from fits.results import FitError
+from fits.sample import ChainFile
+from fits.separation import fit_spectra, sample_spectra, spectral_likelihood
+from fits.separation.agreement import agreement
+from fits.separation.problem import value_and_gradient
+from test_separation import BANDS, START, problem, random_sky
+from test_separation_solvers import constant, regions
+
+SAMPLERS = ("nuts", "emcee")
+NAMES = tuple(sorted(START))
+
+
+def draw(like, sampler, **options):
+    steps = {"nuts": {}, "emcee": {"nsteps": 2500}}[sampler]
+    return sample_spectra(like, sampler=sampler, **({"progress": False} | steps | options))
+
+
+@cache
+def strong():
+    """Signals far above the noise: close to a Gaussian."""
+    _, data, given, _ = problem(sky=random_sky(size=300.0))
+    return spectral_likelihood(random_sky(), BANDS, data, given, START)
+
+
+@cache
+def empty():
+    """Data that say nothing: no signal, no noise."""
+    _, data, given, _ = problem()
+    return spectral_likelihood(random_sky(), BANDS, 0 * data, given, START)
+
+
+def samples(result):
+    chain = result.details["chain"][result.details["discard"] :]
+    return chain.reshape(-1, chain.shape[-1])
+
+
+def check(result, mean, width):
+    """Means within 0.1 sigma and widths within 10 %: 4 errors of 1000 independent samples."""
+    flat = samples(result)
+    assert np.abs((flat.mean(axis=0) - mean) / width).max() < 0.1
+    assert np.abs(flat.std(axis=0) / width - 1).max() < 0.1
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_samples_of_a_well_determined_problem_are_those_of_the_curvature(sampler):
+    like = strong()
+    fit = fit_spectra(like)
+    result = draw(like, sampler)
+    assert result.method == {"nuts": "nuts", "emcee": "mcmc"}[sampler]
+    assert result.converged
+    assert result.free == fit.labels == NAMES
+    width = np.sqrt(np.diagonal(np.linalg.inv(fit.hessian)))
+    check(result, [fit.best_fit[n] for n in NAMES], width)
+    for i, name in enumerate(NAMES):
+        assert abs(result.best_fit[name] - fit.best_fit[name]) < 0.5 * width[i]
+        low, high = result.interval_68[name]
+        assert high - low == pytest.approx(2 * width[i], rel=0.1)
+        assert result.sigma(name) == pytest.approx(width[i], rel=0.1)
+    np.testing.assert_allclose(result.covariance, np.cov(samples(result).T))
+    assert result.chi2 == pytest.approx(fit.chi2, abs=0.5)
+    assert result.details["log_prob"].max() == pytest.approx(-result.chi2 / 2, abs=1e-8)
+    assert set(result.details["tau"]) == set(NAMES)
+    assert 0.2 < result.details["acceptance"] < 0.95
+    if sampler == "nuts":
+        assert result.details["chain"].shape == (1000, 4, 3)
+        assert result.details["divergences"] == 0
+        assert max(result.details["rhat"].values()) < 1.01
+        assert min(result.details["ess"].values()) > 1000
+        assert result.details["gradients"] < 10
+
+
+PRIORS = {
+    # Cuts through the middle, and the two others far out.
+    "dust.T_dust": (-0.5, 6.0),
+    "dust.beta_dust": (-8.0, 8.0),
+    "synchrotron.beta_syn": (-8.0, 8.0),
+}
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_a_cut_posterior_is_that_of_integrals_on_a_grid(sampler):
+    """Correlated, with a long tail, and cut half a standard deviation below the maximum."""
+    like = constant()
+    fit = fit_spectra(like)
+    priors = {
+        name: Uniform(*(fit.best_fit[name] + fit.sigma[name] * np.array(ends)))
+        for name, ends in PRIORS.items()
+    }
+    result = draw(like, sampler, priors=priors, nsteps={"nuts": 1000, "emcee": 4000}[sampler])
+    nodes, weights = scipy.special.roots_legendre(48)
+    axes = [p.low + (p.high - p.low) * (1 + nodes) / 2 for p in (priors[n] for n in NAMES)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    value = jax.jit(
+        lambda like, theta: jax.lax.map(lambda t: -like.total(t[like.index]) / 2, theta)
+    )
+    density = np.asarray(value(like, grid.reshape(-1, 3))).reshape(grid.shape[:3])
+    density = np.exp(density - density.max())
+    density *= np.einsum("i,j,k->ijk", weights, weights, weights)
+    density /= density.sum()
+    mean = np.einsum("ijk,ijkp->p", density, grid)
+    width = np.sqrt(np.einsum("ijk,ijkp->p", density, (grid - mean) ** 2))
+    check(result, mean, width)
+    # Not the Gaussian of the fit: a third of it is cut off.
+    T = NAMES.index("dust.T_dust")
+    assert abs(width[T] / fit.sigma["dust.T_dust"] - 1) > 0.1
+    assert mean[T] - fit.best_fit["dust.T_dust"] > 0.3 * fit.sigma["dust.T_dust"]
+    below = density.sum(axis=tuple({0, 1, 2} - {T})).cumsum()
+    median = np.interp(0.5, below, axes[T])
+    assert np.median(samples(result)[:, T]) == pytest.approx(median, abs=0.15 * width[T])
+    assert samples(result)[:, T].min() > priors["dust.T_dust"].low
+
+
+def test_without_data_the_posterior_is_the_prior():
+    """The Jacobian of bounded parameters: their samples are uniform up to the edges."""
+    priors = {
+        "dust.T_dust": Uniform(10.0, 30.0),
+        "dust.beta_dust": Uniform(1.4, 1.6),
+        "synchrotron.beta_syn": Uniform(2.0, 3.5),
+    }
+    flat = samples(draw(empty(), "nuts", priors=priors))
+    unit = np.stack(
+        [
+            (flat[:, i] - priors[n].low) / (priors[n].high - priors[n].low)
+            for i, n in enumerate(NAMES)
+        ]
+    )
+    shares = np.stack([np.histogram(u, 10, (0, 1))[0] for u in unit]) / unit.shape[1]
+    # 0.1 +- 0.007 with 2000 independent samples.
+    assert np.abs(shares - 0.1).max() < 0.03
+    for sampler in SAMPLERS:
+        with pytest.raises(FitError, match=r"do not determine dust.T_dust, .*: there is nothing"):
+            draw(empty(), sampler)
+        nothing = draw(empty(), sampler, throw=False)
+        assert not nothing.converged
+        assert np.isnan(nothing.covariance).all()
+        assert not nothing.details
+
+
+def test_regions_have_labels_and_those_without_pixels_none():
+    priors = {"dust.T_dust": Gaussian(19.5, 0.5)}
+    like = regions()
+    fit = fit_spectra(like, priors=priors)
+    result = draw(like, "nuts", priors=priors)
+    present = [label for label in fit.labels if label not in ("dust.T_dust[0]", "dust.T_dust[1]")]
+    assert result.free == tuple(present)
+    keep = [fit.labels.index(label) for label in present]
+    width = np.sqrt(np.diagonal(np.linalg.inv(fit.hessian[np.ix_(keep, keep)])))
+    check(result, np.concatenate([np.ravel(fit.best_fit[n]) for n in fit.free])[keep], width)
+    # The density is that of the likelihood and of the prior.
+    theta = result.details["chain"][-1, 0]
+    T = theta[present.index("dust.T_dust[2]")]
+    full = np.array(like.flat({}))
+    full[keep] = theta
+    expected = -float(value_and_gradient(like, full)[0]) - ((T - 19.5) / 0.5) ** 2 / 2
+    assert result.details["log_prob"][-1, 0] == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_seeds_matter_and_repeat(sampler):
+    options = {"nsteps": 20, "throw": False}
+    chains = [draw(strong(), sampler, seed=s, **options).details["chain"] for s in (1, 1, 2)]
+    np.testing.assert_array_equal(chains[0], chains[1])
+    assert not np.array_equal(chains[0], chains[2])
+
+
+def test_how_steps_are_counted_does_not_matter():
+    long, short = (draw(strong(), "nuts", nsteps=n, throw=False) for n in (150, 40))
+    np.testing.assert_array_equal(long.details["chain"][:40], short.details["chain"])
+    one = draw(strong(), "nuts", nsteps=40, nwarmup=0, throw=False).details["chain"]
+    assert one.shape == (40, 4, 3)
+    assert not np.array_equal(one, short.details["chain"])
+
+
+def test_a_stopped_ensemble_goes_on_as_if_it_had_not(tmp_path):
+    whole = draw(strong(), "emcee", nsteps=40, throw=False)
+    path = tmp_path / "chain.h5"
+    draw(strong(), "emcee", nsteps=25, backend=ChainFile(path), throw=False)
+    gone_on = draw(strong(), "emcee", nsteps=40, backend=ChainFile(path), throw=False)
+    np.testing.assert_array_equal(gone_on.details["chain"], whole.details["chain"])
+
+
+def test_short_chains_are_reported():
+    with pytest.raises(FitError, match=r"4 chains of 20 steps: R-hat .*; needed are .*400") as e:
+        draw(strong(), "nuts", nsteps=20, nwarmup=10)
+    assert e.value.result.details["chain"].shape == (20, 4, 3)
+    with pytest.raises(FitError, match=r"100 steps are \d+ autocorrelation times .* at least 50"):
+        draw(strong(), "emcee", nsteps=100)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"sampler": "gibbs"}, ValueError, "`sampler` must be 'nuts' or 'emcee', not 'gibbs'"),
+        (
+            {"priors": {"dust.T_dust": Uniform(30.0, 40.0)}},
+            ValueError,
+            "Start value 21 of 'dust.T_dust' is not inside",
+        ),
+        ({"priors": {"gain.23": Gaussian(1, 1)}}, KeyError, "'gain.23', which is not free"),
+        ({"start": {"dust.T": 1.0}}, KeyError, "Unknown parameter 'dust.T'"),
+        ({"sampler": "emcee", "nwalkers": 5}, ValueError, "at least 6 walkers .*nwalkers=5"),
+        ({"sampler": "emcee", "nchains": 3}, ValueError, "`nchains` is not one of .* 'emcee'"),
+        ({"nwalkers": 32}, ValueError, "`nwalkers` is not one of the sampler 'nuts'"),
+        ({"nsteps": 3}, ValueError, "at least 4 steps and a chain, not nsteps=3"),
+        ({"nchains": 0}, ValueError, "at least 4 steps and a chain, .*nchains=0"),
+    ],
+)
+def test_bad_input_is_refused(options, error, words):
+    with pytest.raises(error, match=words):
+        sample_spectra(strong(), **options)
+
+
+def test_every_argument_is_described():
+    for name in inspect.signature(sample_spectra).parameters:
+        assert f"{name} :" in sample_spectra.__doc__ or f" {name}, " in sample_spectra.__doc__
+
+
+def test_agreement_is_that_of_blackjax_and_of_autoregressive_chains():
+    rng = np.random.default_rng(1)
+    correlation = np.array([-0.4, 0.0, 0.9])
+    chain = rng.normal(size=(2000, 3, 3))
+    for i in range(1, len(chain)):
+        chain[i] = correlation * chain[i - 1] + np.sqrt(1 - correlation**2) * chain[i]
+    rhat, effective = agreement(chain)
+    # Of alternating chains, squares are the worse ones.
+    worse = np.maximum(correlation, correlation**2)
+    np.testing.assert_allclose(effective, 6000 * (1 - worse) / (1 + worse), rtol=0.2)
+    chain[:, 0] += 0.2
+    rhat, _ = agreement(chain)
+    np.testing.assert_allclose(rhat, jax.jit(blackjax.rhat)(np.swapaxes(chain, 0, 1)), rtol=1e-6)
+    assert np.all(rhat[:2] > 1.005)
+    chain[..., 1] = 3.0
+    assert np.isnan(agreement(chain)).any(axis=0).tolist() == [False, True, False]

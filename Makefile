@@ -16,7 +16,7 @@ lint: .venv/.dev
 	$(BIN)/mypy
 
 # Huge pages for all that is allocated: numpy asks for them itself, XLA and numba do not.
-bench: .venv/.dev
+bench: .venv/.bench
 	GLIBC_TUNABLES=glibc.malloc.hugetlb=1 $(BIN)/python -m benchmarks --write
 
 .venv/bin/python:
@@ -32,6 +32,10 @@ bench: .venv/.dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
 	touch $@
 
+.venv/.bench: .venv/.dev requirements-bench.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-bench.txt
+	touch $@
+
 # The newest versions of everything, in a fresh environment; run the tests before committing.
 pin:
 	rm -rf .venv
@@ -39,10 +43,14 @@ pin:
 	$(BIN)/python -m pip install --quiet hatchling editables .
 	( sed -n 1p requirements.txt; $(BIN)/python -m pip freeze | grep -v '^jaxsky' ) > .venv/run.txt
 	$(BIN)/python -m pip install --quiet '.[dev]'
-	( sed -n 1p requirements-dev.txt; $(BIN)/python -m pip freeze | grep -v '^jaxsky' \
-		| grep -vxF -f .venv/run.txt ) > requirements-dev.txt.new
+	$(BIN)/python -m pip freeze | grep -v '^jaxsky' > .venv/all.txt
+	( sed -n 1p requirements-dev.txt; grep -vxF -f .venv/run.txt .venv/all.txt ) > .venv/dev.txt
+	$(BIN)/python -m pip install --quiet -c .venv/all.txt '.[bench]'
+	( sed -n 1p requirements-bench.txt; $(BIN)/python -m pip freeze | grep -v '^jaxsky' \
+		| grep -vxF -f .venv/all.txt ) > .venv/bench.txt
 	mv .venv/run.txt requirements.txt
-	mv requirements-dev.txt.new requirements-dev.txt
+	mv .venv/dev.txt requirements-dev.txt
+	mv .venv/bench.txt requirements-bench.txt
 	rm -rf .venv
 
 clean:

@@ -7,7 +7,14 @@ from pathlib import Path
 import jax
 from rich.console import Console
 
-from benchmarks import band_averages, command, comparisons, likelihoods, simulations
+from benchmarks import (
+    band_averages,
+    command,
+    comparisons,
+    likelihoods,
+    separation,
+    simulations,
+)
 from benchmarks.table import Row, conditions, markdown, rich_table
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
@@ -28,12 +35,18 @@ BENCHMARKS = {
     "analysis": simulations.transform,
     "smoothing-nside": simulations.growth,
     "correlated": simulations.correlated_alm,
+    "separation-likelihood": separation.uniform_noise,
+    "separation-pixels": separation.pixel_noise,
+    "separation-fit": separation.whole_fit,
+    "separation-regions": separation.regions,
+    "separation-simulations": separation.simulations,
+    "separation-samples": separation.samples,
     "coupling": comparisons.coupling,
     "patches": comparisons.patches,
     "commands": comparisons.commands,
 }
 #: These take minutes: they are run by name, and when the table is kept.
-LONG = ("nside-2048", "commands")
+LONG = ("nside-2048", "separation-pixels", "commands")
 
 
 def _arguments() -> argparse.Namespace:

@@ -8,13 +8,15 @@ import jax
 import numpy as np
 import pytest
 import scipy.special
+import scipy.stats
 
 from fits.priors import Gaussian, Uniform
 from fits.results import FitError
 from fits.sample import ChainFile
 from fits.separation import fit_spectra, sample_spectra, spectral_likelihood
 from fits.separation.agreement import agreement
-from fits.separation.problem import value_and_gradient
+from fits.separation.posterior import scaled_posterior
+from fits.separation.problem import Problem, value_and_gradient
 from test_separation import BANDS, START, problem, random_sky
 from test_separation_solvers import constant, regions
 
@@ -28,9 +30,9 @@ def draw(like, sampler, **options):
 
 
 @cache
-def strong():
+def strong(size: float = 300.0):
     """Signals far above the noise: close to a Gaussian."""
-    _, data, given, _ = problem(sky=random_sky(size=300.0))
+    _, data, given, _ = problem(sky=random_sky(size=size))
     return spectral_likelihood(random_sky(), BANDS, data, given, START)
 
 
@@ -120,6 +122,51 @@ def test_a_cut_posterior_is_that_of_integrals_on_a_grid(sampler):
     median = np.interp(0.5, below, axes[T])
     assert np.median(samples(result)[:, T]) == pytest.approx(median, abs=0.15 * width[T])
     assert samples(result)[:, T].min() > priors["dust.T_dust"].low
+
+
+def test_a_cut_through_a_narrow_ridge_is_a_truncated_normal():
+    """One standard deviation above the maximum; temperature and index are correlated by 0.99."""
+    like = strong(1000.0)
+    fit = fit_spectra(like)
+    covariance = np.linalg.inv(fit.hessian)
+    sigma = np.sqrt(np.diagonal(covariance))
+    T = NAMES.index("dust.T_dust")
+    edge = fit.best_fit["dust.T_dust"] + sigma[T]
+    result = draw(
+        like,
+        "nuts",
+        start={"dust.T_dust": edge + sigma[T]},
+        priors={"dust.T_dust": Uniform(edge, 60.0)},
+    )
+    # Mean and variance of a normal variable beyond one.
+    mean, variance = scipy.stats.truncnorm.stats(1, np.inf)
+    shift = covariance[T] / sigma[T] * mean
+    cut = covariance - np.outer(covariance[T], covariance[T]) / sigma[T] ** 2 * (1 - variance)
+    check(result, [fit.best_fit[n] for n in NAMES] + shift, np.sqrt(np.diagonal(cut)))
+    assert min(result.details["ess"].values()) > 1000
+
+
+def test_numbers_without_bounds_have_unit_covariance_and_go_back():
+    """Of samples with a cut, a curved and a free parameter; the Jacobian is the derivative."""
+    priors = {"dust.T_dust": Uniform(15.0, 60.0), "dust.beta_dust": Uniform(1.0, 2.0)}
+    posterior, unknown = scaled_posterior(Problem(strong(), priors), np.array([20.0, 1.5, 3.0]))
+    assert not unknown
+    rng = np.random.default_rng(3)
+    T = 15 + rng.exponential(5, 2000) % 45
+    beta = 1.5 + 0.005 * (T - 20) + 0.02 * np.log(T - 15) + 0.001 * rng.normal(size=2000)
+    values = np.stack([T, beta, 3 + beta + 0.01 * rng.normal(size=2000)], axis=1)
+    assert posterior.adapted(values[:20]) is posterior
+    assert posterior.adapted(values[:1].repeat(2000, axis=0)) is posterior
+    adapted = posterior.adapted(values)
+    z = adapted.coordinates(values)
+    np.testing.assert_allclose(np.cov(z.T), np.eye(3), atol=0.01)
+    for each in (posterior, adapted):
+        z = each.coordinates(values)
+        back, jacobian = jax.jit(jax.vmap(each.values))(z)
+        np.testing.assert_allclose(back, values, rtol=1e-9)
+        slopes = jax.jit(jax.vmap(jax.jacobian(lambda x, each=each: each.values(x)[0])))(z[:5])
+        constant = np.log(np.abs(np.linalg.det(slopes))) - jacobian[:5]
+        np.testing.assert_allclose(constant, constant[0], atol=1e-8)
 
 
 def test_without_data_the_posterior_is_the_prior():

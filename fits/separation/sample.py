@@ -2,31 +2,28 @@
 
 The no-U-turn sampler (Hoffman & Gelman 2014, JMLR 15, 1593) follows the gradient, so it takes a
 few evaluations for a sample that does not depend on the last one, however many parameters there
-are. It moves in numbers without bounds whose covariance is about the unit matrix: a uniform prior
-becomes the logistic map of its range, whose Jacobian is part of the density, and the curvature of
--log posterior at the best fit gives the rest.
+are. It moves in the numbers of `fits.separation.posterior`.
 """
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import blackjax
 import jax
 import jax.numpy as jnp
 import numpy as np
 from blackjax.adaptation.step_size import dual_averaging_adaptation
-from jaxtyping import Array, Bool, Float, Int
 from tqdm import tqdm
 
 from fits.priors import Prior, check_priors
 from fits.results import FitResult
 from fits.sample import ChainFile, ensemble, ensemble_summary, summary
 from fits.separation.agreement import agreement
-from fits.separation.algebra import degenerate
 from fits.separation.fit import fit_spectra
 from fits.separation.likelihood import SpectralLikelihood
-from fits.separation.problem import Problem, prior_terms, value_and_gradient
+from fits.separation.posterior import scaled_posterior
+from fits.separation.problem import Problem, value_and_gradient
 from jaxsky.types import Numeric
 
 __all__ = ["sample_spectra"]
@@ -37,104 +34,16 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "emcee": {"nsteps": 5000, "nwalkers": 32, "backend": None},
 }
 #: Mean acceptance that the step size of the no-U-turn sampler is tuned to.
-ACCEPTANCE = 0.8
+ACCEPTANCE = 0.9
 #: Width of the start positions of its chains, in standard deviations.
 SPREAD = 2.0
 #: Its steps in one call of a program: what progress is counted in.
-BLOCK = 100
+BLOCK = 50
 #: R-hat of chains that agree, and effective samples that each of them needs, after Vehtari et al.
 #: (2021, Bayesian Analysis 16, 667).
 AGREEMENT, EFFECTIVE = 1.01, 100
-
-
-class _Posterior(NamedTuple):
-    """The posterior of the parameters of regions with pixels, and numbers to move in.
-
-    Parameters
-    ----------
-    like, priors : the likelihood, and priors that are not uniform
-    theta, present : the vector of all parameters, and positions of those that are sampled
-    bounded, low, high : whether they have a uniform prior, and its range (any other number if not)
-    center, root : the unbounded numbers are center + root z, or root times z if it is a vector
-    """
-
-    like: SpectralLikelihood
-    priors: list[tuple[Prior, Array]]
-    theta: Float[Array, " all"]
-    present: Int[Array, " par"]
-    bounded: Bool[Array, " par"]
-    low: Float[Array, " par"]
-    high: Float[Array, " par"]
-    center: Float[Array, " par"]
-    root: Float[Array, "*par par"]
-
-    def log_prob(self, values: Float[Array, " par"]) -> Float[Array, ""]:
-        """Log posterior of parameters within their uniform priors, without constants."""
-        theta = self.theta.at[self.present].set(values)
-        value = prior_terms(theta, self.priors)[0]
-        return -self.like.total(theta[self.like.index]) / 2 - value
-
-    def values(self, z: Float[Array, " par"]) -> tuple[Float[Array, " par"], Float[Array, ""]]:
-        """Parameters, and the log of the Jacobian of the logistic map."""
-        y = self.center + (self.root @ z if self.root.ndim == 2 else self.root * z)
-        width = self.high - self.low
-        inside = self.low + width * jax.nn.sigmoid(y)
-        jacobian = jnp.log(width) + jax.nn.log_sigmoid(y) + jax.nn.log_sigmoid(-y)
-        values = jnp.where(self.bounded, inside, y)
-        return values, jnp.sum(jnp.where(self.bounded, jacobian, 0.0))
-
-    def density(self, z: Float[Array, " par"]) -> Float[Array, ""]:
-        """Log density of z."""
-        values, jacobian = self.values(z)
-        return self.log_prob(values) + jacobian
-
-
-def _posterior(problem: Problem, theta: np.ndarray) -> tuple[_Posterior, list[str]]:
-    """The posterior, scaled by its curvature near the best fit; parameters it does not determine.
-
-    Parameters
-    ----------
-    problem : the function
-    theta : the best fit
-    """
-    present = np.flatnonzero(problem.present)
-    bounded = np.isfinite(problem.low[present])
-    low = np.where(bounded, problem.low[present], 0.0)
-    high = np.where(bounded, problem.high[present], 1.0)
-    width = high - low
-
-    def derivatives(theta):
-        local = problem.convex(theta, problem.exact(theta))
-        return problem.curvature(theta, local, present), problem.value(theta)[1][present]
-
-    # Away from the edges by what the density falls over there.
-    matrix, slope = derivatives(theta)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scales = np.stack([1 / np.sqrt(matrix.diagonal()), 1 / np.abs(slope), width / 4])
-    margin = np.nanmin(scales, axis=0)
-    theta = theta.copy()
-    near = np.clip(theta[present], low + margin, high - margin)
-    theta[present] = np.where(bounded, near, theta[present])
-    matrix, slope = derivatives(theta)
-
-    unit = np.where(bounded, (theta[present] - low) / width, 0.5)
-    jacobian = np.where(bounded, width * unit * (1 - unit), 1.0)
-    bend = np.maximum(slope * jacobian * (1 - 2 * unit), 0) + 2 * unit * (1 - unit)
-    diagonal = matrix.diagonal() * jacobian**2 + np.where(bounded, bend, 0.0)
-    unknown = []
-    if isinstance(matrix, np.ndarray):
-        matrix = matrix * jacobian * jacobian[:, None]
-        np.fill_diagonal(matrix, diagonal)
-        unknown = degenerate(matrix, [problem.labels[i] for i in present])
-    elif (flat := ~(diagonal > 0)).any():
-        unknown = [problem.labels[i] for i in present[flat]]
-    root = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    if isinstance(matrix, np.ndarray) and not unknown:
-        scaled = np.linalg.cholesky(matrix * root * root[:, None])
-        root = root[:, None] * np.linalg.inv(scaled).T
-    center = np.where(bounded, np.log(unit / (1 - unit)), theta[present])
-    numbers = (theta, present, bounded, low, high, center, root)
-    return _Posterior(problem.like, problem.priors, *map(jnp.asarray, numbers)), unknown
+#: Share of divergent steps that does no harm: far out in the tail of a cut posterior.
+RARE = 1e-3
 
 
 @jax.jit
@@ -188,27 +97,39 @@ def _advanced(posterior, begun, key, first, nwarmup, steps):
     return jax.lax.scan(step, begun, first + jnp.arange(steps))
 
 
-def _nuts(posterior, labels, chi2_of, *, seed, nsteps, nwarmup, nchains, progress) -> FitResult:
-    z = SPREAD * np.random.default_rng(seed).normal(size=(nchains, len(labels)))
+def _course(posterior, z, key, first, last, nwarmup, bar) -> dict[str, np.ndarray]:
+    """The steps first ... last - 1 of chains that begin at z, in which the step size is tuned."""
     for _ in range(30):
         chains = _begun(posterior, z)
         bad = ~np.isfinite(np.asarray(chains.logdensity))
         if not bad.any():
             break
         # Far out the laws may not be finite.
-        z[bad] /= 2
+        z = np.where(bad[:, None], z / 2, z)
     begin, _, _ = dual_averaging_adaptation(ACCEPTANCE)
     # Of one type from the first call on, so that there is one program.
-    tuning = jax.tree.map(lambda x: jnp.asarray(x, float), begin(len(labels) ** -0.25))
-    state, key = (chains, tuning), jax.random.key(seed)
-    total = nwarmup + nsteps
-    courses = []
+    tuning = jax.tree.map(lambda x: jnp.asarray(x, float), begin(z.shape[1] ** -0.25))
+    state, courses = (chains, tuning), []
+    for number in range(first, last, BLOCK):
+        state, course = _advanced(posterior, state, key, number, nwarmup, BLOCK)
+        courses.append(jax.tree.map(np.asarray, course))
+        bar.update(min(BLOCK, last - number))
+    return {k: np.concatenate([c[k] for c in courses])[: last - first] for k in courses[0]}
+
+
+def _nuts(posterior, labels, chi2_of, *, seed, nsteps, nwarmup, nchains, progress) -> FitResult:
+    z = SPREAD * np.random.default_rng(seed).normal(size=(nchains, len(labels)))
+    key, total = jax.random.key(seed), nwarmup + nsteps
+    pilot = nwarmup // 2 // BLOCK * BLOCK
     with tqdm(total=total, disable=not progress, delay=2, leave=False) as bar:
-        for first in range(0, total, BLOCK):
-            state, course = _advanced(posterior, state, key, first, nwarmup, BLOCK)
-            courses.append(jax.tree.map(np.asarray, course))
-            bar.update(min(BLOCK, total - first))
-    course = {k: np.concatenate([c[k] for c in courses])[nwarmup:total] for k in courses[0]}
+        if pilot and posterior.root.ndim == 2:
+            chain = _course(posterior, z, key, 0, pilot, pilot, bar)["chain"]
+            posterior = posterior.adapted(chain[pilot // 3 :].reshape(-1, len(labels)))
+            z = posterior.coordinates(chain[-1])
+        else:
+            pilot = 0
+        course = _course(posterior, z, key, pilot, total, nwarmup, bar)
+    course = {name: values[nwarmup - pilot :] for name, values in course.items()}
     rhat, effective = agreement(course["chain"])
     worst, least = int(np.argmax(rhat)), float(np.min(effective))
     diverged = int(course["diverged"].sum())
@@ -221,8 +142,8 @@ def _nuts(posterior, labels, chi2_of, *, seed, nsteps, nwarmup, nchains, progres
         failed.append(f"an R-hat below {AGREEMENT}")
     if not least >= EFFECTIVE * nchains:
         failed.append(f"{EFFECTIVE * nchains} effective samples")
-    if diverged:
-        failed.append("no divergent step")
+    if diverged > RARE * nsteps * nchains:
+        failed.append(f"at most {RARE * nsteps * nchains:.0f} divergent ones")
     return summary(
         "nuts",
         labels,
@@ -318,7 +239,8 @@ def sample_spectra(
         samples a second afterwards; for hundreds of regions, where the second fails, minutes. It
         cannot be resumed, the second can.
     nsteps : steps of each chain (1000) or walker (5000) that are kept
-    nwarmup : "nuts": steps before that, in which the step size is tuned (300)
+    nwarmup : "nuts": steps before that (300): half of them to see how parameters vary together,
+        if they are few, and all to tune the step size
     nchains : "nuts": number of chains (4)
     nwalkers : "emcee": size of the ensemble (32)
     seed : of the start positions and the moves
@@ -343,9 +265,9 @@ def sample_spectra(
         the other one, and fewer than twice as many walkers as parameters.
     FitError
         If data and priors do not determine the parameters, R-hat is 1.01 or more, there are fewer
-        than 100 effective samples for each chain, or a step diverged; with "emcee", if the chain
-        is shorter than 50 autocorrelation times. Not if throw=False; the result is in its
-        `.result`.
+        than 100 effective samples for each chain, or more than one in a thousand steps diverged;
+        with "emcee", if the chain is shorter than 50 autocorrelation times. Not if throw=False;
+        the result is in its `.result`.
     """
     options = _options(
         sampler,
@@ -361,7 +283,7 @@ def sample_spectra(
     fit = fit_spectra(like, start, priors=priors, throw=False)
     problem = Problem(like, priors)
     best = np.array(like.flat(like.check(fit.best_fit)))
-    posterior, unknown = _posterior(problem, best)
+    posterior, unknown = scaled_posterior(problem, best)
     labels = tuple(np.array(problem.labels)[problem.present].tolist())
     if unknown:
         method = {"nuts": "nuts", "emcee": "mcmc"}[sampler]

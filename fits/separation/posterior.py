@@ -1,0 +1,198 @@
+"""The spectral posterior in numbers without bounds whose covariance is about the unit matrix.
+
+A uniform prior becomes the logistic map of its range, whose Jacobian is part of the density; the
+curvature of -log posterior at the best fit gives the rest, until there are samples. Where a prior
+cuts the posterior, that map is far from linear. The other parameters then follow the one that is
+cut itself, not its unbounded number, or, from samples on, what fits best of both: so a narrow
+ridge remains straight.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+from jaxtyping import Array, Bool, Float, Int
+
+from fits.priors import Prior
+from fits.separation.algebra import degenerate
+from fits.separation.likelihood import SpectralLikelihood
+from fits.separation.problem import Problem, prior_terms
+
+__all__ = ["Posterior", "scaled_posterior"]
+
+#: Samples for each parameter, from which on they tell more than the curvature at the best fit.
+ENOUGH = 30
+
+#: A prior cuts a parameter that spreads this much in its unbounded number: whose edge is within
+#: about four standard deviations.
+NEAR = 0.25
+
+
+class Posterior(NamedTuple):
+    """The posterior of the parameters of regions with pixels, and numbers to move in.
+
+    Parameters
+    ----------
+    like, priors : the likelihood, and priors that are not uniform
+    theta, present : the vector of all parameters, and positions of those that are sampled
+    bounded, low, high : whether they have a uniform prior, and its range (any other number if not)
+    center, root : the unbounded numbers are center + root z, or root times z if it is a vector
+    cut, middle, lean : parameters that are cut by their prior, about where they are, and what is
+        added to the numbers of the others for each unit of distance from there
+    """
+
+    like: SpectralLikelihood
+    priors: list[tuple[Prior, Array]]
+    theta: Float[Array, " all"]
+    present: Int[Array, " par"]
+    bounded: Bool[Array, " par"]
+    low: Float[Array, " par"]
+    high: Float[Array, " par"]
+    center: Float[Array, " par"]
+    root: Float[Array, "*par par"]
+    cut: Bool[Array, " par"]
+    middle: Float[Array, " par"]
+    lean: Float[Array, "*par par"]
+
+    def log_prob(self, values: Float[Array, " par"]) -> Float[Array, ""]:
+        """Log posterior of parameters within their uniform priors, without constants."""
+        theta = self.theta.at[self.present].set(values)
+        value = prior_terms(theta, self.priors)[0]
+        return -self.like.total(theta[self.like.index]) / 2 - value
+
+    def values(self, z: Float[Array, " par"]) -> tuple[Float[Array, " par"], Float[Array, ""]]:
+        """Parameters, and the log of the Jacobian of the logistic map."""
+        width = self.high - self.low
+        if self.root.ndim == 1:
+            y = self.center + self.root * z
+        else:
+            y = self.center + self.root @ z
+            moved = self.low + width * jax.nn.sigmoid(y) - self.middle
+            y = y + self.lean @ jnp.where(self.cut, moved, 0.0)
+        inside = self.low + width * jax.nn.sigmoid(y)
+        jacobian = jnp.log(width) + jax.nn.log_sigmoid(y) + jax.nn.log_sigmoid(-y)
+        values = jnp.where(self.bounded, inside, y)
+        return values, jnp.sum(jnp.where(self.bounded, jacobian, 0.0))
+
+    def density(self, z: Float[Array, " par"]) -> Float[Array, ""]:
+        """Log density of z."""
+        values, jacobian = self.values(z)
+        return self.log_prob(values) + jacobian
+
+    def coordinates(self, values: Float[np.ndarray, "sample par"]) -> np.ndarray:
+        """The z of parameters, where there is a matrix."""
+        rest = self._unbounded(values) - np.asarray(self.center)
+        moved = np.where(self.cut, values - np.asarray(self.middle), 0.0)
+        return np.linalg.solve(self.root, (rest - moved @ np.asarray(self.lean).T).T).T
+
+    def _unbounded(self, values: np.ndarray) -> np.ndarray:
+        unit = np.where(self.bounded, (values - self.low) / (self.high - self.low), 0.5)
+        # At an edge to rounding, the number is not infinite.
+        return np.where(self.bounded, scipy.special.logit(np.clip(unit, 1e-15, 1 - 1e-15)), values)
+
+    def adapted(self, values: Float[np.ndarray, "sample par"]) -> "Posterior":
+        """With the covariance of samples; the same if they are too few, or do not move."""
+        if self.root.ndim == 1 or len(values) < ENOUGH * values.shape[1]:
+            return self
+        y = self._unbounded(values)
+        center, middle, spread = y.mean(axis=0), values.mean(axis=0), y.std(axis=0)
+        if not np.isfinite(spread).all() or not spread.min() > 0:
+            return self
+        y = (y - center) / spread
+        cut = np.asarray(self.bounded) & (spread > NEAR)
+        first, rest = np.flatnonzero(cut), np.flatnonzero(~cut)
+        width = values[:, first].std(axis=0)
+        # The others as linear functions of cut parameters and of their unbounded numbers.
+        both = np.concatenate([y[:, first], (values[:, first] - middle[first]) / width], axis=1)
+        slopes = np.linalg.lstsq(both, y[:, rest], rcond=1e-6)[0].T
+        rests = y[:, rest] - both @ slopes.T
+        root, lean = np.zeros_like(self.root), np.zeros_like(self.root)
+        try:
+            for own, block in ((first, y[:, first]), (rest, rests)):
+                root[np.ix_(own, own)] = np.linalg.cholesky(block.T @ block / len(block))
+        except np.linalg.LinAlgError:
+            return self
+        root[np.ix_(rest, first)] = slopes[:, : len(first)] @ root[np.ix_(first, first)]
+        lean[np.ix_(rest, first)] = slopes[:, len(first) :] / width
+        return self._replace(
+            center=jnp.asarray(center),
+            root=jnp.asarray(root * spread[:, None]),
+            cut=jnp.asarray(cut),
+            middle=jnp.asarray(middle),
+            lean=jnp.asarray(lean * spread[:, None]),
+        )
+
+
+def scaled_posterior(problem: Problem, theta: np.ndarray) -> tuple[Posterior, list[str]]:
+    """The posterior, scaled by its curvature near the best fit; parameters it does not determine.
+
+    Parameters
+    ----------
+    problem : the function
+    theta : the best fit
+    """
+    present = np.flatnonzero(problem.present)
+    bounded = np.isfinite(problem.low[present])
+    low = np.where(bounded, problem.low[present], 0.0)
+    high = np.where(bounded, problem.high[present], 1.0)
+    width = high - low
+
+    def derivatives(theta):
+        local = problem.convex(theta, problem.exact(theta))
+        return problem.curvature(theta, local, present), problem.value(theta)[1][present]
+
+    # Away from the edges by what the density falls over there.
+    matrix, slope = derivatives(theta)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scales = np.stack([1 / np.sqrt(matrix.diagonal()), 1 / np.abs(slope), width / 4])
+    margin = np.nanmin(scales, axis=0)
+    theta = theta.copy()
+    near = np.clip(theta[present], low + margin, high - margin)
+    theta[present] = np.where(bounded, near, theta[present])
+    matrix, slope = derivatives(theta)
+
+    unit = np.where(bounded, (theta[present] - low) / width, 0.5)
+    jacobian = np.where(bounded, width * unit * (1 - unit), 1.0)
+    bend = np.maximum(slope * jacobian * (1 - 2 * unit), 0) + 2 * unit * (1 - unit)
+    diagonal = matrix.diagonal() * jacobian**2 + np.where(bounded, bend, 0.0)
+    unknown = []
+    if isinstance(matrix, np.ndarray):
+        matrix = matrix * jacobian * jacobian[:, None]
+        np.fill_diagonal(matrix, diagonal)
+        unknown = degenerate(matrix, [problem.labels[i] for i in present])
+    elif (flat := ~(diagonal > 0)).any():
+        unknown = [problem.labels[i] for i in present[flat]]
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    root, cut, lean = scale, np.zeros(len(present), bool), np.zeros(0)
+    if isinstance(matrix, np.ndarray) and not unknown:
+        root, cut, lean = _straightened(matrix * scale * scale[:, None], bounded, scale, jacobian)
+    center = np.where(bounded, np.log(unit / (1 - unit)), theta[present])
+    numbers = (theta, present, bounded, low, high, center, root, cut, theta[present], lean)
+    return Posterior(problem.like, problem.priors, *map(jnp.asarray, numbers)), unknown
+
+
+def _straightened(matrix, bounded, scale, jacobian):
+    """Root, cut parameters, and lean of others on these; see `Posterior`.
+
+    Parameters
+    ----------
+    matrix : curvature in unbounded numbers, scaled to a unit diagonal
+    bounded : parameters with a uniform prior
+    scale : by which it was scaled
+    jacobian : derivative of parameters in unbounded numbers
+    """
+    spread = scale * np.sqrt(np.diagonal(np.linalg.inv(matrix)))
+    cut = bounded & (spread > NEAR)
+    first, rest = np.flatnonzero(cut), np.flatnonzero(~cut)
+    coupling = matrix[np.ix_(rest, first)]
+    follow = -np.linalg.solve(matrix[np.ix_(rest, rest)], coupling)
+    root, lean = np.zeros_like(matrix), np.zeros_like(matrix)
+    for own, block in (
+        (rest, matrix[np.ix_(rest, rest)]),
+        (first, matrix[np.ix_(first, first)] + coupling.T @ follow),
+    ):
+        root[np.ix_(own, own)] = np.linalg.inv(np.linalg.cholesky(block)).T
+    lean[np.ix_(rest, first)] = follow / (scale * jacobian)[first]
+    return root * scale[:, None], cut, lean * scale[:, None]

@@ -100,7 +100,7 @@ def test_a_cut_posterior_is_that_of_integrals_on_a_grid(sampler):
         name: Uniform(*(fit.best_fit[name] + fit.sigma[name] * np.array(ends)))
         for name, ends in PRIORS.items()
     }
-    result = draw(like, sampler, priors=priors, nsteps={"nuts": 1000, "emcee": 4000}[sampler])
+    result = draw(like, sampler, priors=priors, nsteps={"nuts": 1000, "emcee": 6000}[sampler])
     nodes, weights = scipy.special.roots_legendre(48)
     axes = [p.low + (p.high - p.low) * (1 + nodes) / 2 for p in (priors[n] for n in NAMES)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)

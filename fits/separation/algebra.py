@@ -33,12 +33,20 @@ def assembled(
     return scipy.sparse.csc_matrix(matrix + scipy.sparse.diags(diagonal))
 
 
+def _independent(matrix: np.ndarray) -> list[np.ndarray]:
+    """Positions of the independent blocks that a matrix falls into, as regions do."""
+    graph = scipy.sparse.csr_matrix(matrix != 0)
+    count, block = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    order = np.argsort(block, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(block, minlength=count))[:-1])
+
+
 class Factor:
     """Factors of a symmetric matrix; `positive` tells whether it is positive definite.
 
     Parameters
     ----------
-    matrix : dense or sparse
+    matrix : dense or sparse; a dense one is factorised block by block
     """
 
     def __init__(self, matrix: np.ndarray | scipy.sparse.csc_matrix) -> None:
@@ -49,8 +57,11 @@ class Factor:
             return
         if isinstance(matrix, np.ndarray):
             scaled = matrix * self._scale * self._scale[:, None]
+            self._blocks = _independent(scaled)
             try:
-                self._factor = scipy.linalg.cho_factor(scaled)
+                self._factors = [
+                    scipy.linalg.cho_factor(scaled[np.ix_(at, at)]) for at in self._blocks
+                ]
             except (scipy.linalg.LinAlgError, ValueError):
                 self.positive = False
             return
@@ -73,7 +84,11 @@ class Factor:
         scale = self._scale if right.ndim == 1 else self._scale[:, None]
         if hasattr(self, "_sparse"):
             return scale * self._sparse.solve(scale * right)
-        return scale * scipy.linalg.cho_solve(self._factor, scale * right)
+        scaled = scale * right
+        solution = np.empty_like(scaled)
+        for at, factor in zip(self._blocks, self._factors, strict=True):
+            solution[at] = scipy.linalg.cho_solve(factor, scaled[at])
+        return scale * solution
 
 
 def degenerate(
@@ -93,11 +108,15 @@ def degenerate(
     if not isinstance(matrix, np.ndarray):
         return [] if Factor(matrix).positive else list(names)
     scale = 1 / np.sqrt(diagonal)
-    values, vectors = np.linalg.eigh(matrix * scale * scale[:, None])
-    if values[0] > threshold:
-        return []
-    share = np.abs(vectors[:, 0])
-    return [name for name, s in zip(names, share, strict=True) if s > 0.05 * share.max()]
+    scaled = matrix * scale * scale[:, None]
+    found = []
+    for at in _independent(scaled):
+        values, vectors = np.linalg.eigh(scaled[np.ix_(at, at)])
+        if values[0] > threshold:
+            continue
+        share = np.abs(vectors[:, 0])
+        found += at[share > 0.05 * share.max()].tolist()
+    return [names[i] for i in sorted(found)]
 
 
 def variances(

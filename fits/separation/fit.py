@@ -24,10 +24,8 @@ from fits.separation.algebra import Factor, assembled, degenerate, variances
 from fits.separation.likelihood import SpectralLikelihood
 from fits.separation.problem import (
     Problem,
-    cell_fishers,
-    cell_hessians,
+    cell_derivatives,
     prior_terms,
-    value_and_gradient,
 )
 from fits.separation.results import SpectralFit
 from jaxsky.types import Numeric
@@ -44,7 +42,7 @@ def hessian(
     like: SpectralLikelihood, params: Mapping[str, Numeric]
 ) -> Float[np.ndarray, "par par"]:
     """Second derivatives of -ln L in all parameters, regions one after the other."""
-    return _dense(cell_hessians, like, params)
+    return _dense("hessian", like, params)
 
 
 def fisher(like: SpectralLikelihood, params: Mapping[str, Numeric]) -> Float[np.ndarray, "par par"]:
@@ -53,12 +51,13 @@ def fisher(like: SpectralLikelihood, params: Mapping[str, Numeric]) -> Float[np.
     sum_p s^T A_i^T [N^-1 - N^-1 A (A^T N^-1 A)^-1 A^T N^-1] A_j s with A_i the derivative of the
     mixing matrix (Errard, Stivoli & Stompor 2011, PRD 84, 063005).
     """
-    return _dense(cell_fishers, like, params)
+    return _dense("fisher", like, params)
 
 
-def _dense(function, like, params):
+def _dense(which, like, params):
     theta = like.flat(like.check(params))
-    local, index = np.asarray(function(like, theta)), np.asarray(like.index)
+    local = np.asarray(getattr(cell_derivatives(like, theta), which))
+    index = np.asarray(like.index)
     matrix = assembled(local, index, len(theta), np.zeros(len(theta)))
     return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
 
@@ -182,7 +181,7 @@ def fit_spectra(
     keep = np.flatnonzero(problem.present & ~edges)
     labels = problem.labels
     matrix = problem.curvature(theta, problem.exact(theta), keep)
-    scatter = problem.curvature(theta, np.asarray(cell_fishers(like, theta)), keep)
+    scatter = problem.curvature(theta, np.asarray(problem.derivatives(theta).fisher), keep)
     unknown = degenerate(matrix, [labels[i] for i in keep])
     factor = Factor(matrix)
     covariance, sigma = _errors(problem, matrix, factor, scatter, keep, not unknown)
@@ -210,7 +209,7 @@ def fit_spectra(
         covariance=covariance,
         hessian=_widened(matrix, keep, len(theta)) if dense else None,
         fisher=_widened(scatter, keep, len(theta)) if dense else None,
-        chi2=2 * float(value_and_gradient(like, theta)[0]),
+        chi2=2 * float(problem.derivatives(theta).value.sum()),
         dof=like.values - int(problem.present.sum()),
         converged=message == "converged",
         message=message,

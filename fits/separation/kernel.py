@@ -16,7 +16,16 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-__all__ = ["Pixels", "chi2", "explained", "inverse_gram", "residuals", "solve"]
+__all__ = [
+    "Derivatives",
+    "Pixels",
+    "chi2",
+    "derivatives",
+    "explained",
+    "inverse_gram",
+    "residuals",
+    "solve",
+]
 
 
 class Pixels(NamedTuple):
@@ -165,6 +174,65 @@ def explained(
     """Amplitudes, and chi^2 of each pixel."""
     amplitudes, rest, weighted = _parts(mixing, pixels)
     return amplitudes, jnp.sum(rest * weighted, axis=(0, 1))
+
+
+class Derivatives(NamedTuple):
+    """-ln L and its derivatives in the parameters that a mixing matrix depends on.
+
+    Parameters
+    ----------
+    value, gradient, hessian : the function, first and second derivatives
+    fisher : second derivatives for data that are what the parameters predict: the Fisher matrix of
+        the fitted amplitudes, positive semi-definite
+    """
+
+    value: Float[Array, "*batch"]
+    gradient: Float[Array, "*batch free"]
+    hessian: Float[Array, "*batch free free"]
+    fisher: Float[Array, "*batch free free"]
+
+
+def derivatives(
+    mixing: Float[Array, "row unknown"],
+    first: Float[Array, "free row unknown"],
+    second: Float[Array, "free free row unknown"],
+    pixels: Pixels,
+) -> Derivatives:
+    """chi^2 / 2 and its derivatives in closed form, from one factorisation.
+
+    With A the matrix, A_i its derivatives, G = A^T W A, amplitudes s, residuals r, B_i = A_i s and
+    D_i = A_i^T W r - A^T W B_i,
+
+        gradient_i = -r^T W B_i
+        fisher_ij = B_i^T W B_j - (A^T W B_i)^T G^-1 (A^T W B_j)
+        hessian_ij = B_i^T W B_j - r^T W A_ij s - D_i^T G^-1 D_j.
+
+    Parameters
+    ----------
+    mixing, first, second : the matrix and its derivatives
+    pixels : data and weights
+    """
+    right = _projected(mixing, _weighted(pixels, pixels.data))
+    amplitudes, lower = _solved(mixing, pixels, right)
+    rest = pixels.data - _model(mixing, amplitudes)
+    weighted = _weighted(pixels, rest)
+    moved = jax.vmap(lambda m: _model(m, amplitudes))(first)
+    weighted_moved = jax.vmap(lambda maps: _weighted(pixels, maps))(moved)
+    along = jax.vmap(lambda maps: _projected(mixing, maps))(weighted_moved)
+    across = jax.vmap(lambda m: _projected(m, weighted))(first) - along
+    squares = jnp.einsum("ikrn,jkrn->ij", moved, weighted_moved)
+    # Products of residuals and amplitudes, summed over pixels once for both orders.
+    products = jnp.einsum("krn,kun->ru", weighted, amplitudes)
+
+    def inner(x):
+        return jnp.einsum("ikun,jkun->ij", x, jax.vmap(lambda y: _stacked(lower, y))(x))
+
+    return Derivatives(
+        jnp.sum(rest * weighted) / 2,
+        -jnp.einsum("ru,iru->i", products, first),
+        squares - jnp.einsum("ru,ijru->ij", products, second) - inner(across),
+        squares - inner(along),
+    )
 
 
 def _parts(mixing, pixels):

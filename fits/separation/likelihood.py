@@ -129,41 +129,61 @@ class SpectralLikelihood(Likelihood):
             self.mixing.rotated(matrix, values) if each.joint else matrix for each in self.layout
         )
 
-    def _mapped(self, function, local):
-        """A function of (matrix, pixels) in all blocks, for each of `layout`."""
+    def _mapped(self, function, matrices):
+        """A function of (matrices, pixels) in all blocks, for each of `layout`."""
         results = []
-        for matrix, pixels in zip(self.matrices(local), self.pixels, strict=True):
+        for of_cell, pixels in zip(matrices, self.pixels, strict=True):
             blocks, *_, size = pixels.data.shape
-            of_block = matrix if self.block_cell is None else matrix[self.block_cell]
-            if blocks * size <= PASS:
-                results.append(jax.vmap(function)(of_block, pixels))
-                continue
+            cells = self._cell_of_block(blocks)
+
+            def one(inputs, of_cell=of_cell):
+                cell, own = inputs
+                return function(jax.tree.map(lambda x: x[cell], of_cell), own)
+
             at_once = max(1, PASS // size)
-            results.append(
-                jax.lax.map(lambda x: function(*x), (of_block, pixels), batch_size=at_once)
-            )
+            if blocks * size <= PASS:
+                results.append(jax.vmap(one)((cells, pixels)))
+            elif at_once == 1:
+                # With a batch size of 1 XLA copies all data and weights first.
+                results.append(jax.lax.map(one, (cells, pixels)))
+            else:
+                results.append(jax.lax.map(one, (cells, pixels), batch_size=at_once))
         return tuple(results)
+
+    def _cell_of_block(self, blocks: int) -> Int[Array, " block"]:
+        return jnp.arange(blocks) if self.block_cell is None else self.block_cell
 
     def total(self, local: Float[Array, "cell free"]) -> Float[Array, ""]:
         """-2 ln L for parameters of each cell."""
-        parts = self._mapped(kernel.chi2, local)
+        parts = self._mapped(kernel.chi2, self.matrices(local))
         return sum((jnp.sum(part) for part in parts), jnp.zeros(()))
 
-    def predicted(self, local: Float[Array, "cell free"]) -> "SpectralLikelihood":
-        """The same likelihood with data that are exactly what the parameters predict."""
+    def derivatives(self, local: Float[Array, "cell free"]) -> kernel.Derivatives:
+        """-ln L of each cell, and its derivatives in the parameters of the cell."""
+        units = jnp.eye(local.shape[1])
 
-        def model(matrix, pixels):
-            return jnp.einsum("ru,kun->krn", matrix, kernel.solve(matrix, pixels))
+        def slope(function, unit):
+            return jax.jvp(function, (local,), (jnp.broadcast_to(unit, local.shape),))
 
-        pixels = tuple(
-            part._replace(data=data)
-            for part, data in zip(self.pixels, self._mapped(model, local), strict=True)
-        )
-        return eqx.tree_at(lambda like: like.pixels, self, pixels)
+        def first(x):
+            return jax.vmap(
+                lambda unit: jax.jvp(self.matrices, (x,), (jnp.broadcast_to(unit, x.shape),))[1],
+                out_axes=1,
+            )(units)
+
+        one, two = jax.vmap(lambda unit: slope(first, unit), out_axes=(None, 1))(units)
+        every = tuple(zip(self.matrices(local), one, two, strict=True))
+        parts = self._mapped(lambda m, own: kernel.derivatives(m[0], m[1], m[2], own), every)
+        summed = []
+        for part in parts:
+            cells = self._cell_of_block(len(part.value))
+            summed.append(
+                jax.tree.map(lambda x, c=cells: jax.ops.segment_sum(x, c, len(local)), part)
+            )
+        return jax.tree.map(lambda *rows: sum(rows), *summed)
 
     def residuals(self, params):
-        local = self.flat(params)[self.index]
-        parts = self._mapped(kernel.residuals, local)
+        parts = self._mapped(kernel.residuals, self.matrices(self.flat(params)[self.index]))
         return jnp.concatenate([part.ravel() for part in parts])
 
 

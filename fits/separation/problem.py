@@ -15,22 +15,19 @@ from jaxtyping import Bool, Float
 
 from fits.priors import Gaussian, Prior, Uniform, at_edge, bounds
 from fits.separation.algebra import assembled
+from fits.separation.kernel import Derivatives
 from fits.separation.likelihood import SpectralLikelihood
 
 __all__ = [
     "Matrix",
     "Problem",
-    "cell_fishers",
-    "cell_hessians",
+    "cell_derivatives",
     "prior_terms",
     "value_and_gradient",
 ]
 
 #: Dense, or sparse for many parameters.
 Matrix: TypeAlias = np.ndarray | scipy.sparse.csc_matrix
-
-#: Pixels whose second derivatives in all parameters are computed at once.
-AT_ONCE = 1 << 15
 
 
 @jax.jit
@@ -40,30 +37,9 @@ def value_and_gradient(like, theta):
 
 
 @jax.jit
-def cell_hessians(like, theta):
-    """Second derivatives of -ln L in the parameters of each cell, (cell, free, free)."""
-    local = theta[like.index]
-    gradient = jax.grad(lambda x: like.total(x) / 2)
-
-    def column(unit):
-        return jax.jvp(gradient, (local,), (jnp.broadcast_to(unit, local.shape),))[1]
-
-    # Cells are independent: one column of all of them at a time.
-    units = jnp.eye(local.shape[1])
-    pixels = max(part.data.shape[0] * part.data.shape[-1] for part in like.pixels)
-    columns = jax.vmap(column)(units) if pixels <= AT_ONCE else jax.lax.map(column, units)
-    matrices = jnp.moveaxis(columns, 0, -1)
-    return (matrices + jnp.swapaxes(matrices, -1, -2)) / 2
-
-
-@jax.jit
-def _predicted(like, theta):
-    return like.predicted(theta[like.index])
-
-
-def cell_fishers(like, theta):
-    """`cell_hessians` for data that are what the parameters predict: positive semi-definite."""
-    return cell_hessians(_predicted(like, theta), theta)
+def cell_derivatives(like, theta) -> Derivatives:
+    """-ln L of each cell and its derivatives in the parameters of the cell."""
+    return like.derivatives(theta[like.index])
 
 
 @jax.jit
@@ -97,6 +73,8 @@ class Problem:
 
     def __init__(self, like: SpectralLikelihood, priors: Mapping[str, Prior]) -> None:
         self.like = like
+        #: The last vector that derivatives were asked for, and what they are.
+        self._last: tuple[bytes, Derivatives] | None = None
         sizes = {name: like.start[name].size for name in like.free}
         self.owner = np.repeat(np.arange(len(sizes)), list(sizes.values()))
         self.names = tuple(like.free[i] for i in self.owner)
@@ -121,13 +99,23 @@ class Problem:
             labels += [name if single else f"{name}[{k}]" for k in regions]
         return tuple(labels)
 
+    def derivatives(self, theta: np.ndarray) -> Derivatives:
+        """-ln L of each cell and its derivatives, as arrays of numpy; priors left out."""
+        key = theta.tobytes()
+        if self._last is None or self._last[0] != key:
+            found = cell_derivatives(self.like, jnp.asarray(theta))
+            self._last = (key, jax.tree.map(np.asarray, found))
+        return self._last[1]
+
     def value(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
         """The function and its gradient."""
-        value, gradient = value_and_gradient(self.like, theta)
+        cells = self.derivatives(theta)
+        value, gradient = float(np.sum(cells.value)), np.zeros(len(theta))
+        np.add.at(gradient, self.index, cells.gradient)
         if self.priors:
             prior, slope, _ = prior_terms(theta, self.priors)
-            value, gradient = value + prior, gradient + slope
-        return float(value), np.asarray(gradient)
+            value, gradient = value + float(prior), gradient + np.asarray(slope)
+        return value, gradient
 
     def curvature(
         self, theta: np.ndarray, local: np.ndarray, keep: np.ndarray | None = None
@@ -145,7 +133,7 @@ class Problem:
 
     def exact(self, theta: np.ndarray) -> np.ndarray:
         """Second derivatives of -ln L in each cell."""
-        return np.asarray(cell_hessians(self.like, theta))
+        return np.asarray(self.derivatives(theta).hessian)
 
     def convex(self, theta: np.ndarray, exact: np.ndarray) -> np.ndarray:
         """Matrices of cells, those that are not positive replaced by Fisher matrices."""
@@ -155,8 +143,7 @@ class Problem:
         usable &= (diagonal > 0).all(axis=1)
         scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
         usable &= np.linalg.eigvalsh(safe * scale[:, None] * scale[:, :, None])[:, 0] > 0
-        fishers = np.asarray(cell_fishers(self.like, theta))
-        return np.where(usable[:, None, None], exact, fishers)
+        return np.where(usable[:, None, None], exact, self.derivatives(theta).fisher)
 
     def reach(self) -> Float[np.ndarray, " par"]:
         """The longest step of each parameter: beyond what its prior says lie other optima."""

@@ -1,12 +1,11 @@
 """The most probable spectral parameters: Newton's method, or a solver of optimistix.
 
-Newton's method is the default because its programs are those that the checks and the covariance
-need in any case. A first fit of 3 parameters to 15 bands takes 2.6 s of one core, of which nearly
-all is compiling; with BFGS it is 4.7 s, with LevenbergMarquardt 5.3 s. Later fits take 7 to 9 ms
-with any. Of 432 parameters in 192 superpixels, a later fit takes 0.16 s: second derivatives are
-those of each cell alone. LBFGS and BFGS take 0.2 s, LevenbergMarquardt on normal equations 0.3 s,
-Dogleg, which factorises the residuals of all cells together, 8 s. Levenberg and Marquardt's steps
-converge from farthest away.
+Newton's method is the default because its program is that which the checks and the covariance need
+in any case: a first fit, nearly all of it compilation, takes about half the time that it takes with
+a solver of optimistix, and later ones the same few milliseconds. With hundreds of regions its second
+derivatives are those of each cell alone; LBFGS and BFGS take a little longer, LevenbergMarquardt on
+normal equations twice as long, and Dogleg, which factorises the residuals of all cells together, 50
+times. Levenberg and Marquardt's steps converge from farthest away.
 """
 
 from collections.abc import Mapping

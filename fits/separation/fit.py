@@ -1,8 +1,8 @@
 """The most probable spectral parameters: Newton's method, or a solver of optimistix.
 
 Newton's method is the default because its program is that which the checks and the covariance need
-in any case: a first fit, nearly all of it compilation, takes about half the time of one with a solver
-of optimistix, and later ones the same few milliseconds. With hundreds of regions its second
+in any case: a first fit, nearly all of it compilation, takes half the time of one with a solver of
+optimistix, and later ones the same few milliseconds. With hundreds of regions its second
 derivatives are those of each cell alone; LBFGS and BFGS take a little longer, LevenbergMarquardt on
 normal equations twice as long, and Dogleg, which factorises the residuals of all cells together,
 fifty times. Levenberg and Marquardt's steps converge from farthest away.

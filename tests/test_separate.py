@@ -61,7 +61,7 @@ def separated(domain: str = "pixel", nsims: int = 20, sampler: str = "none"):
 
 def test_pulls_of_laws_and_r():
     """In pixels outside a mask, where smoothed noise is correlated and E leaks into B."""
-    how, setup, found = separated("pixel", 250)
+    how, setup, found = separated("pixel", 200)
     domain, lmax, count = setup.domain, 2 * NSIDE, 200
     spectra = camb_spectra(lmax)
     window = expand(gaussian_beam(FWHM, lmax))
@@ -88,7 +88,7 @@ def test_pulls_of_laws_and_r():
         powers = band_powers(found.spectra, maps[found.components.index("cmb")])[1]
         ratios.append(fit_tensors(model, powers).r / sigma)
     every = np.column_stack([pulls, ratios])
-    # 0.15 and 0.1, and the statistical errors of 200 skies and 250 simulations, 0.09 and 0.07.
+    # 0.15 and 0.1, and the statistical errors of 200 skies and 200 simulations, 0.09 and 0.07.
     assert np.all(np.abs(every.mean(axis=0)) < 0.15 + 0.09)
     assert np.all(np.abs(every.std(axis=0) - 1) < 0.1 + 0.07)
     # The likelihood alone takes pixels as independent, which smoothed noise is not.

@@ -93,7 +93,7 @@ def plot_parameters(path: Path, found: Separation, title: str) -> bool:
             middle = float(np.nanmedian(value))
             limit = float(np.nanquantile(np.abs(value - middle), 0.98)) or 1.0
             draw_map(row[0], value, limit, f"${label(name)}$", middle=float(f"{middle:.3g}"))
-            half = float(np.nanquantile(sigma, 0.98)) / 2
+            half = float(f"{np.nanquantile(sigma, 0.98) / 2:.1g}")
             draw_map(row[1], sigma, half, rf"$\sigma({label(name)})$", middle=half)
             row[0].set_title(f"${label(name)}$, {len(found.fit.best_fit[name])} regions")
             row[1].set_title("its standard deviation")

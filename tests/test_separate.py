@@ -17,7 +17,7 @@ from fits.separation import fit_spectra
 from fits.separation.response import Response, widened
 from fits.separation.tensor_ratio import fit_tensors
 from jaxsky.cmb import camb_spectra, realisation
-from jaxsky.harmonics import expand, gaussian_beam, synthesis
+from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis
 from jaxsky.io import InputError
 from jaxsky.settings import SettingsError
 
@@ -121,6 +121,21 @@ def test_errors_of_multipoles_are_those_of_simulations():
     _, _, found = separated("harmonic", 60)
     for i, name in enumerate(found.fit.free):
         assert found.simulated.theta[:, i].std() == pytest.approx(found.fit.sigma[name], rel=0.3)
+
+
+def test_noise_of_multipoles_has_its_spectrum():
+    """That of pixels, and what is correlated between them; 20 draws of 2 x 65 modes: 2.8 %."""
+    _, setup, _ = separated("harmonic")
+    domain, ell = setup.domain, np.arange(2 * NSIDE + 1)
+    rest = np.where(ell > 1, 3 * domain.noise[:, 0], 0.0)
+    for correlated in (domain.correlated, rest):
+        changed = domain._replace(correlated=correlated)
+        draws = [changed.noise_realisation(key) for key in jax.random.split(jax.random.key(3), 20)]
+        power = np.mean([power_spectrum(jnp.asarray(draw)) for draw in draws], axis=0)
+        expected = domain.noise + correlated[:, None]
+        np.testing.assert_allclose(
+            power[..., 8:].mean(axis=-1), expected[..., 8:].mean(axis=-1), rtol=0.05
+        )
 
 
 def test_a_law_that_is_wrong_shows_in_r():

@@ -102,6 +102,7 @@ class HarmonicDomain(NamedTuple):
     fwhms : of the bands [arcmin]
     noise : N_l of the maps as observed [unit^2 sr]
     covariance : of Q and U in each pixel of the bands [unit^2], each at its own nside
+    correlated : N_l of noise that is correlated between pixels, part of `noise`; zero where none
     lmax : largest multipole
     nside, fwhm : of the maps that are made [arcmin]
     """
@@ -113,6 +114,7 @@ class HarmonicDomain(NamedTuple):
     fwhms: Float[np.ndarray, " band"]
     noise: Float[np.ndarray, "band stokes ell"]
     covariance: tuple[Float[Array, "stokes stokes pix"], ...]
+    correlated: Float[np.ndarray, "band ell"]
     lmax: int
     nside: int
     fwhm: float
@@ -125,12 +127,14 @@ class HarmonicDomain(NamedTuple):
 
     def noise_realisation(self, key: Array) -> Float[np.ndarray, "band stokes alm"]:
         """Noise like that of the data."""
-        return np.stack(
-            [
-                np.asarray(analysis(draw(stream(key, "noise", name), covariance), self.lmax, 0))
-                for name, covariance in zip(self.bands, self.covariance, strict=True)
-            ]
-        )
+        bands = []
+        for name, covariance, spectrum in zip(
+            self.bands, self.covariance, self.correlated, strict=True
+        ):
+            alm = analysis(draw(stream(key, "noise", name), covariance), self.lmax, 0)
+            white = jax.random.normal(stream(key, "correlated", name), alm.shape)
+            bands.append(np.asarray(alm + white * expand(jnp.sqrt(jnp.asarray(spectrum)))))
+        return np.stack(bands)
 
     def components(self, like: SpectralLikelihood, params: Mapping, data, **_):
         """Amplitudes of the components with all that is known of them."""

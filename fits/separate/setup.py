@@ -265,11 +265,15 @@ def _multipoles(settings, sky, inputs, foregrounds):
         jnp.asarray(band.noise) * f**2
         for band, f in zip(inputs.bands.values(), factors, strict=True)
     )
+    correlated = np.zeros((len(covariance), lmax + 1))
     spectra = []
-    for band, matrix, factor in zip(inputs.bands.values(), covariance, factors, strict=True):
-        white = jnp.diagonal(matrix).mean() * healpy.nside2pixarea(_nside(band))
-        rest = 0.0 if band.correlated is None else band.correlated[: lmax + 1] * factor**2
-        spectra.append(np.broadcast_to(np.asarray(white + rest), (2, lmax + 1)))
+    for rest, band, matrix, factor in zip(
+        correlated, inputs.bands.values(), covariance, factors, strict=True
+    ):
+        if band.correlated is not None:
+            rest[:] = band.correlated[: lmax + 1] * factor**2
+        white = float(jnp.diagonal(matrix).mean()) * healpy.nside2pixarea(_nside(band))
+        spectra.append(np.broadcast_to(white + rest, (2, lmax + 1)))
 
     def coefficients(maps):
         scaled = [np.asarray(m) * f for m, f in zip(maps, factors, strict=True)]
@@ -283,6 +287,7 @@ def _multipoles(settings, sky, inputs, foregrounds):
         np.array([band.fwhm for band in inputs.bands.values()]),
         np.stack(spectra),
         covariance,
+        correlated,
         lmax,
         main.nside,
         main.fwhm,

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from fits.pseudo_cl import band_powers
+from fits.separate import report
+from fits.separate import separate as module
 from fits.separate.report import tables, warnings
 from fits.separate.separate import separate
 from fits.separate.settings import EMBEDDED, EXAMPLE, SeparateSettings, load_separate
@@ -208,6 +210,32 @@ def test_widened_samples_have_the_errors_of_simulations():
     # With too few simulations for a covariance, each by itself.
     few = widened(chain, np.zeros(3), np.eye(3), found.simulated.theta[:8])
     assert few.covariance.shape == (3, 3)
+
+
+def test_lensing_is_what_the_settings_say():
+    """In the simulations that set errors as well as in the model."""
+    _, setup, whole = separated()
+    how = settings(tensors={"A_lens": 0.25}, separation={"sampler": "none"})
+    found = separate(how, setup)
+    one, other = whole.tensors.model, found.tensors.model
+    leak = whole.spectra.windows[1, :, 0] @ camb_spectra(whole.spectra.lmax)[1]
+    np.testing.assert_allclose(other.lensing - leak, (one.lensing - leak) / 4, rtol=1e-9)
+    np.testing.assert_allclose(other.additive, one.additive, rtol=1e-9)
+    scatter = found.simulated.total.std(axis=0, ddof=1)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(other.covariance(0.0))), scatter, rtol=1e-9)
+    # In the first bin most is E that leaks.
+    assert np.all(scatter[1:] < 0.9 * whole.simulated.total.std(axis=0, ddof=1)[1:])
+    assert "A_lens = 0.25" in " ".join(warnings(found, how))
+
+
+def test_more_parameters_than_can_be_sampled_are_named(monkeypatch):
+    monkeypatch.setattr(module, "SAMPLED", 2)
+    monkeypatch.setattr(report, "SAMPLED", 2)
+    _, setup, _ = separated()
+    how = settings()
+    found = separate(how, setup)
+    assert found.chain is None
+    assert "not sampled: 3 parameters are more than 2" in " ".join(warnings(found, how))
 
 
 def test_simulations_are_kept_and_gone_on_with(tmp_path):

@@ -9,7 +9,7 @@ from rich.table import Table
 from fits.plots import plot_chains
 from fits.record import probability, with_error, write_json, write_log
 from fits.separate import plots
-from fits.separate.separate import Separation
+from fits.separate.separate import SAMPLED, Separation
 from fits.separate.settings import SeparateSettings
 from fits.separation.maps import ComponentMaps
 from jaxsky.io import write_maps
@@ -166,6 +166,10 @@ def warnings(found: Separation, settings: SeparateSettings) -> list[str]:
             f"E that leaks into B at the edge of the mask is up to {share.max():.1f} standard "
             "deviations of BB in a bin. It is part of the model, but a larger "
             "tensors.apodization makes it and the errors smaller."
+        )
+    if settings.separation.sampler != "none" and len(fit.labels) > SAMPLED:
+        sentences.append(
+            f"The posterior was not sampled: {len(fit.labels)} parameters are more than {SAMPLED}."
         )
     if found.chain is not None and not found.chain.converged:
         sentences.append(f"posterior: {found.chain.message}")

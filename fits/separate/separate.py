@@ -28,7 +28,7 @@ from jaxsky.cmb import camb_spectra, tensor_spectra
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.settings import SettingsError
 
-__all__ = ["Separation", "separate"]
+__all__ = ["SAMPLED", "Separation", "separate"]
 
 #: Walkers of emcee, if they are enough.
 WALKERS = 32
@@ -129,7 +129,9 @@ def separate(
 
     report("spectra")
     window, spectra = _spectra(settings.tensors, setup.mask, main.nside, main.fwhm)
-    lensed, tensors = (f(window.size - 1) for f in (camb_spectra, tensor_spectra))
+    tensors = tensor_spectra(window.size - 1)
+    # Simulated and modelled, lensing is what the settings say.
+    lensed = camb_spectra(window.size - 1) * np.array([1, 1, settings.tensors.A_lens, 1])[:, None]
     emission = domain.emission(like, best, _without(found.amplitude, row))
     realisation = Realisation(domain, like, best, response, emission, row, spectra, window, lensed)
     kept = None if out is None else out / "simulations.npz"
@@ -150,7 +152,6 @@ def separate(
         tensors,
         simulated.both.mean(axis=0) + leaked,
         simulated.spectrum.mean(axis=0),
-        A_lens=settings.tensors.A_lens,
         simulated=simulated.total,
     )
     ratio = fit_tensors(model, band_powers(spectra, maps[row])[1])
@@ -160,7 +161,7 @@ def separate(
         left = band_powers(spectra, alone[row])[1]
     sigma, covariance = _errors(settings, like, fit, simulated)
     chain = None
-    if main.sampler != "none" and np.isfinite(response.theta).sum() <= SAMPLED:
+    if main.sampler != "none" and len(fit.labels) <= SAMPLED:
         report("posterior")
         chain = _chain(settings, setup, like, fit, simulated, out)
     return Separation(
@@ -223,11 +224,13 @@ def _errors(settings, like, fit, simulated):
     if settings.separation.domain == "harmonic":
         return fit.sigma, fit.covariance
     sigma = simulated.theta.std(axis=0, ddof=1)
-    determined = np.isfinite(like.flat(fit.best_fit)) & (sigma > 0)
+    determined = np.isfinite(np.asarray(like.flat(fit.best_fit))) & (sigma > 0)
     named = like.named(np.where(determined, sigma, np.nan))
     sizes = {n: float(v) if v.ndim == 0 else np.asarray(v) for n, v in named.items()}
-    covariance = None if fit.covariance is None else np.cov(simulated.theta.T)
-    return sizes, None if covariance is None else np.atleast_2d(covariance)
+    if fit.covariance is None:
+        return sizes, None
+    covariance = np.atleast_2d(np.cov(simulated.theta.T))
+    return sizes, np.where(determined & determined[:, None], covariance, np.nan)
 
 
 def _chain(settings, setup, like, fit, simulated, out):

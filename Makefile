@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: fit test lint bench pin clean
+.PHONY: fit test lint validate bench pin clean
 
 fit: .venv/.run
 	$(BIN)/jaxsky fit --out results/fit --overwrite
@@ -14,6 +14,10 @@ lint: .venv/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# Slow checks, 30 minutes on two cores: kills at random moments, and statistics of many skies.
+validate: .venv/.dev
+	$(BIN)/pytest validation -n auto --maxprocesses 4 --dist worksteal --durations 20
 
 # Huge pages for all that is allocated: numpy asks for them itself, XLA and numba do not.
 bench: .venv/.bench

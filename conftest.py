@@ -1,4 +1,4 @@
-"""Double precision for all tests, and the real sky data where it is to be had."""
+"""Double precision for all tests and slow checks, and the real sky data where it is to be had."""
 
 import os
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 
-DATA = Path(os.environ.get("JAXSKY_DATA", Path(__file__).parents[2] / "shared" / "data"))
+DATA = Path(os.environ.get("JAXSKY_DATA", Path(__file__).parents[1] / "shared" / "data"))
 
 
 @pytest.fixture(scope="session")

@@ -11,9 +11,10 @@ from typing import Any
 
 import jax
 import numpy as np
-from pydantic import BaseModel
 
 from jaxsky.io import write_text
+from jaxsky.lookup import found_files
+from jaxsky.settings import SettingsFile
 
 __all__ = ["fingerprint", "probability", "with_error", "write_json", "write_log"]
 
@@ -69,8 +70,8 @@ def write_json(path: Path, results: dict[str, Any]) -> None:
     write_text(path, json.dumps(_plain(results), indent=2, allow_nan=False) + "\n")
 
 
-def write_log(path: Path, settings: BaseModel, seconds: float) -> None:
-    """When, where, how long, with which versions and settings a run was made."""
+def write_log(path: Path, settings: SettingsFile, seconds: float) -> None:
+    """When, where, how long, with which versions, settings and files a run was made."""
     log = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": sys.argv,
@@ -79,5 +80,6 @@ def write_log(path: Path, settings: BaseModel, seconds: float) -> None:
         "machine": platform.platform(),
         "versions": {name: version(name) for name in PACKAGES},
         "settings": settings.model_dump(mode="json", exclude_none=True),
+        "files": found_files(settings),
     }
     write_text(path, json.dumps(log, indent=2) + "\n")

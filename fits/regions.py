@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from fits.settings import Settings
-from jaxsky.io import degrade_mask, read_mask
+from jaxsky.io import InputError, degrade_mask, read_mask
+from jaxsky.lookup import find_file
 from jaxsky.settings import SettingsError
 
 __all__ = ["known_regions", "region_masks"]
@@ -33,7 +34,7 @@ def region_masks(settings: Settings) -> dict[str, Bool[np.ndarray, " pix"]]:
     common = np.ones(npix, bool)
     if analysis.mask is not None:
         mask = analysis.mask
-        path = folder / mask.file
+        path = find_file(folder, mask.file)
         common = degrade_mask(read_mask(path, key=mask.key, ordering=mask.ordering), analysis.nside)
     regions = {}
     for name in analysis.regions:
@@ -43,15 +44,20 @@ def region_masks(settings: Settings) -> dict[str, Bool[np.ndarray, " pix"]]:
             region = np.abs(latitude) > analysis.latitude
         elif name == "full":
             region = np.ones(npix, bool)
-        elif (folder / name).is_file():
-            region = degrade_mask(read_mask(folder / name), analysis.nside)
         else:
-            raise SettingsError(
-                f"analysis.regions: {name!r} is neither {', '.join(known_regions())} nor a file "
-                f"in {folder}."
-            )
+            region = degrade_mask(read_mask(_mask_file(folder, name)), analysis.nside)
         label = name if name in known_regions() else Path(name).stem
         if label in regions:
             raise SettingsError(f"analysis.regions: two regions are called {label!r}.")
         regions[label] = np.asarray(region & common)
     return regions
+
+
+def _mask_file(folder: Path, name: str) -> Path:
+    try:
+        return find_file(folder, name)
+    except InputError as error:
+        raise SettingsError(
+            f"analysis.regions: {name!r} is neither {', '.join(known_regions())} nor a file that "
+            f"can be read: {error}"
+        ) from None

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from fits.priors import Gaussian, Prior, Uniform
 from jaxsky.settings import (
     BandpassSpec,
+    FileName,
     MapFile,
     MaskFile,
     NoiseFile,
@@ -32,7 +33,7 @@ class Analysis(Table):
 
     nside: Nside = 64
     fwhm: float = Field(60.0, ge=0)
-    regions: list[str] = Field(["strip", "full"], min_length=1)
+    regions: list[FileName] = Field(["strip", "full"], min_length=1)
     latitude: float = Field(20.0, gt=0, lt=90)
     mask: MaskFile | None = None
     stokes: list[Literal["Q", "U", "QU"]] = Field(["Q", "U", "QU"], min_length=1)

@@ -12,6 +12,7 @@ from jaxsky.bandpass import Bandpass
 from jaxsky.components import AME, Component, Dust, Synchrotron
 from jaxsky.io import InputError, Maps, read_bandpass, read_maps, unit_factor
 from jaxsky.io.tables import stokes as stokes_of
+from jaxsky.lookup import find_file
 from jaxsky.noise import (
     check_covariance,
     covariance_from_columns,
@@ -57,7 +58,7 @@ class Template(NamedTuple):
 def read(folder: Path, spec: MapFile) -> Maps:
     """The maps of a file; see `jaxsky.io.read_maps`."""
     return read_maps(
-        folder / spec.file,
+        find_file(folder, spec.file),
         fields=spec.fields,
         hdu=spec.hdu,
         unit=spec.unit,
@@ -165,7 +166,10 @@ def read_bandpass_spec(folder: Path, spec: BandpassSpec) -> Bandpass:
     """The bandpass of a file, or a top-hat."""
     if spec.file is not None:
         return read_bandpass(
-            folder / spec.file, spec.band, detectors=spec.detectors, convention=spec.convention
+            find_file(folder, spec.file),
+            spec.band,
+            detectors=spec.detectors,
+            convention=spec.convention,
         )
     assert spec.center is not None  # one of file and center is given
     if not spec.width:

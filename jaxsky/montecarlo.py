@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 import jaxsky
 from jaxsky.experiment import Experiment, Setup
 from jaxsky.io import write_maps, write_text
+from jaxsky.lookup import found_files
 from jaxsky.preparation import Prepared, plan, prepare
 from jaxsky.simulate import observe_bands
 
@@ -106,6 +107,7 @@ def _claim(out: Path, settings: Experiment, overwrite: bool) -> None:
         "python": platform.python_version(),
         "versions": versions,
         "settings": _content(settings),
+        "files": found_files(settings),
     }
     write_text(out / LOG, json.dumps(content, indent=2) + "\n")
 

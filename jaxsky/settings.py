@@ -20,9 +20,11 @@ from pydantic import (
 __all__ = [
     "BandpassSpec",
     "CovarianceColumns",
+    "FileName",
     "Hits",
     "MapFile",
     "MaskFile",
+    "NamedFile",
     "NoiseColumns",
     "NoiseFile",
     "Nside",
@@ -32,6 +34,7 @@ __all__ = [
     "TemplateFile",
     "Weights",
     "check_angles",
+    "expand",
     "load",
 ]
 
@@ -55,6 +58,15 @@ def _power_of_two(value: int) -> int:
 Nside = Annotated[int, Field(gt=0), AfterValidator(_power_of_two)]
 
 
+class NamedFile(str):
+    """The name of a file, told from other text; see `jaxsky.lookup.find_file`."""
+
+    __slots__ = ()
+
+
+FileName = Annotated[str, Field(min_length=1), AfterValidator(NamedFile)]
+
+
 class _Columns(Table):
     fields: list[str | int] | None = None
     unit: str | None = None
@@ -66,14 +78,14 @@ class _Columns(Table):
 class MapFile(_Columns):
     """Columns of a FITS map; what its header says need not be given."""
 
-    file: str
+    file: FileName
     hdu: int = Field(1, ge=1)
 
 
 class MaskFile(Table):
     """A mask, 1 where a pixel is used: FITS, or one entry of an .npz file."""
 
-    file: str
+    file: FileName
     key: str | None = None
     ordering: Literal["RING", "NESTED"] | None = None
 
@@ -97,7 +109,7 @@ class TemplateFile(MapFile):
 class BandpassSpec(Table):
     """A bandpass: a table in a file, or a top-hat."""
 
-    file: str | None = None
+    file: FileName | None = None
     band: str | None = None
     detectors: list[str] | None = None
     convention: Literal["RJ", "power", "CMB"] | None = None
@@ -114,7 +126,7 @@ class BandpassSpec(Table):
 class NoiseColumns(_Columns):
     """Columns about the noise; what is not given is as in the map that has it, file included."""
 
-    file: str | None = None
+    file: FileName | None = None
     hdu: int | None = Field(None, ge=1)
 
 
@@ -206,8 +218,14 @@ def check_angles(templates: Mapping[str, TemplateFile]) -> None:
             )
 
 
-def _expand(text: str) -> str:
-    """Environment variables in a path: $NAME, or ${NAME:-default}."""
+def expand(text: str) -> str:
+    """Expand `~` and environment variables, $NAME or ${NAME:-default}, in a path.
+
+    Raises
+    ------
+    ValueError
+        If a variable is not set and has no default.
+    """
 
     def value(match: re.Match[str]) -> str:
         name, default = match["braced"] or match["plain"], match["default"]
@@ -217,7 +235,7 @@ def _expand(text: str) -> str:
         return found
 
     pattern = r"\$(?:\{(?P<braced>\w+)(?::-(?P<default>[^}]*))?\}|(?P<plain>\w+))"
-    return re.sub(pattern, value, text)
+    return os.path.expanduser(re.sub(pattern, value, text))
 
 
 def _sentence(path: Path, error: ValidationError) -> str:
@@ -268,9 +286,11 @@ def load(path: Path, model: type[T], overrides: Mapping[str, Mapping[str, Any]] 
             raw[table] = raw.get(table, {}) | given
     try:
         settings = model.model_validate(raw)
-        folder = path.resolve().parent / _expand(settings.data_dir)
+        folder = (path.resolve().parent / expand(settings.data_dir)).resolve()
+        if folder.exists() and not folder.is_dir():
+            raise ValueError(f"{folder} is not a folder")
     except ValidationError as error:
         raise SettingsError(_sentence(path, error)) from None
-    except ValueError as error:
+    except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: links in a circle
         raise SettingsError(f"{path}: data_dir: {error}.") from None
-    return settings.model_copy(update={"data_dir": str(folder.resolve())})
+    return settings.model_copy(update={"data_dir": str(folder)})

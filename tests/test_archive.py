@@ -265,7 +265,7 @@ def served(server, monkeypatch, tmp_path):
     """The server's file as the only product, and a folder for it."""
     wanted = product(f"{server}/good/{NAME}", hash=SHA)
     monkeypatch.setattr("jaxsky.archive.products.catalogue", lambda: {NAME: wanted})
-    monkeypatch.setenv("JAXSKY_DATA", str(tmp_path / "cache"))
+    monkeypatch.setenv("JAXSKY_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
 

@@ -251,7 +251,7 @@ def test_mistakes_in_noise_are_one_sentence(folder, spec, stokes, own, words):
 
 
 def test_files_that_cannot_be_read_are_named_once(folder):
-    with pytest.raises(InputError, match=r"^[^:]*none.fits: no such file\.$"):
+    with pytest.raises(InputError, match=r"^[^:]*none.fits: no such file, and none in [^:]*\.$"):
         noise_of(folder, {"map": {"file": "none.fits"}})
     with pytest.raises(InputError, match=r"no column 'XX'"):
         noise_of(folder, {"covariance": ["XX", *SIX[4:]]}, own=PLANCK)

@@ -326,8 +326,7 @@ def test_labels():
     assert len(set(order)) == len(order)
 
 
-def test_example_is_valid(monkeypatch):
-    monkeypatch.delenv("JAXSKY_DATA", raising=False)
+def test_example_is_valid():
     settings = load_paper(EXAMPLE)
     assert settings.paper.ame.nu_ref == 22.8
 

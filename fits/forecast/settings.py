@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from jaxsky.settings import Nside, SettingsFile, Table, TemplateFile, check_angles, load
+from jaxsky.settings import FileName, Nside, SettingsFile, Table, TemplateFile, check_angles, load
 from jaxsky.units import UNITS
 
 __all__ = ["DEFAULT", "EXAMPLE", "Fisher", "ForecastSettings", "Mask", "Spectra", "load_forecast"]
@@ -52,7 +52,7 @@ class Embedded(Table):
 class Mask(Table):
     """What is used of the sky: a mask in a file, or latitudes above one; its edge made smooth."""
 
-    file: str | None = None
+    file: FileName | None = None
     key: str | None = None
     ordering: Literal["RING", "NESTED"] | None = None
     latitude: float | None = Field(None, ge=0, lt=90)

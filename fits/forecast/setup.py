@@ -15,6 +15,7 @@ from jaxsky.harmonics import gaussian_beam
 from jaxsky.inputs import Template, read_templates, set_parameters_of
 from jaxsky.instrument import Channel, Instrument, load_instrument
 from jaxsky.io import degrade_mask, read_mask
+from jaxsky.lookup import find_file
 from jaxsky.settings import SettingsError
 
 __all__ = ["Setup", "apodize", "build"]
@@ -141,7 +142,7 @@ def _used(settings: ForecastSettings, nside: int) -> Bool[np.ndarray, " pix"]:
         npix = healpy.nside2npix(nside)
         latitude = healpy.pix2ang(nside, np.arange(npix), lonlat=True)[1]
         return np.abs(latitude) > mask.latitude if mask.latitude else np.ones(npix, bool)
-    path = Path(settings.data_dir) / mask.file
+    path = find_file(Path(settings.data_dir), mask.file)
     found = read_mask(path, key=mask.key, ordering=mask.ordering)
     # A coarser mask holds for all pixels inside of its own.
     whole = found if found.size >= 12 * nside**2 else healpy.ud_grade(found.astype(float), nside)

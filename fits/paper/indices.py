@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from fits.paper.settings import IndexFile, SynchrotronIndexFile
 from jaxsky.harmonics import expand, gaussian_beam, synthesis
 from jaxsky.inputs import read
+from jaxsky.lookup import find_file
 from jaxsky.presets import from_pysm_beta
 from jaxsky.settings import SettingsError
 from jaxsky.templates import dust_index, steepening
@@ -100,8 +101,9 @@ def _of_spectrum(folder: Path, file: str | None) -> float:
     """By how much a spectrum in a file steepens; 0 without one."""
     if file is None:
         return 0.0
+    path = find_file(folder, file)
     try:
-        nu, temperature = np.loadtxt(folder / file, unpack=True, usecols=(0, 1))
+        nu, temperature = np.loadtxt(path, unpack=True, usecols=(0, 1))
         return float(steepening(nu, temperature))
     except (OSError, ValueError) as error:
-        raise SettingsError(f"paper.beta_syn.spectrum: {folder / file}: {error}") from None
+        raise SettingsError(f"paper.beta_syn.spectrum: {path}: {error}") from None

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from fits.settings import Settings
 from jaxsky.experiment.settings import SmallScalesTable
-from jaxsky.settings import MapFile, MaskFile, Table, load
+from jaxsky.settings import FileName, MapFile, MaskFile, Table, load
 from jaxsky.small_scales import DUST, SYNCHROTRON
 
 __all__ = ["EMBEDDED", "EXAMPLE", "PaperSettings", "load_paper"]
@@ -37,7 +37,7 @@ class SynchrotronIndexFile(IndexFile):
     """
 
     steepening: float = 0.0
-    spectrum: str | None = None
+    spectrum: FileName | None = None
 
 
 class Paper(Table):

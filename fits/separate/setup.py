@@ -25,6 +25,7 @@ from jaxsky.harmonics import gaussian_beam, resample
 from jaxsky.inputs import LAWS, read
 from jaxsky.instrument import load_instrument
 from jaxsky.io import degrade_mask, read_mask
+from jaxsky.lookup import find_file
 from jaxsky.settings import MapFile, SettingsError
 
 __all__ = ["Setup", "build"]
@@ -94,7 +95,7 @@ def _inside(settings: SeparateSettings) -> Bool[np.ndarray, " pix"]:
     latitude = healpy.pix2ang(main.nside, np.arange(12 * main.nside**2), lonlat=True)[1]
     inside = np.abs(latitude) > main.latitude if main.latitude else np.ones(latitude.size, bool)
     if main.mask is not None:
-        path = Path(settings.data_dir) / main.mask.file
+        path = find_file(Path(settings.data_dir), main.mask.file)
         found = read_mask(path, key=main.mask.key, ordering=main.mask.ordering)
         inside &= np.asarray(degrade_mask(found, main.nside))
     if not inside.any():

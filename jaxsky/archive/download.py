@@ -33,8 +33,9 @@ class _CutError(Exception):
 
 
 def cache_folder() -> Path:
-    """Where products are kept: $JAXSKY_DATA, or the platform's folder for caches."""
-    return Path(os.environ.get("JAXSKY_DATA") or pooch.os_cache("jaxsky"))
+    """Where products are kept: $JAXSKY_CACHE, or the platform's folder for caches."""
+    given = os.environ.get("JAXSKY_CACHE")
+    return Path(given or pooch.os_cache("jaxsky")).expanduser().absolute()
 
 
 def _checksums(folder: Path) -> dict[str, str]:

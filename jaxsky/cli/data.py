@@ -23,7 +23,7 @@ Words = Annotated[
     ),
 ]
 Folder = Annotated[
-    Path | None, typer.Option("--dir", help="Where files are kept; default $JAXSKY_DATA, or the "
+    Path | None, typer.Option("--dir", help="Where files are kept; default $JAXSKY_CACHE, or the "
                               "platform's folder for caches.")
 ]  # fmt: skip
 

@@ -8,6 +8,7 @@ from pydantic import Field, field_validator, model_validator
 
 from jaxsky.settings import (
     BandpassSpec,
+    FileName,
     NoiseFile,
     Nside,
     SettingsFile,
@@ -86,7 +87,7 @@ class CMBTable(Table):
 
     r: float = Field(0.0, ge=0)
     cosmology: dict[str, float] = Field(default={})
-    spectra: str | None = None
+    spectra: FileName | None = None
     format: Literal["camb", "planck"] | None = None
     unit: str | None = None
 
@@ -124,7 +125,7 @@ class BandTable(Table):
     name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_+-][A-Za-z0-9_.+-]*$")
     bandpass: BandpassSpec
     fwhm: float | None = Field(None, ge=0)
-    beam: str | None = None
+    beam: FileName | None = None
     noise: NoiseTable | None = None
 
     @model_validator(mode="after")

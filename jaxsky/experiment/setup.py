@@ -23,6 +23,7 @@ from jaxsky.inputs import (
 )
 from jaxsky.instrument import load_instrument
 from jaxsky.io import InputError, read_beam, read_spectra
+from jaxsky.lookup import find_file
 from jaxsky.observation import DTYPES, Observation, ObservedBand, Source
 from jaxsky.settings import SettingsError
 from jaxsky.small_scales import SmallScales
@@ -225,10 +226,11 @@ def _channels(settings: Experiment) -> dict[str, ObservedBand]:
                         f"bands.{spec.name}.noise: {missing} pixels have no noise; a simulation "
                         "takes maps of the full sky."
                     )
-        beam = spec.fwhm if spec.beam is None else read_beam(folder / spec.beam, 2 * main.nside)
-        channels[spec.name] = ObservedBand(
-            band, jnp.asarray(beam), target, noise, main.diagonal_noise
-        )
+        if spec.beam is None:
+            beam = jnp.asarray(spec.fwhm)
+        else:
+            beam = jnp.asarray(read_beam(find_file(folder, spec.beam), 2 * main.nside))
+        channels[spec.name] = ObservedBand(band, beam, target, noise, main.diagonal_noise)
     return channels
 
 
@@ -245,5 +247,5 @@ def _cmb(settings: Experiment, lmax: int) -> Float[np.ndarray, "4 ell"]:
     spec = settings.cmb
     if spec.spectra is None:
         return camb_spectra(lmax, spec.r, **spec.cosmology)
-    path = Path(settings.data_dir) / spec.spectra
+    path = find_file(Path(settings.data_dir), spec.spectra)
     return read_spectra(path, lmax, format=spec.format, unit=spec.unit)

@@ -1,0 +1,100 @@
+"""Find the files that settings name: next to the settings, or in the cache of downloads."""
+
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from jaxsky.io import InputError
+from jaxsky.settings import NamedFile, SettingsFile, expand
+
+__all__ = ["find_file", "found_files"]
+
+
+def find_file(folder: Path, name: str) -> Path:
+    """Find a file that settings name.
+
+    A name without a folder is looked for in `folder`, then in the cache of `jaxsky data fetch`;
+    with one, it is relative to `folder`. `~`, `$NAME` and `${NAME:-default}` are expanded, unless
+    a file has that very name.
+
+    Parameters
+    ----------
+    folder : the settings' `data_dir`
+    name : as in the settings
+
+    Raises
+    ------
+    jaxsky.io.InputError
+        If it is not there or no file that can be read; says how to fetch it if it is an official
+        product.
+    """
+    if not os.path.lexists(folder / name):
+        try:
+            name = expand(name)
+        except ValueError as error:
+            raise InputError(f"{name}: {error}.") from None
+    path, cache = folder / name, None
+    if not os.path.dirname(name) and not os.path.lexists(path):
+        # The archive's modules are slow to import, and most files are where they are named.
+        from jaxsky.archive import cache_folder
+
+        cache = cache_folder()
+        if os.path.lexists(cache / name):
+            path = cache / name
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(f"{path}: {_missing(path, cache)}.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    except ValueError:
+        raise InputError(f"{name!r}: is no name of a file.") from None
+    if not stat.S_ISREG(mode):
+        kind = "a folder, not a file" if stat.S_ISDIR(mode) else "no regular file"
+        raise InputError(f"{path}: is {kind}.")
+    if not os.access(path, os.R_OK):
+        raise InputError(f"{path}: cannot be read (no permission).")
+    return path
+
+
+def _missing(path: Path, cache: Path | None) -> str:
+    """Why a file is not there, and how it comes."""
+    from jaxsky.archive import cache_folder, catalogue
+
+    if path.is_symlink():
+        return f"is a link to {os.readlink(path)}, which is not there"
+    said = "no such file" if path.parent.is_dir() else "no such file, nor folder"
+    if cache is not None:
+        said += f", and none in the cache {cache}"
+    if path.name in catalogue():
+        said += f"; fetch it with `jaxsky data fetch {path.name}`"
+        if cache is None:
+            said += f" into {cache_folder()}, and name it without a folder"
+    return said
+
+
+def found_files(settings: SettingsFile) -> dict[str, str]:
+    """The files that settings name and that are there: name -> path."""
+    found = {}
+    for name in _names(settings):
+        try:
+            found[str(name)] = str(find_file(Path(settings.data_dir), name))
+        except InputError:
+            continue  # not needed, or the name of a region
+    return found
+
+
+def _names(value: Any) -> Iterator[str]:
+    """All names of files among the values of settings."""
+    if isinstance(value, NamedFile):
+        yield value
+    elif isinstance(value, BaseModel | dict):
+        for _, entry in value if isinstance(value, BaseModel) else value.items():
+            yield from _names(entry)
+    elif isinstance(value, list | tuple):
+        for entry in value:
+            yield from _names(entry)

@@ -1,0 +1,158 @@
+"""Where files that settings name are found, and what is said of those that are not."""
+
+import os
+import stat
+
+import pytest
+
+from fits.record import write_log
+from fits.settings import Settings
+from jaxsky.archive import cache_folder
+from jaxsky.io import InputError
+from jaxsky.lookup import find_file, found_files
+from jaxsky.settings import MapFile, SettingsError, SettingsFile, load
+
+KNOWN = "LFI_RIMO_R3.31.fits"
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch):
+    """The folder of the settings, the cache, and a home."""
+    for name in ("data", "cache", "home"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setenv("JAXSKY_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("JAXSKY_DATA", str(tmp_path / "elsewhere"))
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    return tmp_path / "data", tmp_path / "cache", tmp_path / "home"
+
+
+def test_the_cache_is_the_platforms_or_that_of_the_environment(places, monkeypatch):
+    assert cache_folder() == places[1]
+    monkeypatch.setenv("JAXSKY_CACHE", "~/maps")
+    assert cache_folder() == places[2] / "maps"
+    monkeypatch.delenv("JAXSKY_CACHE")
+    assert cache_folder().name == "jaxsky"
+    assert cache_folder().is_absolute()
+    assert "elsewhere" not in str(cache_folder())  # $JAXSKY_DATA is for settings only
+
+
+def test_a_bare_name_is_next_to_the_settings_or_in_the_cache(places):
+    data, cache, _ = places
+    (cache / "a.fits").touch()
+    assert find_file(data, "a.fits") == cache / "a.fits"
+    (data / "a.fits").touch()
+    assert find_file(data, "a.fits") == data / "a.fits"
+    # With a folder it is meant where it says.
+    for name in ("./b.fits", "sub/b.fits", f"{data}/b.fits"):
+        (cache / "b.fits").touch()
+        with pytest.raises(InputError, match=r"b.fits: no such file"):
+            find_file(data, name)
+    assert find_file(data, "../cache/b.fits").samefile(cache / "b.fits")
+    assert find_file(data / "nowhere", "b.fits") == cache / "b.fits"
+
+
+def test_home_and_environment_are_expanded(places, monkeypatch):
+    data, _, home = places
+    (home / "a.fits").touch()
+    monkeypatch.setenv("MAPS", str(home))
+    for name in ("~/a.fits", "$MAPS/a.fits", "${MAPS}/a.fits", "${NO_MAPS:-~}/a.fits"):
+        assert find_file(data, name) == home / "a.fits"
+    # A file that is called so.
+    for name in ("~a.fits", "map$1.fits"):
+        (data / name).touch()
+        assert find_file(data, name) == data / name
+    with pytest.raises(InputError, match="the environment variable NO_MAPS is not set"):
+        find_file(data, "$NO_MAPS/a.fits")
+
+
+def test_missing_files_are_answered_with_the_command_that_brings_them(places):
+    data, cache, _ = places
+    command = f"`jaxsky data fetch {KNOWN}`"
+    for name, sentence in {
+        "a.fits": f"{data}/a.fits: no such file, and none in the cache {cache}.",
+        "sub/a.fits": f"{data}/sub/a.fits: no such file, nor folder.",
+        KNOWN: f"{data}/{KNOWN}: no such file, and none in the cache {cache}; fetch it with "
+        f"{command}.",
+        f"./{KNOWN}": f"{data}/{KNOWN}: no such file; fetch it with {command} into {cache}, and "
+        "name it without a folder.",
+    }.items():
+        with pytest.raises(InputError) as caught:
+            find_file(data, name)
+        assert str(caught.value) == sentence
+
+
+def test_what_is_there_and_no_file_is_called_what_it_is(places, monkeypatch):
+    data, cache, _ = places
+    (data / "folder").mkdir()
+    (data / "file").touch()
+    (data / "link").symlink_to("gone.fits")
+    (cache / "cached").symlink_to(data / "gone.fits")
+    (data / "circle").symlink_to("circle")
+    os.mkfifo(data / "pipe")
+    for name, words in {
+        "folder": "folder: is a folder, not a file",
+        ".": "is a folder, not a file",
+        "link": "link: is a link to gone.fits, which is not there",
+        "cached": "cached: is a link to .*gone.fits, which is not there",
+        "circle": r"circle: cannot be read \(Too many levels of symbolic links\)",
+        "pipe": "pipe: is no regular file",
+        "file/a.fits": "a.fits: no such file",
+        300 * "a": r"cannot be read \(File name too long\)",
+        "a\0b": r"'a\\x00b': is no name of a file",
+    }.items():
+        with pytest.raises(InputError, match=words):
+            find_file(data, name)
+    (data / "file").chmod(0)
+    monkeypatch.setattr(os, "access", lambda path, mode: os.stat(path).st_mode & stat.S_IRUSR)
+    with pytest.raises(InputError, match=r"file: cannot be read \(no permission\)"):
+        find_file(data, "file")
+
+
+def test_settings_expand_their_folder_and_refuse_what_is_none(places):
+    data, _, home = places
+    path = data / "a.toml"
+    path.write_text("data_dir = '~'")
+    assert load(path, SettingsFile).data_dir == str(home)
+    (data / "circle").symlink_to("circle")
+    for given, words in (
+        ("a.toml", "a.toml: data_dir: .*a.toml is not a folder"),
+        ("circle", "a.toml: data_dir: "),
+    ):
+        path.write_text(f"data_dir = '{given}'")
+        with pytest.raises(SettingsError, match=words):
+            load(path, SettingsFile)
+    with pytest.raises(ValueError, match="at least 1 character"):
+        MapFile(file="")
+
+
+def test_the_log_names_the_paths_that_were_taken(places, tmp_path):
+    data, cache, _ = places
+    for name in ("dust.fits", "mask.fits", "beta.fits"):
+        (data / name).touch()
+    (cache / "map.fits").touch()
+    beta = {"file": "beta.fits", "fields": ["BETA"]}
+    settings = Settings(
+        data_dir=str(data),
+        templates={
+            "dust": {
+                "law": "dust",
+                "file": "dust.fits",
+                "nu_ref": 353.0,
+                "parameters": {"beta_dust": beta},
+            }
+        },
+        bands=[
+            {
+                "name": "dust.fits",
+                "file": "map.fits",
+                "bandpass": {"file": "none.txt"},
+                "noise": {"covariance": ["QQ_COV", "QU_COV", "UU_COV"]},
+            }
+        ],
+        analysis={"regions": ["strip", "mask.fits"]},
+    )
+    paths = {"map.fits": str(cache / "map.fits")}
+    paths |= {name: str(data / name) for name in ("dust.fits", "mask.fits", "beta.fits")}
+    assert found_files(settings) == paths
+    write_log(tmp_path / "log.json", settings, 1.0)
+    assert '"map.fits": "' + str(cache / "map.fits") in (tmp_path / "log.json").read_text()

@@ -1,84 +1,32 @@
-"""Official data products: the catalogue, downloads from a server of our own, and checks."""
+"""Official data products: the catalogue, the command, and checks."""
 
 import hashlib
-import http.server
-import io
-import multiprocessing
 import sys
-import threading
-import time
 
-import numpy as np
 import pytest
-from astropy.io import fits as pyfits
 
 from jaxsky import cli
-from jaxsky.archive import DownloadError, Product, catalogue, download, fetch, find, verify
+from jaxsky.archive import (
+    Product,
+    ProductSet,
+    catalogue,
+    fetch,
+    find,
+    product_sets,
+    total_size,
+    verify,
+)
 from jaxsky.io import InputError
 from jaxsky.units import parse_unit
+from misbehaving import CONTENT, NAME, Handler, fits_bytes, serving
 
-NAME = "map.fits"
-
-
-def fits_bytes(nside=4, names=("Q_STOKES", "U_STOKES"), unit="K_CMB"):
-    """A file in the structure of the archives'."""
-    values = np.arange(12.0 * nside**2, dtype=np.float32)
-    columns = [pyfits.Column(name=n, format="E", array=values, unit=unit) for n in names]
-    table = pyfits.BinTableHDU.from_columns(columns)
-    table.header.update({"PIXTYPE": "HEALPIX", "NSIDE": nside, "ORDERING": "NESTED"})
-    stream = io.BytesIO()
-    pyfits.HDUList([pyfits.PrimaryHDU(), table]).writeto(stream)
-    return stream.getvalue()
-
-
-CONTENT = fits_bytes()
 SHA = "sha256:" + hashlib.sha256(CONTENT).hexdigest()
-
-
-class Handler(http.server.BaseHTTPRequestHandler):
-    """Serves CONTENT in the way that the first folder of the path names."""
-
-    log: list[tuple[str, str | None]] = []  # noqa: RUF012
-
-    def do_GET(self):
-        kind = self.path.split("/")[1]
-        asked = self.headers.get("Range")
-        Handler.log.append((kind, asked))
-        body = {"page": b"<html>down</html>", "other": fits_bytes(8)}.get(kind, CONTENT)
-        first = int(asked[6:-1]) if asked and kind != "whole" else 0
-        if kind == "missing":
-            self.send_error(404)
-            return
-        if first >= len(body):
-            self.send_response(416)
-            self.send_header("Content-Range", f"bytes */{len(body)}")
-            self.end_headers()
-            return
-        self.send_response(206 if first else 200)
-        self.send_header("Content-Length", str(len(body) - first))
-        self.end_headers()
-        body = body[first:]
-        if kind == "cut" and not first:
-            body = body[:1000]
-        if kind == "slow":
-            self.wfile.write(body[:100])
-            self.wfile.flush()
-            time.sleep(1.5)
-            body = body[100:]
-        if kind == "steady":
-            time.sleep(0.5)
-        self.wfile.write(body)
-
-    def log_message(self, *arguments):
-        pass
 
 
 @pytest.fixture(scope="module")
 def server():
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
+    with serving() as address:
+        yield address
 
 
 @pytest.fixture(autouse=True)
@@ -111,6 +59,24 @@ def test_the_catalogue_is_complete():
         assert find([wanted])
 
 
+def test_sets_are_files_of_the_catalogue():
+    assert {p.name for p in find(["planck-44-70"])} == {
+        "LFI_SkyMap_044-BPassCorrected_1024_R3.00_full.fits",
+        "LFI_SkyMap_070-BPassCorrected_1024_R3.00_full.fits",
+        "COM_CompMap_DustPol-commander_1024_R2.00.fits",
+        "COM_CompMap_SynchrotronPol-commander_0256_R2.00.fits",
+        "LFI_RIMO_R3.31.fits",
+    }
+    for name, found in product_sets().items():
+        assert found.name == name
+        assert len(find([name])) == len(found.files)
+        assert name not in {p.group for p in find()}
+        assert total_size(find([name])).startswith("about ")
+    assert total_size(find(["wmap9"])) == "503 MB"
+    assert total_size(find(["haslam"])) == "of unknown size"
+    assert total_size(find(["planck-ancillary"])) == "more than 19 MB"
+
+
 def test_products_are_found_by_group_name_and_part():
     assert len(find(["wmap9"])) == 5
     assert [p.what for p in find(["wmap_band_iqumap_r9_9yr_K_v5.fits"])] == ["K, 23 GHz"]
@@ -141,95 +107,6 @@ def test_a_file_is_fetched_once_and_checked(server, tmp_path, log, known):
     path.write_bytes(damaged)
     with pytest.raises(InputError, match=r"map.fits: has the hash sha256:.* but should have"):
         verify(wanted, tmp_path)
-
-
-def test_a_cut_transfer_is_gone_on_with(server, tmp_path, log):
-    wanted = product(f"{server}/cut/{NAME}", hash=SHA)
-    with pytest.raises(DownloadError, match="ended early, after 1000 bytes; fetch it again"):
-        fetch(wanted, tmp_path)
-    assert not (tmp_path / NAME).exists()
-    assert fetch(wanted, tmp_path).read_bytes() == CONTENT
-    assert log == [("cut", None), ("cut", "bytes=1000-")]
-
-
-def test_what_is_there_is_not_trusted(server, tmp_path, log):
-    part = tmp_path / f"{NAME}.part"
-    # A server that knows no ranges sends all of it.
-    part.write_bytes(CONTENT[:500])
-    assert fetch(product(f"{server}/whole/{NAME}"), tmp_path).read_bytes() == CONTENT
-    (tmp_path / NAME).unlink()
-    # Complete, but not moved to its place.
-    part.write_bytes(CONTENT)
-    assert fetch(product(f"{server}/good/{NAME}"), tmp_path).read_bytes() == CONTENT
-    (tmp_path / NAME).unlink()
-    # More than there is: it is something else.
-    part.write_bytes(2 * CONTENT)
-    with pytest.raises(DownloadError, match="ended early, after 0 bytes"):
-        fetch(product(f"{server}/good/{NAME}"), tmp_path)
-    # The beginning of another file: the hash tells, and the next time it is fetched whole.
-    part.write_bytes(b"SIMPLE" + 500 * b"x")
-    wanted = product(f"{server}/good/{NAME}", hash=SHA)
-    with pytest.raises(DownloadError, match="what came has sha256:"):
-        fetch(wanted, tmp_path)
-    assert fetch(wanted, tmp_path).read_bytes() == CONTENT
-
-
-def test_wrong_files_are_refused(server, tmp_path):
-    for kind, changes, words in (
-        ("page", {}, "map.fits: what came is no FITS file, it begins with '<html>down</html>'"),
-        ("other", {"hash": SHA}, f"but should have {SHA}; if the archive has issued"),
-        ("other", {"size": len(CONTENT)}, f"bytes, but should have {len(CONTENT)} bytes"),
-    ):
-        with pytest.raises(DownloadError) as caught:
-            fetch(product(f"{server}/{kind}/{NAME}", **changes), tmp_path)
-        assert words in str(caught.value)
-        assert not list(tmp_path.glob("map*"))
-    # One that was issued anew can be taken; what it is, is still checked.
-    wanted = product(f"{server}/other/{NAME}", hash=SHA, size=len(CONTENT))
-    assert fetch(wanted, tmp_path, accept=True).exists()
-    assert verify(wanted._replace(nside=8), tmp_path) == "hash, columns, complete"
-    with pytest.raises(InputError, match="nside is 8, but 4 is expected"):
-        verify(wanted, tmp_path)
-
-
-def test_addresses_in_turn_and_mirrors(server, tmp_path, log):
-    wanted = product(f"{server}/missing/{NAME}", f"{server}/good/{NAME}")
-    fetch(wanted, tmp_path)
-    assert [kind for kind, _ in log] == ["missing", "good"]
-    log.clear()
-    fetch(product("http://127.0.0.1:9/x"), tmp_path / "new", mirror=f"{server}/good/")
-    assert [kind for kind, _ in log] == ["good"]
-
-
-def test_without_a_network(server, tmp_path, monkeypatch):
-    wanted = product(f"http://127.0.0.1:9/{NAME}", f"{server}/missing/{NAME}")
-    with pytest.raises(DownloadError) as caught:
-        fetch(wanted, tmp_path)
-    said = str(caught.value)
-    assert (
-        f"http://127.0.0.1:9/{NAME} cannot be reached; {server}/missing/{NAME} answers 404" in said
-    )
-    assert f"put the file into {tmp_path} by hand, or name a --mirror." in said
-    monkeypatch.setattr(download, "TIMEOUT", (0.5, 0.5))
-    with pytest.raises(DownloadError, match="ended early, after 100 bytes"):
-        fetch(product(f"{server}/slow/{NAME}"), tmp_path)
-
-
-def _fetch(wanted, folder):
-    fetch(wanted, folder)
-
-
-def test_processes_do_not_fetch_twice(server, tmp_path, log):
-    wanted = product(f"{server}/steady/{NAME}", hash=SHA)
-    context = multiprocessing.get_context("spawn")
-    others = [context.Process(target=_fetch, args=(wanted, tmp_path)) for _ in range(3)]
-    for process in others:
-        process.start()
-    for process in others:
-        process.join()
-    assert [process.exitcode for process in others] == [0, 0, 0]
-    assert len(log) == 1
-    assert (tmp_path / NAME).read_bytes() == CONTENT
 
 
 def test_what_verify_refuses(tmp_path):
@@ -265,6 +142,9 @@ def served(server, monkeypatch, tmp_path):
     """The server's file as the only product, and a folder for it."""
     wanted = product(f"{server}/good/{NAME}", hash=SHA)
     monkeypatch.setattr("jaxsky.archive.products.catalogue", lambda: {NAME: wanted})
+    sets = {"both": ProductSet("both", "An analysis", (NAME,))}
+    for module in ("products", ""):
+        monkeypatch.setattr(f"jaxsky.archive.{module}".rstrip(".") + ".product_sets", lambda: sets)
     monkeypatch.setenv("JAXSKY_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
@@ -292,7 +172,7 @@ def test_the_command(served, monkeypatch, capsys):
 def test_mistakes_of_the_command(served, server, monkeypatch, capsys, tmp_path):
     for arguments, words in (
         (("fetch", "cobe"), "There is no product 'cobe'"),
-        (("fetch", NAME, "--mirror", f"{server}/missing"), "answers 404. Without a network"),
+        (("fetch", NAME, "--mirror", f"{server}/missing"), "answers 404. Try again later"),
         (("fetch", NAME, "--mirror", f"{server}/cut"), "ended early, after 1000 bytes"),
     ):
         assert command(monkeypatch, *arguments) == 2

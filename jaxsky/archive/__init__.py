@@ -1,15 +1,19 @@
 """Official data products: what there is, where, and in which format; download and checks."""
 
+from jaxsky.archive.cache import DownloadError, cache_folder
 from jaxsky.archive.checking import verify
-from jaxsky.archive.download import DownloadError, cache_folder, fetch
-from jaxsky.archive.products import Product, catalogue, find
+from jaxsky.archive.download import fetch
+from jaxsky.archive.products import Product, ProductSet, catalogue, find, product_sets, total_size
 
 __all__ = [
     "DownloadError",
     "Product",
+    "ProductSet",
     "cache_folder",
     "catalogue",
     "fetch",
     "find",
+    "product_sets",
+    "total_size",
     "verify",
 ]

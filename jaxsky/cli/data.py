@@ -19,7 +19,8 @@ data = typer.Typer(
 Words = Annotated[
     list[str] | None,
     typer.Argument(
-        metavar="[PRODUCT ...]", help="Names of files, parts of them, or groups; without, all."
+        metavar="[PRODUCT ...]",
+        help="Names of files, groups, sets, or parts of the first two; without, all.",
     ),
 ]
 Folder = Annotated[
@@ -28,14 +29,10 @@ Folder = Annotated[
 ]  # fmt: skip
 
 
-def _size(number: int | None) -> str:
-    return "" if number is None else f"{number / 1e6:.0f} MB"
-
-
 @data.command("list")
 def list_products(products: Words = None, folder: Folder = None) -> None:
-    """Name the products, and say which are there."""
-    from jaxsky.archive import cache_folder, find
+    """Name the products and sets of them, and say which are there."""
+    from jaxsky.archive import cache_folder, find, product_sets, total_size
 
     folder = folder or cache_folder()
     table = Table("file", "what", "nside", "unit", "size", "here", title=f"Kept in {folder}")
@@ -46,16 +43,25 @@ def list_products(products: Words = None, folder: Folder = None) -> None:
             table.add_section()
             table.add_row(f"[bold]{group}[/]", product.title)
         path = folder / product.name
-        here = path.exists()
-        size = path.stat().st_size if here else product.size
+        here = path.is_file()
+        known = product._replace(size=path.stat().st_size) if here else product
+        size = total_size([known]) if known.size or known.about else ""
         table.add_row(
             product.name,
             product.what,
             str(product.nside or ""),
             product.unit,
-            _size(size),
+            size,
             "yes" if here else "",
         )
+    if not products:
+        table.add_section()
+        table.add_row("[bold]sets[/]", "files of an analysis")
+        for name, kept in product_sets().items():
+            members = find([name])
+            count = sum((folder / p.name).is_file() for p in members)
+            size = total_size(members)
+            table.add_row(name, kept.title, "", "", size, f"{count} of {len(members)}")
     Console(width=None if console.is_terminal else 200).print(table)
 
 
@@ -63,7 +69,9 @@ def list_products(products: Words = None, folder: Folder = None) -> None:
 def fetch(
     products: Annotated[
         list[str],
-        typer.Argument(metavar="PRODUCT ...", help="Names of files, parts of them, or groups."),
+        typer.Argument(
+            metavar="PRODUCT ...", help="Names of files, groups, sets, or parts of the first two."
+        ),
     ],
     folder: Folder = None,
     mirror: Annotated[
@@ -71,14 +79,16 @@ def fetch(
         typer.Option(envvar="JAXSKY_MIRROR", help="Address of a folder with the files."),
     ] = None,
     accept: Annotated[
-        bool, typer.Option("--accept", help="Take files of another size or hash.")
+        bool, typer.Option("--accept", help="Take files of another size or hash, if all else fits.")
     ] = False,
 ) -> None:
-    """Download products, unless they are there; what was cut is gone on with."""
+    """Download products, unless they are there; what was cut is resumed."""
     from jaxsky import archive
 
     folder = folder or archive.cache_folder()
     wanted = archive.find(products)
+    if len(wanted) > 1:
+        console.print(f"{len(wanted)} files, {archive.total_size(wanted)}.", highlight=False)
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -95,9 +105,14 @@ def fetch(
             def waiting(name: str = product.name) -> None:
                 console.print(f"{name}: another process fetches it; waiting.")
 
-            path = archive.fetch(
-                product, folder, mirror=mirror, accept=accept, report=report, waiting=waiting
-            )
+            try:
+                path = archive.fetch(
+                    product, folder, mirror=mirror, accept=accept, report=report, waiting=waiting
+                )
+            except KeyboardInterrupt:
+                progress.stop()
+                console.print("Stopped; fetch it again to resume.")
+                raise typer.Exit(130) from None
             size = path.stat().st_size
             progress.update(task, completed=size, total=size)
     console.print(f"In {folder}: {len(wanted)} files.", highlight=False, soft_wrap=True)

@@ -1,0 +1,223 @@
+"""One transfer of a file over HTTP, which resumes one that was cut if the file is the same."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import urljoin, urlsplit
+
+import requests
+import urllib3
+
+from jaxsky.archive.cache import DownloadError
+
+__all__ = ["CutError", "RefusedError", "discard", "reason", "source", "transfer"]
+
+#: Seconds to wait for a connection, and for more bytes.
+TIMEOUT = (10.0, 60.0)
+CHUNK = 2**20
+_RANGE = re.compile(r"bytes (\d+)-(\d+)/(\d+|\*)")
+
+#: What may be done about a file of another size or hash.
+ANEW = "; if the archive has issued the file anew, --accept takes it"
+
+Report = Callable[[int, int | None], None]
+
+
+class CutError(Exception):
+    """A transfer that ended early, after so many bytes."""
+
+
+class RefusedError(Exception):
+    """An answer that is not the file; what it is."""
+
+
+class _State(NamedTuple):
+    """What a partial file is of, kept next to it.
+
+    Parameters
+    ----------
+    address : where it comes from
+    version : the server's strong ETag or date of the file
+    total : bytes of the whole file, None if the server did not say
+    """
+
+    address: str
+    version: str
+    total: int | None
+
+
+def _beside(part: Path) -> Path:
+    return part.with_name(f"{part.name}.json")
+
+
+def _state(part: Path) -> _State | None:
+    """What is known of a partial file; None if it has to be begun anew."""
+    try:
+        state = _State(**json.loads(_beside(part).read_text()))
+        have = part.stat().st_size
+    except (OSError, ValueError, TypeError):
+        return None
+    return None if not have or (state.total is not None and have > state.total) else state
+
+
+def source(part: Path) -> str | None:
+    """Address of which a partial file is, None if there is none that can be resumed."""
+    state = _state(part)
+    return state and state.address
+
+
+def discard(part: Path) -> None:
+    """Remove a partial file and what is known of it, in an order that allows to be interrupted."""
+    _beside(part).unlink(missing_ok=True)
+    part.unlink(missing_ok=True)
+
+
+def transfer(address: str, part: Path, report: Report, size: int | None = None) -> None:
+    """Bring a file, or what is missing of it.
+
+    Parameters
+    ----------
+    address : http or https
+    part : the partial file
+    report : called with the bytes that are there, and all bytes or None
+    size : bytes that the file has, None if not known
+
+    Raises
+    ------
+    CutError
+        If the transfer ends early; what came is kept.
+    RefusedError, requests.RequestException
+        If the answer is not the file.
+    DownloadError
+        If there is no room for it.
+    """
+    state = _state(part)
+    if state is not None and state.address != address:
+        state = None
+    if state is not None and part.stat().st_size == state.total:
+        return
+    if state is not None and _resume(address, part, state, report, size):
+        return
+    with _get(address, {}) as answer:
+        answer.raise_for_status()
+        if answer.status_code != requests.codes.ok:
+            raise RefusedError(f"answers {answer.status_code}")
+        total = _length(answer)
+        _check(answer, part, total, total, size)
+        discard(part)
+        if version := _version(answer):
+            state = _State(address, version, total)
+            _beside(part).write_text(json.dumps(state._asdict()))
+        _receive(answer, part, 0, total, report)
+
+
+def _resume(address: str, part: Path, state: _State, report: Report, size: int | None) -> bool:
+    """Bring what is missing; False if the server has no such rest of this version of the file."""
+    have = part.stat().st_size
+    with _get(address, {"Range": f"bytes={have}-", "If-Range": state.version}) as answer:
+        if answer.status_code in (requests.codes.ok, requests.codes.range_not_satisfiable):
+            return False
+        answer.raise_for_status()
+        found = _RANGE.fullmatch(answer.headers.get("Content-Range", ""))
+        if answer.status_code != requests.codes.partial_content or found is None:
+            return False
+        total = state.total if found[3] == "*" else int(found[3])
+        if (
+            int(found[1]) != have
+            or _version(answer) not in (None, state.version)
+            or state.total not in (None, total)
+        ):
+            return False
+        _check(answer, part, total, total and total - have, size)
+        _receive(answer, part, have, total, report)
+    return True
+
+
+def _get(address: str, headers: dict[str, str]) -> requests.Response:
+    # Compressed transfers would have other lengths than the file.
+    headers = {"Accept-Encoding": "identity", **headers}
+    return requests.get(
+        address, headers=headers, stream=True, timeout=TIMEOUT, hooks={"response": _stay_safe}
+    )
+
+
+def _stay_safe(answer: requests.Response, **_: object) -> None:
+    """Refuse to be sent from https to an address that is not."""
+    if answer.is_redirect and urlsplit(answer.url).scheme == "https":
+        there = urljoin(answer.url, answer.headers["Location"])
+        if urlsplit(there).scheme != "https":
+            raise RefusedError(f"sends on to {there}, which is not https")
+
+
+def _version(answer: requests.Response) -> str | None:
+    """What tells this version of the file from others; weak tags do not."""
+    tag = answer.headers.get("ETag", "")
+    return tag if tag.startswith('"') else answer.headers.get("Last-Modified")
+
+
+def _length(answer: requests.Response) -> int | None:
+    text = answer.headers.get("Content-Length", "")
+    return int(text) if text.isdecimal() and "Transfer-Encoding" not in answer.headers else None
+
+
+def _check(
+    answer: requests.Response, part: Path, total: int | None, rest: int | None, size: int | None
+) -> None:
+    """Refuse what need not be transferred to know that it is wrong, or has no room."""
+    encoding = answer.headers.get("Content-Encoding", "identity")
+    if encoding != "identity":
+        raise RefusedError(f"sends the file compressed ({encoding}), unasked")
+    if size is not None and total not in (None, size):
+        raise RefusedError(f"has {total} bytes, but should have {size}{ANEW}")
+    free = shutil.disk_usage(part.parent).free
+    if rest is not None and rest > free:
+        raise DownloadError(
+            f"{part.parent}: {free / 1e6:.0f} MB are free, but {part.stem} takes "
+            f"{rest / 1e6:.0f} MB more; make room, or give another --dir."
+        )
+
+
+def _receive(
+    answer: requests.Response, part: Path, have: int, total: int | None, report: Report
+) -> None:
+    report(have, total)
+    # What has come counts, also before a break.
+    answer.raw.enforce_content_length = False
+    with part.open("ab" if have else "wb") as file:
+        while chunk := _read(answer, have):
+            file.write(chunk)
+            file.flush()
+            have += len(chunk)
+            report(have, total)
+    if total is not None and have != total:
+        raise CutError(have)
+
+
+def _read(answer: requests.Response, have: int) -> bytes:
+    try:
+        return answer.raw.read1(CHUNK, decode_content=False)
+    except (urllib3.exceptions.HTTPError, OSError):
+        raise CutError(have) from None
+
+
+def reason(error: requests.RequestException) -> str:
+    """What is wrong with an address, to follow it in a sentence."""
+    if isinstance(error, requests.HTTPError) and error.response is not None:
+        later = error.response.headers.get("Retry-After")
+        said = f"answers {error.response.status_code}"
+        wait = f"{later} s" if later and later.isdecimal() else f"until {later}"
+        return f"{said}, and asks to wait {wait}" if later else said
+    for kind, words in {
+        requests.Timeout: "does not answer in time",
+        requests.exceptions.SSLError: "has a certificate that cannot be checked",
+        requests.TooManyRedirects: "sends on and on",
+        requests.exceptions.InvalidSchema: "is, or sends on to, no http or https address",
+        requests.exceptions.InvalidURL: "is no address",
+        requests.exceptions.MissingSchema: "is no address",
+    }.items():
+        if isinstance(error, kind):
+            return words
+    return "cannot be reached"

@@ -63,7 +63,7 @@ def find_file(folder: Path, name: str) -> Path:
 
 def _missing(path: Path, cache: Path | None) -> str:
     """Why a file is not there, and how it comes."""
-    from jaxsky.archive import cache_folder, catalogue
+    from jaxsky.archive import cache_folder, catalogue, product_sets
 
     if path.is_symlink():
         return f"is a link to {os.readlink(path)}, which is not there"
@@ -74,6 +74,8 @@ def _missing(path: Path, cache: Path | None) -> str:
         said += f"; fetch it with `jaxsky data fetch {path.name}`"
         if cache is None:
             said += f" into {cache_folder()}, and name it without a folder"
+    if sets := [name for name, found in product_sets().items() if path.name in found.files]:
+        said += f" (all files of such an analysis: `jaxsky data fetch {sets[0]}`)"
     return said
 
 

@@ -66,6 +66,7 @@ RESTS = {
     "cut": lambda first: (206, {}, CONTENT[first:]),
     "dated": lambda first: (206, {"ETag": None}, CONTENT[first:]),
     "capped": lambda first: (206, {}, CONTENT[first : first + CUT]),
+    "untagged": lambda first: (206, {"ETag": None}, REISSUED[first:]),
     "whole": lambda first: (200, {}, CONTENT),
     "offset": lambda first: (206, {"Content-Range": _range(0)}, CONTENT[: len(CONTENT) - first]),
     "total": lambda first: (206, {"Content-Range": f"bytes {first}-9/10"}, CONTENT[first:]),

@@ -13,6 +13,7 @@ from jaxsky.lookup import find_file, found_files
 from jaxsky.settings import MapFile, SettingsError, SettingsFile, load
 
 KNOWN = "LFI_RIMO_R3.31.fits"
+MASK = "wmap_polarization_analysis_mask_r9_9yr_v5.fits"
 
 
 @pytest.fixture
@@ -72,9 +73,9 @@ def test_missing_files_are_answered_with_the_command_that_brings_them(places):
         "a.fits": f"{data}/a.fits: no such file, and none in the cache {cache}.",
         "sub/a.fits": f"{data}/sub/a.fits: no such file, nor folder.",
         KNOWN: f"{data}/{KNOWN}: no such file, and none in the cache {cache}; fetch it with "
-        f"{command}.",
-        f"./{KNOWN}": f"{data}/{KNOWN}: no such file; fetch it with {command} into {cache}, and "
-        "name it without a folder.",
+        f"{command} (all files of such an analysis: `jaxsky data fetch planck-44-70`).",
+        f"./{MASK}": f"{data}/{MASK}: no such file; fetch it with `jaxsky data fetch {MASK}` into "
+        f"{cache}, and name it without a folder.",
     }.items():
         with pytest.raises(InputError) as caught:
             find_file(data, name)

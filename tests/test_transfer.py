@@ -127,6 +127,7 @@ def test_transfers_that_end_early(server, tmp_path, monkeypatch, kind, size):
         ("offset", [None, CUT, None]),
         ("total", [None, CUT, None]),
         ("no range", [None, CUT, None]),
+        ("untagged", [None, CUT, None]),
         ("new", [None, CUT, None]),
         ("new, whole", [None, CUT, None]),
         ("beyond", [None, CUT, None]),
@@ -238,7 +239,7 @@ def test_mirrors_end_as_they_like(server, tmp_path, log):
         (b"", "map.fits: is empty."),
         (CONTENT[:-2880], "truncated"),
         (CONTENT[:3000], "truncated"),
-        (None, "map.fits: is no file."),
+        (None, "map.fits: is no file, or a link to none."),
     ],
 )
 def test_what_is_there_is_checked_and_left(server, tmp_path, log, content, words):

@@ -39,7 +39,8 @@ def fetch(
     What has come of a file that was cut is kept next to its place (`.part`, and `.part.json` for
     its version) and resumed if the server still has that version. Processes that want the same
     file wait for the one that fetches it (`.lock`). All three go when the file is complete. The
-    hash is checked when a file comes; that of one that is there by `verify`.
+    hash is checked when a file comes; that of one that is there by `verify`. Hashes that the
+    catalogue has none of are recorded in `checksums.json` (with a lock that stays).
 
     Parameters
     ----------
@@ -63,7 +64,7 @@ def fetch(
     path, part = folder / product.name, folder / f"{product.name}.part"
     addresses = product.addresses if mirror is None else (_join(mirror, product.name),)
     checksums(folder)  # a damaged record is said before anything is transferred
-    if path.exists():
+    if os.path.lexists(path):
         return _kept(product, path, part)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -89,7 +90,7 @@ def _kept(product: Product, path: Path, part: Path) -> Path:
     """A file that is there, after a check that takes no time."""
     try:
         if not path.is_file():
-            raise InputError(f"{path}: is no file.")
+            raise InputError(f"{path}: is no file, or a link to none.")
         check_size(product, path.parent)
         check_structure(product, path)
     except InputError as error:

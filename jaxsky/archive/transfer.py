@@ -125,9 +125,10 @@ def _resume(address: str, part: Path, state: _State, report: Report, size: int |
         if answer.status_code != requests.codes.partial_content or found is None:
             return False
         total = state.total if found[3] == "*" else int(found[3])
+        dated = not state.version.startswith('"')  # a date need not be said again, a tag must
         if (
             int(found[1]) != have
-            or _version(answer) not in (None, state.version)
+            or _version(answer) not in (None if dated else state.version, state.version)
             or state.total not in (None, total)
         ):
             return False
@@ -168,7 +169,7 @@ def _check(
 ) -> None:
     """Refuse what need not be transferred to know that it is wrong, or has no room."""
     encoding = answer.headers.get("Content-Encoding", "identity")
-    if encoding != "identity":
+    if encoding not in ("", "identity"):
         raise RefusedError(f"sends the file compressed ({encoding}), unasked")
     if size is not None and total not in (None, size):
         raise RefusedError(f"has {total} bytes, but should have {size}{ANEW}")

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 from rich.table import Table
 
@@ -35,7 +36,9 @@ def list_products(products: Words = None, folder: Folder = None) -> None:
     from jaxsky.archive import cache_folder, find, product_sets, total_size
 
     folder = folder or cache_folder()
-    table = Table("file", "what", "nside", "unit", "size", "here", title=f"Kept in {folder}")
+    table = Table(
+        "file", "what", "nside", "unit", "size", "here", title=escape(f"Kept in {folder}")
+    )
     group = None
     for product in find(products or []):
         if product.group != group:
@@ -115,7 +118,9 @@ def fetch(
                 raise typer.Exit(130) from None
             size = path.stat().st_size
             progress.update(task, completed=size, total=size)
-    console.print(f"In {folder}: {len(wanted)} files.", highlight=False, soft_wrap=True)
+    console.print(
+        f"In {folder}: {len(wanted)} files.", highlight=False, markup=False, soft_wrap=True
+    )
 
 
 @data.command()
@@ -138,8 +143,8 @@ def verify(products: Words = None, folder: Folder = None) -> None:
             )
         except InputError as error:
             wrong += 1
-            console.print(f"[red]{error}[/]", highlight=False, soft_wrap=True)
+            console.print(f"[red]{escape(str(error))}[/]", highlight=False, soft_wrap=True)
     if wrong:
         raise typer.Exit(1)
     if not wanted:
-        console.print(f"No product is in {folder}.", highlight=False, soft_wrap=True)
+        console.print(f"No product is in {folder}.", highlight=False, markup=False, soft_wrap=True)

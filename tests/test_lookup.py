@@ -3,12 +3,23 @@
 import os
 import stat
 
+import numpy as np
 import pytest
 
+from fits.forecast.settings import load_forecast
+from fits.forecast.setup import build as build_forecast
+from fits.inputs import read_inputs
+from fits.paper.settings import load_paper
+from fits.paper.sources import Sources
 from fits.record import write_log
-from fits.settings import Settings
+from fits.regions import region_masks
+from fits.separate.settings import load_separate
+from fits.separate.setup import build as build_separation
+from fits.settings import Settings, load_settings
 from jaxsky.archive import cache_folder
-from jaxsky.io import InputError
+from jaxsky.experiment import build as build_experiment
+from jaxsky.experiment import load_experiment
+from jaxsky.io import InputError, write_maps
 from jaxsky.lookup import find_file, found_files
 from jaxsky.settings import MapFile, SettingsError, SettingsFile, load
 
@@ -157,3 +168,161 @@ def test_the_log_names_the_paths_that_were_taken(places, tmp_path):
     assert found_files(settings) == paths
     write_log(tmp_path / "log.json", settings, 1.0)
     assert '"map.fits": "' + str(cache / "map.fits") in (tmp_path / "log.json").read_text()
+
+
+ANALYSIS = """
+[templates.dust]
+law = "dust"
+file = "dust.fits"
+nu_ref = 353.0
+{template}
+[[bands]]
+name = "44"
+file = "dust.fits"
+{band}
+bandpass = {bandpass}
+noise = {noise}
+[analysis]
+nside = 4
+{analysis}
+"""
+SEPARATION = """
+[separation]
+nside = 4
+{separation}
+[components.cmb]
+law = "cmb"
+[components.dust]
+law = "dust"
+nu_ref = 353.0
+{component}
+[free]
+"dust.beta_dust" = {{ start = 1.5 {free} }}
+[[bands]]
+name = "353"
+file = "dust.fits"
+{band}
+bandpass = {{ center = 353.0, width = 0.0 }}
+noise = {{ rms = 1.0 }}
+"""
+FORECAST = """
+[experiment]
+instrument = "core"
+[fisher]
+free = ["r"]
+[spectra]
+lmax = 7
+{mask}
+[templates.dust]
+law = "dust"
+file = "dust.fits"
+nu_ref = 353.0
+"""
+EXPERIMENT = """
+[experiment]
+nside = 4
+fwhm = 1800.0
+{experiment}
+[embedded]
+nside = 8
+{cmb}
+[[bands]]
+name = "44"
+bandpass = {bandpass}
+{beam}
+noise = {noise}
+"""
+PAPER = (
+    ANALYSIS
+    + """
+[templates.synchrotron]
+law = "synchrotron"
+file = "dust.fits"
+nu_ref = 30.0
+"""
+)
+PLAIN = {
+    "template": "",
+    "band": "",
+    "bandpass": "{ center = 44.0, width = 0.0 }",
+    "noise": "{ rms = 1.0 }",
+    "analysis": "",
+    "separation": "",
+    "component": "",
+    "free": "",
+    "mask": "[mask]\nlatitude = 20.0",
+    "experiment": 'include = ["cmb", "noise"]',
+    "cmb": "",
+    "beam": "fwhm = 30.0",
+}
+NONE = 'file = "none.fits"'
+
+
+def fit(path):
+    settings = load_settings(path)
+    region_masks(settings)
+    read_inputs(settings)
+
+
+def paper(path):
+    sources = Sources(load_paper(path))
+    sources.template("dust")
+    sources.index("beta_syn")
+    sources.ame()
+
+
+def separate(path):
+    build_separation(load_separate(path))
+
+
+def forecast(path):
+    build_forecast(load_forecast(path))
+
+
+def simulate(path):
+    build_experiment(load_experiment(path))
+
+
+@pytest.mark.parametrize(
+    ("command", "text", "changes"),
+    [
+        (fit, ANALYSIS.replace('"dust.fits"', '"none.fits"', 1), {}),
+        (fit, ANALYSIS, {"template": f"parameters = {{ beta_dust = {{ {NONE} }} }}"}),
+        (fit, ANALYSIS, {"band": f"leakage = {{ {NONE} }}"}),
+        (fit, ANALYSIS, {"bandpass": f"{{ {NONE} }}"}),
+        (fit, ANALYSIS, {"noise": f"{{ map = {{ {NONE} }} }}"}),
+        (fit, ANALYSIS, {"noise": f"{{ covariance = {{ {NONE}, fields = ['a', 'b', 'c'] }} }}"}),
+        (fit, ANALYSIS, {"noise": f"{{ hits = {{ {NONE}, fields = ['a'], sigma0 = 1.0 }} }}"}),
+        (fit, ANALYSIS, {"analysis": f"mask = {{ {NONE} }}"}),
+        (fit, ANALYSIS, {"analysis": "regions = ['none.fits']"}),
+        (separate, SEPARATION.replace('"dust.fits"', '"none.fits"'), {}),
+        (separate, SEPARATION, {"separation": f"mask = {{ {NONE} }}"}),
+        (separate, SEPARATION, {"component": f"parameters = {{ T_dust = {{ {NONE} }} }}"}),
+        (separate, SEPARATION, {"free": f", regions = {{ file = {{ {NONE} }} }}"}),
+        (separate, SEPARATION, {"free": f", regions = {{ clusters = 2, of = [{{ {NONE} }}] }}"}),
+        (forecast, FORECAST.replace('"dust.fits"', '"none.fits"'), {}),
+        (forecast, FORECAST, {"mask": f"[mask]\n{NONE}"}),
+        (simulate, EXPERIMENT, {"beam": 'beam = "none.fits"'}),
+        (simulate, EXPERIMENT, {"bandpass": f"{{ {NONE} }}"}),
+        (simulate, EXPERIMENT, {"noise": f"{{ map = {{ {NONE} }} }}"}),
+        (simulate, EXPERIMENT, {"cmb": '[cmb]\nspectra = "none.fits"'}),
+        (paper, PAPER.replace('"dust.fits"', '"none.fits"', 1), {}),
+        (paper, PAPER, {"analysis": f"[paper.ame]\nnu_ref = 23.0\n{NONE}"}),
+        (paper, PAPER, {"analysis": f"[paper.beta_syn]\n{NONE}"}),
+        (
+            paper,
+            PAPER,
+            {"analysis": "[paper.beta_syn]\nfile = 'beta.fits'\nspectrum = 'none.fits'"},
+        ),
+    ],
+)
+def test_all_settings_find_files_in_the_same_places(places, command, text, changes):
+    data, cache, _ = places
+    maps = 1 + np.arange(2 * 12 * 4**2).reshape(2, -1)
+    write_maps(data / "dust.fits", maps, names=["Q", "U"], unit="uK_RJ")
+    write_maps(data / "beta.fits", 3.0 + 0.01 * maps[:1] / maps.max(), names=["BETA"], unit="")
+    path = data / "settings.toml"
+    path.write_text(text.format(**PLAIN | changes))
+    words = f"none.fits: no such file, and none in the cache {cache}"
+    with pytest.raises(ValueError, match=words):
+        command(path)

@@ -12,11 +12,12 @@ import numpy as np
 
 from benchmarks.table import Row, time_text
 from benchmarks.timing import interleave, seconds
+from fits.chains import ChainFile
 from fits.compress import gram
 from fits.grid import _log_posterior
 from fits.likelihood import Likelihood, likelihood
 from fits.priors import Uniform
-from fits.sample import ChainFile, sample
+from fits.sample import sample
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.constants import H_OVER_K
 

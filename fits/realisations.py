@@ -2,6 +2,7 @@
 
 import time
 import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -15,6 +16,8 @@ __all__ = ["realisations"]
 
 #: They are written to their file after so many seconds, and when they are stopped.
 SAVED_EVERY = 10.0
+#: What a damaged archive raises besides.
+ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
 
 
 def realisations(
@@ -72,11 +75,12 @@ def _load(path: Path, mark: str, names: Sequence[str]) -> list[list[np.ndarray]]
         with np.load(path) as archive:
             found = str(archive["mark"])
             arrays = [archive[name] for name in names]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        rows = [list(row) for row in zip(*arrays, strict=True)]
+    except (OSError, ValueError, KeyError, TypeError, EOFError, *ZIP_ERRORS) as error:
         raise InputError(f"{path}: is damaged ({error}); start again with --overwrite.") from None
     if found != mark:
         raise InputError(
             f"{path}: holds realisations of other data or settings; choose another --out, or "
             "start again with --overwrite."
         )
-    return [list(row) for row in zip(*arrays, strict=True)]
+    return rows

@@ -1,104 +1,26 @@
 """Posterior samples with emcee: vectorised, stored in HDF5, resumable."""
 
-import copy
 from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import emcee
-import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from fits.chains import ChainFile
 from fits.likelihood import Likelihood, chi2
 from fits.optimize import best_fit
 from fits.priors import Prior, bounds, check_priors, log_prior
 from fits.results import FitResult
-from jaxsky.io import InputError
 from jaxsky.types import Numeric
 
-__all__ = [
-    "ChainFile",
-    "ensemble",
-    "ensemble_summary",
-    "kept_chain",
-    "sample",
-    "summary",
-]
+__all__ = ["ensemble", "ensemble_summary", "sample", "summary"]
 
 #: A chain shorter than this many autocorrelation times is reported as too short.
 ENOUGH = 50
-
-
-class ChainFile(emcee.backends.HDFBackend):
-    """emcee's HDF5 file, written every few hundred steps instead of at each.
-
-    A step takes 0.2 ms and opening the file for it 2 ms. What is on disk is always a state from
-    which the chain goes on exactly as if it had not stopped.
-    """
-
-    def __init__(self, filename: str | Path, name: str = "mcmc", every: int = 250) -> None:
-        super().__init__(str(filename), name=name)
-        self.every = every
-        self._pending: list[tuple[Any, np.ndarray]] = []
-
-    def save_step(self, state: Any, accepted: np.ndarray) -> None:
-        """Keep a step, and write when enough have come together."""
-        # emcee goes on to change the arrays of the state it hands over.
-        self._pending.append((copy.deepcopy(state), accepted.copy()))
-        if len(self._pending) >= self.every:
-            self.flush()
-
-    def flush(self) -> None:
-        """Write the steps that are kept in memory."""
-        if not self._pending:
-            return
-        states = [state for state, _ in self._pending]
-        with self.open("a") as file:
-            group = file[self.name]
-            done = int(group.attrs["iteration"])
-            new = slice(done, done + len(states))
-            group["chain"][new] = [state.coords for state in states]
-            group["log_prob"][new] = [state.log_prob for state in states]
-            group["accepted"][:] += sum(accepted for _, accepted in self._pending)
-            for i, value in enumerate(states[-1].random_state):
-                group.attrs[f"random_state_{i}"] = value
-            group.attrs["iteration"] = new.stop
-        self._pending = []
-
-
-def kept_chain(path: Path, name: str, size: tuple[int, int], mark: str) -> ChainFile:
-    """The place of a chain in its file, to begin there or to go on.
-
-    Parameters
-    ----------
-    path, name : file, and name of the chain in it
-    size : number of walkers and of parameters
-    mark : of all that the chain depends on
-
-    Raises
-    ------
-    jaxsky.io.InputError
-        If the file is damaged, or holds a chain with another mark or size.
-    """
-    if path.exists() and not h5py.is_hdf5(path):
-        raise InputError(f"{path}: is damaged; start again with --overwrite.")
-    backend, mark = ChainFile(path, name), f"{mark} {size}"
-    if not backend.initialized:
-        backend.reset(*size)
-        with backend.open("a") as file:
-            file[name].attrs["fingerprint"] = mark
-        return backend
-    with backend.open() as file:
-        if file[name].attrs.get("fingerprint") != mark:
-            raise InputError(
-                f"{path}: holds a chain of other data or settings; choose another --out, or "
-                "start again with --overwrite."
-            )
-    return backend
 
 
 @partial(jax.jit, static_argnames="free")

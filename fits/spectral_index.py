@@ -12,13 +12,14 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Bool
 
+from fits.chains import kept_chain
 from fits.grid import grid_fit, grid_is_possible
 from fits.likelihood import chi2
 from fits.optimize import best_fit
 from fits.record import fingerprint
 from fits.resolution import Prepared
 from fits.results import FitResult
-from fits.sample import kept_chain, sample
+from fits.sample import sample
 from fits.settings import Settings
 from jaxsky.settings import SettingsError
 

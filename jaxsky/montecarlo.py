@@ -18,6 +18,8 @@ from jaxtyping import Array, Float
 import jaxsky
 from jaxsky.experiment import Experiment, Setup
 from jaxsky.io import write_maps, write_text
+from jaxsky.io.files import check_guards
+from jaxsky.io.folders import alone
 from jaxsky.lookup import found_files
 from jaxsky.preparation import Prepared, plan, prepare
 from jaxsky.simulate import observe_bands
@@ -53,22 +55,34 @@ def _content(settings: Experiment) -> dict[str, Any]:
     return settings.model_dump(mode="json", exclude_none=True, exclude=LAYOUT)
 
 
-def check_folder(out: Path, settings: Experiment, resume: bool, overwrite: bool) -> None:
+def check_folder(
+    out: Path,
+    settings: Experiment,
+    resume: bool,
+    overwrite: bool,
+    indices: range | None = None,
+) -> None:
     """Whether realisations with these settings may be written to a folder.
+
+    Others of the same settings may be there: a Monte Carlo is split over processes so.
+
+    Parameters
+    ----------
+    out, settings : the folder, and what is simulated
+    resume, overwrite : keep or replace what is there
+    indices : numbers of the realisations; by default all
 
     Raises
     ------
     ValueError
         If there are results already and they are neither to be resumed nor replaced, or it is
-        not known that those to be resumed are of the same settings.
+        not known that those that are there are of the same settings.
     """
     log = out / LOG
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{out}: is not a folder; choose another --out.")
     if overwrite:
         return
     if log.exists():
-        if not resume:
+        if not resume and any(_maps(out, indices)):
             raise ValueError(
                 f"{out}: holds a simulation already; go on with --resume, replace it with "
                 "--overwrite, or choose another --out."
@@ -89,18 +103,30 @@ def check_folder(out: Path, settings: Experiment, resume: bool, overwrite: bool)
         )
 
 
-def _maps(out: Path) -> Iterator[Path]:
-    return out.glob("sim_*/*.fits")
+def _maps(out: Path, indices: range | None = None) -> Iterator[Path]:
+    """The maps of some realisations, by default all."""
+    for path in out.glob("sim_*/*.fits"):
+        number = path.parent.name.removeprefix("sim_")
+        if indices is None or (number.isdecimal() and int(number) in indices):
+            yield path
 
 
 def _claim(out: Path, settings: Experiment, overwrite: bool) -> None:
     """Make the folder and leave a log of what is in it, unless that is there."""
-    if overwrite:
-        for path in _maps(out):
-            path.unlink()
-    elif (out / LOG).exists():
-        return
+    check_guards()
     out.mkdir(parents=True, exist_ok=True)
+    with alone(out):
+        if overwrite:
+            for path in (*_maps(out), *out.glob("sim_*.png")):
+                path.unlink()
+        elif (out / LOG).exists():
+            # Another process may have left it since the folder was checked.
+            check_folder(out, settings, resume=True, overwrite=False)
+            return
+        _write_log(out, settings)
+
+
+def _write_log(out: Path, settings: Experiment) -> None:
     versions = {name: version(name) for name in PACKAGES}
     content = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -167,7 +193,13 @@ def _write(
     settings: Experiment,
     header: Mapping[str, Any],
 ) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+    check_guards()
+    log = path.parents[1] / LOG
+    if not log.exists():
+        raise FileNotFoundError(
+            f"{log}: was removed while the simulation ran; start again with --overwrite."
+        )
+    path.parent.mkdir(exist_ok=True)
     write_maps(
         path,
         columns,
@@ -234,6 +266,7 @@ def run(
     overwrite: bool = False,
     report: Callable[[str], None] = lambda message: None,
     note: Callable[[str], None] = lambda message: None,
+    begun: Callable[[], None] = lambda: None,
 ) -> Iterator[Written]:
     """Simulate realisations into files, one for each band; files that are there are kept.
 
@@ -248,6 +281,7 @@ def run(
     overwrite : remove all maps that are in the folder
     report : called with a line before each step of the work
     note : called with sentences that a user should know
+    begun : called when the folder has its log, and what was to be removed from it is
 
     Returns
     -------
@@ -266,6 +300,7 @@ def run(
         nonlocal claimed
         if not claimed:
             _claim(out, settings, overwrite)
+            begun()
             claimed = True
 
     for index in indices:

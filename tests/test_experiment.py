@@ -315,7 +315,7 @@ def test_a_stopped_run_goes_on(three, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(montecarlo, "write_maps", stopped)
     assert command(monkeypatch, path, "--out", out, "--nsims", 3) == 130
-    assert "Stopped; go on with --resume." in capsys.readouterr().err
+    assert "Stopped; resume with --resume." in capsys.readouterr().err
     assert len(content(out)) == 3
     assert not list(out.rglob(".partial*"))
     monkeypatch.setattr(montecarlo, "write_maps", write_file)

@@ -6,12 +6,13 @@ import numpy as np
 import optimistix as optx
 import pytest
 
+from fits.chains import ChainFile
 from fits.grid import grid_fit
 from fits.likelihood import likelihood
 from fits.optimize import best_fit
 from fits.priors import Gaussian, Uniform, from_unbounded, log_prior, to_unbounded
 from fits.results import FitError
-from fits.sample import ChainFile, sample
+from fits.sample import sample
 from jaxsky import Dust, Sky, observe, set_parameters
 from test_likelihood import BANDS, START, fluctuations, problem
 

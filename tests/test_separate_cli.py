@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fits.separate import report
 from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, cli, observe
+from jaxsky.cli.separate import RESULTS
 from jaxsky.harmonics import alm_ell, gaussian_beam, resample, synthesis
 from jaxsky.io import read_maps, write_maps
 
@@ -114,7 +114,7 @@ def test_maps_of_ones_own(folder, tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr()
     assert "dust.beta_dust, median of 2 regions" in printed.out
     names = {p.name for p in out.iterdir()}
-    assert names == set(report.RESULTS)
+    assert names == set(RESULTS)
     for picture in out.glob("*.png"):
         assert picture.read_bytes().startswith(b"\x89PNG")
     result = json.loads((out / "result.json").read_text())
@@ -155,7 +155,7 @@ def test_multipoles_of_files(folder, tmp_path, monkeypatch):
         assert abs(found["best_fit"] - truth) < 5 * found["sigma"]
     assert not (out / "parameters.png").exists()
     names = {p.name for p in out.iterdir()}
-    assert names == set(report.RESULTS) - {"parameters.fits", "parameters.png"}
+    assert names == set(RESULTS) - {"parameters.fits", "parameters.png"}
 
 
 def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
@@ -178,7 +178,7 @@ def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(module, "realisations", stopped)
     assert separate(monkeypatch, path, "--out", out) == 130
-    assert "go on with --resume" in capsys.readouterr().err
+    assert "Stopped; resume with --resume." in capsys.readouterr().err
     monkeypatch.undo()
     assert separate(monkeypatch, path, "--out", out, "--resume") == 0
     assert progress[-1] == 7

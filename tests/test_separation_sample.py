@@ -10,9 +10,9 @@ import pytest
 import scipy.special
 import scipy.stats
 
+from fits.chains import ChainFile
 from fits.priors import Gaussian, Uniform
 from fits.results import FitError
-from fits.sample import ChainFile
 from fits.separation import fit_spectra, sample_spectra, spectral_likelihood
 from fits.separation.agreement import agreement
 from fits.separation.posterior import scaled_posterior

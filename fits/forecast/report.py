@@ -14,10 +14,7 @@ from fits.pseudo_cl import sky_fraction
 from fits.record import write_json, write_log
 from jaxsky.components import is_positive
 
-__all__ = ["RESULTS", "forecast_json", "tables", "warnings", "write_report"]
-
-#: What a forecast leaves in its folder.
-RESULTS = ("forecast.json", "log.json", "bb.png", "fisher.png")
+__all__ = ["forecast_json", "tables", "warnings", "write_report"]
 
 
 def forecast_json(found: Forecast, settings: ForecastSettings) -> dict[str, Any]:
@@ -115,8 +112,9 @@ def write_report(
     out: Path, found: Forecast, settings: ForecastSettings, seconds: float
 ) -> list[Path]:
     """Write forecast.json, the pictures and log.json to a folder; returns what was written."""
-    write_json(out / RESULTS[0], forecast_json(found, settings))
-    write_log(out / RESULTS[1], settings, seconds)
-    plots.plot_b_modes(out / RESULTS[2], found, settings)
-    plots.plot_errors(out / RESULTS[3], found)
-    return [out / name for name in RESULTS]
+    written = [out / name for name in ("forecast.json", "log.json", "bb.png", "fisher.png")]
+    write_json(written[0], forecast_json(found, settings))
+    write_log(written[1], settings, seconds)
+    plots.plot_b_modes(written[2], found, settings)
+    plots.plot_errors(written[3], found)
+    return written

@@ -50,10 +50,6 @@ class Store:
     def __init__(
         self, out: Path, settings: PaperSettings, resume: bool = False, overwrite: bool = False
     ) -> None:
-        if resume and overwrite:
-            raise ValueError("--resume and --overwrite exclude each other.")
-        if out.exists() and not out.is_dir():
-            raise ValueError(f"{out}: is not a folder; choose another --out.")
         self.out, self.items = out, dict[str, Item]()
         self._stale = False
         self._settings = settings.model_dump(mode="json", exclude_none=True)

@@ -14,24 +14,8 @@ from fits.separate.settings import SeparateSettings
 from fits.separation.maps import ComponentMaps
 from jaxsky.io import write_maps
 
-__all__ = ["RESULTS", "result_json", "tables", "warnings", "write_report"]
+__all__ = ["result_json", "tables", "warnings", "write_report"]
 
-#: What a separation leaves in its folder.
-RESULTS = (
-    "result.json",
-    "log.json",
-    "components.fits",
-    "residuals.fits",
-    "parameters.fits",
-    "components.png",
-    "residuals.png",
-    "parameters.png",
-    "spectra.png",
-    "r.png",
-    "posterior.png",
-    "simulations.npz",
-    "chain.h5",
-)
 #: Probabilities below this are worth a word.
 UNLIKELY = 1e-3
 #: As is E in B above this fraction of a power's standard deviation.

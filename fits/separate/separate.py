@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from fits.chains import kept_chain
 from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra
 from fits.realisations import realisations
 from fits.record import fingerprint
 from fits.results import FitResult
-from fits.sample import kept_chain
 from fits.separate.domains import PixelDomain
 from fits.separate.settings import SeparateSettings, Tensors
 from fits.separate.setup import Setup

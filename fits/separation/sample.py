@@ -16,9 +16,10 @@ import numpy as np
 from blackjax.adaptation.step_size import dual_averaging_adaptation
 from tqdm import tqdm
 
+from fits.chains import ChainFile
 from fits.priors import Prior, check_priors
 from fits.results import FitResult
-from fits.sample import ChainFile, ensemble, ensemble_summary, summary
+from fits.sample import ensemble, ensemble_summary, summary
 from fits.separation.agreement import agreement
 from fits.separation.fit import fit_spectra
 from fits.separation.likelihood import SpectralLikelihood

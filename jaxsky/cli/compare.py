@@ -7,7 +7,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from jaxsky.cli.console import check_out, claim, console, progress_bar, write_example
+from jaxsky.cli.console import console, progress_bar, write_example
+from jaxsky.cli.results import results_folder
 
 __all__ = ["compare"]
 
@@ -67,8 +68,10 @@ def compare(
         {"seed": seed, "regions": files or None, "nside": nside},
         {"nsims": nsims},
     )
-    check_out(out, RESULTS, resume, overwrite)
-    with progress_bar() as progress:
+    with (
+        results_folder(out, RESULTS, resume=resume, overwrite=overwrite) as folder,
+        progress_bar() as progress,
+    ):
         task = progress.add_task("reading and preparing maps", total=None)
 
         import matplotlib as mpl
@@ -86,13 +89,9 @@ def compare(
         inputs = inputs_of(settings)
         prepared = prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
         check_comparison(settings, prepared, regions)
-        claim(out, RESULTS, overwrite)
-        try:
-            found = compare(settings, prepared, regions, out / "simulations.npz", show)
-        except KeyboardInterrupt:
-            progress.stop()
-            console.print("Stopped; go on with --resume.")
-            raise typer.Exit(130) from None
+        if overwrite:
+            folder.remove(RESULTS)
+        found = compare(settings, prepared, regions, out / "simulations.npz", show)
         patches = None
         if settings.compare.patches is not None:
             progress.update(task, description="patches")

@@ -1,6 +1,5 @@
-"""What commands share: console and progress, the example of the settings, results' folder."""
+"""What commands share: console and progress, and the example of the settings."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -12,7 +11,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-__all__ = ["check_out", "claim", "console", "progress_bar", "write_example"]
+__all__ = ["console", "progress_bar", "write_example"]
 
 console = Console(stderr=True)
 
@@ -35,29 +34,3 @@ def write_example(path: Path, example: Path) -> None:
         raise ValueError(f"{path}: exists already and is left as it is.")
     path.write_text(example.read_text())
     console.print(f"Written: {path}")
-
-
-def check_out(out: Path, results: Sequence[str], resume: bool | None, overwrite: bool) -> None:
-    """Refuse a folder that has results (patterns), unless they are to be kept or replaced.
-
-    `resume` is None for commands that have nothing to go on with.
-    """
-    if resume and overwrite:
-        raise ValueError("--resume and --overwrite exclude each other.")
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{out}: is not a folder; choose another --out.")
-    if not (resume or overwrite) and any(any(out.glob(name)) for name in results):
-        go_on = "" if resume is None else "go on with --resume, "
-        raise ValueError(
-            f"{out}: holds results already; {go_on}replace them with --overwrite, or choose "
-            "another --out."
-        )
-
-
-def claim(out: Path, results: Sequence[str], overwrite: bool) -> None:
-    """Make the folder of the results, and with overwrite remove those that it has."""
-    out.mkdir(parents=True, exist_ok=True)
-    if overwrite:
-        for name in results:
-            for path in out.glob(name):
-                path.unlink()

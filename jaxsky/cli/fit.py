@@ -7,7 +7,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from jaxsky.cli.console import check_out, claim, console, write_example
+from jaxsky.cli.console import console, write_example
+from jaxsky.cli.results import results_folder
 
 __all__ = ["fit"]
 
@@ -57,9 +58,10 @@ def fit(
     files = [str(Path(r).resolve()) if Path(r).is_file() else r for r in region or []]
     overrides = {"seed": seed, "regions": files or None, "stokes": stokes, "nside": nside}
     settings = fit_settings.load_settings(settings_file or fit_settings.EMBEDDED, overrides)
-    check_out(out, RESULTS, resume, overwrite)
-
-    with console.status("starting") as status:
+    with (
+        results_folder(out, RESULTS, resume=resume, overwrite=overwrite) as folder,
+        console.status("starting") as status,
+    ):
         import matplotlib as mpl
 
         mpl.use("Agg")  # pictures go to files
@@ -72,7 +74,8 @@ def fit(
         regions = region_masks(settings)
         inputs = inputs_of(settings)
         prepared = prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
-        claim(out, RESULTS, overwrite)
+        if overwrite:
+            folder.remove(RESULTS)
         chains = out / "chain.h5"
 
         def report_step(message: str) -> None:
@@ -80,14 +83,7 @@ def fit(
             (status.stop if message.endswith("mcmc") else status.start)()
             status.update(message)
 
-        try:
-            fits = spectral_index.run(
-                settings, prepared, regions, chains, report_step, progress=True
-            )
-        except KeyboardInterrupt:
-            status.stop()
-            console.print("Stopped; go on with --resume.")
-            raise typer.Exit(130) from None
+        fits = spectral_index.run(settings, prepared, regions, chains, report_step, progress=True)
         status.start()
         status.update("drawing")
         seconds = time.perf_counter() - started

@@ -7,9 +7,13 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from jaxsky.cli.console import check_out, claim, console, write_example
+from jaxsky.cli.console import console, write_example
+from jaxsky.cli.results import results_folder
 
 __all__ = ["forecast"]
+
+#: What a forecast leaves in its folder.
+RESULTS = ("forecast.json", "log.json", "bb.png", "fisher.png")
 
 
 def forecast(
@@ -35,17 +39,20 @@ def forecast(
         write_example(settings_file or Path("forecast.toml"), forecast_settings.EXAMPLE)
         return
     settings = forecast_settings.load_forecast(settings_file or forecast_settings.DEFAULT)
-    with console.status("starting") as status:
+    with (
+        results_folder(out, RESULTS, resume=None, overwrite=overwrite) as folder,
+        console.status("starting") as status,
+    ):
         import matplotlib as mpl
 
         mpl.use("Agg")  # pictures go to files
         from fits.forecast import report
         from fits.forecast.forecast import forecast as run
 
-        check_out(out, report.RESULTS, None, overwrite)
         found = run(settings, status.update)
         status.update("drawing")
-        claim(out, report.RESULTS, overwrite)
+        if overwrite:
+            folder.remove(RESULTS)
         written = report.write_report(out, found, settings, time.perf_counter() - started)
     console.print(found.setup.description, highlight=False, markup=False)
     for table in report.tables(found):

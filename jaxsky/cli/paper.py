@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from jaxsky.cli.console import console, progress_bar, write_example
+from jaxsky.cli.results import results_folder
 
 __all__ = ["paper"]
 
@@ -41,7 +42,10 @@ def paper(
         write_example(settings_file or Path("paper.toml"), paper_settings.EXAMPLE)
         return
     settings = paper_settings.load_paper(settings_file or paper_settings.EMBEDDED)
-    with progress_bar() as progress:
+    with (
+        results_folder(out, resume=resume, overwrite=overwrite),
+        progress_bar() as progress,
+    ):
         task = progress.add_task("starting", total=None)
         import matplotlib as mpl
 
@@ -51,14 +55,7 @@ def paper(
         def report(label: str, done: int, of: int) -> None:
             progress.update(task, description=label, completed=done, total=of)
 
-        try:
-            items = run(
-                settings, out, only or (), resume=resume, overwrite=overwrite, report=report
-            )
-        except KeyboardInterrupt:
-            progress.stop()
-            console.print("Stopped; go on with --resume.")
-            raise typer.Exit(130) from None
+        items = run(settings, out, only or (), resume=resume, overwrite=overwrite, report=report)
     for item in items:
         if item.picture is None and item.table is None:
             console.print(f"[yellow](!)[/] {item.label}: {item.differs}", highlight=False)

@@ -7,9 +7,27 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from jaxsky.cli.console import check_out, claim, console, progress_bar, write_example
+from jaxsky.cli.console import console, progress_bar, write_example
+from jaxsky.cli.results import results_folder
 
 __all__ = ["separate"]
+
+#: What a separation leaves in its folder.
+RESULTS = (
+    "result.json",
+    "log.json",
+    "components.fits",
+    "residuals.fits",
+    "parameters.fits",
+    "components.png",
+    "residuals.png",
+    "parameters.png",
+    "spectra.png",
+    "r.png",
+    "posterior.png",
+    "simulations.npz",
+    "chain.h5",
+)
 
 
 def separate(
@@ -52,7 +70,10 @@ def separate(
     settings = separate_settings.load_separate(
         settings_file or separate_settings.EMBEDDED, {"separation": overrides}
     )
-    with progress_bar() as progress:
+    with (
+        results_folder(out, RESULTS, resume=resume, overwrite=overwrite) as folder,
+        progress_bar() as progress,
+    ):
         task = progress.add_task("reading and preparing maps", total=None)
 
         import matplotlib as mpl
@@ -63,8 +84,6 @@ def separate(
         from fits.separate.separate import separate as run
         from fits.separate.setup import build
 
-        check_out(out, report.RESULTS, resume, overwrite)
-
         def say(message: str) -> None:
             progress.update(task, description=message, completed=0, total=None)
 
@@ -73,15 +92,12 @@ def separate(
             progress.update(task, description="simulations", completed=done, total=total)
 
         setup = build(settings)
-        claim(out, report.RESULTS, overwrite)
+        if overwrite:
+            folder.remove(RESULTS)
         try:
             found = run(settings, setup, out, say, show)
         except FitError as error:
             raise ValueError(f"The spectral parameters were not found. {error}") from None
-        except KeyboardInterrupt:
-            progress.stop()
-            console.print("Stopped; go on with --resume.")
-            raise typer.Exit(130) from None
         say("drawing")
         written = report.write_report(out, found, settings, time.perf_counter() - started)
     console.print(setup.description, highlight=False, markup=False)

@@ -9,6 +9,8 @@ from typing import Annotated
 import typer
 
 from jaxsky.cli.console import console, progress_bar, write_example
+from jaxsky.cli.results import results_folder
+from jaxsky.io.folders import ALL
 
 __all__ = ["simulate"]
 
@@ -53,8 +55,6 @@ def simulate(
     if init:
         write_example(experiment_file or Path("experiment.toml"), experiment.EXAMPLE)
         return
-    if resume and overwrite:
-        raise ValueError("--resume and --overwrite exclude each other.")
     if only is not None and only not in ONLY:
         raise ValueError(f"--only must be one of {', '.join(ONLY)}, not {only!r}.")
     settings = experiment.load_experiment(
@@ -66,7 +66,13 @@ def simulate(
             update={"experiment": settings.experiment.model_copy(update=main)}
         )
     started = time.perf_counter()
-    with progress_bar() as progress:
+    indices = range(first, first + nsims)
+    # With --overwrite all realisations are removed, so nobody else may be making any.
+    part = ALL if overwrite else indices
+    with (
+        results_folder(out, resume=resume, overwrite=overwrite, part=part) as folder,
+        progress_bar() as progress,
+    ):
         task = progress.add_task("reading templates", total=None)
 
         def report(message: str) -> None:
@@ -75,29 +81,24 @@ def simulate(
         from jaxsky import montecarlo
         from jaxsky.io import read_maps
 
+        montecarlo.check_folder(out, settings, resume, overwrite, indices)
         setup = experiment.build(settings)
-        montecarlo.check_folder(out, settings, resume, overwrite)
         names = setup.observation.names
         progress.update(task, total=nsims * len(names))
         seconds, notes = {}, dict[str, None]()  # a set that keeps its order
-        indices = range(first, first + nsims)
-        try:
-            for file in montecarlo.run(
-                settings,
-                setup,
-                out,
-                indices,
-                overwrite,
-                report,
-                lambda note: notes.setdefault(note),
-            ):
-                progress.advance(task)
-                if file.seconds is not None:
-                    seconds[file.path] = file.seconds
-        except KeyboardInterrupt:
-            progress.stop()
-            console.print("Stopped; go on with --resume.")
-            raise typer.Exit(130) from None
+        for file in montecarlo.run(
+            settings,
+            setup,
+            out,
+            indices,
+            overwrite,
+            report,
+            lambda note: notes.setdefault(note),
+            lambda: folder.narrow(indices),
+        ):
+            progress.advance(task)
+            if file.seconds is not None:
+                seconds[file.path] = file.seconds
         written = [out / "sim_*"]
         if settings.experiment.sheet:
             import matplotlib as mpl

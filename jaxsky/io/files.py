@@ -1,22 +1,60 @@
 """Files written whole: beside their place, and moved there when they are complete."""
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["whole", "write_text"]
+__all__ = ["PARTIAL", "check_guards", "guards", "whole", "write_text"]
+
+#: How names of files begin that are not complete; the number of their process follows.
+PARTIAL = ".partial-"
+#: Called before anything is written; an exception of theirs keeps it from being written.
+guards: list[Callable[[], None]] = []
+
+
+def check_guards() -> None:
+    """Raise what keeps this process from writing, as that its folder was removed."""
+    for guard in guards:
+        guard()
 
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A place beside a file to write to; it takes the file's place unless there is an error."""
-    beside = path.with_name(f".partial-{os.getpid()}-{path.name}")
+    """A place beside a file to write to; it takes the file's place unless there is an error.
+
+    What is there survives a process that is killed and a full disk. Data are on the disk before
+    they get their name, as some file systems tell only then that there was no room.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written, with the file and the reason in one sentence.
+    """
+    beside = path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
+    check_guards()
     try:
         yield beside
+        _to_disk(beside)
+        check_guards()
         beside.replace(path)
+    except OSError as error:
+        check_guards()
+        reason = error.strerror or str(error).rstrip(".")
+        raise OSError(
+            f"{path}: cannot be written ({reason}); what was complete before is kept."
+        ) from error
     finally:
-        beside.unlink(missing_ok=True)
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)
+
+
+def _to_disk(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -1,0 +1,158 @@
+"""The file of a chain of emcee: whole at any moment, and checked before a run goes on with it."""
+
+import copy
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import emcee
+import h5py
+import numpy as np
+
+from fits.realisations import SAVED_EVERY
+from jaxsky.io import InputError, whole
+
+__all__ = ["ChainFile", "kept_chain"]
+
+#: Entries of numpy's random state, each an attribute of a chain in its file.
+RANDOM_STATE = 5
+
+
+class ChainFile(emcee.backends.HDFBackend):
+    """emcee's HDF5 file, replaced by one with more steps every few seconds.
+
+    HDF5 damages a file if it is stopped while it changes it, or finds the disk full. So changes
+    are made in memory, and what is on disk is always a whole file: a state from which the chain
+    goes on exactly as if it had not stopped.
+
+    Parameters
+    ----------
+    filename, name : file, and name of the chain in it
+    every : seconds between the times at which steps are written
+    """
+
+    def __init__(
+        self, filename: str | Path, name: str = "mcmc", every: float = SAVED_EVERY
+    ) -> None:
+        super().__init__(str(filename), name=name)
+        self.every = every
+        self._changed: h5py.File | None = None
+        self._pending: list[tuple[Any, np.ndarray]] = []
+        self._written, self._due = -1, time.monotonic() + every
+
+    @contextmanager
+    def open(self, mode: str = "r") -> Iterator[h5py.File]:
+        """The file to read from, or to change: what is changed in one `with` is written at once."""
+        if self._changed is not None:
+            yield self._changed
+            return
+        path = Path(self.filename)
+        if mode == "r":
+            if not path.exists():
+                raise FileNotFoundError(f"{path}: is not there, or not any more.")
+            with h5py.File(path) as file:
+                yield file
+            return
+        with h5py.File.in_memory(path.read_bytes() if path.exists() else None) as file:
+            self._changed = file
+            try:
+                yield file
+            finally:
+                self._changed = None
+            file.flush()
+            image = file.id.get_file_image()
+        with whole(path) as beside:
+            beside.write_bytes(image)
+
+    def save_step(self, state: Any, accepted: np.ndarray) -> None:
+        """Keep a step, and write when it is time."""
+        if not self._pending:
+            self._written = int(self.iteration)
+        # emcee goes on to change the arrays of the state it hands over.
+        self._pending.append((copy.deepcopy(state), accepted.copy()))
+        if time.monotonic() > self._due:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the steps that are kept in memory."""
+        if not self._pending:
+            return
+        start, found = time.monotonic(), self.iteration
+        if found == self._written:
+            self._append()
+        # Otherwise an interrupted call has written them already.
+        elif found != self._written + len(self._pending):
+            raise InputError(f"{self.filename}: was changed by another process meanwhile.")
+        self._pending, now = [], time.monotonic()
+        self._due = now + max(self.every, 20 * (now - start))
+
+    def _append(self) -> None:
+        states = [state for state, _ in self._pending]
+        with self.open("a") as file:
+            group = file[self.name]
+            new = slice(self._written, self._written + len(states))
+            group["chain"][new] = [state.coords for state in states]
+            group["log_prob"][new] = [state.log_prob for state in states]
+            group["accepted"][:] += sum(accepted for _, accepted in self._pending)
+            for i, value in enumerate(states[-1].random_state):
+                group.attrs[f"random_state_{i}"] = value
+            group.attrs["iteration"] = new.stop
+
+
+def kept_chain(path: Path, name: str, size: tuple[int, int], mark: str) -> ChainFile:
+    """The place of a chain in its file, to begin there or to go on.
+
+    Parameters
+    ----------
+    path, name : file, and name of the chain in it
+    size : number of walkers and of parameters
+    mark : of all that the chain depends on
+
+    Raises
+    ------
+    jaxsky.io.InputError
+        If the file is damaged, or holds a chain with another mark or size.
+    """
+    backend, mark = ChainFile(path, name), f"{mark} {size}"
+    held = _held(path, name)
+    if held is None:
+        with backend.open("a") as file:
+            backend.reset(*size)
+            file[name].attrs["fingerprint"] = mark
+    elif held != mark:
+        raise InputError(
+            f"{path}: holds a chain of other data or settings; choose another --out, or "
+            "start again with --overwrite."
+        )
+    return backend
+
+
+def _held(path: Path, name: str) -> str | None:
+    """The mark of a chain that is in a file and whole, None if there is none."""
+    if not path.exists():
+        return None
+    try:
+        with h5py.File(path) as file:
+            if name not in file:
+                return None
+            group = file[name]
+            done = int(group.attrs["iteration"])
+            size = int(group.attrs["nwalkers"]), int(group.attrs["ndim"])
+            chain, log_prob = group["chain"][:done], group["log_prob"][:done]
+            accepted, states = group["accepted"][:], [a for a in group.attrs if "random" in a]
+            mark = str(group.attrs.get("fingerprint"))
+        intact = (
+            chain.shape == (done, *size)
+            and log_prob.shape == (done, size[0])
+            and bool(np.isfinite(chain).all() and not np.isnan(log_prob).any())
+            # Steps that were counted but not written are zeros.
+            and bool(chain.any(axis=(1, 2)).all() and (accepted <= done).all())
+            and len(states) == (RANDOM_STATE if done else 0)
+        )
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError):
+        intact = False
+    if not intact:
+        raise InputError(f"{path}: is damaged; start again with --overwrite.")
+    return mark

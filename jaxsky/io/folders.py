@@ -1,0 +1,209 @@
+"""Folders of results: one process works in one, or several, each on a part of its own."""
+
+import errno
+import os
+import socket
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+from typing import NamedTuple
+
+import filelock
+
+from jaxsky.io.files import PARTIAL, guards
+
+__all__ = ["ALL", "Folder", "alone", "occupied"]
+
+#: Locked for moments only, while it is seen who works in a folder.
+GATE = ".lock"
+#: How the name of a file begins that a process keeps locked as long as it works in a folder.
+OWNER = ".running"
+#: The part of a process that shares its folder with no other.
+ALL = range(sys.maxsize)
+#: How a file system says that it has no locks.
+NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EPROTONOSUPPORT}
+
+
+class Owner(NamedTuple):
+    """A process that works in a folder, as the name of its file says; started in ns."""
+
+    pid: int
+    started: int
+    first: int
+    stop: int
+    host: str
+
+    @property
+    def name(self) -> str:
+        """Name of its file."""
+        return "-".join((OWNER, *map(str, self)))
+
+    @classmethod
+    def named(cls, name: str) -> "Owner":
+        """The process with this name of a file."""
+        _, pid, started, first, stop, host = name.split("-", 5)
+        return cls(int(pid), int(started), int(first), int(stop), host)
+
+    def __str__(self) -> str:
+        """Process and start time."""
+        when = datetime.fromtimestamp(self.started / 1e9).isoformat(" ", "seconds")
+        where = "" if self.host == socket.gethostname() else f" on {self.host}"
+        return f"process {self.pid}{where}, started {when}"
+
+
+def _acquire(lock: filelock.BaseFileLock) -> bool:
+    """Lock a file; False if the file system has no locks."""
+    try:
+        lock.acquire()
+    except OSError as error:
+        if error.errno in NO_LOCKS:
+            return False
+        raise
+    return True
+
+
+def _lock(path: Path, timeout: float = 0) -> filelock.BaseFileLock:
+    # The operating system releases it when a process dies; filelock's other kind would stay.
+    return filelock.FileLock(path, timeout=timeout, fallback_to_soft=False)
+
+
+@contextmanager
+def alone(out: Path) -> Iterator[bool]:
+    """Whoever is in here is alone with the list of a folder's processes; for moments only.
+
+    False where the file system has no locks.
+    """
+    lock = _lock(out / GATE, 60)
+    locked = _acquire(lock)
+    try:
+        yield locked
+    finally:
+        if locked:
+            if not any(out.glob(f"{OWNER}-*")):
+                (out / GATE).unlink(missing_ok=True)
+            lock.release()
+
+
+def _owners(out: Path) -> Iterator[Owner]:
+    """Who works in a folder; files of processes that have died are removed."""
+    for path in out.glob(f"{OWNER}-*"):
+        lock = _lock(path)
+        try:
+            lock.acquire()
+        except filelock.Timeout:
+            yield Owner.named(path.name)
+        else:
+            path.unlink(missing_ok=True)
+            lock.release()
+
+
+class Folder:
+    """A folder in which this process works on a part of the results; see `occupied`."""
+
+    def __init__(self, path: Path, part: range) -> None:
+        self.path = path
+        self._owner = Owner(
+            os.getpid(), time.time_ns(), part.start, part.stop, socket.gethostname()
+        )
+        self._lock = _lock(self._place)
+        self.locked = False
+
+    @property
+    def _place(self) -> Path:
+        return self.path / self._owner.name
+
+    def enter(self) -> None:
+        """Work in the folder, unless another process works on the same part."""
+        me = self._owner
+        with alone(self.path) as locked:
+            for other in _owners(self.path) if locked else ():
+                if other.first < me.stop and me.first < other.stop:
+                    raise ValueError(
+                        f"{self.path}: is being written to by another command ({other}); wait "
+                        "for its end, or choose another --out."
+                    )
+            self.locked = locked and _acquire(self._lock)
+            self._place.touch()
+
+    def leave(self) -> None:
+        """Let others work in the folder."""
+        with suppress(OSError):
+            self.check()
+            with alone(self.path):
+                self._place.unlink()
+        self._lock.release()
+
+    def check(self) -> None:
+        """Raise FileNotFoundError if the folder was removed, or is another one now."""
+        if not self._place.exists():
+            raise FileNotFoundError(
+                f"{self.path}: was removed while the command worked in it; the rest of its "
+                "results is not written."
+            )
+
+    def narrow(self, part: range) -> None:
+        """Go on with a smaller part only."""
+        with alone(self.path):
+            before = self._place
+            self._owner = self._owner._replace(first=part.start, stop=part.stop)
+            before.rename(self._place)
+
+    def remove(self, patterns: Sequence[str]) -> None:
+        """Remove files by patterns of their names."""
+        self.check()
+        for pattern in patterns:
+            for path in self.path.glob(pattern):
+                path.unlink(missing_ok=True)
+
+    def clean(self) -> None:
+        """Remove incomplete files of processes that have died."""
+        with alone(self.path) as locked:
+            if not locked:
+                return
+            living = {str(other.pid) for other in _owners(self.path) if other != self._owner}
+            for pattern in (f"{PARTIAL}*", f"*/{PARTIAL}*"):
+                for path in self.path.glob(pattern):
+                    if path.name.split("-")[1] not in living:
+                        path.unlink(missing_ok=True)
+
+
+@contextmanager
+def occupied(out: Path, part: range = ALL) -> Iterator[Folder]:
+    """Work in a folder, which is made if it is not there, and left as it was if that fails.
+
+    Parameters
+    ----------
+    out : the folder
+    part : what of the results is made; processes share a folder only if their parts differ
+
+    Raises
+    ------
+    ValueError
+        If another process works on the same part, with its number and when it started.
+    OSError
+        If the folder cannot be made, or was removed meanwhile.
+    """
+    missing = [folder for folder in (out, *out.parents) if not folder.exists()]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(f"{out}: cannot be made ({error.strerror}); choose another --out.") from error
+    folder = Folder(out, part)
+    try:
+        folder.enter()
+        guards.append(folder.check)
+        try:
+            yield folder
+        except (OSError, ValueError):
+            folder.check()  # the reason of all errors, if there is none any more
+            raise
+        finally:
+            guards.remove(folder.check)
+            folder.leave()
+    finally:
+        for made in missing:
+            with suppress(OSError):
+                made.rmdir()  # unless there is something in it

@@ -59,6 +59,9 @@ ANSWERS = {
     "down": (503, {"Retry-After": "Sun, 29 Nov 2026 00:00:00 GMT"}, b""),
     "elsewhere": (302, {"Location": f"/good/{NAME}"}, b""),
     "circle": (302, {"Location": f"/circle/{NAME}"}, b""),
+    "to brackets": (302, {"Location": "https://[bad/x"}, b""),
+    "to umlauts": (302, {"Location": "\u00fc"}, b""),
+    "two lengths": (200, {"Content-Length": "10, 12"}, CONTENT),
     "to a file": (302, {"Location": "file:///etc/passwd"}, b""),
 }
 #: Answers to a request for a rest, of files whose first answer is cut.

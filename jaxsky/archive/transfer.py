@@ -140,9 +140,14 @@ def _resume(address: str, part: Path, state: _State, report: Report, size: int |
 def _get(address: str, headers: dict[str, str]) -> requests.Response:
     # Compressed transfers would have other lengths than the file.
     headers = {"Accept-Encoding": "identity", **headers}
-    return requests.get(
-        address, headers=headers, stream=True, timeout=TIMEOUT, hooks={"response": _stay_safe}
-    )
+    try:
+        return requests.get(
+            address, headers=headers, stream=True, timeout=TIMEOUT, hooks={"response": _stay_safe}
+        )
+    except requests.RequestException:
+        raise
+    except ValueError:  # of an address that cannot be taken apart
+        raise RefusedError("sends on to no address") from None
 
 
 def _stay_safe(answer: requests.Response, **_: object) -> None:

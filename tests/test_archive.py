@@ -139,10 +139,12 @@ def command(monkeypatch, *arguments):
 
 @pytest.fixture
 def served(server, monkeypatch, tmp_path):
-    """The server's file as the only product, and a folder for it."""
-    wanted = product(f"{server}/good/{NAME}", hash=SHA)
-    monkeypatch.setattr("jaxsky.archive.products.catalogue", lambda: {NAME: wanted})
-    sets = {"both": ProductSet("both", "An analysis", (NAME,))}
+    """The server's file as two products, which are a set, and a folder for them."""
+    wanted = product(f"{server}/good/{NAME}", hash=SHA, size=len(CONTENT))
+    second = wanted._replace(name="second.fits", addresses=(f"{server}/good/second.fits",))
+    known = {NAME: wanted, "second.fits": second}
+    monkeypatch.setattr("jaxsky.archive.products.catalogue", lambda: known)
+    sets = {"both": ProductSet("both", "An analysis", (NAME, "second.fits"))}
     for module in ("products", ""):
         monkeypatch.setattr(f"jaxsky.archive.{module}".rstrip(".") + ".product_sets", lambda: sets)
     monkeypatch.setenv("JAXSKY_CACHE", str(tmp_path / "cache"))
@@ -158,20 +160,28 @@ def test_the_command(served, monkeypatch, capsys):
     assert "map.fits: is not there; fetch it with" in capsys.readouterr().err
     assert command(monkeypatch, "verify") == 0
     assert f"No product is in {served}." in capsys.readouterr().err
-    assert command(monkeypatch, "fetch", "test") == 0
+    assert command(monkeypatch, "fetch", NAME) == 0
     assert f"In {served}: 1 files." in capsys.readouterr().err
+    assert command(monkeypatch, "list") == 0
+    assert "1 of 2" in capsys.readouterr().out
+    assert command(monkeypatch, "fetch", "both") == 0
+    said = capsys.readouterr().err
+    assert "2 files, 17 kB." in said
+    assert f"In {served}: 2 files." in said
     assert command(monkeypatch, "list", "map") == 0
     assert "yes" in capsys.readouterr().out
     assert command(monkeypatch, "verify") == 0
     assert "map.fits: hash, columns, complete" in capsys.readouterr().err
     (served / NAME).write_bytes(CONTENT[:-3000])
     assert command(monkeypatch, "verify") == 1
-    assert "has the hash" in capsys.readouterr().err
+    assert f"has {len(CONTENT) - 3000} bytes, but should have" in capsys.readouterr().err
 
 
 def test_mistakes_of_the_command(served, server, monkeypatch, capsys, tmp_path):
     for arguments, words in (
-        (("fetch", "cobe"), "There is no product 'cobe'"),
+        (("fetch", "cobe"), "There is no product 'cobe'; give the name of a file, a part of one, "),
+        (("fetch", "cobe"), "a group: test; or a set: both."),
+        (("fetch", NAME, "--mirror", "a.org"), "--mirror must begin with https:// or http://"),
         (("fetch", NAME, "--mirror", f"{server}/missing"), "answers 404. Try again later"),
         (("fetch", NAME, "--mirror", f"{server}/cut"), "ended early, after 1000 bytes"),
     ):

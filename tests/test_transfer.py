@@ -358,7 +358,7 @@ def test_files_for_which_there_is_no_room_do_not_begin(server, tmp_path, monkeyp
     usage = shutil.disk_usage(tmp_path)._replace(free=1000)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
     said = refused(product(f"{server}/good/{NAME}"), tmp_path)
-    assert said.startswith(f"{tmp_path}: 0 MB are free, but {NAME} takes 0 MB more; make room")
+    assert said.startswith(f"{tmp_path}: 1 kB are free, but {NAME} takes 9 kB more; make room")
     assert not list(tmp_path.glob("*.part*"))
 
 

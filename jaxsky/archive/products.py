@@ -6,7 +6,15 @@ from functools import cache
 from importlib.resources import files
 from typing import Any, NamedTuple
 
-__all__ = ["Product", "ProductSet", "catalogue", "find", "product_sets", "total_size"]
+__all__ = [
+    "Product",
+    "ProductSet",
+    "catalogue",
+    "find",
+    "in_words",
+    "product_sets",
+    "total_size",
+]
 
 
 class Product(NamedTuple):
@@ -120,6 +128,19 @@ def find(words: Sequence[str] = ()) -> list[Product]:
     return list(found.values())
 
 
+def in_words(size: float) -> str:
+    """A number of bytes with its unit.
+
+    Examples
+    --------
+    >>> in_words(771840), in_words(1.8e9)
+    ('772 kB', '1.8 GB')
+    """
+    if size >= 1e9:
+        return f"{size / 1e9:.1f} GB"
+    return f"{size / 1e6:.0f} MB" if size >= 1e6 else f"{size / 1e3:.0f} kB"
+
+
 def total_size(products: Sequence[Product]) -> str:
     """The size of products together, in words; "about" unless that of each is known exactly.
 
@@ -128,9 +149,9 @@ def total_size(products: Sequence[Product]) -> str:
     >>> total_size(find(["wmap9"])), total_size(find(["planck-44-70"]))
     ('503 MB', 'about 1.8 GB')
     """
-    megabytes = [p.about if p.size is None else p.size / 1e6 for p in products]
-    known = sum(m for m in megabytes if m is not None)
-    size = f"{known / 1e3:.1f} GB" if known >= 1e3 else f"{known:.0f} MB"
-    if None in megabytes:
+    sizes = [p.size if p.size or p.about is None else 1e6 * p.about for p in products]
+    known = sum(size for size in sizes if size is not None)
+    size = in_words(known)
+    if None in sizes:
         return f"more than {size}" if known else "of unknown size"
     return size if all(p.size is not None for p in products) else f"about {size}"

@@ -12,6 +12,7 @@ import requests
 import urllib3
 
 from jaxsky.archive.cache import DownloadError
+from jaxsky.archive.products import in_words
 
 __all__ = ["CutError", "RefusedError", "discard", "reason", "source", "transfer"]
 
@@ -181,8 +182,8 @@ def _check(
     free = shutil.disk_usage(part.parent).free
     if rest is not None and rest > free:
         raise DownloadError(
-            f"{part.parent}: {free / 1e6:.0f} MB are free, but {part.stem} takes "
-            f"{rest / 1e6:.0f} MB more; make room, or give another --dir."
+            f"{part.parent}: {in_words(free)} are free, but {part.stem} takes {in_words(rest)} "
+            "more; make room, or give another --dir."
         )
 
 

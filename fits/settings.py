@@ -1,6 +1,7 @@
 """The settings of an analysis: a TOML file, validated with a sentence for each mistake."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +19,7 @@ from jaxsky.settings import (
     Table,
     TemplateFile,
     check_angles,
+    check_signs,
     load,
 )
 
@@ -67,6 +69,14 @@ class Parameter(Table):
         return Gaussian(*self.gaussian) if self.gaussian else None
 
 
+def check_free(free: Mapping[str, Parameter]) -> None:
+    """Raise ValueError for start values and priors in the other sign convention."""
+    for name, parameter in free.items():
+        mean = [parameter.gaussian[0]] if parameter.gaussian else []
+        end = [parameter.uniform[1]] if parameter.uniform else []
+        check_signs("free", {name: [parameter.start, *mean, *end]})
+
+
 class Noise(NoiseFile):
     """Noise of a band: from files, or at latitudes above one estimated from its own map."""
 
@@ -105,13 +115,14 @@ class Band(MapFile):
     def _one_release(self) -> "Band":
         if self.leakage is None:
             return self
-        if "BPassCorrected" in self.file:
-            raise ValueError(f"leakage is subtracted from {self.file} already")
-        releases = [_RELEASE.search(file) for file in (self.file, self.leakage.file)]
+        for file in self.files:
+            if "BPassCorrected" in file:
+                raise ValueError(f"leakage is subtracted from {file} already")
+        releases = [_RELEASE.search(file) for file in (*self.files, *self.leakage.files)]
         found = [release[1] for release in releases if release]
         if len(set(found)) > 1:
             raise ValueError(
-                f"leakage {self.leakage.file} is of release {found[1]}, but the map {self.file} "
+                f"leakage {self.leakage.label} is of release {found[-1]}, but the map {self.label} "
                 f"of release {found[0]}"
             )
         return self
@@ -202,6 +213,7 @@ class Settings(SettingsFile):
                 f"{', '.join(names)}"
             )
         check_angles(self.templates)
+        check_free(self.free)
         return self
 
     def start(self) -> dict[str, float]:

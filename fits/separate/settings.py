@@ -7,8 +7,17 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from fits.priors import Gaussian, Prior
-from fits.settings import Band, Parameter
-from jaxsky.settings import MapFile, MaskFile, Nside, SettingsFile, Table, load
+from fits.settings import Band, Parameter, check_free
+from jaxsky.settings import (
+    MapFile,
+    MaskFile,
+    Nside,
+    SettingsFile,
+    Table,
+    check_reference,
+    check_signs,
+    load,
+)
 
 __all__ = [
     "EMBEDDED",
@@ -58,6 +67,8 @@ class ComponentTable(Table):
     def _no_reference(self) -> "ComponentTable":
         if self.law == "cmb" and self.nu_ref is not None:
             raise ValueError("the law 'cmb' has no nu_ref: its maps are in uK_CMB")
+        check_reference(self.law, self.nu_ref, self.parameters)
+        check_signs("parameters", self.parameters)
         return self
 
 
@@ -103,6 +114,11 @@ class Embedded(Table):
     truth: dict[str, float] = Field(default={})
     r: float = Field(0.0, ge=0)
 
+    @model_validator(mode="after")
+    def _signs(self) -> "Embedded":
+        check_signs("truth", self.truth)
+        return self
+
 
 class Tensors(Table):
     """How the tensor-to-scalar ratio is taken from BB of the cleaned CMB."""
@@ -134,6 +150,7 @@ class SeparateSettings(SettingsFile):
             raise ValueError(f"the names of the bands must differ, but are {', '.join(names)}")
         if self.cmb is None:
             raise ValueError("components: one must have the law 'cmb'")
+        check_free(self.free)
         if self.separation.domain == "harmonic":
             divided = [name for name, parameter in self.free.items() if parameter.regions]
             if divided:

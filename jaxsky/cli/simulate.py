@@ -111,7 +111,7 @@ def simulate(
             plots.contact_sheet(
                 written[-1],
                 montecarlo.paths(out, names, first),
-                lambda path: read_maps(path, fields=["Q", "U"]).maps,
+                lambda path: read_maps(path, fields=["Q", "U"], missing=[]).maps,
                 setup.observation.lmax,
                 settings.experiment.unit,
                 settings.title,

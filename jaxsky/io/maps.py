@@ -1,7 +1,6 @@
 """HEALPix maps in FITS files: read into the package's conventions, written in full."""
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,14 +11,18 @@ from astropy.io import fits as pyfits
 from jaxtyping import Bool, Float
 
 from jaxsky.bandpass import Bandpass
+from jaxsky.io.columns import parse_stokes
+from jaxsky.io.columns import stokes as stokes_of
 from jaxsky.io.files import whole
-from jaxsky.io.quantities import is_ambiguous, unit_factor, unit_name
-from jaxsky.io.tables import COORDINATES, ORDERINGS, HealpixTable, InputError, open_fits, stokes
+from jaxsky.io.missing import ZEROS, parse_missing, sentinels, zeros
+from jaxsky.io.quantities import unit_factor, unit_name
+from jaxsky.io.rotation import blocks, to_galactic
+from jaxsky.io.sources import Columns, check_alike, read_columns, sources
+from jaxsky.io.tables import InputError, equals
 from jaxsky.types import Numeric
+from jaxsky.units import UNITS
 
 __all__ = ["Maps", "read_maps", "write_maps"]
-
-POLARIZATIONS = {"COSMO": "COSMO", "IAU": "IAU"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +35,15 @@ class Maps:
     mask : True in pixels where every field has a value, shape (pix,)
     unit : unit of all fields, a name of `jaxsky.units`, its square ("K_CMB^2"), "" or "K"
     names : names of the columns
+    stokes : their Stokes parameters, as given or as the names say for certain: one, two of a
+        covariance, "" for none, None where it is not known
     """
 
     maps: Float[np.ndarray, "field pix"]
     mask: Bool[np.ndarray, " pix"]
     unit: str
     names: tuple[str, ...]
+    stokes: tuple[str | None, ...]
 
     @property
     def nside(self) -> int:
@@ -52,146 +58,83 @@ class Maps:
         return replace(self, maps=self.maps * factor, unit=unit_name(unit))
 
 
-def default_fields(table: HealpixTable, argument: str = "fields") -> list[int]:
-    """The first I, Q and U columns that are there, by their names; else a column that is alone."""
-    kinds = [stokes(name) for name in table.names]
-    found = [kinds.index(kind) for kind in "IQU" if kind in kinds]
-    if found:
-        return found
-    columns = [i for i, name in enumerate(table.names) if name.upper() != "PIXEL"]
-    if len(columns) == 1:
-        return columns
-    raise InputError(
-        f"{table.where}: no column is named as I, Q or U; give `{argument}` out of "
-        f"{', '.join(table.names)}."
-    )
+def _agree(stated: str, certain: str | None) -> bool:
+    """True if a column may be what is stated; any may be a spread, or have no Stokes parameter."""
+    if not stated or certain is None:
+        return True
+    return certain in (stated, "") if stated == "I" else stated in (certain, certain * 2)
 
 
-def _agree(given: str, found: str) -> bool:
-    """True if a unit from an argument is the header's, or makes its bare kelvins definite."""
-    return given == found or (is_ambiguous(found) and re.sub("_(CMB|RJ)", "", given) == found)
-
-
-def _unit(table: HealpixTable, columns: list[int], given: str | None) -> str:
-    """The one unit of some columns, from the header and the argument."""
-    units = []
-    for column in columns:
-        text, name = table.unit(column), table.names[column]
-        try:
-            found = None if text is None else unit_name(text)
-        except ValueError:
-            found = None
-        if given is None and (found is None or is_ambiguous(found)):
-            says = (
-                f"has the unit {text!r}, which leaves open what is meant" if text else "has no unit"
-            )
+def _kinds(tables: Sequence[Columns], given: str | Sequence[str] | None) -> list[str | None]:
+    """The Stokes parameter of each column, where it has to be known."""
+    # healpy calls any map TEMPERATURE that is alone in its file.
+    certain = [
+        None if len(tables) > 1 and table.alone and name == "TEMPERATURE" else stokes_of(name)
+        for table in tables
+        for name in table.names
+    ]
+    names = [name for table in tables for name in table.names]
+    where, frame = tables[0].where, tables[0].coordinates
+    if given is not None:
+        stated = parse_stokes(given)
+        if len(stated) != len(names):
             raise InputError(
-                f'{table.where}: column {name} {says}; give `unit`, such as "uK_CMB", "K_RJ", '
-                '"MJy/sr", "K" for a temperature of matter or "" for a pure number.'
+                f"{where}: argument `stokes` names {len(stated)} columns, but {len(names)} are "
+                f"read, {', '.join(names)}."
             )
-        if given is not None and found is not None and not _agree(given, found):
-            raise InputError(
-                f"{table.where}: argument `unit` is {given}, but column {name} is in {found}."
-            )
-        units.append(found if given is None else given)
-    if len(set(units)) > 1:
-        listed = ", ".join(f"{table.names[c]} [{v}]" for c, v in zip(columns, units, strict=True))
+        for name, one, found in zip(names, stated, certain, strict=True):
+            if not _agree(one, found):
+                raise InputError(
+                    f"{where}: argument `stokes` says {one} of column {name}, whose name says "
+                    f"{found or 'that it has no Stokes parameter'}."
+                )
+        return list(stated)
+    if None in certain and (frame != "G" or tables[0].polarization == "IAU"):
+        why = "has the IAU sign of U" if frame == "G" else "is not in Galactic coordinates"
         raise InputError(
-            f"{table.where}: columns have different units, read each by itself: {listed}."
+            f"{where}: the file {why}, and the name of column {names[certain.index(None)]} does "
+            'not say which Stokes parameter it holds; give `stokes`, such as "QU" or "I", one '
+            f"letter for each of {', '.join(names)}."
         )
-    return str(units[0])
+    return certain
 
 
-def _blocks(table: HealpixTable, names: Sequence[str]) -> list[list[int]]:
-    """Rows that turn together when the coordinates change: (Q, U) pairs, and single scalars."""
-    kinds = [stokes(name) for name in names]
-    blocks: list[list[int]] = []
-    row = 0
-    while row < len(kinds):
-        if kinds[row : row + 2] == ["Q", "U"]:
-            blocks.append([row, row + 1])
-        elif kinds[row] in ("", "I"):
-            blocks.append([row])
-        else:
-            raise InputError(
-                f"{table.where}: column {names[row]} cannot be turned to Galactic coordinates; "
-                "read Q followed by U, and no covariances."
-            )
-        row += len(blocks[-1])
-    return blocks
-
-
-def _turned(block: np.ndarray, rotator: healpy.Rotator) -> np.ndarray:
-    """A scalar (1, pix) or Q and U (2, pix), turned in harmonic space."""
-    nside = healpy.npix2nside(block.shape[-1])
-    # Ring weights and eight iterations reach 1e-7 up to here; nothing does at 3 nside.
-    lmax = 5 * nside // 2
-    weights = nside > 1 and healpy.isnsideok(nside, nest=True)
-    maps = block[0] if len(block) == 1 else [np.zeros_like(block[0]), *block]
-    alm = healpy.map2alm(maps, lmax=lmax, iter=8, use_weights=weights)
-    turned = healpy.alm2map(rotator.rotate_alm(alm), nside, lmax=lmax)
-    return np.atleast_2d(turned)[-len(block) :]
-
-
-def _tangents(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    """Unit vectors to the south and the east, shape (2, 3, pix)."""
-    south = [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)]
-    return np.array([south, [-np.sin(phi), np.cos(phi), np.zeros_like(phi)]])
-
-
-def _interpolated(block: np.ndarray, rotator: healpy.Rotator) -> np.ndarray:
-    """A scalar (1, pix) or Q and U (2, pix), turned by interpolation between pixels.
-
-    Q and U turn fast about the poles, so it is the tensor Q (ss - ee) + U (se + es) of the
-    directions south and east that is interpolated, by its Cartesian components.
-    """
-    directions = healpy.pix2ang(healpy.npix2nside(block.shape[-1]), np.arange(block.shape[-1]))
-    source = rotator.I(*directions)
-    if len(block) == 1:
-        return healpy.get_interp_val(block[0], *source)[None]
-    s, e = _tangents(*directions)
-    tensor = block[0] * (s[:, None] * s - e[:, None] * e) + block[1] * (
-        s[:, None] * e + e[:, None] * s
-    )
-    tensor = healpy.get_interp_val(tensor.reshape(9, -1), *source).reshape(3, 3, -1)
-    s, e = np.einsum("ji,kjp->kip", rotator.mat, _tangents(*directions))
-    project = "ip,ijp,jp->p"
-    ss, ee = np.einsum(project, s, tensor, s), np.einsum(project, e, tensor, e)
-    return np.array([(ss - ee) / 2, np.einsum(project, s, tensor, e)])
-
-
-def _to_galactic(
-    maps: np.ndarray, mask: np.ndarray, blocks: list[list[int]], coordinates: str
-) -> tuple[np.ndarray, np.ndarray]:
-    """Maps turned to Galactic coordinates, Q and U as the spin-2 field they are.
-
-    Complete maps are turned in harmonic space, which is exact for a sky without structure above
-    l = 2.5 nside and cuts what is above. A map with pixels missing has no spherical harmonics:
-    it is interpolated between the four nearest pixels, and pixels next to missing ones are lost.
-    """
-    rotator = healpy.Rotator(coord=[coordinates, "G"])
-    turn = _turned if mask.all() else _interpolated
-    turned = np.zeros_like(maps)
-    for rows in blocks:
-        turned[rows] = turn(maps[rows], rotator)
-    if not mask.all():
-        mask = _interpolated(mask[None].astype(float), rotator)[0] > 1 - 1e-9
-        turned[:, ~mask] = 0
-    return turned, mask
+def _ask_about_values(tables: Sequence[Columns], zeros_are_data: bool) -> None:
+    """Refuse columns in which numbers seem to mark pixels without a value."""
+    columns = [column for table in tables for column in table.values]
+    suspects = []
+    for table in tables:
+        for name, values, lowest in zip(table.names, table.values, table.lowest, strict=True):
+            suspects += [
+                f"column {name} is {number:.9g} in {count} of {values.size} pixels, far from its "
+                "other values"
+                for number, count in sentinels(values, lowest)
+            ]
+    if tables[0].unit in UNITS and not zeros_are_data and (share := zeros(columns)) > ZEROS:
+        listed = ", ".join(name for table in tables for name in table.names)
+        suspects.append(f"{listed}: exactly 0 in {share:.0%} of the pixels")
+    if suspects:
+        raise InputError(
+            f"{tables[0].where}: {'; '.join(suspects)}; give `missing`, the numbers that mark "
+            "pixels without a value, or `missing = []` if all are data."
+        )
 
 
 def read_maps(
-    path: str | Path,
+    path: str | Path | Sequence[str | Path],
     *,
     fields: int | str | Sequence[int | str] | None = None,
-    hdu: int | str = 1,
+    hdu: int | str | Sequence[int | str] = 1,
     unit: str | None = None,
     nside: int | None = None,
     ordering: str | None = None,
     coordinates: str | None = None,
     polarization: str | None = None,
+    stokes: str | Sequence[str] | None = None,
+    missing: float | Iterable[float] | None = None,
+    zeros_are_data: bool = False,
 ) -> Maps:
-    """HEALPix maps of a FITS file, in RING order, Galactic coordinates, COSMO sign of U.
+    """HEALPix maps of FITS files, in RING order, Galactic coordinates, COSMO sign of U.
 
     Unit, ordering, coordinates and polarization convention are read from the header; an argument
     stands in where the header is silent, and must agree with it where it is not. NESTED maps are
@@ -199,12 +142,22 @@ def read_maps(
     or Ecliptic coordinates are turned, Q and U together as a spin-2 field (covariances cannot
     be). Partial maps with explicit pixel numbers are read as well.
 
+    Which Stokes parameter a column holds is taken from its name where that is one of Planck's,
+    WMAP's, healpy's and the like (`jaxsky.io.columns`). Files with other names have to be told,
+    by `stokes`, if they have the IAU sign or are not Galactic.
+
+    Pixels without a value are those that are not listed, UNSEEN, NaN, infinite, the header's
+    BAD_DATA, and TNULL in columns of integers. Files in which other numbers seem to mark them
+    (an extreme such as -999 that is repeated and far from the rest; exact zeros in all columns of
+    a brightness in more than 30 % of the pixels) are refused until `missing` says what they are.
+
     Parameters
     ----------
-    path : FITS file
+    path : FITS file; or several, whose columns are one field, such as Q and U in a file each
     fields : columns by name or number; default the first columns named as I, Q and U (I_STOKES,
-        TEMPERATURE, Q_POLARISATION, U_ML, ...), or the only column
-    hdu : number or name of the table
+        TEMPERATURE, Q_POLARISATION, U_ML, ...), or the only column. Of several files or HDUs one
+        that all have, or one for each.
+    hdu : number or name of the table; or several, as many as files, or of one file
     unit : unit of the columns, for example "mK_CMB"; the bare "K" and "mK" of some headers do
         not say which temperature is meant, so there it must be given ("K" for a map of dust
         temperatures, "" for a pure number)
@@ -212,50 +165,53 @@ def read_maps(
     ordering : "RING" or "NESTED"
     coordinates : "G", "C" or "E" (Galactic, Celestial, Ecliptic)
     polarization : "COSMO" or "IAU"; COSMO, HEALPix's own, where nothing is said
+    stokes : Stokes parameters of the columns in their order, "QU", "IQU", "I", or of covariances
+        "QQ QU UU"; "I" or "" for other scalars. Must agree with names that are certain.
+    missing : number or numbers that mark missing pixels, zero among them; [] if all are data
+    zeros_are_data : do not ask about exact zeros, as of a correction that is zero where there
+        is nothing to correct
 
     Raises
     ------
     InputError
-        If the file is missing, truncated or not HEALPix; a column or HDU is missing; something
-        the maps cannot be used without is said neither by header nor argument, or differently by
-        both; the nside is not that expected; no pixel has values.
+        If a file is missing, truncated or not HEALPix; a column or HDU is missing, or holds no
+        real numbers; something the maps cannot be used without is said neither by header nor
+        argument, or differently by both or by several files; the nside is not that expected;
+        no pixel has values.
     ValueError
         If `unit` is unknown.
     """
-    path = Path(path)
     unit = None if unit is None else unit_name(unit)
-    with open_fits(path) as hdus:
-        table = HealpixTable(path, hdus, hdu)
-        if nside is not None and nside != table.nside:
-            raise InputError(f"{table.where}: nside is {table.nside}, but {nside} is expected.")
-        if fields is None:
-            columns = default_fields(table)
-        else:
-            wanted = [fields] if isinstance(fields, int | str) else list(fields)
-            columns = [table.index(field) for field in wanted]
-        if not columns:
-            raise InputError(f"{table.where}: argument `fields` is empty.")
-        names = tuple(table.names[i] for i in columns)
-        unit = _unit(table, columns, unit)
-        ordering = table.state("ordering", ordering, ("ORDERING",), ORDERINGS)
-        frame = table.state("coordinates", coordinates, ("COORDSYS", "SKYCOORD"), COORDINATES)
-        convention = table.state(
-            "polarization", polarization, ("POLCCONV",), POLARIZATIONS, default="COSMO"
-        )
-        maps = np.stack([table.values(i) for i in columns])
-        bad = np.any([table.bad(values) for values in maps], axis=0)
-    if bad.all():
-        raise InputError(f"{table.where}: no pixel has values in {', '.join(names)}.")
-    maps[:, bad] = 0
-    mask = ~bad
-    if ordering == "NESTED":
-        ring = healpy.ring2nest(table.nside, np.arange(mask.size))
-        maps, mask = maps[:, ring], mask[ring]
-    if convention == "IAU":
-        maps *= np.array([[(-1.0) ** stokes(name).count("U")] for name in names])
-    if frame != "G":
-        maps, mask = _to_galactic(maps, mask, _blocks(table, names), frame)
-    return Maps(maps, mask, unit, names)
+    marks = None if missing is None else parse_missing(missing)
+    tables = [
+        read_columns(source, unit, ordering, coordinates, polarization)
+        for source in sources(path, hdu, fields)
+    ]
+    first = tables[0]
+    if nside is not None and nside != first.nside:
+        raise InputError(f"{first.where}: nside is {first.nside}, but {nside} is expected.")
+    check_alike(tables)
+    names = [name for table in tables for name in table.names]
+    kinds = _kinds(tables, stokes)
+    rows = None if first.coordinates == "G" else blocks(first.where, names, kinds)
+    found = False
+    for values in (column for table in tables for column in table.values):
+        for mark in marks or ():
+            marked = equals(values, mark, 1e-6)
+            found |= bool(marked.any())
+            values[marked] = np.nan
+    if marks is None or (marks and not found):
+        _ask_about_values(tables, zeros_are_data)
+    maps = np.stack([column for table in tables for column in table.values])
+    mask = np.isfinite(maps).all(axis=0)
+    if not mask.any():
+        raise InputError(f"{first.where}: no pixel has values in {', '.join(names)}.")
+    maps[:, ~mask] = 0
+    if first.polarization == "IAU":
+        maps *= np.array([[(-1.0) ** (kind or "").count("U")] for kind in kinds])
+    if rows is not None:
+        maps, mask = to_galactic(maps, mask, rows, first.coordinates)
+    return Maps(maps, mask, first.unit, tuple(names), tuple(kinds))
 
 
 def _check_written(

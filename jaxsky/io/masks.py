@@ -7,8 +7,8 @@ import healpy
 import numpy as np
 from jaxtyping import Bool
 
-from jaxsky.io.maps import default_fields
-from jaxsky.io.tables import COORDINATES, ORDERINGS, HealpixTable, InputError, open_fits
+from jaxsky.io.sources import default_fields
+from jaxsky.io.tables import COORDINATES, ORDERINGS, HealpixTable, InputError, equals, open_fits
 
 __all__ = ["degrade_mask", "read_mask"]
 
@@ -27,11 +27,19 @@ def _read_npz(path: Path, key: str | None) -> np.ndarray:
         raise InputError(f"{path}: no such file.")
     try:
         with np.load(path) as archive:
-            return np.asarray(archive[_choose(path, key, list(archive))]).ravel()
+            name = _choose(path, key, list(archive))
+            found = np.squeeze(archive[name])
     except InputError:
         raise
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: not a readable .npz archive ({error}).") from error
+    if found.dtype.kind not in "biuf" or found.ndim != 1:
+        raise InputError(
+            f"{path}: {name} is no mask, but has type {found.dtype} and shape {found.shape}."
+        )
+    values = found.astype(np.float64)
+    values[~np.isfinite(values) | equals(values, healpy.UNSEEN, 1e-5)] = np.nan
+    return values
 
 
 def _in_galactic(mask: np.ndarray, coordinates: str) -> np.ndarray:
@@ -50,6 +58,9 @@ def read_mask(
     ordering: str | None = None,
 ) -> Bool[np.ndarray, " pix"]:
     """A mask from a FITS file or an .npz archive.
+
+    Pixels without a value are not used: those that a partial map does not list, UNSEEN, NaN,
+    BAD_DATA and TNULL of the header.
 
     Parameters
     ----------
@@ -73,7 +84,7 @@ def read_mask(
         leaves no pixel.
     """
     path = Path(path)
-    frame = "G"
+    frame, others = "G", []
     if path.suffix == ".npz":
         order = ORDERINGS.get((ordering or "RING").upper(), "")
         if not order:
@@ -81,26 +92,38 @@ def read_mask(
         values = _read_npz(path, key)
         if not healpy.isnpixok(values.size):
             raise InputError(f"{path}: not a HEALPix mask, {values.size} is not 12 nside^2 pixels.")
+        if order == "NESTED":
+            values = _from_nested(path, values)
     else:
         with open_fits(path) as hdus:
             table = HealpixTable(path, hdus, hdu)
             column = default_fields(table, "key")[0] if key is None else table.index(key)
             order = table.state("ordering", ordering, ("ORDERING",), ORDERINGS)
             frame = table.state("coordinates", None, ("COORDSYS", "SKYCOORD"), COORDINATES, "G")
-            values = table.values(column)
+            values = table.values(column, order, logical=True)
+            others = [name for name in table.names if name != table.names[column]]
     found = healpy.npix2nside(values.size)
     if nside is not None and nside != found:
         raise InputError(f"{path}: nside is {found}, but {nside} is expected.")
-    if odd := int(np.sum((values != 0) & (values != 1))):
+    odd = values[np.isfinite(values) & (values != 0) & (values != 1)]
+    if odd.size:
+        listed = ", ".join(f"{value:.6g}" for value in np.unique(odd)[:3])
         raise InputError(
-            f"{path}: a mask has values 0 and 1, but {odd} of {values.size} pixels have others."
+            f"{path}: a mask has values 0 and 1, but {odd.size} of {values.size} pixels have "
+            f"others, such as {listed}."
         )
-    mask = values.astype(bool)
+    mask = values == 1
     if not mask.any():
-        raise InputError(f"{path}: the mask leaves no pixel.")
-    if order == "NESTED":
-        mask = mask[healpy.ring2nest(found, np.arange(mask.size))]
+        hint = f"; give `key` out of {', '.join(others)}" if key is None and others else ""
+        raise InputError(f"{path}: the mask leaves no pixel{hint}.")
     return mask if frame == "G" else _in_galactic(mask, frame)
+
+
+def _from_nested(path: Path, values: np.ndarray) -> np.ndarray:
+    nside = healpy.npix2nside(values.size)
+    if not healpy.isnsideok(nside, nest=True):
+        raise InputError(f"{path}: ordering is NESTED, but nside is {nside}, no power of 2.")
+    return values[healpy.ring2nest(nside, np.arange(values.size))]
 
 
 def degrade_mask(
@@ -120,6 +143,8 @@ def degrade_mask(
         If nside is not a power of 2 up to that of the mask, or the threshold is outside (0, 1].
     """
     found = healpy.npix2nside(np.size(mask))
+    if not healpy.isnsideok(found, nest=True):
+        raise ValueError(f"Argument `mask` must have nside 1, 2, 4, ..., but has nside {found}.")
     if not healpy.isnsideok(nside, nest=True) or nside > found:
         raise ValueError(
             f"Argument `nside` must be a power of 2 up to that of the mask, {found}, not {nside}."

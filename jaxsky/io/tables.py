@@ -1,6 +1,6 @@
 """FITS tables with their errors, and the HEALPix facts in their headers."""
 
-import re
+import gzip
 import warnings
 import zlib
 from collections.abc import Iterator, Sequence
@@ -11,16 +11,17 @@ import healpy
 import numpy as np
 from astropy.io import fits as pyfits
 from astropy.utils.exceptions import AstropyUserWarning
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 __all__ = [
     "COORDINATES",
     "ORDERINGS",
+    "PIXELS",
     "HealpixTable",
     "InputError",
+    "equals",
     "open_fits",
     "select_hdu",
-    "stokes",
 ]
 
 #: Spellings in headers and arguments, upper case -> the package's.
@@ -32,8 +33,23 @@ COORDINATES = {
 }
 
 
-#: What astropy raises at files that are cut short or no FITS files at all.
-_DAMAGE = (OSError, EOFError, ValueError, TypeError, IndexError, zlib.error, AstropyUserWarning)
+#: Names of the column of pixel numbers in a table with explicit indexing, the usual ones first.
+PIXELS = ("PIXEL", "PIX", "PIXELS", "IPIX", "PIXNUM", "PIXEL_NUMBER", "HPX_PIX", "HEALPIX_PIX")
+#: Formats of columns with real numbers, and what others hold.
+NUMBERS = tuple("BIJKED")
+KINDS = {
+    "L": "logical values",
+    "X": "bits",
+    "A": "text",
+    **dict.fromkeys("CM", "complex numbers"),
+    **dict.fromkeys("PQ", "arrays of different lengths"),
+}
+LARGEST_NSIDE = 8192
+
+#: What only files raise that are cut short or no FITS files at all.
+_DAMAGE = (EOFError, zlib.error, gzip.BadGzipFile, AstropyUserWarning)
+#: What astropy raises at these, and at others that it cannot make sense of.
+_PUZZLED = (OSError, ValueError, TypeError, LookupError, AttributeError, pyfits.VerifyError)
 
 
 class InputError(ValueError):
@@ -44,19 +60,64 @@ class InputError(ValueError):
 def open_fits(path: Path) -> Iterator[pyfits.HDUList]:
     """An open FITS file; what astropy finds wrong with it while it is open is an InputError."""
     if not path.is_file():
-        raise InputError(f"{path}: no such file.")
+        raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}.")
+    damaged = f"{path}: not a FITS file, or a truncated one"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropyUserWarning)
         for message in (".*truncated", ".*[Ee]rror validating header"):
             warnings.filterwarnings("error", message, AstropyUserWarning)
         try:
-            with pyfits.open(path) as hdus:
+            hdus = pyfits.open(path)
+        except PermissionError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+        except (*_DAMAGE, *_PUZZLED) as error:
+            raise InputError(f"{damaged} ({_reason(error)}).") from error
+        try:
+            with hdus:
                 yield hdus
         except InputError:
             raise
         except _DAMAGE as error:
-            reason = " ".join(str(error).split())
-            raise InputError(f"{path}: not a FITS file, or a truncated one ({reason}).") from error
+            raise InputError(f"{damaged} ({_reason(error)}).") from error
+        except _PUZZLED as error:
+            what = damaged if _is_cut(path, hdus) else f"{path}: cannot be read"
+            raise InputError(f"{what} ({_reason(error)}).") from error
+
+
+def _reason(error: BaseException) -> str:
+    return " ".join(str(error).split()).rstrip(".") or type(error).__name__
+
+
+def _is_cut(path: Path, hdus: pyfits.HDUList) -> bool:
+    """True if a file ends before the data that its headers announce."""
+    try:
+        ends = [info["datLoc"] + info["datSpan"] for hdu in hdus if (info := hdu.fileinfo())]
+        with path.open("rb") as plain:
+            packed = plain.read(2) == b"\x1f\x8b"
+        with gzip.open(path) if packed else path.open("rb") as stream:
+            return max(ends, default=0) > stream.seek(0, 2)
+    except (*_DAMAGE, *_PUZZLED):
+        return True
+
+
+def _number(text: str) -> float | None:
+    """A number as headers have it, exponents with D included; None if it is none."""
+    try:
+        return float(text.strip("'\" ").upper().replace("D", "E"))
+    except ValueError:
+        return None
+
+
+def _whole_number(text: str) -> int | None:
+    number = _number(text)
+    return int(number) if number is not None and number.is_integer() else None
+
+
+def equals(
+    values: Float[np.ndarray, " pix"], number: float, rtol: float
+) -> Bool[np.ndarray, " pix"]:
+    """Where values are a number, to a relative difference; zero is exact."""
+    return np.abs(values - number) <= rtol * abs(number)
 
 
 def select_hdu(path: Path, hdus: pyfits.HDUList, hdu: int | str) -> pyfits.BinTableHDU:
@@ -83,6 +144,12 @@ class HealpixTable:
     path : the file, for the messages
     hdus : the open file
     hdu : number or name of the table
+
+    Raises
+    ------
+    InputError
+        If it is no HEALPix map: no binary table, another PIXTYPE, NSIDE or number of rows, pixel
+        numbers that are none or are there twice.
     """
 
     def __init__(self, path: Path, hdus: pyfits.HDUList, hdu: int | str) -> None:
@@ -90,10 +157,16 @@ class HealpixTable:
         self.where = f"{path}, HDU {hdu!r}"
         self._table = select_hdu(path, hdus, hdu)
         self._primary = hdus[0].header
-        self.names: tuple[str, ...] = tuple(self._table.columns.names)
+        names = self._table.columns.names
+        if None in names:
+            number = names.index(None) + 1
+            raise InputError(f"{self.where}: column {number} has no name, TTYPE{number}.")
+        self.names: tuple[str, ...] = tuple(names)
         if (pixtype := self.keyword("PIXTYPE")) not in (None, "HEALPIX"):
             raise InputError(f"{self.where}: not a HEALPix map, PIXTYPE is {pixtype}.")
-        self.nside = self._nside()
+        listed = self._listed()
+        self.nside = self._nside(explicit=listed is not None)
+        self._pixels = None if listed is None else self._check_pixels(listed)
 
     def keyword(self, *names: str) -> str | None:
         """The first of these header keywords that is there, in upper case; None if none is."""
@@ -103,37 +176,85 @@ class HealpixTable:
                     return text.upper()
         return None
 
-    @property
-    def _explicit(self) -> bool:
-        return self.keyword("INDXSCHM") == "EXPLICIT"
+    def _listed(self) -> int | None:
+        """The column of pixel numbers, by which the rows go; None if they go in order."""
+        named = [self.names.index(n) for p in PIXELS for n in self.names if n.upper() == p]
+        scheme = self.keyword("INDXSCHM")
+        explicit = scheme == "EXPLICIT" or (named and scheme != "IMPLICIT")
+        if explicit and self.keyword("NSIDE") is None:
+            raise InputError(f"{self.where}: explicit indexing without NSIDE in the header.")
+        if scheme == "EXPLICIT" and not named:
+            raise InputError(
+                f"{self.where}: explicit indexing, but no column 'PIXEL'; it has "
+                f"{', '.join(self.names)}."
+            )
+        if not named:
+            return None
+        if not explicit:
+            numbers, order = self._stored(named[0]), np.arange(len(self._table.data))
+            if not np.array_equal(numbers, order) and np.array_equal(np.sort(numbers), order):
+                raise InputError(
+                    f"{self.where}: INDXSCHM is IMPLICIT, but column {self.names[named[0]]} has "
+                    "the pixels in another order."
+                )
+            return None
+        return named[0]
 
-    def _nside(self) -> int:
-        stated = self.keyword("NSIDE")
-        if self._explicit:
-            if stated is None:
-                raise InputError(f"{self.where}: explicit indexing without NSIDE in the header.")
-            return int(stated)
-        npix = 0 if not self.names else self._table.data.field(0).size
+    def _nside(self, explicit: bool) -> int:
+        text = self.keyword("NSIDE")
+        stated = None if text is None else _whole_number(text)
+        if text is not None and (stated is None or not 1 <= stated <= LARGEST_NSIDE):
+            raise InputError(
+                f"{self.where}: NSIDE is {text}, but must be a whole number, 1 to {LARGEST_NSIDE}."
+            )
+        if explicit and stated is not None:
+            return stated
+        kinds = (i for i in range(len(self.names)) if self._kind(i) in NUMBERS)
+        first = next(kinds, 0)
+        npix = 0 if not self.names else self._table.data.field(first).size
         if not npix or not healpy.isnpixok(npix):
             raise InputError(
                 f"{self.where}: not a HEALPix map, its columns have {npix} values, "
                 "which is not 12 nside^2."
             )
         nside = healpy.npix2nside(npix)
-        if stated is not None and int(stated) != nside:
+        if stated is not None and stated != nside:
             raise InputError(
                 f"{self.where}: NSIDE is {stated}, but its columns have {npix} pixels "
                 f"(nside {nside})."
             )
         return nside
 
+    def _check_pixels(self, column: int) -> Int[np.ndarray, " row"]:
+        """The numbers of the pixels, each of them one of the sky and there once."""
+        stored, npix = self._stored(column), healpy.nside2npix(self.nside)
+        where = f"{self.where}: column {self.names[column]}"
+        with np.errstate(invalid="ignore"):
+            pixels = stored.astype(np.int64)
+        if bad := np.flatnonzero(~((pixels == stored) & (pixels >= 0) & (pixels < npix))).tolist():
+            raise InputError(
+                f"{where} has {len(bad)} of {pixels.size} values that are no pixels of nside "
+                f"{self.nside} (0 to {npix - 1}), such as {stored[bad[0]]:g}."
+            )
+        if stored.dtype == np.float32 and npix > 2**24:
+            raise InputError(
+                f"{where} is in single precision, which cannot hold the pixels of nside "
+                f"{self.nside}."
+            )
+        if twice := pixels.size - np.unique(pixels).size:
+            raise InputError(f"{where} has {twice} pixels more than once.")
+        return pixels
+
     def index(self, field: int | str) -> int:
-        """Number of a column given by name (in any case) or number."""
+        """Number of a column given by name (in any case, if that is clear) or number."""
         if isinstance(field, str):
-            upper = [name.upper() for name in self.names]
-            if field.upper() in upper:
-                return upper.index(field.upper())
-        elif 0 <= field < len(self.names):
+            same = [i for i, name in enumerate(self.names) if name == field]
+            same = same or [i for i, n in enumerate(self.names) if n.upper() == field.upper()]
+            if len(same) > 1:
+                raise InputError(f"{self.where}: {len(same)} columns are called {field!r}.")
+            if same:
+                return same[0]
+        elif not isinstance(field, bool) and 0 <= field < len(self.names):
             return int(field)
         raise InputError(f"{self.where}: no column {field!r}; it has {', '.join(self.names)}.")
 
@@ -141,22 +262,93 @@ class HealpixTable:
         """TUNIT of a column; None if it is missing or blank."""
         return str(self._table.header.get(f"TUNIT{index + 1}", "")).strip() or None
 
-    def values(self, index: int) -> Float[np.ndarray, " pix"]:
-        """A column over the full sky in float64 and native byte order; UNSEEN where not given."""
-        column = np.array(self._table.data.field(index), dtype=np.float64).ravel()
-        if not self._explicit:
-            return column
-        pixels = np.asarray(self._table.data.field(self.index("PIXEL"))).ravel()
-        full = np.full(healpy.nside2npix(self.nside), healpy.UNSEEN)
-        full[pixels] = column
+    def _kind(self, index: int) -> str:
+        """The letter of a column's format."""
+        return str(self._table.columns[index].format).lstrip("0123456789")[:1]
+
+    def _stored(self, index: int) -> np.ndarray:
+        """A column of numbers as it is, one after the other."""
+        kind, name = self._kind(index), self.names[index]
+        if kind not in NUMBERS:
+            raise InputError(
+                f"{self.where}: column {name} holds {KINDS.get(kind, kind)}, not real numbers."
+            )
+        found = np.asarray(self._table.data.field(index))
+        if found.ndim > 2:
+            shape = " x ".join(map(str, found.shape[1:]))
+            raise InputError(f"{self.where}: column {name} has a table of {shape} in each row.")
+        return found.ravel()
+
+    def _null(self, index: int) -> int | None:
+        """TNULL of a column: a stored integer, before it is scaled."""
+        key = f"TNULL{index + 1}"
+        text = str(self._table.header.get(key, "")).strip()
+        found = _whole_number(text)
+        if text and found is None:
+            raise InputError(f"{self.where}: {key} is {text}, which is not a whole number.")
+        return found
+
+    def lowest(self, index: int) -> float | None:
+        """What the lowest integer stands for that a column can store; None for other types."""
+        if self._kind(index) not in "IJK":
+            return None
+        raw = self._table.data.view(np.ndarray)
+        least = float(np.iinfo(raw.dtype[index].base).min)
+        header, number = self._table.header, index + 1
+        return least * header.get(f"TSCAL{number}", 1.0) + header.get(f"TZERO{number}", 0.0)
+
+    def values(
+        self, index: int, ordering: str, *, logical: bool = False
+    ) -> Float[np.ndarray, " pix"]:
+        """A column over the full sky in RING order, float64.
+
+        NaN where it has no value: pixels that are not listed, UNSEEN, BAD_DATA and TNULL of the
+        header, NaN and infinity.
+
+        Parameters
+        ----------
+        index : number of the column
+        ordering : "RING" or "NESTED", that of the file
+        logical : columns of true and false are 1 and 0 rather than refused
+        """
+        if ordering == "NESTED" and not healpy.isnsideok(self.nside, nest=True):
+            raise InputError(
+                f"{self.where}: ordering is NESTED, but nside is {self.nside}, no power of 2."
+            )
+        npix = healpy.nside2npix(self.nside)
+        if logical and self._kind(index) == "L":
+            column = np.array(self._table.data.field(index), dtype=np.float64).ravel()
+        else:
+            column = self._real(index)
+        if column.size != (npix if self._pixels is None else self._pixels.size):
+            raise InputError(
+                f"{self.where}: column {self.names[index]} has {column.size} values, but there "
+                f"are {npix if self._pixels is None else self._pixels.size} pixels."
+            )
+        if self._pixels is None:
+            nested = ordering == "NESTED"
+            return column[healpy.ring2nest(self.nside, np.arange(npix))] if nested else column
+        pixels = self._pixels
+        full = np.full(npix, np.nan)
+        full[healpy.nest2ring(self.nside, pixels) if ordering == "NESTED" else pixels] = column
         return full
 
-    def bad(self, values: Float[np.ndarray, " pix"]) -> np.ndarray:
-        """Where a column is UNSEEN, the header's BAD_DATA, NaN or infinite; shape (pix,)."""
-        bad = ~np.isfinite(values) | np.isclose(values, healpy.UNSEEN, rtol=1e-5, atol=0)
-        if (stated := self.keyword("BAD_DATA")) is not None:
-            bad |= np.isclose(values, float(stated), rtol=1e-5, atol=0)
-        return bad
+    def _real(self, index: int) -> Float[np.ndarray, " row"]:
+        """A column of real numbers, NaN where it has none."""
+        column = np.array(self._stored(index), dtype=np.float64)
+        bad = ~np.isfinite(column) | equals(column, healpy.UNSEEN, 1e-5)
+        if (text := self.keyword("BAD_DATA")) is not None and text != "UNSEEN":
+            stated = _number(text)
+            if stated is None:
+                raise InputError(f"{self.where}: BAD_DATA is {text}, which is not a number.")
+            bad |= equals(column, stated, 1e-5)
+        if (null := self._null(index)) is not None:
+            # What is not an integer has no TNULL by the standard, but says what it means.
+            raw = self._table.data.view(np.ndarray)
+            stored = raw[raw.dtype.names[index]].ravel()
+            bad |= stored == null if stored.dtype.kind in "iu" else equals(column, null, 1e-5)
+        column[bad] = np.nan
+        return column
 
     def state(
         self,
@@ -203,23 +395,3 @@ class HealpixTable:
                 f"one of {choices}."
             )
         return stated
-
-
-_STOKES = re.compile(r"(TEMPERATURE|INTENSITY|[IQU]|[TI][TIQU]|QQ|QU|UU)(?![A-Z0-9])")
-
-
-def stokes(name: str) -> str:
-    """Stokes parameter of a column by its name (a pair for a covariance), "" if it has none.
-
-    Examples
-    --------
-    >>> [stokes(name) for name in ("Q_POLARISATION", "TEMPERATURE", "IU_COV", "U_ML", "T_D")]
-    ['Q', 'I', 'IU', 'U', '']
-    """
-    if name.upper() == "T":
-        return "I"
-    match = _STOKES.match(name.upper())
-    if match is None:
-        return ""
-    found = {"TEMPERATURE": "I", "INTENSITY": "I"}.get(match[1], match[1])
-    return found.replace("T", "I")

@@ -183,7 +183,7 @@ def read_band(folder: Path, spec: BandSettings) -> Band:
         For files that cannot be read as what they should be.
     """
     found = read(folder, spec)
-    check_stokes(f"bands.{spec.name}", found.names, "QU")
+    check_stokes(f"bands.{spec.name}", found, "QU")
     bandpass = read_bandpass_spec(folder, spec.bandpass)
     factor = bandpass.conversion(found.unit, "uK_RJ")
     maps, used = jnp.asarray(found.maps[-2:]) * factor, np.asarray(found.mask)
@@ -206,8 +206,8 @@ def read_band(folder: Path, spec: BandSettings) -> Band:
 
 def _read_leakage(folder: Path, spec: BandSettings, bandpass: Bandpass) -> Leakage:
     assert spec.leakage is not None  # as called
-    found = read(folder, spec.leakage)
-    check_stokes(f"bands.{spec.name}.leakage", found.names, "QU")
+    found = read(folder, spec.leakage, zeros_are_data=True)
+    check_stokes(f"bands.{spec.name}.leakage", found, "QU")
     factor = bandpass.conversion(found.unit, "uK_RJ")
     maps = jnp.asarray(found.maps[-2:]) * factor
     return Leakage(maps, np.asarray(found.mask), spec.leakage.fwhm)

@@ -19,9 +19,9 @@ from jaxsky.settings import (
     Table,
     TemplateFile,
     check_angles,
-    check_signs,
     load,
 )
+from jaxsky.settings_values import check_signs
 
 __all__ = ["Settings", "load_settings"]
 

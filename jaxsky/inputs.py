@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import AME, Component, Dust, Synchrotron
 from jaxsky.io import InputError, Maps, read_bandpass, read_maps, unit_factor
-from jaxsky.io.tables import stokes as stokes_of
+from jaxsky.io.columns import stokes as stokes_of
 from jaxsky.lookup import find_file
 from jaxsky.noise import (
     check_covariance,
@@ -20,6 +20,7 @@ from jaxsky.noise import (
     rms_covariance,
     weights_covariance,
 )
+from jaxsky.parameter_maps import parameter_map
 from jaxsky.parameters import set_parameters
 from jaxsky.settings import (
     BandpassSpec,
@@ -40,6 +41,7 @@ __all__ = [
     "read",
     "read_bandpass_spec",
     "read_noise",
+    "read_parameter",
     "read_templates",
     "set_parameters_of",
 ]
@@ -55,17 +57,54 @@ class Template(NamedTuple):
     used: Bool[np.ndarray, " pix"]
 
 
-def read(folder: Path, spec: MapFile) -> Maps:
-    """The maps of a file; see `jaxsky.io.read_maps`."""
+def read(
+    folder: Path,
+    spec: MapFile,
+    *,
+    stokes: str | Sequence[str] | None = None,
+    zeros_are_data: bool = False,
+) -> Maps:
+    """The maps of a file; see `jaxsky.io.read_maps`.
+
+    Parameters
+    ----------
+    folder : of the files
+    spec : what the settings say
+    stokes : Stokes parameters of the columns where the use of the file tells them, in place of
+        those in the settings
+    zeros_are_data : see `jaxsky.io.read_maps`
+    """
     return read_maps(
-        find_file(folder, spec.file),
+        [find_file(folder, name) for name in spec.files],
         fields=spec.fields,
         hdu=spec.hdu,
         unit=spec.unit,
         ordering=spec.ordering,
         coordinates=spec.coordinates,
         polarization=spec.polarization,
+        stokes=spec.stokes if stokes is None else stokes,
+        missing=spec.missing,
+        zeros_are_data=zeros_are_data,
     )
+
+
+def read_parameter(
+    folder: Path,
+    spec: MapFile,
+    name: str,
+    nside: int,
+    where: str,
+    of: str = "that of the template",
+) -> tuple[Float[np.ndarray, " pix"], Bool[np.ndarray, " pix"]]:
+    """The map of a spectral parameter and where it is known; see `jaxsky.parameter_maps`.
+
+    Raises
+    ------
+    jaxsky.io.InputError, SettingsError
+        For files that cannot be read as what they should be.
+    """
+    found = read(folder, spec, stokes="", zeros_are_data=True)
+    return parameter_map(found, name, nside, where, of=of, stated=spec.missing is not None)
 
 
 def read_templates(
@@ -103,15 +142,19 @@ def _read_template(
     dtype: type[np.floating],
 ) -> Template:
     found = read(folder, spec)
-    check_stokes(f"templates.{name}", found.names, "I" if spec.angles else stokes)
-    factor = np.asarray(conversion(found.unit, "uK_RJ", spec.nu_ref))
+    check_stokes(f"templates.{name}", found, "I" if spec.angles else stokes)
+    try:
+        factor = np.asarray(conversion(found.unit, "uK_RJ", spec.nu_ref))
+    except ValueError as error:
+        raise SettingsError(f"templates.{name}.unit: {error}") from None
     maps = jnp.asarray((found.maps * factor).astype(dtype))
     used = np.asarray(found.mask)
     parameters: dict[str, Any] = {"nu_ref": spec.nu_ref}
     for key, value in spec.parameters.items():
         if isinstance(value, MapFile):
-            column = read(folder, value)
-            parameters[key], used = jnp.asarray(column.maps)[0], used & np.asarray(column.mask)
+            place = f"templates.{name}.parameters.{key}"
+            column, known = read_parameter(folder, value, key, found.nside, place)
+            parameters[key], used = jnp.asarray(column), used & known
         else:
             parameters[key] = tuple(value) if isinstance(value, list) else value
     try:
@@ -152,14 +195,14 @@ def set_parameters_of(
     return changed
 
 
-def check_stokes(where: str, names: Sequence[str], wanted: str) -> None:
-    """Refuse columns that are too few, or by their names other Stokes parameters than wanted."""
+def check_stokes(where: str, found: Maps, wanted: str) -> None:
+    """Refuse other Stokes parameters than wanted, Q and U of all three aside, or another number."""
     listed = " and ".join(filter(None, (", ".join(wanted[:-1]), wanted[-1])))
-    if len(names) < len(wanted):
-        raise SettingsError(f"{where}: fields must name {listed}, not {', '.join(names)}.")
-    said = [stokes_of(name) for name in names[-len(wanted) :]]
-    if any(s and s != w for s, w in zip(said, wanted, strict=True)):
-        raise SettingsError(f"{where}.fields: {', '.join(names)} are not {listed} by their names.")
+    names, expected = ", ".join(found.names), "IQU" if len(found.names) == 3 else wanted
+    if len(found.names) != len(expected) or not expected.endswith(wanted):
+        raise SettingsError(f"{where}: fields must name {listed}, not {names}.")
+    if any(s not in (None, w) for s, w in zip(found.stokes, expected, strict=True)):
+        raise SettingsError(f"{where}.fields: {names} are not {listed} by their names.")
 
 
 def read_bandpass_spec(folder: Path, spec: BandpassSpec) -> Bandpass:
@@ -226,7 +269,7 @@ def _covariance(folder, noise, bandpass, nside, stokes, where, unit, own):
     kinds = ("map", "covariance", "hits", "weights")
     kind = next(k for k in kinds if getattr(noise, k) is not None)
     spec, where = getattr(noise, kind), f"{where}.{kind}"
-    found = read(folder, _file(spec, own, where))
+    found = _read_columns(folder, _file(spec, own, where), kind, where)
     if found.nside != nside:
         raise SettingsError(f"{where}: nside is {found.nside}, but that of the map is {nside}.")
     maps, known = jnp.asarray(found.maps), np.asarray(found.mask)
@@ -237,8 +280,6 @@ def _covariance(folder, noise, bandpass, nside, stokes, where, unit, own):
     if kind == "covariance":
         if len(maps) == 3 and n == 3:
             raise SettingsError(f"{where}: I, Q and U need six columns, II, IQ, IU, QQ, QU, UU.")
-        pairs = ("QQ", "QU", "UU") if len(maps) == 3 else ("II", "IQ", "IU", "QQ", "QU", "UU")
-        _check_pairs(where, found.names, pairs)
         columns = maps * unit_factor(found.unit, "uK_RJ^2", bandpass)
         return covariance_from_columns(columns)[-n:, -n:], known
     _check_number(f"{where}.sigma0", len(spec.sigma0), stokes)
@@ -246,7 +287,6 @@ def _covariance(folder, noise, bandpass, nside, stokes, where, unit, own):
     if kind == "weights":
         if n != 2:
             raise SettingsError(f"{where}: weights are those of Q and U, not of {stokes}.")
-        _check_pairs(where, found.names, ("QQ", "QU", "UU"))
         known = known & (maps[0] * maps[2] > 0)
         weights = jnp.where(known, maps, jnp.array([1.0, 0.0, 1.0])[:, None])
         return weights_covariance(jnp.broadcast_to(sigma0, (n,)), weights), known
@@ -255,13 +295,26 @@ def _covariance(folder, noise, bandpass, nside, stokes, where, unit, own):
     return hits_covariance(jnp.broadcast_to(sigma0, (n,)), hits, n), known
 
 
-def _check_pairs(where: str, names: Sequence[str], wanted: Sequence[str]) -> None:
-    """Refuse columns that by their names are other pairs of Stokes parameters than wanted."""
-    said = [stokes_of(name) for name in names]
-    if any(len(s) == 2 and s != w for s, w in zip(said, wanted, strict=True)):
+def _read_columns(folder: Path, spec: MapFile, kind: str, where: str) -> Maps:
+    """Columns about the noise, with the Stokes parameters that their place in the settings says."""
+    tables = max(len(spec.files), len(spec.hdu) if isinstance(spec.hdu, list) else 1)
+    number = max(tables, len(spec.fields or []))
+    if kind == "map" and spec.fields is None and tables == 1:
+        number = len(read(folder, spec).names)
+    pairs: dict[str, dict[int, tuple[str, ...]]] = {
+        "map": {1: (), 2: ("QQ", "UU"), 3: ("II", "QQ", "UU")},
+        "covariance": {3: ("QQ", "QU", "UU"), 6: ("II", "IQ", "IU", "QQ", "QU", "UU")},
+        "weights": {3: ("QQ", "QU", "UU")},
+    }
+    wanted = pairs.get(kind, {}).get(number, ())
+    fields = spec.fields or []
+    said = [stokes_of(name) if isinstance(name, str) else None for name in fields]
+    if any(s is not None and w not in (s, s * 2) for s, w in zip(said, wanted, strict=False)):
+        listed = ", ".join(w[0] if kind == "map" else w for w in wanted)
         raise SettingsError(
-            f"{where}.fields: {', '.join(names)} are not {', '.join(wanted)} by their names."
+            f"{where}.fields: {', '.join(map(str, fields))} are not {listed} by their names."
         )
+    return read(folder, spec, stokes=wanted or "")
 
 
 def _file(spec: MapFile | NoiseColumns, own: MapFile | None, where: str) -> MapFile:
@@ -272,7 +325,9 @@ def _file(spec: MapFile | NoiseColumns, own: MapFile | None, where: str) -> MapF
     if "file" not in said:
         if own is None:
             raise SettingsError(f"{where}: file is missing.")
-        taken = set(MapFile.model_fields) - {"fields", "unit"}
+        if len(own.files) > 1 or (isinstance(own.hdu, list) and "hdu" not in said):
+            raise SettingsError(f"{where}: the map has several files or HDUs; give file and hdu.")
+        taken = set(MapFile.model_fields) - {"fields", "unit", "stokes", "missing"}
         said = own.model_dump(include=taken, exclude_none=True) | said
     return MapFile(**said)
 

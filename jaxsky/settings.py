@@ -18,6 +18,15 @@ from pydantic import (
     model_validator,
 )
 
+from jaxsky.settings_values import (
+    check_reference,
+    check_signs,
+    file_names,
+    hdu_numbers,
+    missing_numbers,
+    stokes_words,
+)
+
 __all__ = [
     "BandpassSpec",
     "CovarianceColumns",
@@ -35,9 +44,6 @@ __all__ = [
     "TemplateFile",
     "Weights",
     "check_angles",
-    "check_reference",
-    "check_sign",
-    "check_signs",
     "expand",
     "load",
 ]
@@ -71,41 +77,10 @@ class NamedFile(str):
 FileName = Annotated[str, Field(min_length=1), AfterValidator(NamedFile)]
 
 
-def _files(value: Any) -> Any:
-    names = value if isinstance(value, list | tuple) else [value]
-    if not names or not all(isinstance(name, str) and name for name in names):
-        raise ValueError(f"must be the name of a file, or a list of them, not {value!r}")
-    return value
-
-
-def _hdus(value: Any) -> Any:
-    numbers = value if isinstance(value, list | tuple) else [value]
-    whole = all(isinstance(n, int) and not isinstance(n, bool) and n >= 1 for n in numbers)
-    if not numbers or not whole:
-        raise ValueError(
-            f"must be the number of an HDU, 1 or greater than that, or a list, not {value!r}"
-        )
-    return value
-
-
-def _stokes(value: Any) -> Any:
-    from jaxsky.io.columns import parse_stokes  # reading is slow to import
-
-    parse_stokes(value if isinstance(value, str | list | tuple) else [value])
-    return value
-
-
-def _missing(value: Any) -> Any:
-    from jaxsky.io.missing import parse_missing
-
-    parse_missing([value] if not isinstance(value, list | tuple) else value)
-    return value
-
-
-Files = Annotated[FileName | list[FileName], BeforeValidator(_files)]
-Hdus = Annotated[int | list[int], BeforeValidator(_hdus)]
-Stokes = Annotated[str | list[str], BeforeValidator(_stokes)]
-Missing = Annotated[float | list[float], BeforeValidator(_missing)]
+Files = Annotated[FileName | list[FileName], BeforeValidator(file_names)]
+Hdus = Annotated[int | list[int], BeforeValidator(hdu_numbers)]
+Stokes = Annotated[str | list[str], BeforeValidator(stokes_words)]
+Missing = Annotated[float | list[float], BeforeValidator(missing_numbers)]
 
 
 class _Columns(Table):
@@ -144,46 +119,6 @@ class MaskFile(Table):
     file: FileName
     key: str | None = None
     ordering: Literal["RING", "NESTED"] | None = None
-
-
-#: Where the reference frequency of a law may lie [GHz].
-REFERENCES = {"dust": (1.0, 2e4), "synchrotron": (0.01, 1e3), "ame": (0.01, 1e3)}
-
-
-def check_reference(law: str, nu_ref: float | None, parameters: Mapping[str, Any]) -> None:
-    """Raise ValueError for a reference frequency that is given twice, or not in GHz."""
-    if nu_ref is not None and "nu_ref" in parameters:
-        raise ValueError(
-            f"nu_ref is given twice, {nu_ref:g} and in parameters; leave one of them out"
-        )
-    given = parameters.get("nu_ref", nu_ref)
-    if law not in REFERENCES or not isinstance(given, int | float):
-        return
-    least, most = REFERENCES[law]
-    if not least <= given <= most:
-        raise ValueError(
-            f"nu_ref is in GHz, for the law {law!r} from {least:g} to {most:g}, not {given:g}"
-        )
-
-
-def check_sign(name: str, *values: float) -> None:
-    """Raise ValueError for an index beta_syn in the sign of T ~ nu^beta, by its dotted name."""
-    negative = [value for value in values if value <= 0]
-    if name.split(".")[-1] == "beta_syn" and negative:
-        raise ValueError(
-            f"{name}: beta_syn is the index in T ~ nu^-beta_syn, positive and about 3, not "
-            f"{negative[0]:g}; that of T ~ nu^beta has the other sign"
-        )
-
-
-def check_signs(table: str, values: Mapping[str, Any]) -> None:
-    """`check_sign` of the numbers in a table of settings."""
-    for name, value in values.items():
-        numbers = value if isinstance(value, list) else [value]
-        try:
-            check_sign(name, *(x for x in numbers if isinstance(x, int | float)))
-        except ValueError as error:
-            raise ValueError(f"{table}.{error}") from None
 
 
 class TemplateFile(MapFile):

@@ -284,7 +284,10 @@ class Example(SettingsFile):
         ("{ hits = { fields = ['a', 'b'], sigma0 = 1 } }", "noise.hits.fields: list should have"),
         ("{ hits = { sigma0 = -1.0 } }", "noise.hits.sigma0.0: input should be greater than 0"),
         ("{ hits = { sigma0 = [1, 2, 3, 4] } }", "noise.hits.sigma0: list should have at most 3"),
-        ("{ hits = { sigma0 = 1.0, hdu = 0 } }", "noise.hits.hdu: input should be greater than"),
+        (
+            "{ hits = { sigma0 = 1.0, hdu = 0 } }",
+            "noise.hits.hdu: must be the number of an HDU, 1 or more, or a list of them, not 0",
+        ),
     ],
 )
 def test_mistakes_in_the_table_of_noise_are_one_sentence(tmp_path, noise, words):

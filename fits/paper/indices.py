@@ -1,5 +1,6 @@
 """Maps of spectral indices: read, taken from templates, or drawn."""
 
+import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from fits.paper.settings import IndexFile, SynchrotronIndexFile
 from jaxsky.harmonics import expand, gaussian_beam, synthesis
 from jaxsky.inputs import read
 from jaxsky.lookup import find_file
+from jaxsky.parameter_maps import parameter_map
 from jaxsky.presets import from_pysm_beta
 from jaxsky.settings import SettingsError
 from jaxsky.templates import dust_index, steepening
@@ -77,19 +79,13 @@ def read_index(folder: Path, name: str, spec: IndexFile) -> Index:
     SettingsError, jaxsky.io.InputError
         For files that cannot be read as what they should be.
     """
-    found = read(folder, spec)
-    if len(found.maps) != 1:
-        raise SettingsError(
-            f"paper.{name}.fields: must name one map, not {', '.join(found.names)}."
-        )
-    values, used = jnp.asarray(found.maps[0]), np.asarray(found.mask)
-    origin, fwhm, by = (
-        f"{SYMBOLS[name]} is that of {Path(spec.file).name}",
-        max(FWHM[name], spec.fwhm),
-        0.0,
-    )
-    if name == "beta_syn" and bool(jnp.all(values[used] < 0)):
-        values, origin = from_pysm_beta(values), f"{origin} with the other sign"
+    where, found = f"paper.{name}", read(folder, spec, stokes="", zeros_are_data=True)
+    origin, fwhm, by = f"{SYMBOLS[name]} is that of {spec.label}", max(FWHM[name], spec.fwhm), 0.0
+    if name == "beta_syn" and bool(np.all(found.maps[:, found.mask] < 0)):
+        found = dataclasses.replace(found, maps=np.asarray(from_pysm_beta(found.maps)))
+        origin = f"{origin} with the other sign"
+    stated = spec.missing is not None
+    values, used = parameter_map(found, name, found.nside, where, stated=stated)
     smooth = dust_index(values, spec.fwhm, fwhm, found.nside, None if used.all() else used)
     if isinstance(spec, SynchrotronIndexFile):
         by = spec.steepening + _of_spectrum(folder, spec.spectrum)

@@ -2,11 +2,12 @@
 
 from pathlib import Path
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from fits.settings import Settings
 from jaxsky.experiment.settings import SmallScalesTable
 from jaxsky.settings import FileName, MapFile, MaskFile, Table, load
+from jaxsky.settings_values import check_reference
 from jaxsky.small_scales import DUST, SYNCHROTRON
 
 __all__ = ["EMBEDDED", "EXAMPLE", "PaperSettings", "load_paper"]
@@ -20,6 +21,11 @@ class IntensityFile(MapFile):
 
     nu_ref: float = Field(gt=0)
     fwhm: float = Field(0.0, ge=0)
+
+    @model_validator(mode="after")
+    def _plausible(self) -> "IntensityFile":
+        check_reference("ame", self.nu_ref, {})
+        return self
 
 
 class IndexFile(MapFile):

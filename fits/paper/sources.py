@@ -120,9 +120,7 @@ class Sources:
         """What the sky is, in a sentence."""
         if self.embedded:
             return MODEL
-        files = ", ".join(
-            f"{name} {Path(t.file).name}" for name, t in self.settings.templates.items()
-        )
+        files = ", ".join(f"{name} {t.label}" for name, t in self.settings.templates.items())
         return f"Templates from files: {files}."
 
     @property
@@ -135,7 +133,7 @@ class Sources:
                 f"{self.settings.embedded.nside} rather than Planck's Commander maps."
             )
         files = (
-            f"{law} from {Path(self._spec(law)[1].file).name} (nside {self.template(law).nside})"
+            f"{law} from {self._spec(law)[1].label} (nside {self.template(law).nside})"
             for law in PAPER_FWHM
         )
         return f"The templates are those that are given: {listed(files)}."
@@ -222,14 +220,16 @@ class Sources:
         nu_ref, own = NU_AME, 0.0
         if spec is not None:
             found = read(self.folder, spec)
-            if len(found.maps) != 1:
+            if found.stokes not in (("I",), (None,), ("",)):
                 raise SettingsError(
                     f"paper.ame.fields: must name one intensity map, not {', '.join(found.names)}."
                 )
+            if missing := int(np.sum(~np.asarray(found.mask))):
+                raise SettingsError(f"paper.ame: {missing} pixels have no value.")
             factor = np.asarray(conversion(found.unit, "uK_RJ", spec.nu_ref))
             intensity = jnp.asarray(found.maps[0] * factor)
             nu_ref, own = spec.nu_ref, spec.fwhm
-            origin = f"the intensity of AME is {Path(spec.file).name}"
+            origin = f"the intensity of AME is {spec.label}"
             origin += f", from {nu_ref:g} to 23 GHz by the paper's law" * (nu_ref != NU_AME)
         else:
             intensity = self.galaxy.dust[0] / 2

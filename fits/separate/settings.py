@@ -14,10 +14,9 @@ from jaxsky.settings import (
     Nside,
     SettingsFile,
     Table,
-    check_reference,
-    check_signs,
     load,
 )
+from jaxsky.settings_values import check_reference, check_signs
 
 __all__ = [
     "EMBEDDED",

@@ -22,10 +22,11 @@ from fits.separation.regions import clusters, latitude_bands, superpixels
 from jaxsky import CMB, Component, Sky, get_parameters, observe, parameter_names, set_parameters
 from jaxsky.galaxy import embedded_sky
 from jaxsky.harmonics import gaussian_beam, resample
-from jaxsky.inputs import LAWS, read
+from jaxsky.inputs import LAWS, read, read_parameter
 from jaxsky.instrument import load_instrument
 from jaxsky.io import degrade_mask, read_mask
 from jaxsky.lookup import find_file
+from jaxsky.parameter_maps import one_column
 from jaxsky.settings import MapFile, SettingsError
 
 __all__ = ["Setup", "build"]
@@ -69,7 +70,10 @@ def build(settings: SeparateSettings) -> Setup:
     """
     main, folder = settings.separation, Path(settings.data_dir)
     inside = _inside(settings)
-    sky = _sky(settings)
+    sky, known = _sky(settings)
+    inside &= known
+    if not inside.any():
+        raise SettingsError("separation.mask: leaves no pixel in which parameters are known.")
     if settings.embedded is not None:
         inputs, foregrounds = _observed(settings)
     else:
@@ -97,24 +101,30 @@ def _inside(settings: SeparateSettings) -> Bool[np.ndarray, " pix"]:
     if main.mask is not None:
         path = find_file(Path(settings.data_dir), main.mask.file)
         found = read_mask(path, key=main.mask.key, ordering=main.mask.ordering)
-        inside &= np.asarray(degrade_mask(found, main.nside))
+        try:
+            inside &= np.asarray(degrade_mask(found, main.nside))
+        except ValueError as error:
+            raise SettingsError(f"separation.mask: {error}") from None
     if not inside.any():
         raise SettingsError("separation.mask: leaves no pixel.")
     return inside
 
 
-def _sky(settings: SeparateSettings) -> Sky:
-    """The laws, on one pixel, or on all if parameters are maps."""
+def _sky(settings: SeparateSettings) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
+    """The laws, on one pixel, or on all if parameters are maps; and where these are known."""
     folder, nside = Path(settings.data_dir), settings.separation.nside
     given = settings.components.values()
     maps = any(isinstance(value, MapFile) for c in given for value in c.parameters.values())
     amplitude = jnp.ones((2, 12 * nside**2 if maps else 1))
     components: dict[str, Component] = {}
+    known = np.ones(12 * nside**2, bool)
     for name, spec in settings.components.items():
         numbers: dict = {} if spec.nu_ref is None else {"nu_ref": spec.nu_ref}
         for key, value in spec.parameters.items():
             if isinstance(value, MapFile):
-                numbers[key] = _map(folder, value, nside, f"components.{name}.parameters.{key}")
+                place = f"components.{name}.parameters.{key}"
+                column, has = read_parameter(folder, value, key, nside, place, "separation.nside")
+                numbers[key], known = jnp.asarray(column), known & has
             else:
                 numbers[key] = tuple(value) if isinstance(value, list) else value
         try:
@@ -122,17 +132,18 @@ def _sky(settings: SeparateSettings) -> Sky:
             components[name] = law(amplitude, **numbers)
         except (TypeError, ValueError) as error:
             raise SettingsError(f"components.{name}: {error}") from None
-    return Sky(components)
+    return Sky(components), known
 
 
-def _map(folder: Path, spec: MapFile, nside: int, where: str) -> Float[np.ndarray, " pix"]:
-    """A map of one column at the resolution of the separation."""
-    found = read(folder, spec)
-    if len(found.maps) != 1:
-        raise SettingsError(f"{where}: fields must name one column, not {', '.join(found.names)}.")
-    if found.nside != nside:
-        raise SettingsError(f"{where}: nside is {found.nside}, but separation.nside is {nside}.")
-    return np.asarray(found.maps[0])
+def _map(
+    folder: Path, spec: MapFile, nside: int, where: str, used: Bool[np.ndarray, " pix"]
+) -> Float[np.ndarray, " pix"]:
+    """A map of one column at the resolution of the separation, with values where it is used."""
+    found = read(folder, spec, stokes="", zeros_are_data=True)
+    values = one_column(found, nside, where, "separation.nside")
+    if empty := int(np.sum(used & ~np.asarray(found.mask))):
+        raise SettingsError(f"{where}: {empty} of {used.sum()} used pixels have no value.")
+    return values
 
 
 def _labels(settings: SeparateSettings, used: Bool[np.ndarray, " pix"]) -> dict[str, np.ndarray]:
@@ -159,13 +170,13 @@ def _regions(
     if regions.latitudes is not None:
         return latitude_bands(nside, regions.latitudes)
     if regions.file is not None:
-        values = _map(folder, regions.file, nside, f"{where}.file")
+        values = _map(folder, regions.file, nside, f"{where}.file", used)
         if not np.array_equal(values[used], np.round(values[used])):
             raise SettingsError(f"{where}.file: labels must be whole numbers.")
         return np.where(used, values, 0).astype(int)
     assert regions.clusters is not None  # one of them is given
     # Without maps, pixels are alike that lie close together.
-    rows = [_map(folder, spec, nside, f"{where}.of") for spec in regions.of]
+    rows = [_map(folder, spec, nside, f"{where}.of", used) for spec in regions.of]
     maps = np.stack(rows) if rows else np.stack(healpy.pix2vec(nside, np.arange(used.size)))
     return clusters(np.where(used, maps, np.nan), regions.clusters, seed=settings.separation.seed)
 

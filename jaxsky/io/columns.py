@@ -14,10 +14,17 @@ __all__ = ["choose", "parse_stokes", "stokes"]
 
 _LETTERS = {"I": "I", "T": "I", "Q": "Q", "U": "U"}
 _RUNS = ("FULL", "HM1", "HM2", "HR1", "HR2", "YR1", "YR2", "Y1", "Y2")
-_OF_ONE = ("STOKES", "STOKES_INP", "POLARISATION", "POLARIZATION", "ML", "MEAN")
-_OF_ONE += tuple(f"{word}_{run}" for word, run in product(("ML", "MEAN", "STOKES"), _RUNS))
+_OF_ONE = (
+    *("STOKES", "STOKES_INP", "POLARISATION", "POLARIZATION", "ML", "MEAN"),
+    *(f"{word}_{run}" for word, run in product(("ML", "MEAN", "STOKES"), _RUNS)),
+)
 _SPREADS = ("RMS", "STD", "STDDEV", "SIGMA", "ERR", "ERROR", "COV", "VAR", "VARIANCE")
 _OF_TWO = ("COV", "COVAR", "COVARIANCE", "VAR", "VARIANCE", "INVCOV", "WEIGHT", "WEIGHTS")
+_SCALARS = (
+    *("HITS", "HIT", "N_OBS", "NOBS", "N_HITS", "NHITS", "HITMAP", "MASK", "LABEL"),
+    *("BETA", "BETA_D", "BETA_S", "BETA_DUST", "BETA_SYN", "BETA_ML", "BETA_MEAN"),
+    *("T_D", "T_DUST", "TEMP_ML", "TEMP_MEAN", "CURVATURE", "NU_PIV"),
+)
 
 
 def _known() -> dict[str, str]:
@@ -35,10 +42,7 @@ def _known() -> dict[str, str]:
         for word in _OF_TWO:
             forms = (f"{a}{b}_{word}", f"{word}_{a}{b}", f"{a}{b}{word}", f"{word}{a}{b}")
             names |= dict.fromkeys((*forms, f"{word}_{a}_{b}", f"{a}_{b}_{word}"), pair)
-    scalars = ("HITS", "HIT", "N_OBS", "NOBS", "N_HITS", "NHITS", "HITMAP", "MASK", "LABEL")
-    scalars += ("BETA", "BETA_D", "BETA_S", "BETA_DUST", "BETA_SYN", "BETA_ML", "BETA_MEAN")
-    scalars += ("T_D", "T_DUST", "TEMP_ML", "TEMP_MEAN", "CURVATURE", "NU_PIV", *PIXELS)
-    return names | dict.fromkeys(scalars, "")
+    return names | dict.fromkeys((*_SCALARS, *PIXELS), "")
 
 
 _KNOWN = _known()
@@ -87,7 +91,7 @@ def parse_stokes(given: str | Sequence[str]) -> list[str]:
     Parameters
     ----------
     given : a letter per column ("IQU"), or words: a sequence, or text with blanks or commas
-        ("QQ QU UU"); "" is a column without a Stokes parameter
+        ("QQ QU UU"); an entry "" is a column without a Stokes parameter
 
     Raises
     ------

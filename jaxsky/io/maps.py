@@ -76,7 +76,7 @@ def _kinds(tables: Sequence[Columns], given: str | Sequence[str] | None) -> list
     names = [name for table in tables for name in table.names]
     where, frame = tables[0].where, tables[0].coordinates
     if given is not None:
-        stated = parse_stokes(given)
+        stated = [""] * len(names) if isinstance(given, str) and not given else parse_stokes(given)
         if len(stated) != len(names):
             raise InputError(
                 f"{where}: argument `stokes` names {len(stated)} columns, but {len(names)} are "
@@ -166,7 +166,8 @@ def read_maps(
     coordinates : "G", "C" or "E" (Galactic, Celestial, Ecliptic)
     polarization : "COSMO" or "IAU"; COSMO, HEALPix's own, where nothing is said
     stokes : Stokes parameters of the columns in their order, "QU", "IQU", "I", or of covariances
-        "QQ QU UU"; "I" or "" for other scalars. Must agree with names that are certain.
+        "QQ QU UU"; "I" or, of all columns, "" for what has none, such as hits. Must agree with
+        names that are certain.
     missing : number or numbers that mark missing pixels, zero among them; [] if all are data
     zeros_are_data : do not ask about exact zeros, as of a correction that is zero where there
         is nothing to correct

@@ -1,8 +1,9 @@
 """Pixels without a value, as arguments mark them or as their values give them away."""
 
 import numbers
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -21,7 +22,7 @@ REPEATED, MORE_OFTEN = 4, 3
 ZEROS = 0.3
 
 
-def parse_missing(given: float | Iterable[float]) -> list[float]:
+def parse_missing(given: Any) -> list[float]:
     """The numbers that an argument says to mark missing pixels.
 
     Raises
@@ -29,7 +30,7 @@ def parse_missing(given: float | Iterable[float]) -> list[float]:
     InputError
         For what is not a number or several.
     """
-    several = [given] if isinstance(given, numbers.Real | str) else list(given)
+    several: list = [given] if isinstance(given, numbers.Real | str) else list(given)
     if any(isinstance(x, bool) or not isinstance(x, numbers.Real) for x in several):
         raise InputError(f"Argument `missing` must be a number or a list of them, not {given!r}.")
     return [float(x) for x in several]
@@ -74,7 +75,7 @@ def _marks(rest: np.ndarray, extreme: float, count: int, usual: bool) -> np.ndar
         return None
     near, end = (others.min(), others.max())[:: 1 if extreme < others.min() else -1]
     far = abs(near - extreme) > abs(np.median(others) - near)
-    often = max(REPEATED, 1 + MORE_OFTEN * np.count_nonzero(others == near))
+    often = max(REPEATED, 1 + MORE_OFTEN * int(np.count_nonzero(others == near)))
     is_mark = far and (usual or abs(extreme) >= HUGE or (count >= often and near != end))
     if usual and count > 1 and not is_mark:
         is_mark = not np.array_equal(others, np.round(others))
@@ -88,4 +89,4 @@ def zeros(columns: Sequence[Float[np.ndarray, " pix"]]) -> float:
     for _, values in pairwise(columns):
         known &= np.isfinite(values)
         empty &= values == 0
-    return float(np.count_nonzero(empty & known) / max(np.count_nonzero(known), 1))
+    return float(np.count_nonzero(empty & known)) / max(float(np.count_nonzero(known)), 1.0)

@@ -133,7 +133,7 @@ def test_settings_expand_their_folder_and_refuse_what_is_none(places):
         path.write_text(f"data_dir = '{given}'")
         with pytest.raises(SettingsError, match=words):
             load(path, SettingsFile)
-    with pytest.raises(ValueError, match="at least 1 character"):
+    with pytest.raises(ValueError, match="must be the name of a file"):
         MapFile(file="")
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from fits.paper.settings import IndexFile, SynchrotronIndexFile
 from jaxsky.harmonics import expand, gaussian_beam, synthesis
 from jaxsky.inputs import read
+from jaxsky.io import InputError
 from jaxsky.lookup import find_file
 from jaxsky.parameter_maps import parameter_map
 from jaxsky.presets import from_pysm_beta
@@ -97,9 +98,11 @@ def _of_spectrum(folder: Path, file: str | None) -> float:
     """By how much a spectrum in a file steepens; 0 without one."""
     if file is None:
         return 0.0
-    path = find_file(folder, file)
     try:
+        path = find_file(folder, file)
         nu, temperature = np.loadtxt(path, unpack=True, usecols=(0, 1))
         return float(steepening(nu, temperature))
+    except InputError as error:
+        raise SettingsError(f"paper.beta_syn.spectrum: {error}") from None
     except (OSError, ValueError) as error:
         raise SettingsError(f"paper.beta_syn.spectrum: {path}: {error}") from None

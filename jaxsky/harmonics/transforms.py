@@ -14,6 +14,7 @@ from jaxbind.contrib.jaxducc0 import get_healpix_sht
 from jaxtyping import Array, Float, Int
 
 from jaxsky.checks import check_double
+from jaxsky.harmonics.ending import finish_at_exit
 from jaxsky.harmonics.packing import alm_from_healpy, alm_to_healpy, lmax_of
 
 __all__ = ["ENGINES", "adjoint_synthesis", "analysis", "rotate", "synthesis"]
@@ -58,8 +59,10 @@ def _transform(nside: int, lmax: int, spin: int):
 
 
 def _check_engine(engine: str) -> None:
+    """Refuse an unknown engine, and have the process wait for the known ones when it ends."""
     if engine not in ENGINES:
         raise ValueError(f"Argument `engine` must be one of {', '.join(ENGINES)}, not {engine!r}.")
+    finish_at_exit()
 
 
 @partial(jax.jit, static_argnames=("nside", "engine", "spin"))

@@ -82,13 +82,13 @@ class Band(NamedTuple):
 class Inputs(NamedTuple):
     """Templates and bands by name, and what is known about them.
 
-    `cmb` holds the spectra TT, EE, BB, TE [uK_CMB^2] or None, `truth` the parameters of a
-    simulation, and `description` says what the maps are.
+    `r` is the tensor-to-scalar ratio of the CMB, None where there is no CMB, `truth` holds the
+    parameters of a simulation, and `description` says what the maps are.
     """
 
     templates: dict[str, Template]
     bands: dict[str, Band]
-    cmb: Float[np.ndarray, "4 ell"] | None
+    r: float | None
     truth: dict[str, float] | None
     description: str
 
@@ -115,11 +115,11 @@ def embedded_inputs(settings: Settings, galaxy: EmbeddedSky | None = None) -> In
     ]
     bandpasses = [channel.band() for channel in channels]
     lmax = 2 * embedded.nside  # what the pixels resolve without aliasing
-    spectra = camb_spectra(2 * lmax, settings.cmb.r) if settings.cmb.include else None
+    r = settings.cmb.r if settings.cmb.include else None
     cmb_key, *noise_keys = jax.random.split(jax.random.key(seed), 1 + len(channels))
     components = dict(sky.components)
-    if spectra is not None:
-        alm = realisation(cmb_key, jnp.asarray(spectra)[:, : lmax + 1])
+    if r is not None:
+        alm = realisation(cmb_key, camb_spectra(lmax, r))
         components["cmb"] = CMB(synthesis(alm, embedded.nside))
     seen = observe(Sky(components), bandpasses)
 
@@ -140,7 +140,7 @@ def embedded_inputs(settings: Settings, galaxy: EmbeddedSky | None = None) -> In
     known = parameter_names(sky)
     free = get_parameters(sky, [name for name in settings.free if name in known])
     truth = {name: float(value) for name, value in free.items()}
-    return Inputs(templates, bands, spectra, truth, galaxy.description)
+    return Inputs(templates, bands, r, truth, galaxy.description)
 
 
 def leak(intensity: Float[Array, " pix"]) -> Float[Array, "2 pix"]:
@@ -169,9 +169,8 @@ def read_inputs(settings: Settings) -> Inputs:
     folder = Path(settings.data_dir)
     sky = set_parameters_of(read_templates(folder, settings.templates), settings.fixed)
     bands = {spec.name: read_band(folder, spec) for spec in settings.bands}
-    nside = max(healpy.npix2nside(band.maps.shape[-1]) for band in bands.values())
-    spectra = camb_spectra(4 * nside, settings.cmb.r) if settings.cmb.include else None
-    return Inputs(sky, bands, spectra, None, settings.title)
+    r = settings.cmb.r if settings.cmb.include else None
+    return Inputs(sky, bands, r, None, settings.title)
 
 
 def read_band(folder: Path, spec: BandSettings) -> Band:

@@ -13,6 +13,7 @@ from fits.inputs import Inputs
 from fits.likelihood import Likelihood, likelihood
 from fits.preparation import Preparation, prepare_component
 from jaxsky import Bandpass, Sky, observe
+from jaxsky.cmb import camb_spectra
 from jaxsky.harmonics import gaussian_beam, pixel_window
 from jaxsky.types import Numeric
 
@@ -154,12 +155,12 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
     spectra = windows = None
     if not fwhm:  # averaged pixels hold multipoles beyond those they resolve
         lmax = 4 * nside
-    if inputs.cmb is not None:
+    if inputs.r is not None:
         beams = [fwhm or band.fwhm for band in inputs.bands.values()]
         windows = jnp.stack([gaussian_beam(beam, lmax) for beam in beams])
         if not fwhm:
             windows = windows * pixel_window(nside, lmax)
-        spectra = jnp.asarray(inputs.cmb)[1:3, : lmax + 1]
+        spectra = jnp.asarray(camb_spectra(lmax, inputs.r)[1:3])
     noise = tuple(
         band.noise * kept for band, kept in zip(inputs.bands.values(), whole, strict=True)
     )

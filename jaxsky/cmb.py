@@ -24,60 +24,110 @@ PLANCK_2018 = {
 }
 
 
-@cache
+#: What this module gives to `camb.set_params` itself.
+OWN = ("r", "lmax", "max_l_tensor", "max_eta_k_tensor", "WantScalars", "WantTensors")
+#: Where the first pieces of spectra end. Each piece is a run of its own with the same settings
+#: whatever is asked for, so a multipole has one value; the next piece ends at twice that.
+SCALARS_END, TENSORS_END = 1500, 3000
+
+
 def camb_spectra(lmax: int, r: float = 0.0, **cosmology: float) -> Float[np.ndarray, "4 ell"]:
-    """Lensed spectra C_l of TT, EE, BB, TE with tensors [uK_CMB^2], l = 0 ... lmax.
+    """Spectra C_l of TT, EE, BB, TE [uK_CMB^2], l = 0 ... lmax: lensed scalars, and r tensors.
+
+    The primordial spectra are power laws about k = 0.05 / Mpc: that of scalars with the
+    amplitude `As` and the tilt `ns` of the cosmology, that of tensors with r `As` and no tilt,
+    unless the cosmology has another, `nt`. So the spectra are linear in r, with `tensor_spectra`
+    as the slope. A multipole has the same value whatever lmax is.
 
     Parameters
     ----------
     lmax : largest multipole
-    r : tensor-to-scalar ratio
+    r : tensor-to-scalar ratio at k = 0.05 / Mpc
     **cosmology : of `camb.set_params`, instead of `PLANCK_2018`
 
     Raises
     ------
     ValueError
-        If r is negative.
+        If lmax or r are negative, or CAMB does not take the cosmology.
     """
-    if r < 0:
-        raise ValueError(f"Argument `r` must not be negative, but is {r}.")
-    import camb  # takes as long to import as a small simulation takes
-
-    # The lensing of l = lmax needs higher multipoles, and CAMB some for its interpolation.
-    params = camb.set_params(
-        **(cosmology or PLANCK_2018), r=r, WantTensors=r > 0, lmax=max(lmax + 500, 1000)
-    )
-    results = camb.get_results(params)
-    return np.asarray(results.get_total_cls(lmax, CMB_unit="muK", raw_cl=True)).T
+    if not (np.isfinite(r) and r >= 0):
+        raise ValueError(f"Argument `r` must be a number from 0 on, but is {r}.")
+    scalars = _joined(_scalars, SCALARS_END, lmax, cosmology)
+    return scalars + r * tensor_spectra(lmax, **cosmology) if r else scalars
 
 
-@cache
 def tensor_spectra(lmax: int, **cosmology: float) -> Float[np.ndarray, "4 ell"]:
     """Spectra C_l of TT, EE, BB, TE of tensors with r = 1 [uK_CMB^2], l = 0 ... lmax.
 
-    Their primordial spectrum has no tilt, so for another r they are these times r. They are not
-    lensed.
+    For another r they are these times r. They are not lensed. See `camb_spectra` for their
+    primordial spectrum.
 
     Parameters
     ----------
     lmax : largest multipole
     **cosmology : of `camb.set_params`, instead of `PLANCK_2018`
-    """
-    import camb
 
-    lowest = max(lmax, 600)  # CAMB's own
-    params = camb.set_params(
-        **(cosmology or PLANCK_2018),
+    Raises
+    ------
+    ValueError
+        If lmax is negative, or CAMB does not take the cosmology.
+    """
+    return _joined(_tensors, TENSORS_END, lmax, cosmology)
+
+
+def _joined(piece, end, lmax, cosmology):
+    """Spectra up to lmax from pieces, the first of which ends at `end`."""
+    if lmax < 0:
+        raise ValueError(f"Argument `lmax` must not be negative, but is {lmax}.")
+    for name, value in cosmology.items():
+        if name in OWN:
+            raise ValueError(f"{name!r} is no parameter of the cosmology.")
+        if name in PLANCK_2018 and name != "omk" and not value >= 0:
+            raise ValueError(f"Parameter {name!r} of the cosmology is {value}, which is negative.")
+    pieces, begin = [], 0
+    while begin <= lmax:
+        pieces.append(piece(end, **(cosmology or PLANCK_2018))[:, begin : lmax + 1])
+        begin, end = end + 1, 2 * end
+    return np.concatenate(pieces, axis=1)
+
+
+@cache
+def _scalars(end, **cosmology):
+    """Lensed scalars up to l = end: BB within 0.2 % of CAMB at its highest accuracy."""
+    # The lensing of l = end needs higher multipoles.
+    lmax = end + 1000
+    accuracy = {"lens_potential_accuracy": max(4.0, (lmax - 1500) / 500)} | cosmology
+    results = _results(**accuracy, lmax=lmax)
+    return results.get_lensed_scalar_cls(end, CMB_unit="muK", raw_cl=True).T
+
+
+@cache
+def _tensors(end, **cosmology):
+    """Tensors with r = 1 up to l = end: within 0.7 % up to l = 1000."""
+    lmax = end + 500
+    # Between too few multipoles, CAMB's interpolation is off by 2 % beyond l = 500.
+    accuracy = {"nt": 0.0, "lSampleBoost": 2, "lAccuracyBoost": 2} | cosmology
+    results = _results(
+        **accuracy,
         r=1.0,
-        nt=0.0,
         WantTensors=True,
         WantScalars=False,
-        lmax=lowest,
-        max_l_tensor=lowest,
-        max_eta_k_tensor=2.5 * lowest,
+        lmax=lmax,
+        max_l_tensor=lmax,
+        max_eta_k_tensor=3 * lmax,
     )
-    results = camb.get_results(params)
-    return np.asarray(results.get_tensor_cls(lmax, CMB_unit="muK", raw_cl=True)).T
+    return results.get_tensor_cls(end, CMB_unit="muK", raw_cl=True).T
+
+
+def _results(**arguments):
+    """What CAMB computes for arguments of `camb.set_params`."""
+    import camb  # takes as long to import as a small simulation takes
+
+    try:
+        return camb.get_results(camb.set_params(**arguments))
+    except (camb.CAMBError, camb.CAMBFortranError, TypeError, ValueError) as error:
+        said = " ".join(str(error).split())
+        raise ValueError(f"CAMB does not take the cosmology: {said}") from None
 
 
 def realisation(

@@ -1,5 +1,6 @@
 """The CMB: spectra from CAMB and Gaussian realisations of them."""
 
+import camb
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,16 +41,85 @@ def test_polarization_alone_is_that_of_a_realisation_with_intensity():
 
 
 def test_tensors_are_what_r_adds():
-    tensors = cmb.tensor_spectra(LMAX)
+    tensors, scalars = cmb.tensor_spectra(LMAX), cmb.camb_spectra(LMAX)
     assert tensors.shape == (4, LMAX + 1)
-    # CAMB tilts them by -r/8, which is little for a small r.
-    added = (cmb.camb_spectra(LMAX, r=1e-3) - cmb.camb_spectra(LMAX)) / 1e-3
-    np.testing.assert_allclose(tensors[1:3, 2:], added[1:3, 2:], rtol=3e-3)
     assert not tensors[:, :2].any()
+    for r in (1e-3, 0.1):
+        np.testing.assert_array_equal(cmb.camb_spectra(LMAX, r), scalars + r * tensors)
+
+
+def test_tensors_are_those_of_cambs_r():
+    """With the scalars in the same run, and r and the tilt as they are written in CAMB."""
+    changes = {"r": 0.1, "nt": 0.0, "WantTensors": True, "lSampleBoost": 2}
+    direct = camb.set_params(**cmb.PLANCK_2018, **changes, lmax=600)
+    both = camb.get_results(direct).get_tensor_cls(300, CMB_unit="muK", raw_cl=True).T
+    added = cmb.camb_spectra(300, r=0.1) - cmb.camb_spectra(300)
+    np.testing.assert_allclose(added[1:3, 2:], both[1:3, 2:], rtol=0.02)
+    ells = [64, 300]
+    changed = cmb.tensor_spectra(300, **cmb.PLANCK_2018, nt=-0.5)[2, ells]
+    tilted = changed / cmb.tensor_spectra(300)[2, ells]
+    # l = 64 is about k = 0.0046 / Mpc or more, where a tilt about 0.05 / Mpc is a factor of 3.3.
+    assert 1 < tilted[1] < tilted[0] < 3.3
+
+
+def test_a_multipole_has_one_value():
+    many = cmb.camb_spectra(2000, r=0.05)
+    for lmax in (2, LMAX, 601, 1500, 1501):
+        few = cmb.camb_spectra(lmax, r=0.05)
+        assert few.shape == (4, lmax + 1)
+        np.testing.assert_array_equal(few, many[:, : lmax + 1])
+    few[:] = 0  # what one caller does with it is not what another gets
+    np.testing.assert_array_equal(cmb.camb_spectra(2000, r=0.05), many)
+
+
+def test_lensing_does_not_end_with_a_piece():
+    """The first piece of scalars against the next one, which is made to higher multipoles."""
+    first, longer = cmb.camb_spectra(1500), cmb._scalars(3000, **cmb.PLANCK_2018)[:, :1501]
+    np.testing.assert_allclose(first[:3, 2:], longer[:3, 2:], rtol=1e-3)
+
+
+def test_tensors_reach_any_multipole():
+    """Against a run of CAMB to higher multipoles, with other steps."""
+    direct = camb.set_params(
+        **cmb.PLANCK_2018,
+        r=1.0,
+        nt=0.0,
+        WantTensors=True,
+        WantScalars=False,
+        lmax=4500,
+        max_l_tensor=4500,
+        max_eta_k_tensor=10000,
+        lSampleBoost=1.5,
+    )
+    expected = camb.get_results(direct).get_tensor_cls(2000, CMB_unit="muK", raw_cl=True).T
+    found = cmb.tensor_spectra(2000)
+    for first, end, close in ((2, 1000, 0.01), (1000, 1500, 0.03), (1500, 2001, 0.15)):
+        ells = slice(first, end)
+        np.testing.assert_allclose(found[1:3, ells], expected[1:3, ells], rtol=close)
+
+
+@pytest.mark.parametrize(
+    ("cosmology", "words"),
+    [
+        ({"H0": -70.0}, "'H0' of the cosmology is -70.0, which is negative"),
+        ({"H0": np.nan}, "'H0' of the cosmology is nan"),
+        ({"H0": 0.5}, "CAMB does not take the cosmology: H0 is the value in km/s/Mpc"),
+        ({"omega": 0.3}, "CAMB does not take the cosmology: Unrecognized parameter: omega"),
+        ({"max_l_tensor": 100}, "'max_l_tensor' is no parameter of the cosmology"),
+        ({"WantTensors": 1.0}, "'WantTensors' is no parameter of the cosmology"),
+    ],
+)
+def test_cosmologies_that_are_none_are_refused(cosmology, words):
+    for spectra in (cmb.camb_spectra, cmb.tensor_spectra):
+        with pytest.raises(ValueError, match=words):
+            spectra(10, **(cmb.PLANCK_2018 | cosmology))
 
 
 def test_refuses_nonsense():
-    with pytest.raises(ValueError, match="`r` must not be negative, but is -1"):
-        cmb.camb_spectra(10, r=-1)
+    for r in (-1, np.nan, np.inf):
+        with pytest.raises(ValueError, match=f"`r` must be a number from 0 on, but is {r}"):
+            cmb.camb_spectra(10, r=r)
+    with pytest.raises(ValueError, match="`lmax` must not be negative, but is -2"):
+        cmb.tensor_spectra(-2)
     with pytest.raises(ValueError, match="`stokes` must be 'QU' or 'IQU', not 'Q'"):
         cmb.realisation(jax.random.key(0), jnp.ones((4, 5)), "Q")

@@ -246,6 +246,9 @@ def _band(folder: Path, spec: BandTable) -> Bandpass:
 def _cmb(settings: Experiment, lmax: int) -> Float[np.ndarray, "4 ell"]:
     spec = settings.cmb
     if spec.spectra is None:
-        return camb_spectra(lmax, spec.r, **spec.cosmology)
+        try:
+            return camb_spectra(lmax, spec.r, **spec.cosmology)
+        except ValueError as error:
+            raise SettingsError(f"cmb.cosmology: {error}") from None
     path = find_file(Path(settings.data_dir), spec.spectra)
     return read_spectra(path, lmax, format=spec.format, unit=spec.unit)

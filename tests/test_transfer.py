@@ -386,6 +386,11 @@ def test_processes_do_not_fetch_twice(server, tmp_path, log):
     assert (tmp_path / NAME).read_bytes() == CONTENT
 
 
+def test_file_systems_without_locks(server, tmp_path, monkeypatch):
+    monkeypatch.setattr("filelock.FileLock.acquire", no_room(errno.ENOSYS))
+    assert fetch(product(f"{server}/good/{NAME}"), tmp_path).read_bytes() == CONTENT
+
+
 def test_leftovers_of_a_process_that_ended_are_removed(server, tmp_path):
     (tmp_path / NAME).write_bytes(CONTENT)
     for name in (f"{NAME}.part", f"{NAME}.part.json", f".{NAME}.lock"):

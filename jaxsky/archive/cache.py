@@ -4,7 +4,7 @@ import errno
 import json
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,10 +13,12 @@ import pooch
 
 from jaxsky.archive.products import Product
 from jaxsky.io import InputError
+from jaxsky.io.folders import NO_LOCKS
 
 __all__ = [
     "CHECKSUMS",
     "DownloadError",
+    "alone",
     "cache_folder",
     "checksums",
     "file_hash",
@@ -69,11 +71,35 @@ def file_hash(path: Path, like: str = "sha256:") -> str:
 
 def remember(product: Product, folder: Path, value: str) -> None:
     """Record the hash of a product's file."""
-    with filelock.FileLock(folder / f".{CHECKSUMS}.lock"):
+    with alone(folder / f".{CHECKSUMS}.lock"):
         known = checksums(folder) | {product.name: value}
         new = folder / f".{CHECKSUMS}.new"
         new.write_text(json.dumps(known, indent=2, sort_keys=True) + "\n")
         os.replace(new, folder / CHECKSUMS)
+
+
+@contextmanager
+def alone(path: Path, waiting: Callable[[], None] = lambda: None) -> Iterator[None]:
+    """Hold a lock, which ends with the process; without one where a file system has none.
+
+    Parameters
+    ----------
+    path : of the lock
+    waiting : called if another process has it
+    """
+    lock = filelock.FileLock(path, fallback_to_soft=False)
+    try:
+        lock.acquire(blocking=False)
+    except filelock.Timeout:
+        waiting()
+        lock.acquire()
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 @contextmanager

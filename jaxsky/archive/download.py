@@ -2,16 +2,16 @@
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import filelock
 import requests
 import urllib3
 
 from jaxsky.archive import transfer
 from jaxsky.archive.cache import (
     DownloadError,
+    alone,
     cache_folder,
     checksums,
     file_hash,
@@ -68,7 +68,7 @@ def fetch(
         return _kept(product, path, part)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        with _alone(folder / f".{product.name}.lock", waiting):
+        with alone(folder / f".{product.name}.lock", waiting):
             if path.exists():  # another process has brought it
                 return _kept(product, path, part)
             found = _download(product, addresses, part, accept, report)
@@ -104,20 +104,6 @@ def _tidy(part: Path) -> None:
     """Remove what a download needs beside its file; processes that wait look for that first."""
     transfer.discard(part)
     part.with_name(f".{part.stem}.lock").unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def _alone(lock: Path, waiting: Callable[[], None]) -> Iterator[None]:
-    alone = filelock.FileLock(lock)
-    try:
-        alone.acquire(blocking=False)
-    except filelock.Timeout:
-        waiting()
-        alone.acquire()
-    try:
-        yield
-    finally:
-        alone.release()
 
 
 def _download(

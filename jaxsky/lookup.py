@@ -1,14 +1,13 @@
 """Find the files that settings name: next to the settings, or in the cache of downloads."""
 
 import os
-import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 
-from jaxsky.io import InputError
+from jaxsky.io import InputError, MissingFileError, check_file
 from jaxsky.settings import NamedFile, SettingsFile, expand
 
 __all__ = ["find_file", "found_files"]
@@ -46,18 +45,9 @@ def find_file(folder: Path, name: str) -> Path:
         if os.path.lexists(cache / name):
             path = cache / name
     try:
-        mode = path.stat().st_mode
-    except (FileNotFoundError, NotADirectoryError):
-        raise InputError(f"{path}: {_missing(path, cache)}.") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
-    except ValueError:
-        raise InputError(f"{name!r}: is no name of a file.") from None
-    if not stat.S_ISREG(mode):
-        kind = "a folder, not a file" if stat.S_ISDIR(mode) else "no regular file"
-        raise InputError(f"{path}: is {kind}.")
-    if not os.access(path, os.R_OK):
-        raise InputError(f"{path}: cannot be read (no permission).")
+        check_file(path)
+    except MissingFileError:
+        raise MissingFileError(f"{path}: {_missing(path, cache)}.") from None
     return path
 
 
@@ -65,8 +55,6 @@ def _missing(path: Path, cache: Path | None) -> str:
     """Why a file is not there, and how it comes."""
     from jaxsky.archive import cache_folder, catalogue, product_sets
 
-    if path.is_symlink():
-        return f"is a link to {os.readlink(path)}, which is not there"
     said = "no such file" if path.parent.is_dir() else "no such file, nor folder"
     if cache is not None:
         said += f", and none in the cache {cache}"

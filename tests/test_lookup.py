@@ -110,7 +110,7 @@ def test_what_is_there_and_no_file_is_called_what_it_is(places, monkeypatch):
         "pipe": "pipe: is no regular file",
         "file/a.fits": "a.fits: no such file",
         300 * "a": r"cannot be read \(File name too long\)",
-        "a\0b": r"'a\\x00b': is no name of a file",
+        "a\0b": r"a\\x00b': is no name of a file",
     }.items():
         with pytest.raises(InputError, match=words):
             find_file(data, name)

@@ -7,6 +7,7 @@ import healpy
 import numpy as np
 from jaxtyping import Bool
 
+from jaxsky.io.errors import check_file
 from jaxsky.io.sources import default_fields
 from jaxsky.io.tables import COORDINATES, ORDERINGS, HealpixTable, InputError, equals, open_fits
 
@@ -23,8 +24,7 @@ def _choose(path: Path, key: str | None, known: list[str]) -> str:
 
 
 def _read_npz(path: Path, key: str | None) -> np.ndarray:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
+    check_file(path)
     try:
         with np.load(path) as archive:
             name = _choose(path, key, list(archive))

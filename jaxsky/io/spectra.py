@@ -8,6 +8,7 @@ import numpy as np
 from astropy.io import fits as pyfits
 from jaxtyping import Float
 
+from jaxsky.io.errors import check_file
 from jaxsky.io.quantities import unit_factor, unit_name
 from jaxsky.io.tables import InputError, open_fits
 
@@ -32,8 +33,7 @@ _ROUNDING = 1 + 1e-5
 
 def is_fits(path: Path) -> bool:
     """True for a FITS file, compressed or not; raises InputError if there is no file."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
+    check_file(path)
     with path.open("rb") as stream:
         start = stream.read(6)
     return start == b"SIMPLE" or start.startswith(b"\x1f\x8b")

@@ -13,6 +13,8 @@ from astropy.io import fits as pyfits
 from astropy.utils.exceptions import AstropyUserWarning
 from jaxtyping import Bool, Float, Int
 
+from jaxsky.io.errors import InputError, check_file
+
 __all__ = [
     "COORDINATES",
     "ORDERINGS",
@@ -52,15 +54,10 @@ _DAMAGE = (EOFError, zlib.error, gzip.BadGzipFile, AstropyUserWarning)
 _PUZZLED = (OSError, ValueError, TypeError, LookupError, AttributeError, pyfits.VerifyError)
 
 
-class InputError(ValueError):
-    """A file that cannot be used, as it is or as it was asked for; one sentence with the names."""
-
-
 @contextmanager
 def open_fits(path: Path) -> Iterator[pyfits.HDUList]:
     """An open FITS file; what astropy finds wrong with it while it is open is an InputError."""
-    if not path.is_file():
-        raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}.")
+    check_file(path)
     damaged = f"{path}: not a FITS file, or a truncated one"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropyUserWarning)
@@ -68,8 +65,6 @@ def open_fits(path: Path) -> Iterator[pyfits.HDUList]:
             warnings.filterwarnings("error", message, AstropyUserWarning)
         try:
             hdus = pyfits.open(path)
-        except PermissionError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
         except (*_DAMAGE, *_PUZZLED) as error:
             raise InputError(f"{damaged} ({_reason(error)}).") from error
         try:

@@ -67,9 +67,11 @@ def _agree(stated: str, certain: str | None) -> bool:
 
 def _kinds(tables: Sequence[Columns], given: str | Sequence[str] | None) -> list[str | None]:
     """The Stokes parameter of each column, where it has to be known."""
-    # healpy calls any map TEMPERATURE that is alone in its file.
+    # healpy calls any map T or TEMPERATURE that is alone in its file.
     certain = [
-        None if len(tables) > 1 and table.alone and name == "TEMPERATURE" else stokes_of(name)
+        None
+        if table.alone and name in ("T", "TEMPERATURE") and (len(tables) > 1 or given is not None)
+        else stokes_of(name)
         for table in tables
         for name in table.names
     ]

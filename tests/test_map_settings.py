@@ -1,0 +1,432 @@
+"""Map entries of settings: files as the archives and other codes write them, through to values."""
+
+import healpy
+import numpy as np
+import pytest
+from astropy.io import fits as pyfits
+
+from fits import settings as fit_settings
+from fits.inputs import read_band, read_inputs
+from fits.paper.settings import PaperSettings
+from fits.separate.settings import SeparateSettings
+from fits.separate.setup import build
+from jaxsky.experiment.settings import Experiment
+from jaxsky.inputs import read, read_templates
+from jaxsky.io import InputError
+from jaxsky.settings import MapFile, SettingsError, TemplateFile
+
+NSIDE = 8
+NPIX = 12 * NSIDE**2
+RNG = np.random.default_rng(11)
+I, Q, U = RNG.normal(size=(3, NPIX))  # noqa: E741
+NEST = healpy.nest2ring(NSIDE, np.arange(NPIX))
+
+
+def table(columns, units, name="MAP", form="E", **header):
+    """A table with columns given in RING, as they are in the file's ordering."""
+    nside = healpy.npix2nside(len(next(iter(columns.values()))))
+    order = np.arange(12 * nside**2)
+    if header.get("ORDERING") == "NESTED":
+        order = healpy.nest2ring(nside, order)
+    made = [
+        pyfits.Column(n, form, unit=unit, array=np.asarray(c)[order])
+        for (n, c), unit in zip(columns.items(), units, strict=True)
+    ]
+    hdu = pyfits.BinTableHDU.from_columns(made, name=name)
+    keys = {"PIXTYPE": "HEALPIX", "ORDERING": "RING", "NSIDE": nside, "COORDSYS": "G"} | header
+    hdu.header.update({k: v for k, v in keys.items() if v is not None})
+    return hdu
+
+
+def write(path, *tables):
+    pyfits.HDUList([pyfits.PrimaryHDU(), *tables]).writeto(path, overwrite=True)
+    return path
+
+
+def band(folder, entry, unit="uK_RJ"):
+    """Q and U of a band at one frequency in the unit of its file, and where they are known."""
+    full = {"name": "b", "bandpass": {"center": 30.0}, "noise": {"rms": 1.0}} | entry
+    found = read_band(folder, fit_settings.Band.model_validate(full))
+    return np.asarray(found.maps) / float(found.bandpass.conversion(unit, "uK_RJ")), found
+
+
+POLARIZED = ["Q_POLARISATION", "U_POLARISATION"]
+
+
+def test_wmap_nine_years(tmp_path):
+    """NESTED, mK without a kind, no coordinates; hits in the maps, weights in a second table."""
+    names = ["TEMPERATURE", *POLARIZED, "N_OBS"]
+    hits = RNG.integers(100, 900, NPIX).astype(float)
+    hits[3] = 0
+    maps = dict(zip(names, (I, Q, U, hits), strict=True))
+    weights = {"N_OBS": hits, "QQ": hits / 2, "QU": 0.1 * hits, "UU": hits / 3}
+    keys = {"ORDERING": "NESTED", "COORDSYS": None}
+    write(
+        tmp_path / "wmap_band_iqumap_r9_9yr_K_v5.fits",
+        table(maps, ["mK", *["mK,thermodynamic"] * 2, "counts"], "Stokes Maps", **keys),
+        table(weights, ["counts"] * 4, "Weight Arrays", **keys),
+    )
+    entry = {"file": "wmap_band_iqumap_r9_9yr_K_v5.fits", "fields": POLARIZED, "coordinates": "G"}
+    for noise, variance in (
+        ({"hits": {"fields": ["N_OBS"], "sigma0": 1.4}}, lambda n: 1.4**2 / n),
+        (
+            {"weights": {"fields": ["QQ", "QU", "UU"], "hdu": 2, "sigma0": 1.4}},
+            lambda n: 1.4**2 / (1 / 2 - 0.01 * 3) / n,
+        ),
+    ):
+        values, found = band(tmp_path, entry | {"noise": noise}, "mK_CMB")
+        assert np.flatnonzero(~found.used).tolist() == [3]
+        np.testing.assert_allclose(values[:, found.used], [Q[hits > 0], U[hits > 0]], rtol=1e-6)
+        factor = float(found.bandpass.conversion("mK_CMB", "uK_RJ"))
+        expected = variance(hits[hits > 0]) * factor**2
+        np.testing.assert_allclose(found.noise[0, 0, found.used], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("iau", [False, True])
+def test_planck_maps_with_covariances(tmp_path, iau):
+    """2015 and 2018: NESTED, K_CMB, six columns of covariance; the same in IAU's sign."""
+    sign = -1 if iau else 1
+    names = ["I_STOKES", "Q_STOKES", "U_STOKES", "HITS"]
+    maps = dict(zip(names, (I, Q, sign * U, 9 + 0 * I), strict=True))
+    pairs = {"II": 1.0, "IQ": 0.0, "IU": 0.0, "QQ": 3.0, "QU": sign * 0.5, "UU": 2.0}
+    maps |= {f"{pair}_COV": np.full(NPIX, value) for pair, value in pairs.items()}
+    maps["Q_STOKES"] = np.where(np.arange(NPIX) == 7, -1.6375e30, Q)
+    units = ["K_CMB"] * 3 + ["n/a"] + ["(K_CMB)^2"] * 6
+    keys = {"ORDERING": "NESTED", "COORDSYS": "GALACTIC", "BAD_DATA": -1.6375e30}
+    keys["POLCCONV"] = "IAU" if iau else "COSMO"
+    write(tmp_path / "LFI_SkyMap_044_1024_R3.00_full.fits", table(maps, units, **keys))
+    entry = {
+        "file": "LFI_SkyMap_044_1024_R3.00_full.fits",
+        "fields": ["Q_STOKES", "U_STOKES"],
+        "noise": {"covariance": ["QQ_COV", "QU_COV", "UU_COV"]},
+    }
+    values, found = band(tmp_path, entry, "K_CMB")
+    used = np.arange(NPIX) != 7
+    np.testing.assert_array_equal(found.used, used)
+    np.testing.assert_allclose(values[:, used], [Q[used], U[used]], rtol=1e-6)
+    factor = float(found.bandpass.conversion("K_CMB", "uK_RJ"))
+    expected = np.array([[3.0, 0.5], [0.5, 2.0]])[..., None] * factor**2
+    np.testing.assert_allclose(found.noise, np.broadcast_to(expected, (2, 2, NPIX)), rtol=1e-6)
+
+
+def test_spass_with_files_of_its_noise(tmp_path):
+    """IAU, a file for each Stokes parameter and each noise; all columns are called UNKNOWN1."""
+    keys = {"POLCCONV": "IAU"}
+    for name, values in {
+        "q": Q,
+        "u": U,
+        "sq": 1 + Q**2,
+        "su": 2 + U**2,
+        "squ": 0.1 + 0 * Q,
+    }.items():
+        unit = "K_RJ^2" if name == "squ" else "K_RJ"
+        write(tmp_path / f"{name}.fits", table({"UNKNOWN1": values}, [unit], form="D", **keys))
+    entry = {"file": ["q.fits", "u.fits"], "noise": {"map": {"file": ["sq.fits", "su.fits"]}}}
+    with pytest.raises(InputError, match=r"q.fits.*UNKNOWN1.*give `stokes`"):
+        band(tmp_path, entry)
+    values, found = band(tmp_path, entry | {"stokes": "QU"}, "K_RJ")
+    np.testing.assert_allclose(values, [Q, -U], rtol=1e-12)
+    rms = np.sqrt(np.einsum("iip->ip", found.noise)) / 1e6
+    np.testing.assert_allclose(rms, [1 + Q**2, 2 + U**2], rtol=1e-12)
+    with pytest.raises(SettingsError, match=r"bands.b.fields: UNKNOWN1, UNKNOWN1 are not Q and U"):
+        band(tmp_path, entry | {"stokes": ["U", "Q"]})
+    # The order of a covariance is that of the settings: U in it changes the sign.
+    spec = {"fields": ["A", "B", "C"], "file": "cov.fits"}
+    columns = {"A": np.full(NPIX, 3.0), "B": np.full(NPIX, 0.5), "C": np.full(NPIX, 2.0)}
+    write(tmp_path / "cov.fits", table(columns, ["K_RJ^2"] * 3, **keys))
+    _, found = band(tmp_path, entry | {"stokes": "QU", "noise": {"covariance": spec}})
+    np.testing.assert_allclose(found.noise[0, 1], -0.5e12, rtol=1e-6)
+    # What is of the map is not taken for its noise where the map has several files.
+    with pytest.raises(SettingsError, match=r"bands.b.noise.covariance: the map has several files"):
+        band(tmp_path, entry | {"stokes": "QU", "noise": {"covariance": ["A", "B", "C"]}})
+
+
+def test_noise_in_celestial_coordinates(tmp_path):
+    columns = {"Q_RMS": 1 + Q**2, "U_RMS": 1 + U**2}
+    write(tmp_path / "rms.fits", table(columns, ["uK_RJ"] * 2, COORDSYS="C"))
+    write(tmp_path / "m.fits", table({"Q": Q, "U": U}, ["uK_RJ"] * 2))
+    entry = {"file": "m.fits", "noise": {"map": {"file": "rms.fits", "fields": ["Q_RMS", "U_RMS"]}}}
+    with pytest.raises(InputError, match=r"rms.fits.*Q_RMS cannot be turned"):
+        band(tmp_path, entry)
+    columns = {"Q_RMS": np.full(NPIX, 2.0)}
+    write(tmp_path / "rms.fits", table(columns, ["uK_RJ"], COORDSYS="C"))
+    entry["noise"]["map"]["fields"] = ["Q_RMS"]
+    np.testing.assert_allclose(band(tmp_path, entry)[1].noise[1, 1], 4.0, rtol=1e-6)
+
+
+def test_healpy_and_pysm(tmp_path):
+    """Full, partial and NESTED with healpy's own names; PySM's names with their frequency."""
+    path, options = tmp_path / "m.fits", {"overwrite": True, "coord": "G", "dtype": np.float64}
+    part = np.where(np.arange(NPIX) % 3 == 0, healpy.UNSEEN, [I, Q, U])
+    for maps, nest, partial in [
+        ([I, Q, U], False, False),
+        ([I, Q, U], True, False),
+        (part, False, True),
+        (part[1:], True, True),
+    ]:
+        given = [healpy.reorder(m, r2n=True) for m in maps] if nest else maps
+        healpy.write_map(path, given, nest=nest, partial=partial, column_units="uK_RJ", **options)
+        values, found = band(tmp_path, {"file": "m.fits"})
+        expected = np.ones(NPIX, bool) if maps is not part and not partial else part[0] > -1e30
+        np.testing.assert_array_equal(found.used, expected)
+        np.testing.assert_array_equal(values[:, expected], np.array([Q, U])[:, expected])
+    columns = {"Q_353GHz": Q, "U_353GHz": U, "BETA_D": 1.5 + 0.01 * I, "T_D": 20 + I}
+    write(tmp_path / "pysm.fits", table(columns, ["uK_RJ"] * 2 + [None, "K"], form="D"))
+    parameters = {
+        "beta_dust": {"file": "pysm.fits", "fields": ["BETA_D"], "unit": ""},
+        "T_dust": {"file": "pysm.fits", "fields": ["T_D"], "unit": "K"},
+    }
+    spec = {"law": "dust", "file": "pysm.fits", "nu_ref": 353.0, "parameters": parameters}
+    dust = read_templates(tmp_path, {"dust": TemplateFile(**spec)})["dust"].component
+    np.testing.assert_array_equal(dust.amplitude, [Q, U])
+    np.testing.assert_array_equal(dust.beta_dust, 1.5 + 0.01 * I)
+    np.testing.assert_array_equal(dust.T_dust, 20 + I)
+
+
+def test_footprints_and_marks_in_settings(tmp_path):
+    north = np.arange(NPIX) < 0.4 * NPIX
+    columns = {"Q": np.where(north, 0, Q), "U": np.where(north, 0, U)}
+    write(tmp_path / "zeros.fits", table(columns, ["uK_RJ"] * 2))
+    marked = {n: np.where(north, -999.0, v) for n, v in columns.items()}
+    write(tmp_path / "marked.fits", table(marked, ["uK_RJ"] * 2))
+    for name, missing in (("zeros", 0.0), ("marked", -999), ("marked", [-999.0, 0.0])):
+        with pytest.raises(InputError, match=rf"{name}.fits.*give `missing`"):
+            band(tmp_path, {"file": f"{name}.fits"})
+        found = band(tmp_path, {"file": f"{name}.fits", "missing": missing})[1]
+        np.testing.assert_array_equal(found.used, ~north)
+    assert band(tmp_path, {"file": "zeros.fits", "missing": []})[1].used.all()
+    spec = {"law": "dust", "file": "zeros.fits", "nu_ref": 353.0}
+    with pytest.raises(InputError, match=r"zeros.fits.*give `missing`"):
+        read_templates(tmp_path, {"dust": TemplateFile(**spec)})
+    # A correction is zero where there is nothing to correct.
+    write(tmp_path / "m.fits", table({"Q": Q, "U": U}, ["uK_RJ"] * 2))
+    leakage = band(tmp_path, {"file": "m.fits", "leakage": {"file": "zeros.fits"}})[1].leakage
+    assert leakage.used.all()
+    with pytest.raises(InputError, match=r"marked.fits.*give `missing`"):
+        band(tmp_path, {"file": "m.fits", "leakage": {"file": "marked.fits"}})
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ({"file": []}, "must be the name of a file, or a list of them"),
+        ({"file": ["a.fits", 3]}, "must be the name of a file, or a list of them"),
+        ({"hdu": 0}, "must be the number of an HDU, 1 or more, or a list of them, not 0"),
+        ({"hdu": [1, True]}, "must be the number of an HDU"),
+        ({"hdu": "MAP"}, "must be the number of an HDU"),
+        ({"stokes": "QV"}, "`stokes` must name I, Q, U or pairs"),
+        ({"stokes": 3}, "`stokes` must name I, Q, U or pairs"),
+        ({"missing": "zero"}, "`missing` must be a number or a list of them, not"),
+        ({"missing": True}, "`missing` must be a number or a list of them, not"),
+    ],
+)
+def test_mistakes_in_map_entries(entry, words):
+    with pytest.raises(ValueError, match=words):
+        MapFile.model_validate({"file": "m.fits"} | entry)
+
+
+def test_too_many_columns_or_others(tmp_path):
+    columns = {"I": I, "Q": Q, "U": U, "HITS": 9 + 0 * I, "X": Q}
+    write(tmp_path / "m.fits", table(columns, ["uK_RJ"] * 5))
+    for fields, words in [
+        (["HITS", "I", "Q", "U"], "fields must name Q and U, not HITS, I, Q, U"),
+        (["HITS", "Q"], "HITS, Q are not Q and U by their names"),
+        (["X", "HITS"], "X, HITS are not Q and U by their names"),
+        (["U", "Q"], "U, Q are not Q and U by their names"),
+        (["HITS", "Q", "U"], "HITS, Q, U are not Q and U by their names"),
+        (["Q"], "fields must name Q and U, not Q"),
+    ]:
+        with pytest.raises(SettingsError, match=words):
+            band(tmp_path, {"file": "m.fits", "fields": fields})
+    np.testing.assert_allclose(band(tmp_path, {"file": "m.fits", "fields": ["Q", "X"]})[0][1], Q)
+
+
+# Maps of parameters
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write(tmp_path / "m.fits", table({"Q": Q, "U": U}, ["uK_RJ"] * 2))
+    holes = np.arange(NPIX) < 40
+    columns = {
+        "BETA": 1.5 + 0.01 * I,
+        "K": 1.5 + 0.01 * I,
+        "KELVIN": 20 + I,
+        "MILLI": 1e3 * (20 + I),
+        "NEGATIVE": -3.0 + 0.01 * I,
+        "ZEROS": np.where(holes, 0, 1.5 + 0.01 * I),
+        "HOLES": np.where(holes, healpy.UNSEEN, 20 + I),
+    }
+    units = ["1", "K", "K", "mK", "1", "1", "K"]
+    write(tmp_path / "p.fits", table(columns, units, form="D"))
+    write(tmp_path / "coarse.fits", table({"BETA": np.full(48, 1.5)}, ["1"]))
+    return tmp_path
+
+
+DUST = {"law": "dust", "file": "m.fits", "nu_ref": 353.0}
+SYNCHROTRON = {"law": "synchrotron", "file": "m.fits", "nu_ref": 30.0}
+
+
+def parameter(folder, spec, name, entry):
+    full = spec | {"parameters": {name: {"file": "p.fits"} | entry}}
+    found = read_templates(folder, {"t": TemplateFile.model_validate(full)})["t"]
+    return np.asarray(getattr(found.component, name)), found.used
+
+
+@pytest.mark.parametrize(
+    ("spec", "name", "entry", "words"),
+    [
+        (
+            DUST,
+            "beta_dust",
+            {"fields": ["K"], "unit": "K"},
+            "beta_dust is a pure number, but column K is in K",
+        ),
+        (DUST, "beta_dust", {"fields": ["BETA", "ZEROS"]}, "must name one column, not BETA, ZEROS"),
+        (DUST, "beta_dust", {"file": "coarse.fits"}, "nside is 2, but that of the template is 8"),
+        (DUST, "beta_dust", {"fields": ["ZEROS"]}, "ZEROS is 0 in 40 pixels.*give `missing`"),
+        (DUST, "T_dust", {"fields": ["BETA"]}, "T_dust is in K, but column BETA is in no unit"),
+        (
+            SYNCHROTRON,
+            "beta_syn",
+            {"fields": ["NEGATIVE"]},
+            "beta_syn is the index in T ~ nu.-beta_syn",
+        ),
+    ],
+)
+def test_maps_of_parameters_are_checked(folder, spec, name, entry, words):
+    with pytest.raises(SettingsError, match=rf"templates.t.parameters.{name}: .*{words}"):
+        parameter(folder, spec, name, entry)
+
+
+def test_maps_of_parameters_that_are_right(folder):
+    for entry in ({"fields": ["KELVIN"], "unit": "K"}, {"fields": ["MILLI"], "unit": "mK"}):
+        found, used = parameter(folder, DUST, "T_dust", entry)
+        np.testing.assert_allclose(found, 20 + I, rtol=1e-12)
+        assert used.all()
+    # Pixels without a value are not used, and hold one that the law can be computed with.
+    found, used = parameter(folder, DUST, "T_dust", {"fields": ["HOLES"], "unit": "K"})
+    np.testing.assert_array_equal(used, np.arange(NPIX) >= 40)
+    np.testing.assert_array_equal(found[used], (20 + I)[used])
+    np.testing.assert_array_equal(found[~used], np.median((20 + I)[used]))
+    found, used = parameter(folder, DUST, "beta_dust", {"fields": ["ZEROS"], "missing": 0.0})
+    assert used.sum() == NPIX - 40
+    assert (found > 1).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"parameters": {"nu_ref": 353.0}}, "nu_ref is given twice, 353 and in parameters"),
+        ({"nu_ref": 353e9}, "nu_ref is in GHz, for the law 'dust' from 1 to 20000, not 3.53e.11"),
+        ({"nu_ref": 353e3}, "nu_ref is in GHz, for the law 'dust' from 1 to 20000, not 353000"),
+        ({"nu_ref": 0.353}, "nu_ref is in GHz, for the law 'dust' from 1 to 20000, not 0.353"),
+        ({"nu_ref": -353.0}, "greater than 0"),
+        (
+            {"law": "synchrotron", "nu_ref": 30e3},
+            "nu_ref is in GHz, for the law 'synchrotron' from",
+        ),
+        ({"law": "synchrotron", "parameters": {"beta_syn": -3.1}}, "has the other sign"),
+        ({"law": "synchrotron", "parameters": {"beta_syn": 0.0}}, "positive and about 3, not 0"),
+    ],
+)
+def test_numbers_of_templates_are_checked(change, words):
+    with pytest.raises(ValueError, match=words):
+        TemplateFile.model_validate(DUST | change)
+
+
+@pytest.mark.parametrize(
+    "table_",
+    [
+        {"fixed": {"synchrotron.beta_syn": -3.1}},
+        {"free": {"synchrotron.beta_syn": {"start": -3.1}}},
+        {"free": {"synchrotron.beta_syn": {"start": -3.1, "uniform": [-4.0, -2.0]}}},
+        {"free": {"synchrotron.beta_syn": {"start": 3.1, "gaussian": [-3.1, 0.3]}}},
+    ],
+)
+def test_the_other_sign_of_beta_syn_is_named_with_its_key(table_):
+    key = next(iter(table_))
+    words = rf"{key}.synchrotron.beta_syn: beta_syn is the index in T ~ nu\^-beta_syn"
+    templates = {"synchrotron": SYNCHROTRON}
+    entry = {"name": "b", "file": "m.fits", "bandpass": {"center": 30.0}, "noise": {"rms": 1.0}}
+    with pytest.raises(ValueError, match=words):
+        PaperSettings.model_validate({"templates": templates, "bands": [entry]} | table_)
+    separate = {
+        "components": {"cmb": {"law": "cmb"}, "s": {"law": "synchrotron"}},
+        "bands": [entry],
+    }
+    if key == "free":
+        with pytest.raises(ValueError, match=words):
+            SeparateSettings.model_validate(separate | table_)
+    else:
+        raw = {"templates": templates, "experiment": {"instrument": "wmap"}} | table_
+        with pytest.raises(ValueError, match=words):
+            Experiment.model_validate(raw)
+    offset = {"free": {"synchrotron.beta_syn.offset": {"start": -0.1, "uniform": [-1.0, 0.5]}}}
+    PaperSettings.model_validate({"templates": templates, "bands": [entry]} | offset)
+
+
+def separation(folder, **change):
+    names = ("a", "b", "c")
+    bands = [
+        {"name": n, "file": "m.fits", "bandpass": {"center": 30.0 + 60 * i}, "noise": {"rms": 1.0}}
+        for i, n in enumerate(names)
+    ]
+    raw = {
+        "data_dir": str(folder),
+        "separation": {"nside": NSIDE, "fwhm": 900.0, "sampler": "none"},
+        "components": {"cmb": {"law": "cmb"}, "dust": {"law": "dust"}},
+        "free": {"dust.beta_dust": {"start": 1.5}},
+        "bands": bands,
+    }
+    return SeparateSettings.model_validate(raw | change)
+
+
+def test_maps_of_parameters_in_separations(folder):
+    def with_(name, **entry):
+        parameters = {name: {"file": "p.fits"} | entry}
+        components = {"cmb": {"law": "cmb"}, "dust": {"law": "dust", "parameters": parameters}}
+        return build(separation(folder, components=components))
+
+    for entry, words in [
+        ({"name": "beta_dust", "file": "coarse.fits"}, "nside is 2, but separation.nside is 8"),
+        ({"name": "beta_dust", "fields": ["K"], "unit": "K"}, "beta_dust is a pure number"),
+        ({"name": "T_dust", "fields": ["BETA", "ZEROS"]}, "fields must name one"),
+    ]:
+        where = rf"components.dust.parameters.{entry['name']}: {words}"
+        with pytest.raises(SettingsError, match=where):
+            with_(**entry)
+    found = with_("T_dust", fields=["HOLES"], unit="K")
+    assert not found.domain.used[:40].any()
+    regions = {"file": {"file": "p.fits", "fields": ["HOLES"], "unit": "K"}}
+    free = {"dust.beta_dust": {"start": 1.5, "regions": regions}}
+    words = r"free.dust.beta_dust.regions.file: 40 of 768 used pixels have no value"
+    with pytest.raises(SettingsError, match=words):
+        build(separation(folder, free=free))
+    with pytest.raises(ValueError, match="nu_ref is given twice"):
+        separation(
+            folder,
+            components={
+                "cmb": {"law": "cmb"},
+                "dust": {"law": "dust", "nu_ref": 353.0, "parameters": {"nu_ref": 545.0}},
+            },
+        )
+
+
+def test_what_a_log_holds_is_read_again(tmp_path):
+    """Settings with lists, as they were written into a log."""
+    for name, values in {"q": Q, "u": U}.items():
+        write(tmp_path / f"{name}.fits", table({"X": values}, ["uK_RJ"], POLCCONV="IAU"))
+    entry = {"file": ["q.fits", "u.fits"], "hdu": [1, 1], "stokes": ["Q", "U"], "missing": [-1.0]}
+    raw = {
+        "data_dir": str(tmp_path),
+        "templates": {"synchrotron": SYNCHROTRON | entry},
+        "bands": [entry | {"name": "b", "bandpass": {"center": 30.0}, "noise": {"rms": 1.0}}],
+        "cmb": {"include": False},
+    }
+    settings = fit_settings.Settings.model_validate(raw)
+    again = fit_settings.Settings.model_validate(settings.model_dump(mode="json"))
+    found = read_inputs(again)
+    np.testing.assert_allclose(found.bands["b"].maps, [Q, -U], rtol=1e-6)
+    assert again.bands[0].label == "q.fits, u.fits"
+    assert read(tmp_path, again.bands[0]).stokes == ("Q", "U")

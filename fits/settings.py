@@ -8,13 +8,22 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from fits.priors import Gaussian, Prior, Uniform
+from jaxsky.setting_types import (
+    BandName,
+    ComponentName,
+    Nside,
+    Pair,
+    Seed,
+    Several,
+    Word,
+    check_names,
+)
 from jaxsky.settings import (
     BandpassSpec,
     FileName,
     MapFile,
     MaskFile,
     NoiseFile,
-    Nside,
     SettingsFile,
     Table,
     TemplateFile,
@@ -35,23 +44,21 @@ class Analysis(Table):
 
     nside: Nside = 64
     fwhm: float = Field(60.0, ge=0)
-    regions: list[FileName] = Field(["strip", "full"], min_length=1)
+    regions: Several[FileName] = Field(["strip", "full"])
     latitude: float = Field(20.0, gt=0, lt=90)
     mask: MaskFile | None = None
-    stokes: list[Literal["Q", "U", "QU"]] = Field(["Q", "U", "QU"], min_length=1)
-    methods: list[Literal["grid", "gradient", "mcmc"]] = Field(
-        ["grid", "gradient", "mcmc"], min_length=1
-    )
+    stokes: Several[Literal["Q", "U", "QU"]] = Field(["Q", "U", "QU"])
+    methods: Several[Literal["grid", "gradient", "mcmc"]] = Field(["grid", "gradient", "mcmc"])
     likelihood: Literal["exact", "diagonal"] = "exact"
-    seed: int = Field(0, ge=0)
+    seed: Seed = 0
 
 
 class Parameter(Table):
     """A free parameter: where to start, and its prior."""
 
     start: float
-    uniform: tuple[float, float] | None = None
-    gaussian: tuple[float, float] | None = None
+    uniform: Pair[float] | None = None
+    gaussian: Pair[float] | None = None
 
     @model_validator(mode="after")
     def _one_prior(self) -> "Parameter":
@@ -105,7 +112,7 @@ _RELEASE = re.compile(r"_R(\d)\.\d\d")
 class Band(MapFile):
     """An observed map with its bandpass, beam and noise."""
 
-    name: str = Field(min_length=1)
+    name: BandName
     bandpass: BandpassSpec
     fwhm: float = Field(0.0, ge=0)
     noise: Noise
@@ -135,7 +142,7 @@ class Embedded(Table):
     known: it is subtracted again.
     """
 
-    channels: dict[str, list[str]] = Field({"planck": ["44", "70"]}, min_length=1)
+    channels: dict[str, Several[Word]] = Field({"planck": ["44", "70"]}, min_length=1)
     nside: Nside = 128
     leakage: dict[str, float] = Field(default_factory=dict)
 
@@ -187,7 +194,7 @@ class Settings(SettingsFile):
     free: dict[str, Parameter] = Field(default_factory=dict)
     fixed: dict[str, float] = Field(default_factory=dict)
     embedded: Embedded | None = None
-    templates: dict[str, TemplateFile] = Field(default_factory=dict)
+    templates: dict[ComponentName, TemplateFile] = Field(default_factory=dict)
     bands: list[Band] = Field(default_factory=list)
     cmb: CMBSettings = CMBSettings()
     grid: Grid = Grid()
@@ -203,8 +210,8 @@ class Settings(SettingsFile):
         if both := set(self.free) & set(self.fixed):
             raise ValueError(f"{', '.join(sorted(both))} cannot be both free and fixed")
         names = [band.name for band in self.bands]
-        if len(set(names)) < len(names):
-            raise ValueError(f"the names of the bands must differ, but are {', '.join(names)}")
+        check_names("bands", names)
+        check_names("templates", self.templates)
         if self.embedded is not None:
             names = [name for names in self.embedded.channels.values() for name in names]
         if self.compare.patches not in (None, *names):

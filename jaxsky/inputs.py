@@ -213,6 +213,8 @@ def read_bandpass_spec(folder: Path, spec: BandpassSpec) -> Bandpass:
             spec.band,
             detectors=spec.detectors,
             convention=spec.convention,
+            unit=spec.unit,
+            fields=spec.fields,
         )
     assert spec.center is not None  # one of file and center is given
     if not spec.width:

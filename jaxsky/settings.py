@@ -2,8 +2,9 @@
 
 import os
 import re
+import reprlib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -14,10 +15,12 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    ValidationInfo,
     field_validator,
     model_validator,
 )
 
+from jaxsky.setting_types import Several, Word
 from jaxsky.settings_values import (
     check_reference,
     check_signs,
@@ -37,7 +40,6 @@ __all__ = [
     "NamedFile",
     "NoiseColumns",
     "NoiseFile",
-    "Nside",
     "SettingsError",
     "SettingsFile",
     "Table",
@@ -54,18 +56,19 @@ class SettingsError(ValueError):
 
 
 class Table(BaseModel):
-    """A table of settings: its fields are the keys, and no others."""
+    """A table of settings: its fields are the keys, and no others, with values of their types.
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    A number in quotes, a switch where a number is meant and an empty word are mistakes.
+    """
 
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
 
-def _power_of_two(value: int) -> int:
-    if value & (value - 1):
-        raise ValueError(f"nside must be a power of two, not {value}")
-    return value
-
-
-Nside = Annotated[int, Field(gt=0), AfterValidator(_power_of_two)]
+    @field_validator("*")
+    @classmethod
+    def _not_empty(cls, value: Any, info: ValidationInfo) -> Any:
+        if value == "" and info.field_name not in ("title", "unit"):
+            raise ValueError("must not be empty")
+        return value
 
 
 class NamedFile(str):
@@ -148,8 +151,10 @@ class BandpassSpec(Table):
 
     file: FileName | None = None
     band: str | None = None
-    detectors: list[str] | None = None
+    detectors: Several[Word] | None = None
     convention: Literal["RJ", "power", "CMB"] | None = None
+    unit: str | None = None
+    fields: list[str | int] | None = None
     center: float | None = Field(None, gt=0)
     width: float | None = Field(None, ge=0)
 
@@ -157,6 +162,9 @@ class BandpassSpec(Table):
     def _one_kind(self) -> "BandpassSpec":
         if (self.file is None) == (self.center is None):
             raise ValueError("give a bandpass either as file or as center and width")
+        of_file = [key for key in ("band", "detectors", "unit", "fields") if getattr(self, key)]
+        if self.file is None and of_file:
+            raise ValueError(f"{', '.join(of_file)}: of the file of a bandpass, not of center")
         return self
 
 
@@ -280,25 +288,55 @@ def expand(text: str) -> str:
     return os.path.expanduser(re.sub(pattern, value, text))
 
 
-def _sentence(path: Path, error: ValidationError) -> str:
-    parts = []
+def _key(raw: Any, place: Sequence[str | int], missing: bool) -> str:
+    """The dotted key of a mistake; its place also names types, which are no keys."""
+    keys = []
+    for i, step in enumerate(place):
+        if isinstance(raw, dict) and step in raw:
+            keys.append(str(step))
+            raw = raw[step]
+        elif isinstance(raw, list) and isinstance(step, int):
+            keys.append(str(step))
+            raw = raw[step] if step < len(raw) else None
+        elif missing and i == len(place) - 1:
+            keys.append(str(step))
+    return ".".join(keys)
+
+
+def _sentence(path: Path, raw: Any, error: ValidationError) -> str:
+    wrong: dict[str, list[str]] = {}
+    types: dict[str, str] = {}
     for item in error.errors():
-        where = ".".join(str(key) for key in item["loc"])
         what = item["msg"].removeprefix("Value error, ")
+        where = _key(raw, item["loc"], item["type"] == "missing")
         if item["type"] == "extra_forbidden":
             what = "unknown key"
         elif item["type"] == "missing":
             what = "is missing"
-        elif not item["msg"].startswith("Value error"):
-            what = f"{what[0].lower()}{what[1:]}, not {item['input']!r}"
-        parts.append(f"{where}: {what}" if where else what)
-    return f"{path}: {'; '.join(parts)}."
+        elif item["type"].endswith(("_type", "literal_error")):
+            wanted = what.removeprefix("Input should be ").partition(" or instance")[0]
+            wanted = wanted.replace("dictionary", "table")
+            known = types.get(where, "input should be ").partition(", not ")[0]
+            joined = known + ("" if known.endswith("be ") else " or ") + wanted
+            types[where] = f"{joined}, not {reprlib.repr(item['input'])}"
+            continue
+        elif item["msg"] == what:
+            value = "" if ", not " in what else f", not {reprlib.repr(item['input'])}"
+            what = f"{what[0].lower()}{what[1:]}{value}"
+        wrong.setdefault(where, []).append(what)
+    # Of a value that may be of several types, those that it is not matter only if it is none.
+    places = [*wrong, *types]
+    for where, what in types.items():
+        if where not in wrong and not any(place.startswith(f"{where}.") for place in places):
+            wrong[where] = [what]
+    sentences = [": ".join(filter(None, (k, " or ".join(w)))) for k, w in wrong.items()]
+    return f"{path}: {'; '.join(sentences)}."
 
 
-T = TypeVar("T", bound=SettingsFile)
+S = TypeVar("S", bound=SettingsFile)
 
 
-def load(path: Path, model: type[T], overrides: Mapping[str, Mapping[str, Any]] | None = None) -> T:
+def load(path: Path, model: type[S], overrides: Mapping[str, Mapping[str, Any]] | None = None) -> S:
     """Settings from a TOML file.
 
     Parameters
@@ -332,7 +370,7 @@ def load(path: Path, model: type[T], overrides: Mapping[str, Mapping[str, Any]] 
         if folder.exists() and not folder.is_dir():
             raise ValueError(f"{folder} is not a folder")
     except ValidationError as error:
-        raise SettingsError(_sentence(path, error)) from None
+        raise SettingsError(_sentence(path, raw, error)) from None
     except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: links in a circle
         raise SettingsError(f"{path}: data_dir: {error}.") from None
     return settings.model_copy(update={"data_dir": str(folder)})

@@ -16,11 +16,11 @@ from jaxsky.inputs import (
     set_parameters_of,
 )
 from jaxsky.io import InputError
+from jaxsky.setting_types import Nside
 from jaxsky.settings import (
     BandpassSpec,
     MapFile,
     NoiseFile,
-    Nside,
     SettingsError,
     SettingsFile,
     Table,
@@ -276,13 +276,13 @@ class Example(SettingsFile):
         ),
         ("{ rms = 1.0, covariance = ['a', 'b', 'c'] }", "not rms, covariance."),
         ("{ level = 1.0 }", "noise.level: unknown key"),
-        ("{ covariance = ['a', 'b', 'c', 'd'] }", "noise.covariance.fields: name the columns QQ, "),
+        ("{ covariance = ['a', 'b', 'c', 'd'] }", "noise.covariance: name the columns QQ, "),
         ("{ covariance = [] }", "not none."),
-        ("{ covariance = 'QQ' }", "noise.covariance: input should be a valid dictionary"),
+        ("{ covariance = 'QQ' }", "noise.covariance: input should be a valid table"),
         ("{ hits = { fields = ['N_OBS'] } }", "noise.hits.sigma0: is missing."),
         ("{ hits = { sigma0 = 1.0 } }", "noise.hits.fields: is missing."),
         ("{ hits = { fields = ['a', 'b'], sigma0 = 1 } }", "noise.hits.fields: list should have"),
-        ("{ hits = { sigma0 = -1.0 } }", "noise.hits.sigma0.0: input should be greater than 0"),
+        ("{ hits = { sigma0 = -1.0 } }", "noise.hits.sigma0: input should be greater than 0"),
         ("{ hits = { sigma0 = [1, 2, 3, 4] } }", "noise.hits.sigma0: list should have at most 3"),
         (
             "{ hits = { sigma0 = 1.0, hdu = 0 } }",
@@ -312,7 +312,7 @@ def test_settings_of_any_model_with_values_replaced(tmp_path, monkeypatch):
     path.write_text("")
     assert load(path, Example, {"analysis": {"nside": 2}}).analysis.nside == 2
     path.write_text("analysis = 3")
-    with pytest.raises(SettingsError, match=r"analysis: input should be a valid dictionary"):
+    with pytest.raises(SettingsError, match=r"analysis: input should be a valid table"):
         load(path, Example, {"analysis": {"nside": 2}})
     path.write_text("analysis.nside = 6")
     with pytest.raises(SettingsError, match=r"analysis.nside: nside must be a power of two, not 6"):

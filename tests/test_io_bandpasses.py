@@ -86,7 +86,7 @@ def test_rimo_of_either_instrument(tmp_path):
     assert lfi.convention == "RJ"
     # Wavenumbers from 0 on, one of them twice.
     k = np.concatenate([[0.0], NU[:6], NU[5:]]) / 29.9792458
-    values = np.concatenate([[1.0], weights[:5], [0.9, 1.1], weights[6:]])
+    values = np.concatenate([[1e-9], weights[:5], [0.9, 1.1], weights[6:]])
     path = rimo(tmp_path / "hfi.fits", [("BANDPASS_F353", k, values)], "1/cm")
     hfi = read_bandpass(path, "F353")
     np.testing.assert_allclose(hfi.nu, NU, rtol=1e-15)
@@ -107,7 +107,7 @@ def test_detectors_count_equally(tmp_path):
 
 def test_text_tables(tmp_path):
     path = table(
-        tmp_path / "b.txt", "nu weight", "# GHz", "28, 1", "", "30 2.0 0.1", "! end", "3.2e1\t1"
+        tmp_path / "b.txt", "nu weight", "# GHz", "28, 1", "", "30 2.0 0.1", "! end", "3.2D1\t1"
     )
     read = read_bandpass(path, convention="RJ")
     assert (read.nu.tolist(), read.weights.tolist()) == ([28, 30, 32], [1, 2, 1])
@@ -134,14 +134,105 @@ def test_text_tables(tmp_path):
         (["-1 1", "0 1"], "no sample at a positive frequency"),
         (["30 1", "31 x"], r"b.txt, line 2: not two numbers: '31 x'"),
         (["30 1", "31"], r"line 2: not two numbers"),
-        (["# nothing"], "no line has two numbers"),
-        (["|nu|w|", "|d|d|", "|parsec| |", "30 1"], "unit is 'parsec', not one of Hz, MHz"),
+        (["# nothing"], "no line has numbers"),
+        (["|nu|w|", "|d|d|", "|parsec| |", "30 1"], "unit is 'parsec', not one of Hz, kHz, MHz"),
     ],
 )
 def test_bad_text_tables(tmp_path, lines, words):
     path = table(tmp_path / "b.txt", *lines)
     with pytest.raises(InputError, match=words):
         read_bandpass(path, convention="RJ")
+
+
+#: Columns of frequency and weight in GHz, and as other files have them.
+SAMPLES = ([28.0, 30.5, 32.0], [1.0, 2.0, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("content", "arguments"),
+    [
+        (b"28 1\n30.5 2\n32 .5\n", {}),
+        (b"\xef\xbb\xbf28 1\n30.5 2\n32 .5\n", {}),
+        ("28 1\n30.5 2\n32 .5\n".encode("utf-16"), {}),
+        (b"28\t1\r\n30.5\t2\r\n32\t.5\r\n", {}),
+        (b"28,1,0\n30.5,2,0\n32,.5,0\n", {}),
+        (b"28;1\n30,5;2,0\n32;,5\n", {}),
+        (b"nu weight\n2.8D+01 1d0\n30.5 2\n32 5D-01\n", {}),
+        (b"# 30 GHz band\n28 1 # low\n30.5 2 ok\n32 .5\n", {}),
+        (b"0 0\n28 1\n30.5 2\n32 .5\n", {}),
+        (b"nu_MHz weight\n28000 1\n30500 2\n32000 .5\n", {}),
+        (b"# the 30 GHz band: nu [Hz], T [K/GHz]\n28e9 1\n30.5e9 2\n32e9 .5\n", {}),
+        (b"# nu/THz, weight\n.028 1\n.0305 2\n.032 .5\n", {}),
+        (b".028 1\n.0305 2\n.032 .5\n", {"unit": "THz"}),
+        (b"28 1\n30.5 2\n32 .5\n", {"unit": "GHz"}),
+        (b"28000 1\n30500 2\n32000 .5\n", {"unit": "mhz"}),
+        (b"i nu w\n0 28 1\n1 30.5 2\n2 32 .5\n", {"fields": [1, 2]}),
+        (b"i nu w\n0 28 1\n1 30.5 2\n2 32 .5\n", {"fields": ["nu", "w"]}),
+        (b"|i|nu|w|\n|int|d|d|\n||GHz||\n 0 28 1\n 1 30.5 2\n 2 32 .5\n", {"fields": ["nu", "w"]}),
+    ],
+)
+def test_text_that_is_read_right(tmp_path, content, arguments):
+    path = tmp_path / "b.txt"
+    path.write_bytes(content)
+    band = read_bandpass(path, convention="RJ", **arguments)
+    np.testing.assert_allclose((band.nu, band.weights), SAMPLES, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("content", "arguments"),
+    [
+        (b"# wavenumber [cm^-1]\n1 1\n2 3\n", {}),
+        (b"1 1\n2 3\n", {"unit": "1/cm"}),
+        (b"# wavelength in microns\n5000 3\n10000 1\n", {}),
+        (b"5 3\n10 1\n", {"unit": "mm"}),
+    ],
+)
+def test_wavenumbers_and_wavelengths(tmp_path, content, arguments):
+    path = tmp_path / "b.txt"
+    path.write_bytes(content)
+    band = read_bandpass(path, convention="power", **arguments)
+    np.testing.assert_allclose((band.nu, band.weights), ([29.9792458, 59.9584916], [1, 3]))
+
+
+@pytest.mark.parametrize(
+    ("content", "arguments", "words"),
+    [
+        (b"30,5 2,0\n31,0 1,0\n", {}, "line 1: '30,5' is two numbers or one with a decimal comma"),
+        (b"nu w\n30.5 2\n31,5\t1\n", {}, "line 3: '31,5' is two numbers or one"),
+        (b"30,5,2,0\n31,5,1,0\n", {}, "line 1: '30,5,2,0' may have decimal commas"),
+        (b"3O.5 2\n31 1\n", {}, "line 1: not two numbers: '3O.5 2'"),
+        (b"\xef\xbb\xbf3x 2\n31 1\n", {}, "line 1: not two numbers"),
+        (b"nu 1\n30 1\n", {}, "line 1: not two numbers: 'nu 1'"),
+        (b"30 1\n\n31 1_0\n", {}, "line 3: not two numbers: '31 1_0'"),
+        (b"30 1\n|31 1|\n", {}, "line 2: a header among the rows"),
+        (b"30 1\n31\x00 1\n", {}, "for it has NUL bytes"),
+        ("30 1\n31 1\n".encode("utf-16-le"), {}, "for it has NUL bytes"),
+        (b"", {}, "no line has numbers"),
+        (b"0 28 1\n1 30 2\n2 32 1\n", {}, "first of 3 columns may not be the frequency; give"),
+        (b"1 28 1\n2 30 2\n3 32 1\n", {}, "give `fields`, the columns of frequency and weight"),
+        (b"row nu w\n7 28 1\n8 30 2\n", {}, r"the first of 3 columns \(row nu w\) may not be"),
+        (b"weight nu\n1 28\n2 30\n", {}, r"the first of 2 columns \(weight nu\) may not be"),
+        (b"28 30 1\n30 31 1\n", {"fields": [1, 3]}, "no column 3; it has 0 to 2"),
+        (b"28 30 1\n30 31 1\n", {"fields": ["w", 1]}, "no column 'w'; it has 0 to 2"),
+        (b"28 30 1\n30 31 1\n", {"fields": [1]}, "`fields` must name two columns, not 1"),
+        (b" ".join([b"1"] * 3000) + b"\n", {}, "3000 columns; give `fields`"),
+        (b"28000 1\n30000 1\n", {}, "middle of the band is at 29000 GHz, .* give `unit`"),
+        (b"0.028 1\n0.03 1\n", {}, "is at 0.029 GHz, outside of 1 to 3000 GHz; give `unit`"),
+        (b"28e9 1\n30e9 1\n", {}, "outside of 1 to 3000 GHz; give `unit`"),
+        (b"# nu [GHz]\n28e9 1\n30e9 1\n", {}, "is at 2.9e.10 GHz, outside of 0.01 to 30000 GHz"),
+        (b"# nu [GHz] or [MHz]\n28 1\n30 1\n", {}, "names the units GHz, MHz; give `unit`"),
+        (b"# nu [GHz]\n28 1\n30 1\n", {"unit": "MHz"}, "is 'MHz', but the file says 'GHz'"),
+        (b"# wavelength\n28 1\n30 1\n", {}, "unit of the frequencies is missing; give `unit`"),
+        (b"|nu|w|\n|d|d|\n28 1\n30 1\n", {}, "unit of the frequencies is missing; give `unit`"),
+        (b"28 1\n30 1\n", {"unit": "K"}, "unit is 'K', not one of Hz, kHz, MHz"),
+        (b"-1 .5\n0 1\n30 1\n31 1\n", {}, "2 samples of the bandpass at nu <= 0 have weights"),
+    ],
+)
+def test_text_that_is_refused(tmp_path, content, arguments, words):
+    path = tmp_path / "b.txt"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=rf"b\.txt.*{words}"):
+        read_bandpass(path, convention="RJ", **arguments)
 
 
 def test_bad_rimos(tmp_path):

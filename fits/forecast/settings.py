@@ -5,7 +5,18 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from jaxsky.settings import FileName, Nside, SettingsFile, Table, TemplateFile, check_angles, load
+from jaxsky.setting_types import (
+    BandName,
+    ComponentName,
+    Distinct,
+    Nside,
+    Pair,
+    Seed,
+    Several,
+    Word,
+    check_names,
+)
+from jaxsky.settings import FileName, SettingsFile, Table, TemplateFile, check_angles, load
 from jaxsky.units import UNITS
 
 __all__ = ["DEFAULT", "EXAMPLE", "Fisher", "ForecastSettings", "Mask", "Spectra", "load_forecast"]
@@ -21,13 +32,13 @@ class Experiment(Table):
     """An instrument of `jaxsky.instrument`."""
 
     instrument: str | None = None
-    channels: list[str] | None = Field(None, min_length=1)
+    channels: Several[Word] | None = None
 
 
 class BandTable(Table):
     """A band of an experiment of one's own; see `jaxsky.instrument.Channel`."""
 
-    name: str = Field(min_length=1)
+    name: BandName
     center: Positive
     width: Positive
     fwhm: Positive
@@ -46,7 +57,7 @@ class Embedded(Table):
     """The embedded model of the Galaxy."""
 
     nside: Nside = 128
-    seed: int = Field(0, ge=0, lt=2**32)
+    seed: Seed = 0
 
 
 class Mask(Table):
@@ -70,12 +81,12 @@ class Mask(Table):
 class Spectra(Table):
     """Spectra of the foregrounds outside the mask, and what they are shown against."""
 
-    bands: list[str] | None = Field(None, min_length=1, max_length=7)
+    bands: Annotated[Several[Word], Field(max_length=7)] | None = None
     lmin: Multipole = 2
     lmax: Multipole = 250
     width: int = Field(10, ge=1)
-    fit: tuple[Multipole, Multipole] = (20, 200)
-    r: list[Positive] = Field([0.1, 0.01, 0.001], min_length=1, max_length=4)
+    fit: Pair[Multipole] = (20, 200)
+    r: Several[Positive] = Field([0.1, 0.01, 0.001], max_length=4)
 
     @model_validator(mode="after")
     def _ranges(self) -> "Spectra":
@@ -89,12 +100,12 @@ class Spectra(Table):
 class Fisher(Table):
     """The Fisher matrix: what is free, and what is known of it before."""
 
-    free: list[str] = Field(["r"], min_length=1)
-    foregrounds: list[Literal["amplitude", "slope", "correlation"]] = Field(
+    free: Several[Word] = Field(["r"])
+    foregrounds: Distinct[Literal["amplitude", "slope", "correlation"]] = Field(
         ["amplitude", "slope", "correlation"]
     )
     priors: dict[str, Positive] = Field(default={})
-    spectra: list[Literal["EE", "BB"]] = Field(["BB"], min_length=1)
+    spectra: Several[Literal["EE", "BB"]] = Field(["BB"])
     lmin: Multipole = 2
     lmax: Annotated[int, Field(ge=2, le=3000)] = 300
     r: float = Field(0.0, ge=0)
@@ -104,10 +115,6 @@ class Fisher(Table):
     def _consistent(self) -> "Fisher":
         if not self.lmin < self.lmax:
             raise ValueError(f"lmax, {self.lmax}, must be above lmin, {self.lmin}")
-        for key in ("free", "spectra", "foregrounds"):
-            names = getattr(self, key)
-            if len(set(names)) < len(names):
-                raise ValueError(f"{key} has a name twice: {', '.join(names)}")
         return self
 
 
@@ -117,7 +124,7 @@ class ForecastSettings(SettingsFile):
     experiment: Experiment = Experiment()
     bands: list[BandTable] = Field(default=[])
     embedded: Embedded | None = None
-    templates: dict[str, TemplateFile] = Field(default={})
+    templates: dict[ComponentName, TemplateFile] = Field(default={})
     fixed: dict[str, float] = Field(default={})
     mask: Mask
     spectra: Spectra = Spectra()
@@ -131,6 +138,8 @@ class ForecastSettings(SettingsFile):
             raise ValueError("experiment.channels chooses from an instrument, not from bands")
         if (self.embedded is None) == (not self.templates):
             raise ValueError("give either templates or the table embedded")
+        check_names("bands", (band.name for band in self.bands))
+        check_names("templates", self.templates)
         check_angles(self.templates)
         return self
 

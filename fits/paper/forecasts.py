@@ -32,13 +32,15 @@ def _settings(settings: PaperSettings, sources: Sources) -> ForecastSettings:
     if not sources.embedded:
         sky = {"templates": settings.templates, "fixed": settings.fixed}
         lmax = min(LMAX, 2 * min(sources.template(n).nside for n in ("dust", "synchrotron")) - 8)
-    return ForecastSettings(
-        title=settings.title,
-        data_dir=settings.data_dir,
-        experiment={"instrument": "core"},
-        mask=mask,
-        spectra=Spectra(bands=list(BANDS), lmax=lmax, fit=(20, min(200, lmax - 10))),
-        **sky,
+    return ForecastSettings.model_validate(
+        {
+            "title": settings.title,
+            "data_dir": settings.data_dir,
+            "experiment": {"instrument": "core"},
+            "mask": mask,
+            "spectra": Spectra(bands=list(BANDS), lmax=lmax, fit=(20, min(200, lmax - 10))),
+            **sky,
+        }
     )
 
 

@@ -6,6 +6,7 @@ from pydantic import Field, model_validator
 
 from fits.settings import Settings
 from jaxsky.experiment.settings import SmallScalesTable
+from jaxsky.setting_types import Pair
 from jaxsky.settings import FileName, MapFile, MaskFile, Table, load
 from jaxsky.settings_values import check_reference
 from jaxsky.small_scales import DUST, SYNCHROTRON
@@ -50,7 +51,7 @@ class Paper(Table):
     """What only the figures of the paper need."""
 
     fwhm: float = Field(5.0, gt=0)
-    center: tuple[float, float] = (180.0, 30.0)
+    center: Pair[float] = (180.0, 30.0)
     dust: SmallScalesTable = SmallScalesTable(EE=DUST.EE, BB=DUST.BB)
     synchrotron: SmallScalesTable = SmallScalesTable(EE=SYNCHROTRON.EE, BB=SYNCHROTRON.BB)
     ame: IntensityFile | None = None

@@ -8,14 +8,8 @@ from pydantic import Field, model_validator
 
 from fits.priors import Gaussian, Prior
 from fits.settings import Band, Parameter, check_free
-from jaxsky.settings import (
-    MapFile,
-    MaskFile,
-    Nside,
-    SettingsFile,
-    Table,
-    load,
-)
+from jaxsky.setting_types import Nside, Seed, SeparatedName, Several, Word, check_names
+from jaxsky.settings import MapFile, MaskFile, SettingsFile, Table, load
 from jaxsky.settings_values import check_reference, check_signs
 
 __all__ = [
@@ -49,7 +43,7 @@ class Main(Table):
     nsims: int = Field(100, ge=20)
     sampler: Literal["nuts", "emcee", "none"] = "nuts"
     nsteps: int | None = Field(None, ge=100)
-    seed: int = Field(0, ge=0, lt=2**32)
+    seed: Seed = 0
 
 
 class ComponentTable(Table):
@@ -108,7 +102,7 @@ class Embedded(Table):
     """
 
     instrument: str = "litebird"
-    channels: list[str] | None = Field(None, min_length=2)
+    channels: Annotated[Several[Word], Field(min_length=2)] | None = None
     nside: Nside = 64
     truth: dict[str, float] = Field(default={})
     r: float = Field(0.0, ge=0)
@@ -134,7 +128,7 @@ class SeparateSettings(SettingsFile):
     """All settings of a component separation."""
 
     separation: Main = Main()
-    components: dict[str, ComponentTable] = Field(min_length=2)
+    components: dict[SeparatedName, ComponentTable] = Field(min_length=2)
     free: dict[str, FreeParameter] = Field(min_length=1)
     embedded: Embedded | None = None
     bands: list[Band] = Field(default=[])
@@ -144,11 +138,12 @@ class SeparateSettings(SettingsFile):
     def _consistent(self) -> "SeparateSettings":
         if (self.embedded is None) == (not self.bands):
             raise ValueError("give either bands or the table embedded")
-        names = [band.name for band in self.bands]
-        if len(set(names)) < len(names):
-            raise ValueError(f"the names of the bands must differ, but are {', '.join(names)}")
+        check_names("bands", (band.name for band in self.bands))
+        check_names("components", self.components)
         if self.cmb is None:
             raise ValueError("components: one must have the law 'cmb'")
+        if self.components.get("cmb", self.components[self.cmb]).law != "cmb":
+            raise ValueError("components.cmb: must have the law 'cmb'; choose another name")
         check_free(self.free)
         if self.separation.domain == "harmonic":
             divided = [name for name, parameter in self.free.items() if parameter.regions]

@@ -6,11 +6,20 @@ from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from jaxsky.setting_types import (
+    BandName,
+    ComponentName,
+    Nside,
+    Pair,
+    Seed,
+    Several,
+    Word,
+    check_names,
+)
 from jaxsky.settings import (
     BandpassSpec,
     FileName,
     NoiseFile,
-    Nside,
     SettingsFile,
     Table,
     TemplateFile,
@@ -40,19 +49,19 @@ class Main(Table):
     """What is observed, and what is written."""
 
     instrument: str | None = None
-    channels: list[str] | None = Field(None, min_length=1)
+    channels: Several[Word] | None = None
     samples: int = Field(51, ge=2)
     nside: Nside = 256
     fwhm: float | Literal["own"] = "own"
     stokes: Literal["QU", "IQU"] = "QU"
     unit: Literal["uK_RJ", "uK_CMB"] = "uK_RJ"
-    include: list[str] | None = Field(None, min_length=1)
-    outputs: tuple[Literal["total", "components"], ...] = ("total",)
+    include: Several[Word] | None = None
+    outputs: Several[Literal["total", "components"]] = Field(["total"])
     precision: Literal["single", "double"] = "single"
     sheet: bool = True
     diagonal_noise: bool = False
-    seed: int = Field(0, ge=0, lt=2**32)
-    small_scales_seed: int | None = Field(None, ge=0, lt=2**32)
+    seed: Seed = 0
+    small_scales_seed: Seed | None = None
 
     @field_validator("fwhm")
     @classmethod
@@ -66,16 +75,16 @@ class Embedded(Table):
     """The embedded model of the Galaxy."""
 
     nside: Nside = 256
-    seed: int = Field(0, ge=0, lt=2**32)
+    seed: Seed = 0
     model: dict[str, float] = Field(default={})
 
 
 class SmallScalesTable(Table):
     """Small scales of a component; see `jaxsky.small_scales.SmallScales`."""
 
-    EE: tuple[int, int]
-    BB: tuple[int, int]
-    slope: float | tuple[float, float] | None = None
+    EE: Pair[int]
+    BB: Pair[int]
+    slope: float | Pair[float] | None = None
     tilt: float = 0.0
     amplitude: float = Field(1.0, ge=0)
     modulation_fwhm: float = Field(180.0, gt=0)
@@ -122,7 +131,7 @@ class NoiseTable(NoiseFile):
 class BandTable(Table):
     """A band of an experiment of one's own."""
 
-    name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_+-][A-Za-z0-9_.+-]*$")
+    name: BandName
     bandpass: BandpassSpec
     fwhm: float | None = Field(None, ge=0)
     beam: FileName | None = None
@@ -140,7 +149,7 @@ class Experiment(SettingsFile):
 
     experiment: Main = Main()
     embedded: Embedded | None = None
-    templates: dict[str, TemplateFile] = Field(default={})
+    templates: dict[ComponentName, TemplateFile] = Field(default={})
     fixed: dict[str, float] = Field(default={})
     small_scales: dict[str, SmallScalesTable] = Field(default={})
     cmb: CMBTable = CMBTable()
@@ -156,9 +165,8 @@ class Experiment(SettingsFile):
             raise ValueError("experiment.samples is of an instrument's bands, not of bands")
         if self.embedded is not None and self.templates:
             raise ValueError("give either templates or the table embedded")
-        names = [band.name for band in self.bands]
-        if len(set(names)) < len(names):
-            raise ValueError(f"the names of the bands must differ, but are {', '.join(names)}")
+        check_names("bands", (band.name for band in self.bands))
+        check_names("templates", self.templates)
         check_angles(self.templates)
         known = [*self.foregrounds(), "cmb", "noise"]
         for name in self.experiment.include or []:

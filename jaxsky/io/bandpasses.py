@@ -1,15 +1,19 @@
 """Bandpasses in files: Planck RIMO (FITS), IPAC tables and plain text."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
+from astropy import units as u
 from astropy.io import fits as pyfits
 
 from jaxsky.bandpass import CONVENTIONS, Bandpass
 from jaxsky.constants import GHZ_PER_INVERSE_CM
+from jaxsky.io.spectra import is_fits
 from jaxsky.io.tables import InputError, open_fits, select_hdu
+from jaxsky.io.text import TextTable, number, read_text
 
 __all__ = ["read_bandpass"]
 
@@ -19,17 +23,45 @@ Samples: TypeAlias = tuple[np.ndarray, np.ndarray]
 #: Unit of a RIMO's WAVENUMBER -> (factor to GHz, convention). The LFI column holds frequencies,
 #: and its weights act on antenna temperature; those of HFI act on power.
 _RIMO = {"GHz": (1.0, "RJ"), "1/cm": (GHZ_PER_INVERSE_CM, "power")}
-_FREQUENCIES = {"Hz": 1e-9, "MHz": 1e-3, "GHz": 1.0, "THz": 1e3}
-_COMMENTS = ("#", ";", "%", "!", "\\", "|", "//", "*")
+#: astropy's name of a unit -> how it is spelt; wavenumbers and wavelengths are converted.
+_UNITS = {
+    **{f"{prefix}Hz": re.compile(f"{prefix}hz", re.I) for prefix in ("", "k", "M", "G", "T")},
+    "1/cm": re.compile(r"1/cm|cm(\^|\*\*)?[({]?-1[)}]?", re.I),
+    "um": re.compile(r"microns?|micrometers?|[u\u00b5\u03bc]m", re.I),
+    "mm": re.compile("mm"),
+}
+_UNIT = re.compile(
+    rf"(?<![a-z0-9])(?:{'|'.join(f'(?:{x.pattern})' for x in _UNITS.values())})(?![a-z0-9^*/-])",
+    re.I,
+)
+#: Words of a header: what has a unit that is divided by, what is no frequency in GHz.
+_FREQUENCY = re.compile(r"(nu|\u03bd|f|freq\w*|wavenumbers?|wavelengths?|lambda)\s*/$", re.I)
+_NO_UNIT = re.compile(r"wave(number|length)|lambda", re.I)
+_NO_FREQUENCY = re.compile(
+    r"index|idx|i|n|no\.?|number|row|sample|channel|id|weights?|w|t|trans\w*|response|bandpass",
+    re.I,
+)
+#: Weights below this fraction of the largest are none.
+_NO_WEIGHT = 1e-6
+#: A band has more columns than these only if its table is something else, or lies on its side.
+_WIDEST = 8
+#: Middle of a band [GHz]: where no unit is stated, and where one is.
+_BARE, _STATED = (1.0, 3000.0), (0.01, 30000.0)
 
 
 def _checked(path: Path, nu: np.ndarray, weights: np.ndarray) -> Samples:
-    """The samples at positive frequencies; raises InputError if they are no bandpass."""
+    """The samples at positive frequencies [GHz]; raises InputError if they are no bandpass."""
     if bad := int(np.sum(~np.isfinite(nu) | ~np.isfinite(weights))):
         raise InputError(f"{path}: {bad} of {nu.size} samples of the bandpass are not finite.")
-    nu, weights = nu[nu > 0], weights[nu > 0]
-    if not nu.size:
+    low = nu <= 0
+    if low.all():
         raise InputError(f"{path}: the bandpass has no sample at a positive frequency.")
+    if np.any(np.abs(weights[low]) > _NO_WEIGHT * np.abs(weights).max()):
+        raise InputError(
+            f"{path}: {low.sum()} samples of the bandpass at nu <= 0 have weights up to "
+            f"{np.abs(weights[low]).max():g}."
+        )
+    nu, weights = nu[~low], weights[~low]
     if np.any(steps := np.diff(nu) <= 0):
         at = int(np.argmax(steps))
         raise InputError(
@@ -123,35 +155,101 @@ def _read_rimo(
     return _mean([samples for samples, _ in found]), found[0][1]
 
 
-def _read_text(path: Path) -> tuple[Samples, str | None]:
-    """The first two columns of a table; an IPAC table's header gives the frequency's unit."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: neither a FITS file nor a text table.") from None
-    bars = [line for line in lines if line.startswith("|")]
-    rows: list[tuple[float, float]] = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.lstrip().startswith(_COMMENTS):
-            continue
-        try:
-            nu, weight = (float(cell) for cell in line.replace(",", " ").split()[:2])
-        except ValueError:
-            if not rows:  # names of the columns
-                continue
-            raise InputError(f"{path}, line {number}: not two numbers: {line.strip()!r}.") from None
-        rows.append((nu, weight))
-    if not rows:
-        raise InputError(f"{path}: no line has two numbers, frequency [GHz] and weight.")
-    samples = np.array(rows).T
-    if not bars:
-        return _checked(path, *samples), None
-    unit = bars[2].split("|")[1].strip() if len(bars) > 2 else ""
-    if unit not in _FREQUENCIES:
+def _stated_units(table: TextTable) -> list[str]:
+    """Units of frequencies that an IPAC header or the words above the rows state."""
+    if table.bars:
+        unit = table.bars[2].split("|")[0].strip() if len(table.bars) > 2 else ""
+        return [_known_unit(unit)] if unit else []
+    found: dict[str, None] = {}  # a set that keeps its order
+    for line in table.header:
+        for match in _UNIT.finditer(line):
+            before = line[: match.start()].rstrip(" ([")
+            of_weights = before.endswith("/") and not _FREQUENCY.search(before)
+            # "the 30 GHz band" is a name; weights may be per GHz.
+            if not (before[-1:].isdigit() or of_weights or before.lower().endswith("per")):
+                found[_known_unit(match[0])] = None
+    return list(found)
+
+
+def _known_unit(text: str) -> str:
+    """astropy's spelling of a unit, whose case files do not respect; as it is if there is none."""
+    word = text.strip()
+    return next((name for name, spelling in _UNITS.items() if spelling.fullmatch(word)), word)
+
+
+def _to_GHz(path: Path, samples: np.ndarray, unit: str) -> np.ndarray:
+    """Samples of a table with frequencies, wavenumbers or wavelengths turned to GHz."""
+    known = _known_unit(unit)
+    if known not in _UNITS:
         raise InputError(
-            f"{path}: the frequencies' unit is {unit!r}, not one of {', '.join(_FREQUENCIES)}."
+            f"{path}: the frequencies' unit is {unit!r}, not one of {', '.join(_UNITS)}."
         )
-    return _checked(path, samples[0] * _FREQUENCIES[unit], samples[1]), "power"
+    with np.errstate(divide="ignore"):
+        nu = u.Quantity(samples[0], known).to_value(u.GHz, equivalencies=u.spectral())
+    falls = u.Unit(known).physical_type == "length"
+    return np.array([nu, samples[1]])[:, :: -1 if falls else 1]
+
+
+def _columns(path: Path, table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
+    """Numbers of the columns of frequency and weight."""
+    width = len(table.rows[0].cells)
+    names = table.names(width)
+    if fields is None:
+        shown = f" ({' '.join(names)})" if names else ""
+        if width > _WIDEST:
+            raise InputError(
+                f"{path}: {width} columns{shown}; give `fields`, those of frequency and weight."
+            )
+        first = [row.cells[0] for row in table.rows]
+        counted = first in ([str(i + start) for i in range(len(first))] for start in (0, 1))
+        if (counted and width > 2) or (names and _NO_FREQUENCY.fullmatch(names[0])):
+            raise InputError(
+                f"{path}: the first of {width} columns{shown} may not be the frequency; give "
+                "`fields`, the columns of frequency and weight, such as [1, 2]."
+            )
+        return [0, 1]
+    if len(fields) != 2:
+        raise InputError(f"{path}: argument `fields` must name two columns, not {len(fields)}.")
+    columns = [names.index(f) if isinstance(f, str) and f in names else f for f in fields]
+    for column in columns:
+        if isinstance(column, str) or not 0 <= column < width:
+            known = ", ".join(names) or f"0 to {width - 1}"
+            raise InputError(f"{path}: no column {column!r}; it has {known}.")
+    return [int(column) for column in columns]
+
+
+def _read_text(
+    path: Path, fields: Sequence[int | str] | None, given: str | None
+) -> tuple[Samples, str | None]:
+    """Frequencies and weights of a table, and the convention, which IPAC tables have."""
+    table = read_text(path)
+    columns = _columns(path, table, fields)
+    rows = []
+    for line, text, cells in table.rows:
+        values = [number(cells[c]) if c < len(cells) else None for c in columns]
+        if None in values:
+            raise InputError(f"{path}, line {line}: not two numbers: {text!r}.")
+        rows.append(values)
+    samples = np.array(rows, np.float64).T
+    stated = _stated_units(table)
+    words = " ".join([*table.bars[:1], *table.header])
+    if given and len(stated) == 1 and _known_unit(given) not in stated:
+        raise InputError(f"{path}: argument `unit` is {given!r}, but the file says {stated[0]!r}.")
+    if not given and len(stated) > 1:
+        raise InputError(f"{path}: the header names the units {', '.join(stated)}; give `unit`.")
+    unit = given or next(iter(stated), None)
+    if unit is None and (table.bars or _NO_UNIT.search(words)):
+        raise InputError(f"{path}: the unit of the frequencies is missing; give `unit`.")
+    nu, weights = _checked(path, *_to_GHz(path, samples, unit or "GHz"))
+    low, high = _BARE if unit is None else _STATED
+    center = float(np.average(nu, weights=np.abs(weights)))
+    if not low <= center <= high:
+        asked = "" if unit else "; give `unit`, such as MHz or THz, or GHz if it is right"
+        raise InputError(
+            f"{path}: in {unit or 'GHz'}, the middle of the band is at {center:g} GHz, outside of "
+            f"{low:g} to {high:g} GHz{asked}."
+        )
+    return (nu, weights), "power" if table.bars else None
 
 
 def read_bandpass(
@@ -160,6 +258,8 @@ def read_bandpass(
     *,
     detectors: Sequence[str] | None = None,
     convention: str | None = None,
+    unit: str | None = None,
+    fields: Sequence[int | str] | None = None,
     trim: float = 0.0,
 ) -> Bandpass:
     r"""The bandpass of a band or of some detectors, from a file.
@@ -170,11 +270,12 @@ def read_bandpass(
       detectors instead, each normalised to unit integral. Samples that HFI flags as interpolated
       over CO lines are used like the others.
     * IPAC tables (WMAP), with the frequency's unit from their header: convention "power".
-    * Text with two columns, frequency [GHz] and weight, separated by blanks or commas; comments
-      start with # ; % ! \ | // or *. Such a file does not say its convention, so it has to be
-      given.
+    * Text with two columns, frequency and weight, separated by blanks, commas or semicolons
+      (`jaxsky.io.text.read_text`). Their unit is the one that the header states ("nu [MHz]",
+      "nu_GHz"), else GHz, provided that the middle of the band is then within 1 and 3000 GHz.
+      Such a file does not say its convention, so it has to be given.
 
-    Samples at nu <= 0 are dropped.
+    Samples without weight at nu <= 0 are dropped.
 
     Parameters
     ----------
@@ -182,6 +283,10 @@ def read_bandpass(
     band : band of a RIMO
     detectors : detectors of a RIMO
     convention : "RJ", "power" or "CMB" (`Bandpass`), where the format's is not right
+    unit : unit of the frequencies of a text file that does not state it: "Hz", "kHz", "MHz",
+        "GHz", "THz", wavenumbers "1/cm", wavelengths "um" or "mm"
+    fields : columns of frequency and weight of a text file that has more than these, by number
+        from 0 or by name
     trim : cut both ends of the band up to where the weight exceeds this fraction of the largest.
         HFI tables have 12 000 to 17 000 samples up to 18 THz; 1e-6 leaves 360 to 5 400 and
         changes the factors from K_CMB to MJy/sr by less than 5e-6 (1e-4: by up to 8e-4).
@@ -190,8 +295,8 @@ def read_bandpass(
     ------
     InputError
         If the file is missing or damaged; band or detector is not found; frequencies do not
-        increase, values are not finite, or the integral is not positive; the convention is
-        missing.
+        increase, values are not finite, or the integral is not positive; a row is not two
+        numbers; there is weight at nu <= 0; convention, unit or columns are not certain.
     ValueError
         If `convention` or `trim` is no valid value.
     """
@@ -201,17 +306,16 @@ def read_bandpass(
         raise ValueError(f"Argument `convention` must be one of {known}, not {convention!r}.")
     if not 0 <= trim < 1:
         raise ValueError(f"Argument `trim` must be within [0, 1), but is {trim}.")
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
-    with path.open("rb") as stream:
-        start = stream.read(6)
     found: str | None
-    if start == b"SIMPLE" or start.startswith(b"\x1f\x8b"):
+    if is_fits(path):
+        for name, argument in {"unit": unit, "fields": fields}.items():
+            if argument is not None:
+                raise InputError(f"{path}: argument `{name}` is for text files, this is FITS.")
         (nu, weights), found = _read_rimo(path, None if band is None else str(band), detectors)
     elif band is not None or detectors is not None:
         raise InputError(f"{path}: a text table has one band; leave out `band` and `detectors`.")
     else:
-        (nu, weights), found = _read_text(path)
+        (nu, weights), found = _read_text(path, fields, unit)
     if (convention := convention or found) is None:
         known = ", ".join(CONVENTIONS)
         raise InputError(f"{path}: the file does not say it; give `convention`, one of {known}.")

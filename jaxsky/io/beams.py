@@ -6,8 +6,9 @@ import numpy as np
 from astropy.io import fits as pyfits
 from jaxtyping import Float
 
-from jaxsky.io.spectra import fits_table, is_fits, multipole_range, text_table
+from jaxsky.io.spectra import fits_table, is_fits, multipole_range
 from jaxsky.io.tables import InputError, open_fits
+from jaxsky.io.text import text_table
 
 __all__ = ["read_beam"]
 
@@ -48,8 +49,8 @@ def read_beam(path: str | Path, lmax: int, *, hdu: int | str = 1) -> Float[np.nd
 
     The table must hold b_l, by which a_lm are multiplied, not its square.
 
-    * Text with columns l and b_l; further columns are ignored. Comments start with # ; % ! | or
-      a backslash (IPAC tables, as of WMAP).
+    * Text with columns l and b_l (`jaxsky.io.text.read_text`), IPAC tables as of WMAP among it;
+      further columns are ignored.
     * FITS tables from l = 0 on, of HEALPix or Planck: the first column named TEMPERATURE,
       INTENSITY, T, NOMINAL or BL, so of a file with several that of the temperature.
 

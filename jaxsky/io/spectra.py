@@ -11,8 +11,9 @@ from jaxtyping import Float
 from jaxsky.io.errors import check_file
 from jaxsky.io.quantities import unit_factor, unit_name
 from jaxsky.io.tables import InputError, open_fits
+from jaxsky.io.text import text_table
 
-__all__ = ["fits_table", "is_fits", "multipole_range", "read_spectra", "text_table"]
+__all__ = ["fits_table", "is_fits", "multipole_range", "read_spectra"]
 
 SPECTRA = ("TT", "EE", "BB", "TE")
 #: First columns of text files, by format.
@@ -26,7 +27,6 @@ _NAMES = {
     **dict.fromkeys(("G-T", "T-E CROSS C_L"), "TE"),
 }
 _D_ELL = re.compile(r"(?<![a-z0-9])D_?(L|ELL)(?![a-z])|\bL\s*\*?\s*\(L\s*\+\s*1\)", re.I)
-_COMMENTS = ("#", ";", "%", "!", "\\", "|")
 #: |TE| may exceed sqrt(TT EE) by this factor, the rounding of text with six digits.
 _ROUNDING = 1 + 1e-5
 
@@ -37,37 +37,6 @@ def is_fits(path: Path) -> bool:
     with path.open("rb") as stream:
         start = stream.read(6)
     return start == b"SIMPLE" or start.startswith(b"\x1f\x8b")
-
-
-def text_table(path: Path) -> tuple[list[list[str]], Float[np.ndarray, "row column"]]:
-    """Lines before the numbers of a text table, split into words, and the numbers."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: neither a FITS file nor a text table.") from None
-    header: list[list[str]] = []
-    rows: list[list[float]] = []
-    for number, line in enumerate(lines, start=1):
-        text = line.strip()
-        if text.startswith(_COMMENTS):
-            header.append(text.strip("".join(_COMMENTS)).replace("|", " ").split())
-        if not text or text.startswith(_COMMENTS):
-            continue
-        try:
-            row = [float(cell) for cell in text.replace(",", " ").split()]
-        except ValueError:
-            if not rows:  # names of the columns
-                header.append(text.replace(",", " ").split())
-                continue
-            raise InputError(f"{path}, line {number}: not a row of numbers: {text!r}.") from None
-        if rows and len(row) != len(rows[0]):
-            raise InputError(
-                f"{path}, line {number}: {len(row)} numbers, but {len(rows[0])} in the lines above."
-            )
-        rows.append(row)
-    if not rows:
-        raise InputError(f"{path}: no line has numbers.")
-    return header, np.array(rows)
 
 
 def fits_table(

@@ -1,0 +1,153 @@
+"""Tables of numbers in text files: what is a header, what is a row, and what is neither."""
+
+import codecs
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsky.io.tables import InputError
+
+__all__ = ["Row", "TextTable", "read_text", "text_table"]
+
+COMMENTS = ("#", ";", "%", "!", "\\", "|", "//", "*")
+_TRAILING = re.compile(r"\s(?:[#!%\\]|//).*")
+_NUMBER = re.compile(
+    r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:[ed][+-]?\d+)?|nan|inf|infinity)", re.I | re.ASCII
+)
+
+
+class Row(NamedTuple):
+    """A line of a table: its number in the file, its text and its fields."""
+
+    line: int
+    text: str
+    cells: list[str]
+
+
+class TextTable(NamedTuple):
+    """Lines of a text file: comments and names of columns, the bars of an IPAC header, rows."""
+
+    header: list[str]
+    bars: list[str]
+    rows: list[Row]
+
+    def names(self, columns: int) -> list[str]:
+        """Names of the columns: those of the last line of the header with so many words."""
+        lines = [
+            re.split(r"[\s,;|]+", re.sub(r"[(\[].*?[)\]]", "", h).strip(" ,;|"))
+            for h in [*self.bars[:1], *self.header]
+        ]
+        return next((words for words in reversed(lines) if len(words) == columns), [])
+
+
+def number(cell: str) -> float | None:
+    """The value of a field, exponents of Fortran (1.0D+01) included; None if it is no number."""
+    if not _NUMBER.fullmatch(cell):
+        return None
+    word = cell.lower()
+    return float(word if "n" in word else word.replace("d", "e"))
+
+
+def _lines(path: Path) -> list[str]:
+    content = path.read_bytes()
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        text = content.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: neither a FITS file nor a text table.") from None
+    if "\0" in text:
+        raise InputError(f"{path}: neither a FITS file nor a text table, for it has NUL bytes.")
+    return text.splitlines()
+
+
+def _cells(path: Path, line: int, text: str) -> list[str]:
+    """Fields between semicolons, commas or blanks; a comma may be decimal in the first case only.
+
+    Raises
+    ------
+    InputError
+        If commas stand inside of numbers that blanks separate.
+    """
+    if ";" in text:
+        return [cell.strip().replace(",", ".") for cell in text.strip(" ;").split(";")]
+    words = [word.strip(",") for word in text.split()]
+    for word in words if len(words) > 1 else ():
+        if "," in word and all(number(part) is not None for part in word.split(",")):
+            raise InputError(
+                f"{path}, line {line}: {word!r} is two numbers or one with a decimal comma; write "
+                "decimal points, or semicolons between the columns."
+            )
+    return [cell for cell in re.split(r"[\s,]+", text) if cell]
+
+
+def read_text(path: Path) -> TextTable:
+    r"""The lines of a text table; UTF-8, or UTF-16 with its mark.
+
+    Comments start with # ; % ! \ | // or *. Columns are separated by blanks, commas or semicolons.
+    A line before the first row is a header if none of its fields is a number.
+
+    Raises
+    ------
+    InputError
+        If the file is no text, has no rows, or commas that separate columns or decimals.
+    """
+    table = TextTable([], [], [])
+    for line, whole in enumerate(_lines(path), start=1):
+        text = whole.strip()
+        if not text:
+            continue
+        if text.startswith("|") and table.rows:
+            raise InputError(f"{path}, line {line}: a header among the rows: {text!r}.")
+        if text.startswith(COMMENTS):
+            (table.bars if text.startswith("|") else table.header).append(
+                text.lstrip("".join(COMMENTS)).strip()
+            )
+            continue
+        cells = _cells(path, line, _TRAILING.sub("", text))
+        if not table.rows and all(number(cell) is None for cell in cells):
+            table.header.append(text)
+        else:
+            table.rows.append(Row(line, text, cells))
+    if not table.rows:
+        raise InputError(f"{path}: no line has numbers.")
+    _check_commas(path, table.rows)
+    return table
+
+
+def _check_commas(path: Path, rows: list[Row]) -> None:
+    """Refuse rows such as 30,5,2,0: two numbers with decimal commas, or four."""
+    cells = [cell for row in rows for cell in row.cells]
+    halves = all(len(row.cells) % 2 == 0 and len(row.cells) > 2 for row in rows)
+    commas = all(len(row.text.split()) == 1 and "," in row.text for row in rows)
+    if halves and commas and all(cell.lstrip("+-").isdigit() for cell in cells):
+        raise InputError(
+            f"{path}, line {rows[0].line}: {rows[0].text!r} may have decimal commas; write decimal "
+            "points, or semicolons between the columns."
+        )
+
+
+def text_table(path: Path) -> tuple[list[list[str]], Float[np.ndarray, "row column"]]:
+    """Lines before the numbers of a text table, split into words, and the numbers.
+
+    Raises
+    ------
+    InputError
+        If the file is no text, or a row is not of numbers, as many as in those above.
+    """
+    found = read_text(path)
+    width = len(found.rows[0].cells)
+    table = []
+    for line, text, cells in found.rows:
+        values = [value for cell in cells if (value := number(cell)) is not None]
+        if len(values) < len(cells):
+            raise InputError(f"{path}, line {line}: not a row of numbers: {text!r}.")
+        if len(values) != width:
+            raise InputError(
+                f"{path}, line {line}: {len(values)} numbers, but {width} in the lines above."
+            )
+        table.append(values)
+    words = [re.split(r"[\s,;|]+", line.strip(" ,;|")) for line in [*found.bars, *found.header]]
+    return words, np.array(table)

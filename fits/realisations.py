@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from jaxsky.checks import check_seed
 from jaxsky.io import InputError, whole
 
 __all__ = ["realisations"]
@@ -45,6 +46,7 @@ def realisations(
     jaxsky.io.InputError
         If the file is damaged, or holds realisations of other data or settings.
     """
+    check_seed("seed", seed)
     done = [] if path is None else _load(path, mark, names)
     held, saved = len(done), time.monotonic()
     try:

@@ -15,6 +15,7 @@ from fits.likelihood import Likelihood, chi2
 from fits.optimize import best_fit
 from fits.priors import Prior, bounds, check_priors, log_prior
 from fits.results import FitResult
+from jaxsky.checks import check_seed
 from jaxsky.types import Numeric
 
 __all__ = ["ensemble", "ensemble_summary", "sample", "summary"]
@@ -81,6 +82,7 @@ def ensemble(
     ValueError
         For fewer than twice as many walkers as parameters, or no step.
     """
+    check_seed("seed", seed)
     if nwalkers < 2 * size or nsteps < 1:
         raise ValueError(
             f"MCMC needs at least {2 * size} walkers and a step for {size} parameters, "
@@ -148,6 +150,7 @@ def sample(
     FitError
         If the chain is too short, unless throw=False; the result is in its `.result`.
     """
+    check_seed("seed", seed)
     free = tuple(sorted(like.check(start)))
     priors = check_priors(priors, free)
     sampler = ensemble(

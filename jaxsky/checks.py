@@ -5,7 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-__all__ = ["as_array", "check_double", "check_finite", "check_positive", "is_concrete"]
+from jaxsky.bare import refuse_unit, takes_quantities
+
+__all__ = [
+    "as_array",
+    "check_double",
+    "check_finite",
+    "check_positive",
+    "check_seed",
+    "is_concrete",
+]
 
 
 def is_concrete(x: object) -> bool:
@@ -13,6 +22,7 @@ def is_concrete(x: object) -> bool:
     return not isinstance(x, jax.core.Tracer)
 
 
+@takes_quantities
 def as_array(name: str, value: object) -> Array:
     """`value` as a floating-point JAX array in native byte order.
 
@@ -21,11 +31,7 @@ def as_array(name: str, value: object) -> Array:
     TypeError
         If it carries a unit (JAX would drop it silently) or is not numeric.
     """
-    if hasattr(value, "unit"):
-        raise TypeError(
-            f"Argument `{name}` carries the unit {value.unit}; jaxsky takes bare arrays. "
-            "Convert it first, for example with jaxsky.io.from_quantity."
-        )
+    refuse_unit(name, value)
     if isinstance(value, np.ndarray) and not value.dtype.isnative:
         value = value.astype(value.dtype.newbyteorder("="))
     try:
@@ -61,6 +67,17 @@ def check_positive(name: str, value: Array | np.ndarray) -> None:
         raise ValueError(
             f"Argument `{name}` must be positive, but its smallest value is {float(value.min()):g}."
         )
+
+
+def check_seed(name: str, value: object) -> None:
+    """Raise TypeError if a seed is no integer, ValueError if it is not within 0 and 2^32 - 1.
+
+    Without double precision, JAX keeps the lower 32 bits of other seeds without a word.
+    """
+    if not isinstance(value, int | np.integer) or isinstance(value, bool):
+        raise TypeError(f"Argument `{name}` must be an int, but is {value!r}.")
+    if not 0 <= value < 2**32:
+        raise ValueError(f"Argument `{name}` must be from 0 to 2^32 - 1, but is {value}.")
 
 
 def check_double(what: str) -> None:

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsky.checks import as_array, check_finite, check_positive
+from jaxsky.checks import as_array, check_finite, check_positive, check_seed
 from jaxsky.components import Dust, Synchrotron
 from jaxsky.harmonics import alm_ell, resample, synthesis
 from jaxsky.sky import Sky
@@ -293,13 +293,12 @@ def _integrate(
 
 
 def _check(nside: int, seed: int, steps: int) -> None:
-    for name, value in {"nside": nside, "seed": seed, "steps": steps}.items():
+    check_seed("seed", seed)
+    for name, value in {"nside": nside, "steps": steps}.items():
         if not isinstance(value, int | np.integer) or isinstance(value, bool):
             raise TypeError(f"Argument `{name}` must be an int, but is {value!r}.")
     if not healpy.isnsideok(nside, nest=True):
         raise ValueError(f"Argument `nside` must be a power of two, but is {nside}.")
-    if not 0 <= seed < 2**32:
-        raise ValueError(f"Argument `seed` must be from 0 to 2^32 - 1, but is {seed}.")
     if steps < 1:
         raise ValueError(f"Argument `steps` must be positive, but is {steps}.")
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxsky
+from jaxsky.checks import check_seed
 from jaxsky.experiment import Experiment, Setup
 from jaxsky.io import write_maps, write_text
 from jaxsky.io.files import check_guards
@@ -43,6 +44,8 @@ class Written(NamedTuple):
 
 def realisation_key(seed: int, index: int) -> Array:
     """The key of a realisation, from nothing but the seed and its number."""
+    check_seed("seed", seed)
+    check_seed("index", index)
     return jax.random.fold_in(jax.random.key(seed), index)
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from fits.realisations import realisations
 from fits.resolution import Prepared
+from jaxsky.checks import check_seed
 from jaxsky.harmonics import analysis, lmax_of, power_spectrum
 
 __all__ = ["Simulated", "full_sky_spectra", "simulate", "sums_of_squares"]
@@ -101,6 +102,7 @@ def simulate(
     jaxsky.io.InputError
         If the file is damaged, or holds realisations of other data or settings.
     """
+    check_seed("seed", seed)
     foregrounds = _alms(model, lmax)
     inside = jnp.asarray(np.stack(list(regions.values())))
 

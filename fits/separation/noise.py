@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxsky.bare import refuse_unit, takes_quantities
 from jaxsky.types import Numeric
 
 __all__ = ["Noise", "as_noise", "bare", "chunks"]
@@ -22,6 +23,7 @@ def chunks(npix: int, size: int = CHUNK) -> Iterator[slice]:
         yield slice(start, min(start + size, npix))
 
 
+@takes_quantities
 def bare(name: str, value: object) -> np.ndarray:
     """A numeric array without a copy, in whatever precision it has.
 
@@ -30,11 +32,7 @@ def bare(name: str, value: object) -> np.ndarray:
     TypeError
         If it carries a unit, or is not an array of real numbers.
     """
-    if hasattr(value, "unit"):
-        raise TypeError(
-            f"Argument `{name}` carries the unit {value.unit}; jaxsky takes bare arrays. "
-            "Convert it first, for example with jaxsky.io.from_quantity."
-        )
+    refuse_unit(name, value)
     array = np.asarray(value)
     if array.dtype.kind not in "fiu":
         raise TypeError(f"Argument `{name}` must be a real array, but is {array.dtype}.")

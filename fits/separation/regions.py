@@ -8,6 +8,7 @@ import numpy as np
 import scipy.cluster.vq
 from jaxtyping import Int
 
+from jaxsky.checks import check_seed
 from jaxsky.types import Numeric
 
 __all__ = ["Cells", "check_labels", "clusters", "intersections", "latitude_bands", "superpixels"]
@@ -79,6 +80,7 @@ def clusters(
     ValueError
         For a wrong shape, or fewer pixels than clusters.
     """
+    check_seed("seed", seed)
     values = np.atleast_2d(np.asarray(maps, float))
     good = np.isfinite(values).all(axis=0)
     if values.ndim != 2 or not 1 <= count <= good.sum():

@@ -25,6 +25,7 @@ from fits.separation.fit import fit_spectra
 from fits.separation.likelihood import SpectralLikelihood
 from fits.separation.posterior import scaled_posterior
 from fits.separation.problem import Problem, value_and_gradient
+from jaxsky.checks import check_seed
 from jaxsky.types import Numeric
 
 __all__ = ["sample_spectra"]
@@ -270,6 +271,7 @@ def sample_spectra(
         with "emcee", if the chain is shorter than 50 autocorrelation times. Not if throw=False;
         the result is in its `.result`.
     """
+    check_seed("seed", seed)
     options = _options(
         sampler,
         {

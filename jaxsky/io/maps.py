@@ -11,6 +11,7 @@ from astropy.io import fits as pyfits
 from jaxtyping import Bool, Float
 
 from jaxsky.bandpass import Bandpass
+from jaxsky.bare import takes_quantities
 from jaxsky.io.columns import parse_stokes
 from jaxsky.io.columns import stokes as stokes_of
 from jaxsky.io.files import whole
@@ -50,6 +51,7 @@ class Maps:
         """Resolution of the maps."""
         return healpy.npix2nside(self.maps.shape[-1])
 
+    @takes_quantities
     def to(
         self, unit: str, at: Numeric | Bandpass | None = None, nu_ref: float | None = None
     ) -> "Maps":

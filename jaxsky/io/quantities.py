@@ -7,6 +7,7 @@ import numpy as np
 from astropy import units as u
 
 from jaxsky.bandpass import Bandpass
+from jaxsky.bare import takes_quantities
 from jaxsky.types import Numeric
 from jaxsky.units import UNITS, conversion, parse_unit
 
@@ -74,6 +75,7 @@ def _base(name: str) -> tuple[str, int]:
     return (name[:-2], 2) if name.endswith("^2") else (name, 1)
 
 
+@takes_quantities
 def unit_factor(
     source: str,
     target: str,
@@ -125,6 +127,7 @@ def unit_factor(
     return float(conversion(source_base, target_base, nu)) ** power
 
 
+@takes_quantities
 def from_quantity(
     quantity: Any,
     unit: str,

@@ -1,0 +1,120 @@
+"""Public functions take bare numbers: what carries a unit is refused by the argument's name.
+
+JAX and numpy drop the unit of an astropy quantity without a word. Importing this module, as the
+two packages do before all else, has every function and method that a module names in `__all__`
+checked, in the manner of beartype and jaxtyping; so none can be forgotten.
+"""
+
+import functools
+import inspect
+import sys
+from collections.abc import Callable
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from types import ModuleType
+from typing import Any, TypeVar
+
+import numpy as np
+from pydantic import BaseModel
+
+__all__ = ["refuse_unit", "takes_quantities"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+PACKAGES = ("jaxsky", "fits")
+#: Looked at first, for it is quick: types that carry no unit.
+PLAIN = frozenset({bool, int, float, str, type(None), np.ndarray, np.float64, np.int64})
+
+
+def _unit(value: object) -> object:
+    """The unit of a number or an array of astropy, unyt or pint; None for all else."""
+    unit = getattr(value, "unit", getattr(value, "units", None))
+    numeric = any(hasattr(value, name) for name in ("__array__", "value", "magnitude"))
+    return unit if numeric else None
+
+
+def refuse_unit(name: str, value: object) -> None:
+    """Raise TypeError if a value, or an entry of a list or dict, carries a unit."""
+    if type(value) in PLAIN:
+        return
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            refuse_unit(str(key), entry)
+    elif isinstance(value, list | tuple):
+        for entry in value:
+            if type(entry) not in PLAIN:
+                refuse_unit(name, entry)
+    elif (unit := _unit(value)) is not None:
+        raise TypeError(
+            f"Argument `{name}` carries the unit {unit}; jaxsky takes bare arrays. "
+            "Convert it first, for example with jaxsky.io.from_quantity."
+        )
+
+
+def takes_quantities(function: F) -> F:
+    """Mark a public function that converts quantities, or refuses them, by itself."""
+    function.__dict__["takes_quantities"] = True
+    return function
+
+
+def _guarded(function: Callable[..., Any]) -> Callable[..., Any]:
+    parameters = inspect.signature(function).parameters.values()
+    names = [p.name for p in parameters if p.kind not in (p.KEYWORD_ONLY, p.VAR_KEYWORD)]
+
+    @functools.wraps(function)
+    def checked(*args: Any, **kwargs: Any) -> Any:
+        for i, value in enumerate(args):
+            if type(value) not in PLAIN:
+                refuse_unit(names[min(i, len(names) - 1)] if names else "", value)
+        for name, value in kwargs.items():
+            refuse_unit(name, value)
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def _guard_class(cls: type) -> None:
+    """Guard the constructor and the public methods that a class defines itself."""
+    for name, member in list(vars(cls).items()):
+        method = getattr(member, "__func__", member)
+        public = not name.startswith("_") or name in ("__init__", "__call__")
+        exempt = inspect.isclass(method) or hasattr(method, "takes_quantities")
+        if not public or not callable(method) or exempt:
+            continue
+        guarded = _guarded(method)
+        wrap = type(member) if isinstance(member, classmethod | staticmethod) else None
+        setattr(cls, name, wrap(guarded) if wrap else guarded)
+
+
+def _guard(module: ModuleType) -> None:
+    """Guard what a module names in `__all__` and defines itself."""
+    for name in getattr(module, "__all__", ()):
+        value = getattr(module, name)
+        if getattr(value, "__module__", None) != module.__name__:
+            continue
+        if inspect.isclass(value):
+            if not issubclass(value, BaseModel | BaseException):
+                _guard_class(value)
+        elif callable(value) and not hasattr(value, "takes_quantities"):
+            setattr(module, name, _guarded(value))
+
+
+class _Loader(SourceFileLoader):
+    def exec_module(self, module: ModuleType) -> None:
+        super().exec_module(module)
+        _guard(module)
+
+
+class _Finder:
+    """Finds the modules of the packages as Python does, and guards them once they are executed."""
+
+    @staticmethod
+    def find_spec(name: str, path: Any, target: Any = None) -> ModuleSpec | None:
+        if name.partition(".")[0] not in PACKAGES:
+            return None
+        spec = PathFinder.find_spec(name, path, target)
+        if spec is not None and type(spec.loader) is SourceFileLoader:
+            spec.loader = _Loader(spec.loader.name, spec.loader.path)
+        return spec
+
+
+sys.meta_path.insert(0, _Finder)

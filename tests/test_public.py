@@ -1,0 +1,168 @@
+"""What all public functions refuse: quantities, whose unit would be dropped, and bad seeds.
+
+Functions are found by themselves, and each of their numbers is given as a quantity in turn.
+"""
+
+import importlib
+import inspect
+import pkgutil
+import re
+
+import numpy as np
+import pytest
+from astropy import units as u
+from pydantic import BaseModel, ValidationError
+
+import fits
+import jaxsky
+from fits.settings import Analysis
+from jaxsky import Bandpass, Sky, Synchrotron, observe, set_parameters
+from jaxsky.checks import as_array
+from jaxsky.io import Maps, unit_factor
+from jaxsky.montecarlo import realisation_key
+
+#: Annotations of arguments that may be numbers, or hold some.
+NUMERIC = re.compile(
+    r"\b(int|float|complex|Array|ArrayLike|Numeric|Parameter|Float|Int|Bool|ndarray|Any|object)\b"
+)
+#: They convert quantities, or refuse them under a name that they are given.
+BY_THEMSELVES = {"from_quantity", "unit_factor", "Maps.to", "refuse_unit", "as_array", "noise.bare"}
+
+
+def modules():
+    """All modules of the packages but those of the command line."""
+    for package in (jaxsky, fits):
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if not found.name.startswith("jaxsky.cli"):
+                yield importlib.import_module(found.name)
+
+
+def public():
+    """Functions, constructors and methods that `__all__` names, by name.
+
+    Named tuples keep what they are given, unit included; settings have types (tested below).
+    """
+    for module in modules():
+        for name in getattr(module, "__all__", ()):
+            value = getattr(module, name)
+            if getattr(value, "__module__", None) != module.__name__ or not callable(value):
+                continue
+            where = f"{module.__name__}.{name}"
+            if not inspect.isclass(value):
+                yield where, value
+            elif not issubclass(value, BaseModel | BaseException | str):
+                if not issubclass(value, tuple):
+                    yield where, value
+                for method in vars(value):
+                    bound = getattr(value, method)
+                    if callable(bound) and (not method.startswith("_") or method == "__call__"):
+                        yield f"{where}.{method}", bound
+
+
+def numbers(function):
+    """The arguments of a function that may be numbers."""
+    for parameter in inspect.signature(function).parameters.values():
+        bare = parameter.annotation is parameter.empty
+        if parameter.name != "self" and (bare or NUMERIC.search(str(parameter.annotation))):
+            yield parameter
+
+
+PUBLIC = dict(public())
+CASES = [
+    pytest.param(function, parameter, id=f"{where}-{parameter.name}")
+    for where, function in PUBLIC.items()
+    for parameter in numbers(function)
+    if not any(where.endswith(f".{name}") for name in BY_THEMSELVES)
+]
+
+
+def test_the_sweep_sees_the_packages():
+    assert len(PUBLIC) > 300
+    assert len(CASES) > 500
+    for name in ("jaxsky.bandpass.Bandpass.shifted", "jaxsky.sed.power_law", "fits.grid.grid_fit"):
+        assert name in PUBLIC
+
+
+QUANTITY = 2 * u.GHz
+
+
+def call(function, parameter, value):
+    """The function with one argument, and None for all others that it needs."""
+    several = (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+    others = {
+        p.name: None
+        for p in inspect.signature(function).parameters.values()
+        if p.default is p.empty and p.kind not in several and p.name != parameter.name
+    }
+    if parameter.kind is parameter.VAR_POSITIONAL:
+        return function(*others.values(), value)
+    return function(**others, **{parameter.name: value})
+
+
+@pytest.mark.parametrize(("function", "parameter"), CASES)
+def test_a_quantity_is_refused(function, parameter):
+    for value in (QUANTITY, [1.0, QUANTITY], {"any": (QUANTITY,)}):
+        name = "any" if isinstance(value, dict) else parameter.name
+        with pytest.raises(TypeError, match=rf"^Argument `{name}` carries the unit GHz; jaxsky"):
+            call(function, parameter, value)
+
+
+SEEDED = [
+    pytest.param(function, parameter, id=where)
+    for where, function in PUBLIC.items()
+    for parameter in numbers(function)
+    if parameter.name == "seed" and not inspect.isclass(function)
+]
+
+
+@pytest.mark.parametrize(("function", "parameter"), SEEDED)
+def test_a_seed_is_a_natural_number_of_32_bits(function, parameter):
+    for value, error in [
+        (True, TypeError),
+        (1.0, TypeError),
+        ("1", TypeError),
+        (-1, ValueError),
+        (2**32, ValueError),
+        (2**53, ValueError),
+    ]:
+        with pytest.raises(error, match=f"Argument `seed` must be .*, but is {value!r}"):
+            call(function, parameter, value)
+
+
+def test_seeds_that_are_right():
+    assert len(SEEDED) >= 8
+    keys = [realisation_key(seed, 0) for seed in (0, np.int64(1), 2**32 - 1)]
+    assert len({str(key) for key in keys}) == 3
+    with pytest.raises(ValueError, match="Argument `index` must be from 0 to"):
+        realisation_key(0, 2**32)
+
+
+def test_what_converts_quantities():
+    assert unit_factor("K_CMB", "K_RJ", at=0.1 * u.THz) == unit_factor("K_CMB", "K_RJ", at=100.0)
+    maps = Maps(np.ones((1, 12)), np.ones((1, 12), bool), "K_CMB", ("I_STOKES",))
+    expected = maps.to("uK_RJ", at=100.0).maps
+    np.testing.assert_array_equal(maps.to("uK_RJ", at=100 * u.GHz).maps, expected)
+    with pytest.raises(TypeError, match="Argument `nu` carries the unit MHz"):
+        as_array("nu", 3 * u.MHz)
+
+
+def test_what_is_refused_inside_of_other_things():
+    with pytest.raises(TypeError, match="Argument `delta` carries the unit MHz"):
+        Bandpass.delta(44.0).shifted(1 * u.MHz)
+    sky = Sky({"synchrotron": Synchrotron(np.ones((2, 12)))})
+    with pytest.raises(TypeError, match=r"Argument `synchrotron.nu_ref` carries the unit GHz"):
+        set_parameters(sky, {"synchrotron.nu_ref": QUANTITY})
+    with pytest.raises(TypeError, match="Argument `nu_ref` carries the unit GHz"):
+        Synchrotron(np.ones((2, 12)), nu_ref=QUANTITY)
+    with pytest.raises(TypeError, match="Argument `tolerance` carries the unit GHz"):
+        observe(sky, [Bandpass.delta(44.0)], tolerance=QUANTITY)
+    with pytest.raises(ValidationError, match="fwhm\\n  Input should be a valid number"):
+        Analysis(fwhm=60 * u.arcmin)
+
+
+def test_arrays_of_other_packages_are_refused():
+    class Pint:  # pint's quantities say `units` and `magnitude`, those of unyt are arrays
+        units, magnitude = "gigahertz", 44.0
+
+    with pytest.raises(TypeError, match="carries the unit gigahertz"):
+        Bandpass.delta(Pint())

@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 
 from fits.compress import gram, square_root
 from jaxsky import Bandpass, Sky, observe_components, parameter_names, set_parameters
-from jaxsky.checks import as_array, check_double
+from jaxsky.checks import UNSEEN, as_array, check_double
 from jaxsky.interpolation import NodeCounts, Nodes
 from jaxsky.parameters import OFFSET, unknown_parameter
 from jaxsky.sky import interpolation_nodes
@@ -188,10 +188,10 @@ def _check_maps(sky: Sky, bands: Mapping[str, Any], data: Array, sigma: Array) -
     if bad := int(jnp.sum(~(sigma > 0))):
         raise ValueError(f"Argument `sigma` has {bad} of {sigma.size} values that are not > 0.")
     used = jnp.isfinite(jnp.broadcast_to(sigma, shape))
-    if bad := int(jnp.sum(used & ~jnp.isfinite(data))):
+    if bad := int(jnp.sum(used & (~jnp.isfinite(data) | (data < UNSEEN)))):
         raise ValueError(
-            f"Argument `data` has {bad} values that are not finite in pixels that are used; "
-            "mask them with an infinite `sigma`."
+            f"Argument `data` has {bad} values that are not finite (or UNSEEN) in pixels that are "
+            "used; mask them with an infinite `sigma`."
         )
     if not bool(used.any()):
         raise ValueError("No pixel is left: the mask, or an infinite `sigma`, covers the map.")

@@ -8,16 +8,6 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from fits.priors import Gaussian, Prior, Uniform
-from jaxsky.setting_types import (
-    BandName,
-    ComponentName,
-    Nside,
-    Pair,
-    Seed,
-    Several,
-    Word,
-    check_names,
-)
 from jaxsky.settings import (
     BandpassSpec,
     FileName,
@@ -29,6 +19,16 @@ from jaxsky.settings import (
     TemplateFile,
     check_angles,
     load,
+)
+from jaxsky.settings_types import (
+    BandName,
+    ComponentName,
+    Nside,
+    Pair,
+    Seed,
+    Several,
+    Word,
+    check_names,
 )
 from jaxsky.settings_values import check_signs
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky import sed
@@ -25,15 +26,23 @@ def template() -> Any:
     return eqx.field(converter=_converted)
 
 
-def parameter(default: Any = dataclasses.MISSING, *, positive: bool = False) -> Any:
+def parameter(
+    default: Any = dataclasses.MISSING,
+    *,
+    positive: bool = False,
+    within: tuple[float, float] | None = None,
+    hint: str = "",
+) -> Any:
     """Field of a component for a spectral parameter: a number, or a map of shape (pix,).
 
     Parameters
     ----------
     default : value if none is given; without, the parameter is required
     positive : refuse values that are not positive
+    within : refuse a number, or a map by its median, outside of this range
+    hint : what to do about that
     """
-    metadata = {"positive": positive}
+    metadata = {"positive": positive, "within": within, "hint": hint}
     if default is dataclasses.MISSING:
         return eqx.field(converter=_converted, metadata=metadata)
     return eqx.field(converter=_converted, metadata=metadata, default=default)
@@ -61,7 +70,7 @@ class Component(eqx.Module):
     ------
     TypeError, ValueError
         On construction, for units, wrong shapes, values that are not finite, or not positive
-        where they have to be.
+        where they have to be; for a beta_syn with the other sign, and a nu_ref that is not in GHz.
 
     Examples
     --------
@@ -113,13 +122,42 @@ def _check(name: str, value: object, npix: int, metadata: Any) -> None:
         )
     if "positive" not in metadata:
         raise TypeError(f"Field `{name}` must be declared with jaxsky.components.parameter.")
-    (check_positive if metadata["positive"] else check_finite)(name, array)
+    _check_value(name, array, metadata)
+
+
+def _check_value(name: str, value: Array, metadata: Any) -> None:
+    (check_positive if metadata.get("positive") else check_finite)(name, value)
+    within = metadata.get("within")
+    if within is None or not is_concrete(value):
+        return
+    (low, high), middle = within, float(np.median(value))
+    if not low <= middle <= high:
+        what = "is" if value.ndim == 0 else "its median is"
+        raise ValueError(
+            f"Argument `{name}` must be from {low:g} to {high:g}, but {what} {middle:g}; "
+            f"{metadata['hint']}."
+        )
 
 
 def is_positive(component: type[Component], field: str) -> bool:
     """True if a field of a component is declared to be positive."""
     declared = {f.name: f.metadata for f in dataclasses.fields(component)}
     return bool(declared[field].get("positive"))
+
+
+def check_value(component: type[Component], field: str, name: str, value: Array) -> None:
+    """Raise ValueError if a concrete value, called `name`, is none that a field may have."""
+    declared = {f.name: f.metadata for f in dataclasses.fields(component)}
+    _check_value(name, value, declared[field])
+
+
+#: Where the reference frequency of a law may lie [GHz].
+REFERENCES = {"dust": (1.0, 2e4), "synchrotron": (0.01, 1e3), "ame": (0.01, 1e3)}
+
+
+def _reference(default: float, law: str) -> Any:
+    """Field for the reference frequency of a law [GHz]."""
+    return parameter(default, positive=True, within=REFERENCES[law], hint="it has to be in GHz")
 
 
 class Synchrotron(Component):
@@ -135,10 +173,14 @@ class Synchrotron(Component):
     """
 
     amplitude: Float[Array, "stokes pix"] = template()
-    beta_syn: Parameter = parameter(3.10)
+    beta_syn: Parameter = parameter(
+        3.10,
+        within=(0.0, 10.0),
+        hint="T ~ nu^-beta_syn, so jaxsky.presets.from_pysm_beta makes 3.1 of an index of -3.1",
+    )
     curvature: Parameter = parameter(0.0)
     nu_piv: Parameter = parameter(23.0, positive=True)
-    nu_ref: Parameter = parameter(30.0, positive=True)
+    nu_ref: Parameter = _reference(30.0, "synchrotron")
 
     def sed(self, nu):
         return sed.curved_power_law(nu, self.beta_syn, self.curvature, self.nu_piv, self.nu_ref)
@@ -173,7 +215,7 @@ class Dust(Component):
     beta_dust: Parameter | tuple[Parameter, ...] = parameter(1.53)
     T_dust: Parameter | tuple[Parameter, ...] = parameter(21.0, positive=True)
     E_dust: tuple[Parameter, ...] | None = parameter(None)
-    nu_ref: Parameter = parameter(353.0, positive=True)
+    nu_ref: Parameter = _reference(353.0, "dust")
     nu_pivot: Parameter | None = parameter(None, positive=True)
 
     def __post_init__(self) -> None:
@@ -225,7 +267,7 @@ class AME(Component):
     polarization_fraction: Parameter = parameter(1.0)
     m60: Parameter = parameter(4.0)
     nu_max: Parameter = parameter(19.0, positive=True)
-    nu_ref: Parameter = parameter(23.0, positive=True)
+    nu_ref: Parameter = _reference(23.0, "ame")
 
     def __check_init__(self) -> None:
         nu_max = as_array("nu_max", self.nu_max)

@@ -10,8 +10,8 @@ from collections.abc import Iterable, Mapping
 import jax
 from jaxtyping import Array, ArrayLike
 
-from jaxsky.checks import as_array, check_finite, check_positive
-from jaxsky.components import is_positive
+from jaxsky.checks import as_array
+from jaxsky.components import check_value
 from jaxsky.sky import Sky
 
 __all__ = ["OFFSET", "get_parameters", "parameter_names", "set_parameters"]
@@ -56,6 +56,12 @@ def get_parameters(sky: Sky, names: Iterable[str]) -> dict[str, Array]:
     return {name: leaves[name] for name in names}
 
 
+def check_parameter(sky: Sky, target: str, name: str, value: Array) -> None:
+    """Raise ValueError if a concrete value, called `name`, is none that a parameter may have."""
+    component, field = target.split(".")[:2]
+    check_value(type(sky[component]), field, name, value)
+
+
 def set_parameters(sky: Sky, params: Mapping[str, ArrayLike]) -> Sky:
     """A sky with some parameters replaced, or shifted for names that end in ".offset".
 
@@ -70,7 +76,7 @@ def set_parameters(sky: Sky, params: Mapping[str, ArrayLike]) -> Sky:
         If a name is unknown; the message lists the known ones.
     ValueError
         If a value is neither a number nor a map of the sky's pixels (amplitudes: of their shape),
-        is not finite, or not positive where it has to be.
+        is not finite, or none that the component takes.
 
     Examples
     --------
@@ -94,8 +100,5 @@ def set_parameters(sky: Sky, params: Mapping[str, ArrayLike]) -> Sky:
             wanted = f"shape {(stokes, npix)}" if amplitude else f"a number or of shape ({npix},)"
             raise ValueError(f"Parameter {name!r} must be {wanted}, but has shape {value.shape}.")
         leaves[target] = leaves[target] + value if name.endswith(OFFSET) else value
-        check_finite(name, leaves[target])
-        component, field = target.split(".")[:2]
-        if is_positive(type(sky[component]), field):
-            check_positive(name, leaves[target])
+        check_parameter(sky, target, name, leaves[target])
     return jax.tree.unflatten(structure, list(leaves.values()))

@@ -10,10 +10,9 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxsky.checks import as_array, is_concrete
+from jaxsky.checks import as_array
 from jaxsky.components import Component, Dust, Synchrotron
 from jaxsky.sky import Sky
 
@@ -49,17 +48,6 @@ def preset_names() -> list[str]:
     return list(_presets())
 
 
-def _check_sign(name: str, maps: dict[str, ArrayLike]) -> None:
-    """A beta_syn that is nowhere positive is PySM's, with the other sign."""
-    if "beta_syn" in maps:
-        beta = as_array("beta_syn", maps["beta_syn"])
-        if is_concrete(beta) and bool(jnp.all(beta < 0)):
-            raise ValueError(
-                f"Argument `beta_syn` of preset {name!r} is negative everywhere; an index in "
-                "PySM's sign is converted by jaxsky.presets.from_pysm_beta."
-            )
-
-
 def preset(name: str, amplitude: ArrayLike, **maps: ArrayLike) -> Component:
     """A component with the law and the constants of a preset.
 
@@ -80,7 +68,7 @@ def preset(name: str, amplitude: ArrayLike, **maps: ArrayLike) -> Component:
     TypeError
         If a map is missing, or one is given that the preset does not take.
     ValueError
-        If `beta_syn` is negative everywhere, or the component refuses the arrays.
+        If the component refuses the arrays, as it does a `beta_syn` of the other sign.
 
     Examples
     --------
@@ -101,7 +89,6 @@ def preset(name: str, amplitude: ArrayLike, **maps: ArrayLike) -> Component:
         if key not in needed:
             takes = ", ".join(f"`{k}`" for k in needed) or "no maps"
             raise TypeError(f"Preset {name!r} has no argument `{key}`; it takes {takes}.")
-    _check_sign(name, maps)
     if "pysm_beta" in constants:
         constants["beta_syn"] = from_pysm_beta(constants.pop("pysm_beta"))
     return component(amplitude, **constants, **maps)

@@ -20,7 +20,7 @@ from pydantic import (
     model_validator,
 )
 
-from jaxsky.setting_types import Several, Word
+from jaxsky.settings_types import Several, Word
 from jaxsky.settings_values import (
     check_reference,
     check_signs,

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+from jaxsky.components import REFERENCES
+
 __all__ = [
     "check_reference",
     "check_sign",
@@ -12,9 +14,6 @@ __all__ = [
     "missing_numbers",
     "stokes_words",
 ]
-
-#: Where the reference frequency of a law may lie [GHz].
-REFERENCES = {"dust": (1.0, 2e4), "synchrotron": (0.01, 1e3), "ame": (0.01, 1e3)}
 
 
 def check_reference(law: str, nu_ref: float | None, parameters: Mapping[str, Any]) -> None:

@@ -180,3 +180,27 @@ def test_bad_arguments_are_refused(make, error, words):
 
 def test_big_endian_maps_are_taken():
     assert Dust(MAPS.astype(">f8")).amplitude.dtype == jnp.float64
+
+
+@pytest.mark.parametrize(
+    ("component", "parameters", "words"),
+    [
+        (Synchrotron, {"beta_syn": -3.1}, "must be from 0 to 10, but is -3.1; T ~ nu.-beta_syn"),
+        (Synchrotron, {"beta_syn": np.linspace(-3.2, 0.1, 12)}, "its median is -1.55"),
+        (Synchrotron, {"nu_ref": 30e9}, r"from 0.01 to 1000, but is 3e\+10; it has to be in GHz"),
+        (Synchrotron, {"nu_ref": -30.0}, "must be positive, but its smallest value is -30"),
+        (Dust, {"nu_ref": 0.353}, "must be from 1 to 20000, but is 0.353; it has to be in GHz"),
+        (Dust, {"nu_ref": 353e3}, r"but is 353000; it has to be in GHz"),
+        (AME, {"nu_ref": 22800.0}, "must be from 0.01 to 1000, but is 22800; it has to be in GHz"),
+    ],
+)
+def test_signs_and_units_that_are_meant_otherwise(component, parameters, words):
+    (name,) = parameters
+    with pytest.raises(ValueError, match=rf"Argument `{name}` .*{words}"):
+        component(np.ones((2, 12)), **parameters)
+    sky = Sky({"one": component(np.ones((2, 12)))})
+    with pytest.raises(ValueError, match=rf"Argument `one.{name}` .*{words}"):
+        set_parameters(sky, {f"one.{name}": parameters[name]})
+    # What is traced is not looked at, and a map may scatter beyond.
+    jax.jit(lambda x: set_parameters(sky, {f"one.{name}": x})["one"].sed(30.0))(1.0)
+    Synchrotron(np.ones((2, 12)), beta_syn=np.linspace(-0.1, 3.2, 12))

@@ -16,7 +16,6 @@ from jaxsky.inputs import (
     set_parameters_of,
 )
 from jaxsky.io import InputError
-from jaxsky.setting_types import Nside
 from jaxsky.settings import (
     BandpassSpec,
     MapFile,
@@ -28,6 +27,7 @@ from jaxsky.settings import (
     check_angles,
     load,
 )
+from jaxsky.settings_types import Nside
 
 NSIDE = 4
 NPIX = 12 * NSIDE**2

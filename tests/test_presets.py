@@ -104,7 +104,7 @@ def test_the_sign_of_beta():
     assert float(from_pysm_beta(-3.0)) == 3.0
     falling = preset("s1", MAPS, beta_syn=from_pysm_beta(np.full(NPIX, -3.0)))
     np.testing.assert_allclose(falling.sed(46.0), 1 / 8, rtol=1e-14)
-    with pytest.raises(ValueError, match=r"`beta_syn` of preset 's1' is negative.*from_pysm_beta"):
+    with pytest.raises(ValueError, match=r"`beta_syn` must be from 0 .*its median.*from_pysm_beta"):
         preset("s1", MAPS, beta_syn=BETA_S)
 
 

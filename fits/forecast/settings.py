@@ -5,7 +5,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from jaxsky.setting_types import (
+from jaxsky.settings import FileName, SettingsFile, Table, TemplateFile, check_angles, load
+from jaxsky.settings_types import (
     BandName,
     ComponentName,
     Distinct,
@@ -16,7 +17,6 @@ from jaxsky.setting_types import (
     Word,
     check_names,
 )
-from jaxsky.settings import FileName, SettingsFile, Table, TemplateFile, check_angles, load
 from jaxsky.units import UNITS
 
 __all__ = ["DEFAULT", "EXAMPLE", "Fisher", "ForecastSettings", "Mask", "Spectra", "load_forecast"]

@@ -8,8 +8,8 @@ from pydantic import Field, model_validator
 
 from fits.priors import Gaussian, Prior
 from fits.settings import Band, Parameter, check_free
-from jaxsky.setting_types import Nside, Seed, SeparatedName, Several, Word, check_names
 from jaxsky.settings import MapFile, MaskFile, SettingsFile, Table, load
+from jaxsky.settings_types import Nside, Seed, SeparatedName, Several, Word, check_names
 from jaxsky.settings_values import check_reference, check_signs
 
 __all__ = [

@@ -29,7 +29,7 @@ from fits.separation.regions import Cells, check_labels, intersections
 from jaxsky import Bandpass, Component, Sky, get_parameters, set_parameters
 from jaxsky.bandpass import Samples, stack_bands
 from jaxsky.checks import as_array, check_double, check_finite
-from jaxsky.parameters import unknown_parameter
+from jaxsky.parameters import check_parameter, unknown_parameter
 from jaxsky.types import Numeric
 from jaxsky.units import parse_unit
 
@@ -202,10 +202,13 @@ def _unit_sky(sky: Sky) -> tuple[Sky, dict[str, np.ndarray]]:
 def _check_start(
     sky: Sky, bands: SpectralBands, start: Mapping[str, Numeric], labels: Mapping[str, Numeric]
 ) -> None:
-    known = (*spectral_names(sky), *bands.parameter_names())
+    spectral = spectral_names(sky)
+    known = (*spectral, *bands.parameter_names())
     for name in (*start, *labels):
         if name not in known:
             raise unknown_parameter(name, known)
+        if name in start and name in spectral:
+            check_parameter(sky, name, name, as_array(name, start[name]))
     for name in labels:
         if name not in start:
             raise ValueError(f"There are labels for {name!r}, which is not in `start`.")

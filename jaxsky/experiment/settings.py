@@ -6,16 +6,6 @@ from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from jaxsky.setting_types import (
-    BandName,
-    ComponentName,
-    Nside,
-    Pair,
-    Seed,
-    Several,
-    Word,
-    check_names,
-)
 from jaxsky.settings import (
     BandpassSpec,
     FileName,
@@ -25,6 +15,16 @@ from jaxsky.settings import (
     TemplateFile,
     check_angles,
     load,
+)
+from jaxsky.settings_types import (
+    BandName,
+    ComponentName,
+    Nside,
+    Pair,
+    Seed,
+    Several,
+    Word,
+    check_names,
 )
 from jaxsky.units import UNITS
 

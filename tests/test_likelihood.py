@@ -348,6 +348,16 @@ def same_templates():
             ValueError,
             "`data` has 768 values that are not",
         ),
+        (
+            {"data": np.where(np.arange(NPIX) == 3, -1.6375e30, np.ones((2, 2, NPIX)))},
+            ValueError,
+            r"`data` has 4 values that are not finite \(or UNSEEN\) in pixels that are used",
+        ),
+        (
+            {"start": {"synchrotron.beta_syn": -3.1}},
+            ValueError,
+            "`synchrotron.beta_syn` must be from 0 to 10, but is -3.1; T ~ nu",
+        ),
         ({"stokes": "V"}, ValueError, "`stokes` must be among 'QU', not 'V'"),
         (
             {"stokes": "Q", "start": {"offset.44.U": 0.0}},

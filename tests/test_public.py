@@ -139,7 +139,7 @@ def test_seeds_that_are_right():
 
 def test_what_converts_quantities():
     assert unit_factor("K_CMB", "K_RJ", at=0.1 * u.THz) == unit_factor("K_CMB", "K_RJ", at=100.0)
-    maps = Maps(np.ones((1, 12)), np.ones((1, 12), bool), "K_CMB", ("I_STOKES",))
+    maps = Maps(np.ones((1, 12)), np.ones((1, 12), bool), "K_CMB", ("I",), ("I",))
     expected = maps.to("uK_RJ", at=100.0).maps
     np.testing.assert_array_equal(maps.to("uK_RJ", at=100 * u.GHz).maps, expected)
     with pytest.raises(TypeError, match="Argument `nu` carries the unit MHz"):

@@ -15,6 +15,10 @@ from jaxsky.settings import SettingsError
 __all__ = ["known_regions", "region_masks"]
 
 
+#: Names of masks become parts of file names.
+LONGEST = 200
+
+
 def known_regions() -> Iterable[str]:
     """Names of regions that are not files."""
     return ("strip", "outside", "full")
@@ -38,6 +42,7 @@ def region_masks(settings: Settings) -> dict[str, Bool[np.ndarray, " pix"]]:
         common = degrade_mask(read_mask(path, key=mask.key, ordering=mask.ordering), analysis.nside)
     regions = {}
     for name in analysis.regions:
+        label = name if name in known_regions() else _label(name)
         if name == "strip":
             region = np.abs(latitude) <= analysis.latitude
         elif name == "outside":
@@ -46,11 +51,24 @@ def region_masks(settings: Settings) -> dict[str, Bool[np.ndarray, " pix"]]:
             region = np.ones(npix, bool)
         else:
             region = degrade_mask(read_mask(_mask_file(folder, name)), analysis.nside)
-        label = name if name in known_regions() else Path(name).stem
         if label in regions:
             raise SettingsError(f"analysis.regions: two regions are called {label!r}.")
         regions[label] = np.asarray(region & common)
     return regions
+
+
+def _label(file: str) -> str:
+    """The name of a region in results, and in the names of their files: that of its mask."""
+    label = Path(file).stem
+    if label in known_regions():
+        raise SettingsError(
+            f"analysis.regions: the file {file} is called as a region of latitudes; rename it."
+        )
+    if (length := len(label.encode())) > LONGEST:
+        raise SettingsError(
+            f"analysis.regions: a mask's name has at most {LONGEST} bytes, not {length}: {file}."
+        )
+    return label
 
 
 def _mask_file(folder: Path, name: str) -> Path:

@@ -93,10 +93,13 @@ def observe_bands(
     Raises
     ------
     ValueError
-        If the beam of a channel is finer than that of a component, the CMB's spectra end below
-        2 nside, or there is nothing to observe in a channel.
+        If a component is called "cmb", "noise" or "total", the beam of a channel is finer than
+        that of a component, the CMB's spectra end below 2 nside, or there is nothing to observe
+        in a channel.
     """
     nside, lmax, stokes = observation.nside, observation.lmax, observation.stokes
+    if taken := {"cmb", "noise", "total"} & set(prepared):
+        raise ValueError(f"A component cannot be called {taken.pop()!r}, as another map is.")
     for name, channel in observation.channels.items():
         if not prepared and cmb is None and channel.noise is None:
             raise ValueError(

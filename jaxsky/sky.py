@@ -28,7 +28,8 @@ class Sky(eqx.Module):
     TypeError
         If a value is not a component.
     ValueError
-        If the mapping is empty, or the shapes (stokes, pix) of the amplitudes differ.
+        If the mapping is empty, a name has a dot, or the shapes (stokes, pix) of the amplitudes
+        differ.
 
     Examples
     --------
@@ -48,6 +49,11 @@ class Sky(eqx.Module):
             raise ValueError("Argument `components` must have at least one component.")
         shapes = {}
         for name, component in self.components.items():
+            if not isinstance(name, str) or not name or "." in name:
+                raise ValueError(
+                    f"A component's name is the first part of dotted names of parameters, so it "
+                    f"must be text without dots, not {name!r}."
+                )
             if not isinstance(component, Component):
                 raise TypeError(
                     f"Component {name!r} must be a jaxsky Component, "

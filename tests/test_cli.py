@@ -251,6 +251,18 @@ def test_init_writes_an_example_that_is_valid(tmp_path, monkeypatch, capsys):
     assert path.read_text() == "mine"
 
 
+@pytest.mark.parametrize("command", ["fit", "compare", "separate", "simulate"])
+@pytest.mark.parametrize("seed", [-1, 2**32, 2**53, 1.5, "x"])
+def test_seeds_out_of_bounds(command, seed, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    monkeypatch.setattr("sys.argv", ["jaxsky", command, "--seed", str(seed), "--out", str(out)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 2
+    assert "--seed" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def one_sentence(capsys) -> str:
     """What was printed: one sentence, no traceback."""
     printed = " ".join(capsys.readouterr().err.split())

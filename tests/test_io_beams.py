@@ -117,3 +117,17 @@ def test_bad_windows(tmp_path):
             read_beam(path, LMAX, **arguments)
     with pytest.raises(ValueError, match="`lmax` must not be negative, but is -1"):
         read_beam(tmp_path / "c.txt", -1)
+
+
+def test_damaged_rows_are_not_skipped(tmp_path):
+    path = tmp_path / "b.txt"
+    path.write_bytes(b"\xef\xbb\xbf0 2D0\n1 1.0\n")
+    assert read_beam(path, 1).tolist() == [1, 0.5]
+    for content, words in [
+        ("O 1\n1 1\n2 1\n", "line 1: not a row of numbers: 'O 1'"),
+        ("l b_l\n0 1,0\n1 0,9\n", "line 2: '1,0' is two numbers or one with a decimal comma"),
+        ("0 1\n1\n", "line 2: 1 numbers, but 2 in the lines above"),
+    ]:
+        path.write_text(content)
+        with pytest.raises(InputError, match=rf"b.txt, {words}"):
+            read_beam(path, 1)

@@ -237,3 +237,33 @@ def test_fits_that_leave_something_open(tmp_path):
     (tmp_path / "cut.fits").write_bytes(whole[:-2880])
     with pytest.raises(InputError, match=r"cut.fits: not a FITS file, or a truncated one"):
         read_spectra(tmp_path / "cut.fits", LMAX)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (
+            "L TT TE EE BB\n2 1,5 0 1 1\n",
+            "line 2: '1,5' is two numbers or one with a decimal comma",
+        ),
+        (
+            "L TT TE EE BB\n2 1O.5 0 1 1\n3 1 0 1 1\n",
+            "line 2: not a row of numbers: '2 1O.5 0 1 1'",
+        ),
+        ("L TT TE EE BB\n2 1 0 1 1\nx y z u v\n", "line 3: not a row of numbers: 'x y z u v'"),
+        ("L TT TE EE BB\n2 1 0 1 1\x00\n", "for it has NUL bytes"),
+        ("", "no line has numbers"),
+    ],
+)
+def test_damaged_rows_are_not_skipped(tmp_path, content, words):
+    path = tmp_path / "b.txt"
+    path.write_text(content)
+    with pytest.raises(InputError, match=rf"b.txt.*{words}"):
+        read_spectra(path, 2)
+
+
+def test_marks_of_the_encoding_and_exponents_of_fortran(tmp_path):
+    content = "# L TT TE EE BB\n2;1,5D+0;0;1d0;.5\n".encode("utf-8-sig")
+    (tmp_path / "b.txt").write_bytes(content)
+    spectra = read_spectra(tmp_path / "b.txt", 2)
+    np.testing.assert_allclose(spectra[:, 2], np.array([1.5, 1, 0.5, 0]) * 2 * np.pi / 6)

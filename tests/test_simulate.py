@@ -401,6 +401,12 @@ def test_cmb_as_a_component_is_seen_as_the_cmb():
     assert rms(simulate(KEY, mine, how) - sky) < 1e-5 * rms(sky)
 
 
+@pytest.mark.parametrize("name", ["cmb", "noise", "total"])
+def test_names_of_other_maps_are_taken(name):
+    with pytest.raises(ValueError, match=f"component cannot be called '{name}', as another map is"):
+        simulate(KEY, {name: Source(Synchrotron(template(3)), OWN)}, observation(target=1200.0))
+
+
 def test_intensity():
     """I, Q, U: a component against healpy, the correlation of T with E, noise in three rows."""
     maps = template(3, 3)

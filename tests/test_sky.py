@@ -103,6 +103,8 @@ def test_unknown_names_are_answered_with_the_known_ones():
     ("call", "error", "words"),
     [
         (lambda s: Sky({}), ValueError, "at least one component"),
+        (lambda s: Sky({"a.b": s["dust"]}), ValueError, "text without dots, not 'a.b'"),
+        (lambda s: Sky({"": s["dust"]}), ValueError, "text without dots, not ''"),
         (lambda s: Sky({"dust": np.ones(3)}), TypeError, "'dust' must be a jaxsky Component"),
         (
             lambda s: Sky({"a": s["dust"], "b": Dust(np.ones((2, 12)))}),

@@ -22,6 +22,7 @@ from jaxsky.harmonics import alm_ell, gaussian_beam, resample, synthesis
 from jaxsky.inputs import Template
 from jaxsky.instrument import load_instrument
 from jaxsky.noise import draw, fit_knee, knee_spectrum, uniform_covariance
+from jaxsky.settings import SettingsError
 
 
 def random_alm(lmax: int, seed: int = 0) -> jnp.ndarray:
@@ -199,6 +200,14 @@ def test_embedded_run_recovers_the_truth(quick_settings, tmp_path):
                 assert abs(r.best_fit[name] - truth) < 4 * sigma
                 assert abs(r.best_fit[name] - results["gradient"].best_fit[name]) < 0.1 * sigma
                 assert r.sigma(name) == pytest.approx(sigma, rel=0.05)
+
+
+def test_masks_with_names_that_results_cannot_bear(quick_settings, tmp_path):
+    for name, words in [("strip.fits", "is called as a region"), ("m" * 210, "at most 200 bytes")]:
+        healpy.write_map(tmp_path / name, np.ones(48), dtype=np.float64)
+        analysis = quick_settings.analysis.model_copy(update={"regions": [str(tmp_path / name)]})
+        with pytest.raises(SettingsError, match=rf"analysis.regions: .*{words}"):
+            region_masks(quick_settings.model_copy(update={"analysis": analysis}))
 
 
 def test_regions(quick_settings):

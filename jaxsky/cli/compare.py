@@ -38,7 +38,10 @@ def compare(
         bool, typer.Option("--init", help="Write a commented example of the settings and stop.")
     ] = False,
     seed: Annotated[
-        int | None, typer.Option(help="Seed of realisations, and of the maps of the embedded sky.")
+        int | None,
+        typer.Option(
+            min=0, max=2**32 - 1, help="Seed of realisations, and of the maps of the embedded sky."
+        ),
     ] = None,
     region: Annotated[
         list[str] | None, typer.Option(help="strip, outside, full or a mask file; repeatable.")

@@ -43,7 +43,10 @@ def separate(
         bool, typer.Option("--init", help="Write a commented example of the settings and stop.")
     ] = False,
     seed: Annotated[
-        int | None, typer.Option(help="Seed of simulations, chains, and maps of the embedded sky.")
+        int | None,
+        typer.Option(
+            min=0, max=2**32 - 1, help="Seed of simulations, chains, and maps of the embedded sky."
+        ),
     ] = None,
     nside: Annotated[int | None, typer.Option(help="Common nside of the maps.")] = None,
     domain: Annotated[

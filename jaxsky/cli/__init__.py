@@ -6,11 +6,12 @@ import sys
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 import jaxsky
 from jaxsky.cli import compare, data, fit, forecast, paper, separate, simulate
-from jaxsky.cli.console import console
+from jaxsky.cli.console import replace_unprintable
+from jaxsky.cli.errors import print_error
+from jaxsky.cli.interrupt import prompt
 
 __all__ = ["app", "main"]
 
@@ -63,12 +64,13 @@ def _return_memory() -> None:
 def main() -> None:
     """Run the command line: double precision on, mistakes as one sentence and exit code 2."""
     _return_memory()
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
+    replace_unprintable()
     try:
-        app()
-    except (ValueError, KeyError, OSError) as error:
-        message = error.args[0] if isinstance(error, KeyError) else error
-        console.print(f"[red]jaxsky:[/] {escape(str(message))}", highlight=False, soft_wrap=True)
+        with prompt():
+            import jax
+
+            jax.config.update("jax_enable_x64", True)
+            app()
+    except Exception as error:
+        print_error(error)
         sys.exit(2)

@@ -5,9 +5,15 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
-from jaxsky.cli.console import console, progress_bar, write_example
+from jaxsky.cli.console import (
+    console,
+    print_tables,
+    print_written,
+    progress_bar,
+    warn,
+    write_example,
+)
 from jaxsky.cli.results import results_folder
 
 __all__ = ["compare"]
@@ -102,8 +108,8 @@ def compare(
         progress.update(task, description="drawing")
         seconds = time.perf_counter() - started
         written = report.write_report(out, inputs, settings, found, seconds, patches)
-    console.print(inputs.description, highlight=False)
-    Console().print(report.comparison_table(found))
+    console.print(inputs.description)
+    print_tables(report.comparison_table(found))
     for sentence in report.warnings(found):
-        console.print(f"[yellow](!)[/] {sentence}", highlight=False)
-    console.print("Written: " + ", ".join(map(str, written)), highlight=False, soft_wrap=True)
+        warn(sentence)
+    print_written(written)

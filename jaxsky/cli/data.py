@@ -4,12 +4,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 from rich.table import Table
+from rich.text import Text
 
-from jaxsky.cli.console import console
+from jaxsky.cli.console import console, print_tables
 
 __all__ = ["data"]
 
@@ -36,15 +35,13 @@ def list_products(products: Words = None, folder: Folder = None) -> None:
     from jaxsky.archive import cache_folder, find, product_sets, total_size
 
     folder = folder or cache_folder()
-    table = Table(
-        "file", "what", "nside", "unit", "size", "here", title=escape(f"Kept in {folder}")
-    )
+    table = Table("file", "what", "nside", "unit", "size", "here", title=f"Kept in {folder}")
     group = None
     for product in find(products or []):
         if product.group != group:
             group = product.group
             table.add_section()
-            table.add_row(f"[bold]{group}[/]", product.title)
+            table.add_row(Text(group, style="bold"), product.title)
         path = folder / product.name
         here = path.is_file()
         known = product._replace(size=path.stat().st_size) if here else product
@@ -59,13 +56,13 @@ def list_products(products: Words = None, folder: Folder = None) -> None:
         )
     if not products:
         table.add_section()
-        table.add_row("[bold]sets[/]", "files of an analysis")
+        table.add_row(Text("sets", style="bold"), "files of an analysis")
         for name, kept in product_sets().items():
             members = find([name])
             count = sum((folder / p.name).is_file() for p in members)
             size = total_size(members)
             table.add_row(name, kept.title, "", "", size, f"{count} of {len(members)}")
-    Console(width=None if console.is_terminal else 200).print(table)
+    print_tables(table, width=None if console.is_terminal else 200)
 
 
 @data.command()
@@ -91,9 +88,9 @@ def fetch(
     folder = folder or archive.cache_folder()
     wanted = archive.find(products)
     if len(wanted) > 1:
-        console.print(f"{len(wanted)} files, {archive.total_size(wanted)}.", highlight=False)
+        console.print(f"{len(wanted)} files, {archive.total_size(wanted)}.")
     with Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         DownloadColumn(),
         TransferSpeedColumn(),
@@ -118,9 +115,7 @@ def fetch(
                 raise typer.Exit(130) from None
             size = path.stat().st_size
             progress.update(task, completed=size, total=size)
-    console.print(
-        f"In {folder}: {len(wanted)} files.", highlight=False, markup=False, soft_wrap=True
-    )
+    console.print(f"In {folder}: {len(wanted)} files.", soft_wrap=True)
 
 
 @data.command()
@@ -138,13 +133,12 @@ def verify(products: Words = None, folder: Folder = None) -> None:
         try:
             console.print(
                 f"{product.name}: {archive.verify(product, folder)}",
-                highlight=False,
                 soft_wrap=True,
             )
         except InputError as error:
             wrong += 1
-            console.print(f"[red]{escape(str(error))}[/]", highlight=False, soft_wrap=True)
+            console.print(str(error), style="red", soft_wrap=True)
     if wrong:
         raise typer.Exit(1)
     if not wanted:
-        console.print(f"No product is in {folder}.", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"No product is in {folder}.", soft_wrap=True)

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
+from rich.text import Text
 
-from jaxsky.cli.console import console, write_example
+from jaxsky.cli.console import console, print_tables, print_written, warn, write_example
 from jaxsky.cli.results import results_folder
 
 __all__ = ["fit"]
@@ -83,17 +83,16 @@ def fit(
         def report_step(message: str) -> None:
             # emcee's progress bar takes the place of the status line.
             (status.stop if message.endswith("mcmc") else status.start)()
-            status.update(message)
+            status.update(Text(message))
 
         fits = spectral_index.run(settings, prepared, regions, chains, report_step, progress=True)
         status.start()
         status.update("drawing")
         seconds = time.perf_counter() - started
         written = report.write_report(out, inputs, settings, fits, seconds)
-    console.print(inputs.description, highlight=False)
-    Console().print(report.result_table(fits))
+    console.print(inputs.description)
+    print_tables(report.result_table(fits))
     for sentence in report.warnings(fits, settings.analysis.methods):
-        console.print(f"[yellow](!)[/] {sentence}", highlight=False)
+        warn(sentence)
     written += [chains] if chains.exists() else []
-    # Not wrapped, so that paths can be copied.
-    console.print("Written: " + ", ".join(map(str, written)), highlight=False, soft_wrap=True)
+    print_written(written)

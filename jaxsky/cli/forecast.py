@@ -5,9 +5,15 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
+from rich.text import Text
 
-from jaxsky.cli.console import console, write_example
+from jaxsky.cli.console import (
+    console,
+    print_tables,
+    print_written,
+    warn,
+    write_example,
+)
 from jaxsky.cli.results import results_folder
 
 __all__ = ["forecast"]
@@ -49,15 +55,13 @@ def forecast(
         from fits.forecast import report
         from fits.forecast.forecast import forecast as run
 
-        found = run(settings, status.update)
+        found = run(settings, lambda message: status.update(Text(message)))
         status.update("drawing")
         if overwrite:
             folder.remove(RESULTS)
         written = report.write_report(out, found, settings, time.perf_counter() - started)
-    console.print(found.setup.description, highlight=False, markup=False)
-    for table in report.tables(found):
-        Console().print(table)
+    console.print(found.setup.description)
+    print_tables(*report.tables(found))
     for sentence in report.warnings(found):
-        console.print(f"[yellow](!)[/] {sentence}", highlight=False)
-    # Not wrapped, so that paths can be copied.
-    console.print("Written: " + ", ".join(map(str, written)), highlight=False, soft_wrap=True)
+        warn(sentence)
+    print_written(written)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from jaxsky.cli.console import console, progress_bar, write_example
+from jaxsky.cli.console import console, progress_bar, warn, write_example
 from jaxsky.cli.results import results_folder
 
 __all__ = ["paper"]
@@ -58,10 +58,9 @@ def paper(
         items = run(settings, out, only or (), resume=resume, overwrite=overwrite, report=report)
     for item in items:
         if item.picture is None and item.table is None:
-            console.print(f"[yellow](!)[/] {item.label}: {item.differs}", highlight=False)
+            warn(f"{item.label}: {item.differs}")
     console.print(
         f"Written: {out / 'index.html'}, {len(items)} figures and tables "
         f"({time.perf_counter() - started:.1f} s).",
-        highlight=False,
         soft_wrap=True,
     )

@@ -4,22 +4,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import typer
-
-from jaxsky.cli.console import console
+from jaxsky.cli.console import warn
+from jaxsky.cli.errors import logged
+from jaxsky.cli.interrupt import interruptible
 from jaxsky.io.folders import ALL, Folder, occupied
 
-__all__ = ["interruptible", "results_folder"]
-
-
-@contextmanager
-def interruptible(resumed: str = "") -> Iterator[None]:
-    """Have Ctrl-C end the command with exit code 130, and say how it is resumed."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        console.print(f"Stopped{resumed}.")
-        raise typer.Exit(130) from None
+__all__ = ["results_folder"]
 
 
 @contextmanager
@@ -52,12 +42,11 @@ def results_folder(
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is not a folder; choose another --out.")
     stopped = interruptible("" if resume is None else "; resume with --resume")
-    with stopped, occupied(out, part) as folder:
+    with stopped, occupied(out, part) as folder, logged(out):
         if not folder.locked:
-            console.print(
-                f"[yellow](!)[/] {out}: this file system has no locks, so see to it that no other "
-                "command writes there meanwhile.",
-                highlight=False,
+            warn(
+                f"{out}: this file system has no locks, so see to it that no other command writes "
+                "there meanwhile."
             )
         if not (resume or overwrite) and any(any(out.glob(name)) for name in results):
             go_on = "" if resume is None else "go on with --resume, "

@@ -5,9 +5,15 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
-from jaxsky.cli.console import console, progress_bar, write_example
+from jaxsky.cli.console import (
+    console,
+    print_tables,
+    print_written,
+    progress_bar,
+    warn,
+    write_example,
+)
 from jaxsky.cli.results import results_folder
 
 __all__ = ["separate"]
@@ -103,10 +109,8 @@ def separate(
             raise ValueError(f"The spectral parameters were not found. {error}") from None
         say("drawing")
         written = report.write_report(out, found, settings, time.perf_counter() - started)
-    console.print(setup.description, highlight=False, markup=False)
-    for table in report.tables(found):
-        Console().print(table)
+    console.print(setup.description)
+    print_tables(*report.tables(found))
     for sentence in report.warnings(found, settings):
-        console.print(f"[yellow](!)[/] {sentence}", highlight=False)
-    # Not wrapped, so that paths can be copied.
-    console.print("Written: " + ", ".join(map(str, written)), highlight=False, soft_wrap=True)
+        warn(sentence)
+    print_written(written)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from jaxsky.cli.console import console, progress_bar, write_example
+from jaxsky.cli.console import console, progress_bar, warn, write_example
 from jaxsky.cli.results import results_folder
 from jaxsky.io.folders import ALL
 
@@ -118,15 +118,14 @@ def simulate(
                 settings.experiment.unit,
                 settings.title,
             )
-    console.print(setup.description, highlight=False, markup=False)
+    console.print(setup.description)
     for sentence in notes:
-        console.print(f"[yellow](!)[/] {sentence}", highlight=False)
+        warn(sentence)
     kept = nsims * len(names) - len(seconds)
     rate = f"{statistics.median(seconds.values()):.2g} s a band, " if seconds else ""
     console.print(
         f"Written: {len(seconds)} maps in {' and '.join(map(str, written))}"
         + (f"; {kept} maps were there already" if kept else "")
         + f" ({rate}{time.perf_counter() - started:.1f} s in all).",
-        highlight=False,
         soft_wrap=True,
     )

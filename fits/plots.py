@@ -1,5 +1,6 @@
 """Pictures of fits: the grid, the marginal distributions, the posterior of the chains."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from getdist import MCSamples, chains, plots
 
 from fits.results import FitResult
 from fits.spectral_index import Fit, all_free
-from jaxsky.plots import STYLE, save
+from jaxsky.plots import STYLE, draw_title, in_formula, plain, save
 
 __all__ = ["label", "plot_chains", "plot_grids", "plot_marginals", "plot_posterior"]
 
@@ -46,18 +47,17 @@ BAND_SYMBOLS = {
 
 def label(name: str) -> str:
     """TeX for a parameter's name, without dollar signs."""
-    name, _, region = name.partition("[")
+    if region := re.fullmatch(r"(.+)(\[\d+\])", name):
+        return rf"{label(region[1])}\ {region[2]}"
     parts = name.split(".")
-    if region:
-        return rf"{label(name)}\ [{region}"
     if parts[0] in BAND_SYMBOLS:
         symbol, unit = BAND_SYMBOLS[parts[0]]
-        return rf"{symbol}_{{\rm {parts[1]}}}{unit}"
+        return rf"{symbol}_{in_formula(parts[1])}{unit}"
     if parts[0] == "offset":
-        return rf"o_{{\rm {parts[1]}}}^{parts[2]}\ [\mu{{\rm K}}_{{\rm RJ}}]"
+        return rf"o_{in_formula(parts[1])}^{in_formula(parts[2])}\ [\mu{{\rm K}}_{{\rm RJ}}]"
     shift = r"\Delta " if parts[-1] == "offset" else ""
     number = "".join(rf"\ ({int(p) + 1})" for p in parts[2:] if p.isdigit())
-    return shift + SYMBOLS.get(parts[1], rf"{{\rm {parts[1]}}}") + number
+    return shift + SYMBOLS.get(parts[1], in_formula(parts[1])) + number
 
 
 def _tex(name: str) -> str:
@@ -107,10 +107,10 @@ def plot_grids(
                 _grid_panel(axis, fit.results["grid"], truth)
                 alike = [f for f in with_grid if f.stokes == fit.stokes]
                 axis.set(xlim=_limits(alike, x), ylim=_limits(alike, y))
-                axis.set_title(f"{region}, {' + '.join(fit.stokes)}")
+                axis.set_title(plain(f"{region}, {' + '.join(fit.stokes)}"))
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-        figure.suptitle(title, fontsize=9)
+        draw_title(figure, title, fontsize=9)
         save(figure, path)
     return True
 
@@ -156,7 +156,7 @@ def _samples(result: FitResult, name: str) -> MCSamples:
         samples=chain.reshape(-1, len(result.free)),
         names=list(result.free),
         labels=[label(n) for n in result.free],
-        label=name,
+        label=plain(name),
     )
 
 
@@ -196,13 +196,13 @@ def plot_marginals(
                     _marginal_curve(axis, fit, name)
                 if truth and name in truth:
                     axis.axvline(truth[name], **TRUTH, label="truth")
-                axis.set(ylim=(0, 1.12), ylabel="relative probability", title=region)
+                axis.set(ylim=(0, 1.12), ylabel="relative probability", title=plain(region))
                 axis.xaxis.set_tick_params(labelbottom=True)
         for axis, name in zip(axes[-1], free, strict=True):
             axis.set(xlabel=_tex(name), xlim=_limits(fits, name))
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-        figure.suptitle(title, fontsize=9)
+        draw_title(figure, title, fontsize=9)
         save(figure, path)
     return True
 
@@ -258,6 +258,6 @@ def plot_chains(
         for result, color in zip(results.values(), REGION_COLORS, strict=False):
             interval = result.interval_68[name]
             plotter.subplots[i, i].axvspan(*interval, color=color, alpha=0.15, linewidth=0)
-    plotter.fig.suptitle(f"{title}; 68 % shaded", fontsize=8, y=1.03)
+    draw_title(plotter.fig, f"{title}; 68 % shaded", fontsize=8, y=1.03)
     with mpl.rc_context(STYLE | {"savefig.dpi": 200}):
         save(plotter.fig, path)

@@ -1,5 +1,8 @@
 """Pictures of maps and spectra."""
 
+import re
+import textwrap
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,18 @@ from matplotlib.axes import Axes
 from jaxsky.harmonics import analysis, power_spectrum
 from jaxsky.io import whole
 
-__all__ = ["COLORS", "STYLE", "contact_sheet", "draw_map", "draw_patch", "draw_spectra", "save"]
+__all__ = [
+    "COLORS",
+    "STYLE",
+    "contact_sheet",
+    "draw_map",
+    "draw_patch",
+    "draw_spectra",
+    "draw_title",
+    "in_formula",
+    "plain",
+    "save",
+]
 
 STYLE: Any = {
     "font.size": 9,
@@ -35,11 +49,32 @@ DEPTH = 1e-7
 UNITS = {"uK_RJ": r"$\mu{\rm K}_{\rm RJ}$", "uK_CMB": r"$\mu{\rm K}_{\rm CMB}$"}
 
 
+def plain(text: str) -> str:
+    """Text that is drawn as it is: between its dollar signs there is no formula."""
+    return text.replace("$", r"\$")
+
+
+def in_formula(text: str) -> str:
+    """A name as upright letters of a formula, drawn as it is."""
+    escaped = re.sub(r"([$%#&_{} ])", r"\\\1", re.sub(r"[\\^~]", "?", text))
+    return rf"{{\rm {escaped}}}"
+
+
+def draw_title(figure: plt.Figure, title: str, **options: Any) -> None:
+    """Write a title above a figure as it is; what is longer than three lines is cut."""
+    lines = [textwrap.fill(line, 110, max_lines=3) for line in title.splitlines()]
+    figure.suptitle(plain("\n".join(lines)), **options)
+
+
 def save(figure: plt.Figure, path: Path) -> None:
     """Write a figure as PNG, whole, and close it."""
     # A constrained layout fits already; cropping would draw it once more.
     box = None if figure.get_layout_engine() is not None else "tight"
-    with whole(path) as beside, plt.rc_context({"savefig.bbox": box}):
+    with (
+        whole(path) as beside,
+        plt.rc_context({"savefig.bbox": box}),
+        warnings.catch_warnings(action="ignore", category=UserWarning),  # glyphs a font lacks
+    ):
         figure.savefig(beside, format="png")
     plt.close(figure)
 
@@ -129,7 +164,7 @@ def draw_spectra(
         ell = np.arange(len(spectrum))
         shown = slice(2, None)
         scaled = ell * (ell + 1) / (2 * np.pi) * spectrum
-        axes.loglog(ell[shown], scaled[shown], label=name, **{"color": color, **options})
+        axes.loglog(ell[shown], scaled[shown], label=plain(name), **{"color": color, **options})
     # A few round numbers: by default, labels run into each other where there is less than a decade.
     axes.xaxis.set_major_locator(mpl.ticker.LogLocator(subs=(1, 3)))
     axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
@@ -182,11 +217,11 @@ def contact_sheet(
             limit = float(np.quantile(np.abs(maps), 0.99)) or 1.0
             for axes, values, which in zip(row, maps, "QU", strict=True):
                 draw_map(axes, values, limit, UNITS[unit])
-                axes.set_title(f"{name}: {which}")
+                axes.set_title(plain(f"{name}: {which}"))
         for axes, index, which in zip(grid[-1], (0, 1), ("EE", "BB"), strict=True):
             draw_spectra(axes, {n: s[index] for n, s in spectra.items()}, unit)
             axes.set_title(which)
             axes.set_ylim(bottom=axes.get_ylim()[1] * DEPTH)
         grid[-1, 0].legend(title="band", ncols=2, frameon=False)
-        figure.suptitle(title, fontsize=10)
+        draw_title(figure, title, fontsize=10)
         save(figure, path)

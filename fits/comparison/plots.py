@@ -16,7 +16,7 @@ from fits.comparison.spectra import LMIN, BandSpectra
 from fits.patches import PatchFits
 from fits.record import probability, with_error
 from jaxsky.harmonics import average_pixels
-from jaxsky.plots import COLORS, STYLE, UNITS, draw_map, save
+from jaxsky.plots import COLORS, STYLE, UNITS, draw_map, draw_title, plain, save
 
 __all__ = [
     "plot_leakage",
@@ -44,7 +44,7 @@ def _scatter_panel(axes: Axes, scatter: Scatter, x: np.ndarray, y: np.ndarray) -
     axes.set(xlim=line, ylim=line, aspect="equal")
     axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(4))
     axes.yaxis.set_major_locator(mpl.ticker.MaxNLocator(4))
-    axes.set_title(f"{scatter.band}: {scatter.stokes}")
+    axes.set_title(plain(f"{scatter.band}: {scatter.stokes}"))
     axes.text(
         0.04,
         0.96,
@@ -85,7 +85,7 @@ def plot_scatter(
                 row[0].set_ylabel(f"observed [{UNIT}]")
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
-        figure.suptitle(title, fontsize=9)
+        draw_title(figure, title, fontsize=9)
         save(figure, path)
 
 
@@ -132,8 +132,8 @@ def plot_maps(
                 )
                 for axes, values, head in zip(row[2 * s :], maps, heads, strict=False):
                     draw_map(axes, np.where(used, values, np.nan), limit, UNIT)
-                    axes.set_title(head)
-        figure.suptitle(title, fontsize=9)
+                    axes.set_title(plain(head))
+        draw_title(figure, title, fontsize=9)
         save(figure, path)
 
 
@@ -168,7 +168,7 @@ def _spectrum_panel(axes: Axes, spectra: BandSpectra, index: int) -> None:
     axes.set_ylim(bottom=0.3 * min(observed.min(), _dl(spectra.foregrounds[index])[1].min()))
     bins = spectra.binned.shape[-1]
     axes.set_title(
-        rf"{spectra.band}: {name}, $\chi^2$ = {spectra.chi2[index]:.1f} / {bins} bins, "
+        rf"{plain(spectra.band)}: {name}, $\chi^2$ = {spectra.chi2[index]:.1f} / {bins} bins, "
         f"PTE {probability(spectra.pte[index])}"
     )
 
@@ -188,7 +188,7 @@ def plot_spectra(path: Path, spectra: Sequence[BandSpectra], title: str) -> None
             axes.set_xlabel(r"multipole $\ell$")
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-        figure.suptitle(title, fontsize=9)
+        draw_title(figure, title, fontsize=9)
         save(figure, path)
 
 
@@ -209,10 +209,10 @@ def plot_leakage(path: Path, spectra: Sequence[BandSpectra], title: str) -> None
             axes.plot(*_dl(one.foregrounds[1]), color="k", lw=0.9, ls="--", label="foregrounds")
             axes.plot(*_dl(one.noise[1]), color=COLORS[2], lw=1.2, ls=":", label="noise")
             _log_axes(axes)
-            axes.set(xlabel=r"multipole $\ell$", title=f"{one.band}: BB")
+            axes.set(xlabel=r"multipole $\ell$", title=plain(f"{one.band}: BB"))
             axes.legend(frameon=False)
         grid[0, 0].set_ylabel(POWER)
-        figure.suptitle(title, fontsize=9)
+        draw_title(figure, title, fontsize=9)
         save(figure, path)
 
 
@@ -273,7 +273,7 @@ def _plot_patch_pairs(path, points, star, labels, heads, title):
             axes.set_title(head, fontsize=8)
         handles, names = panels[0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False)
-        figure.suptitle(title, fontsize=9)
+        draw_title(figure, title, fontsize=9)
         save(figure, path)
 
 

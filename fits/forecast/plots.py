@@ -12,7 +12,7 @@ from fits.forecast.fisher import Errors
 from fits.forecast.forecast import Forecast
 from fits.forecast.settings import ForecastSettings
 from fits.plots import label
-from jaxsky.plots import COLORS, STYLE, UNITS, save
+from jaxsky.plots import COLORS, STYLE, UNITS, plain, save
 
 __all__ = ["plot_b_modes", "plot_errors"]
 
@@ -31,7 +31,7 @@ def plot_b_modes(path: Path, found: Forecast, settings: ForecastSettings) -> Non
         figure, axes = plt.subplots(figsize=(COLUMN, 3.9), layout="constrained")
         for (name, powers), color in zip(found.powers.items(), COLORS, strict=False):
             BB = np.where(powers[1] > 0, powers[1], np.nan)
-            axes.loglog(found.spectra.centers, BB, color=color, lw=1.8, label=_band(name))
+            axes.loglog(found.spectra.centers, BB, color=color, lw=1.8, label=plain(_band(name)))
             noise = noise_spectrum(found.setup.instrument[name], lmax)[2:]
             axes.loglog(ell, D * noise, color=color, lw=0.7)
         axes.loglog(ell, D * found.lensed[2, 2 : lmax + 1], color=LENSING, lw=1.2)

@@ -12,7 +12,7 @@ from fits.plots import label
 from fits.record import with_error
 from fits.separate.separate import Separation
 from jaxsky import CMB
-from jaxsky.plots import COLORS, STYLE, UNITS, draw_map, save
+from jaxsky.plots import COLORS, STYLE, UNITS, draw_map, draw_title, plain, save
 
 __all__ = ["plot_components", "plot_parameters", "plot_ratio", "plot_residuals", "plot_spectra"]
 
@@ -49,8 +49,8 @@ def plot_components(path: Path, found: Separation, title: str) -> None:
             limit = float(np.nanquantile(np.abs(maps), 0.99))
             for axes, values, stokes in zip(row, maps, "QU", strict=True):
                 draw_map(axes, values, limit, f"{stokes} [{_unit(found, name)}]")
-                axes.set_title(f"{_title(found, name)}: {stokes}")
-        figure.suptitle(title, fontsize=9)
+                axes.set_title(plain(f"{_title(found, name)}: {stokes}"))
+        draw_title(figure, title, fontsize=9)
         save(figure, path)
 
 
@@ -67,8 +67,8 @@ def plot_residuals(path: Path, found: Separation, unit: str, title: str) -> None
             limit = 3 * float(np.nanstd(maps))
             for axes, values, stokes in zip(row, maps, "QU", strict=True):
                 draw_map(axes, values, limit, f"{stokes} [{UNITS[unit]}]", middle=0.0)
-                axes.set_title(f"{names[b]}: {stokes}, data less components")
-        figure.suptitle(title, fontsize=9)
+                axes.set_title(plain(f"{names[b]}: {stokes}, data less components"))
+        draw_title(figure, title, fontsize=9)
         save(figure, path)
 
 
@@ -97,7 +97,7 @@ def plot_parameters(path: Path, found: Separation, title: str) -> bool:
             draw_map(row[1], sigma, half, rf"$\sigma({label(name)})$", middle=half)
             row[0].set_title(f"${label(name)}$, {len(found.fit.best_fit[name])} regions")
             row[1].set_title("its standard deviation")
-        figure.suptitle(title, fontsize=9)
+        draw_title(figure, title, fontsize=9)
         save(figure, path)
     return True
 
@@ -162,7 +162,7 @@ def plot_spectra(path: Path, found: Separation, title: str) -> None:
         axes.set_ylim(bottom=max(low, np.nanmax(ratio.model.lensing) * 1e-8))
         axes.yaxis.set_major_locator(mpl.ticker.LogLocator(numticks=20))
         figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=7)
-        figure.suptitle(title, fontsize=8)
+        draw_title(figure, title, fontsize=8)
         save(figure, path)
 
 
@@ -194,7 +194,7 @@ def plot_ratio(path: Path, found: Separation, title: str) -> None:
         )
         axes.ticklabel_format(axis="x", style="sci", scilimits=(-2, 3), useMathText=True)
         figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=7)
-        figure.suptitle(title, fontsize=8)
+        draw_title(figure, title, fontsize=8)
         save(figure, path)
 
 

@@ -1,5 +1,6 @@
 """Errors as one sentence; tracebacks, which are for those who look for the cause, in a file."""
 
+import dis
 import tempfile
 import traceback
 from collections.abc import Iterator
@@ -17,10 +18,15 @@ LOG = "error.log"
 LONGEST = 500
 
 
-def _module(error: BaseException) -> str:
-    """Package whose code raised an error."""
-    frames = list(traceback.walk_tb(error.__traceback__))
-    return str(frames[-1][0].f_globals.get("__name__", "")).partition(".")[0] if frames else ""
+def _raised_in(error: BaseException) -> tuple[str, bool]:
+    """Package in which an error came up, and whether its code has raised it, or what it called."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    if trace is None:
+        return "", False
+    package = str(trace.tb_frame.f_globals.get("__name__", "")).partition(".")[0]
+    return package, trace.tb_frame.f_code.co_code[trace.tb_lasti] == dis.opmap["RAISE_VARARGS"]
 
 
 def _is_sentence(error: BaseException) -> bool:
@@ -32,7 +38,8 @@ def _is_sentence(error: BaseException) -> bool:
     if isinstance(error, KeyError) and " " not in str(error.args[0] if error.args else ""):
         return False
     kinds = (ValueError, KeyError, OSError, FitError)
-    return isinstance(error, kinds) and _module(error) in ("jaxsky", "fits")
+    package, raised = _raised_in(error)
+    return isinstance(error, kinds) and raised and package in ("jaxsky", "fits")
 
 
 def _sentence(error: BaseException) -> str:
@@ -47,7 +54,7 @@ def _summary(error: BaseException) -> str:
     first = lines[0][:LONGEST].rstrip(".") if lines else ""
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in first:
         return f"There is not enough memory ({first or 'MemoryError'})."
-    kind = f"{type(error).__name__} in {_module(error)}"
+    kind = f"{type(error).__name__} in {_raised_in(error)[0]}"
     return f"{kind}: {first}." if first else f"{kind}."
 
 

@@ -16,6 +16,8 @@ __all__ = ["interruptible", "prompt"]
 #: Ctrl-C is repeated after this time [s], in case a callback has swallowed it; and after so many
 #: repetitions the process ends where it is.
 PATIENCE, REPETITIONS = 1.0, 3
+#: Time for a thread to take notice [s].
+MOMENT = 0.1
 
 
 class _Interrupts:
@@ -90,7 +92,8 @@ def interruptible(resumed: str = "") -> Iterator[None]:
     except KeyboardInterrupt:
         pass
     except Exception:
-        if not _current.pressed.is_set():  # else it is what a library made of the interrupt
+        # It may be what a library made of the interrupt, of which the thread hears only now.
+        if not _current.pressed.wait(MOMENT):
             raise
     else:
         _current.words = words

@@ -1,0 +1,173 @@
+"""What ends a command: errors of libraries as one sentence, Ctrl-C at any moment."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxsky import cli
+from jaxsky.cli import errors
+from jaxsky.cli.results import results_folder
+
+JAXSKY = Path(sys.executable).with_name("jaxsky")
+
+
+def run(monkeypatch, capsys, function) -> tuple[int, str]:
+    """Exit code and errors of a command line that does this."""
+    monkeypatch.setattr(cli, "app", function)
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    return stop.value.code, capsys.readouterr().err.replace("\n", " ")
+
+
+def raises(error):
+    def fail(out=None):
+        raise error
+
+    return fail
+
+
+def in_folder(out, function):
+    def command():
+        with results_folder(out, resume=False, overwrite=False):
+            function()
+
+    return command
+
+
+def test_sentences_of_our_own_have_no_traceback(monkeypatch, capsys):
+    from jaxsky.units import conversion
+
+    code, said = run(monkeypatch, capsys, lambda: conversion("furlong", "uK_RJ", 30.0))
+    assert code == 2
+    assert said.startswith("jaxsky: ")
+    assert "furlong" in said
+    assert "Traceback" not in said
+    code, said = run(monkeypatch, capsys, lambda: Path("/no/[bold]/such").read_text())
+    assert code == 2
+    assert said == "jaxsky: /no/[bold]/such: No such file or directory. "
+
+
+@pytest.mark.parametrize(
+    ("fail", "words"),
+    [
+        (lambda: np.linalg.inv(np.zeros((2, 2))), "LinAlgError in numpy: Singular matrix."),
+        (lambda: np.zeros(3).reshape(2), "ValueError in tests: cannot reshape"),
+        (lambda: {}["key"], "KeyError in "),
+        (raises(MemoryError()), "There is not enough memory"),
+        (raises(RecursionError("deep\nand deeper")), ": deep."),
+        (raises(AssertionError()), "AssertionError in "),
+        (raises(RuntimeError("[/] [bold] :smile:")), "[/] [bold] :smile:"),
+    ],
+)
+def test_errors_of_libraries_are_sentences(monkeypatch, capsys, tmp_path, fail, words):
+    out = tmp_path / "[red]out"
+    code, said = run(monkeypatch, capsys, in_folder(out, fail))
+    assert code == 2
+    assert words in said
+    assert said.rstrip().endswith(f"Traceback: {out / errors.LOG}")
+    assert "Traceback (most recent call last)" in (out / errors.LOG).read_text()
+    code, said = run(monkeypatch, capsys, fail)
+    assert code == 2
+    assert words in said
+    log = Path(said.split("Traceback: ")[1].strip())
+    assert "Traceback (most recent call last)" in log.read_text()
+    log.unlink()
+
+
+def test_a_log_is_that_of_the_last_run(monkeypatch, capsys, tmp_path):
+    run(monkeypatch, capsys, in_folder(tmp_path, raises(TypeError("x"))))
+    assert (tmp_path / errors.LOG).exists()
+    with results_folder(tmp_path, resume=False, overwrite=False):
+        pass
+    assert not (tmp_path / errors.LOG).exists()
+
+
+def test_terminals_without_unicode(tmp_path):
+    """Tables, and names that an encoding lacks."""
+    environment = os.environ | {"PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
+    run = subprocess.run(
+        [JAXSKY, "data", "list", "--dir", tmp_path / "µ☃"],
+        env=environment, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert "Kept in" in run.stdout
+    assert "Traceback" not in run.stderr
+
+
+def test_a_reader_that_leaves():
+    run = subprocess.run(
+        f"{JAXSKY} data list | head -n 1", shell=True, capture_output=True, text=True, check=True
+    )
+    assert run.stderr == ""
+
+
+STOPPED = """
+import gc, os, signal, sys, threading, time
+from pathlib import Path
+import jax, numpy as np
+from jaxsky import cli
+from jaxsky.cli.results import results_folder
+
+def swallowed():  # by a callback of the garbage collector, as those of JAX
+    def callback(phase, info):
+        if not threading.main_thread().ident == threading.get_ident() or done:
+            return
+        done.append(1)
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(0.01)
+    done = []
+    gc.callbacks.append(callback)
+    gc.collect()
+    while True:
+        time.sleep(0.01)
+
+def other_error():  # a library makes another error of it
+    try:
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(1)
+    except KeyboardInterrupt:
+        raise RuntimeError("INTERNAL: KeyboardInterrupt") from None
+
+def caught():  # again and again
+    signal.raise_signal(signal.SIGINT)
+    while True:
+        try:
+            time.sleep(0.01)
+        except BaseException:
+            pass
+
+def computing():  # the main thread waits without a look at signals
+    threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+    long = jax.jit(lambda x: jax.lax.fori_loop(0, 10**9, lambda i, x: jax.numpy.sin(x), x))
+    long(np.ones(1000)).block_until_ready()
+
+def app():
+    with results_folder(Path(sys.argv[2]), resume=False, overwrite=False):
+        globals()[sys.argv[1]]()
+
+cli.app = app
+cli.main()
+"""
+
+
+@pytest.mark.parametrize("how", ["swallowed", "other_error", "caught", "computing"])
+def test_ctrl_c_ends_a_command(tmp_path, how):
+    began = time.monotonic()
+    run = subprocess.run(
+        [sys.executable, "-c", STOPPED, how, tmp_path],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert run.returncode == 130
+    assert run.stderr == "Stopped; resume with --resume.\n"
+    assert time.monotonic() - began < 50
+
+
+def test_ctrl_c_before_there_is_a_folder(monkeypatch, capsys):
+    assert run(monkeypatch, capsys, raises(KeyboardInterrupt())) == (130, "Stopped. ")

@@ -32,6 +32,7 @@ from jaxsky.inputs import (
     read_noise,
     read_templates,
     set_parameters_of,
+    uK_RJ_per,
 )
 from jaxsky.instrument import load_instrument
 from jaxsky.noise import (
@@ -184,7 +185,7 @@ def read_band(folder: Path, spec: BandSettings) -> Band:
     found = read(folder, spec)
     check_stokes(f"bands.{spec.name}", found, "QU")
     bandpass = read_bandpass_spec(folder, spec.bandpass)
-    factor = bandpass.conversion(found.unit, "uK_RJ")
+    factor = uK_RJ_per(found.unit, bandpass, f"bands.{spec.name}")
     maps, used = jnp.asarray(found.maps[-2:]) * factor, np.asarray(found.mask)
     leakage = _read_leakage(folder, spec, bandpass) if spec.leakage else None
     if spec.noise.estimate_above is not None:
@@ -207,7 +208,7 @@ def _read_leakage(folder: Path, spec: BandSettings, bandpass: Bandpass) -> Leaka
     assert spec.leakage is not None  # as called
     found = read(folder, spec.leakage, zeros_are_data=True)
     check_stokes(f"bands.{spec.name}.leakage", found, "QU")
-    factor = bandpass.conversion(found.unit, "uK_RJ")
+    factor = uK_RJ_per(found.unit, bandpass, f"bands.{spec.name}.leakage")
     maps = jnp.asarray(found.maps[-2:]) * factor
     return Leakage(maps, np.asarray(found.mask), spec.leakage.fwhm)
 

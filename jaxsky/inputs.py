@@ -32,7 +32,6 @@ from jaxsky.settings import (
     TemplateFile,
 )
 from jaxsky.sky import Sky
-from jaxsky.units import conversion
 
 __all__ = [
     "LAWS",
@@ -44,6 +43,7 @@ __all__ = [
     "read_parameter",
     "read_templates",
     "set_parameters_of",
+    "uK_RJ_per",
 ]
 
 LAWS: dict[str, type[Component]] = {"dust": Dust, "synchrotron": Synchrotron, "ame": AME}
@@ -143,10 +143,7 @@ def _read_template(
 ) -> Template:
     found = read(folder, spec)
     check_stokes(f"templates.{name}", found, "I" if spec.angles else stokes)
-    try:
-        factor = np.asarray(conversion(found.unit, "uK_RJ", spec.nu_ref))
-    except ValueError as error:
-        raise SettingsError(f"templates.{name}.unit: {error}") from None
+    factor = uK_RJ_per(found.unit, spec.nu_ref, f"templates.{name}")
     maps = jnp.asarray((found.maps * factor).astype(dtype))
     used = np.asarray(found.mask)
     parameters: dict[str, Any] = {"nu_ref": spec.nu_ref}
@@ -193,6 +190,20 @@ def set_parameters_of(
         component = set_parameters(Sky({name: templates[name].component}), values)[name]
         changed[name] = templates[name]._replace(component=component)
     return changed
+
+
+def uK_RJ_per(unit: str, at: Bandpass | float, where: str) -> float:
+    """What a map is multiplied by to be in uK_RJ, at a frequency [GHz] or over a band.
+
+    Raises
+    ------
+    SettingsError
+        If the unit is none of a brightness; `where` is the table of the map in the settings.
+    """
+    try:
+        return float(unit_factor(unit, "uK_RJ", at))
+    except ValueError as error:
+        raise SettingsError(f"{where}.unit: {error}") from None
 
 
 def check_stokes(where: str, found: Maps, wanted: str) -> None:
@@ -284,6 +295,10 @@ def _covariance(folder, noise, bandpass, nside, stokes, where, unit, own):
             raise SettingsError(f"{where}: I, Q and U need six columns, II, IQ, IU, QQ, QU, UU.")
         columns = maps * unit_factor(found.unit, "uK_RJ^2", bandpass)
         return covariance_from_columns(columns)[-n:, -n:], known
+    if found.unit:
+        raise SettingsError(
+            f"{where}.unit: {kind} are pure numbers, but are said to be {found.unit}."
+        )
     _check_number(f"{where}.sigma0", len(spec.sigma0), stokes)
     sigma0 = jnp.array(spec.sigma0)[-n:] * unit_factor(spec.sigma0_unit or unit, "uK_RJ", bandpass)
     if kind == "weights":

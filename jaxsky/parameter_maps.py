@@ -64,7 +64,8 @@ def parameter_map(
                 f"{found.names[0]} is in {found.unit or 'no unit'}."
             ) from None
     known = values[used]
-    marks = [] if stated else sentinels(known, zero=True)
+    # An index or a temperature is not zero; a curvature or a fraction may be.
+    marks = sentinels(known, zero=True) if not stated and name.startswith(("beta", "T_")) else []
     if marks:
         raise SettingsError(
             f"{where}: column {found.names[0]} is {marks[0][0]:g} in {marks[0][1]} pixels, far "

@@ -251,7 +251,13 @@ class SettingsFile(Table):
 
     @model_validator(mode="after")
     def _signs(self) -> "SettingsFile":
-        check_signs("fixed", getattr(self, "fixed", {}))
+        fixed, templates = getattr(self, "fixed", {}), getattr(self, "templates", {})
+        check_signs("fixed", fixed)
+        for name in templates:
+            if f"{name}.nu_ref" in fixed:
+                raise ValueError(
+                    f"fixed.{name}.nu_ref: nu_ref is given twice, here and in templates.{name}"
+                )
         return self
 
 

@@ -281,6 +281,8 @@ def theta(nside):
         (np.maximum(0, np.arange(NPIX) - 300) // 7, "counts"),
         (np.exp(5 * I), "MJy/sr"),
         (np.arange(NPIX) % 12, "1"),
+        (np.array([0, 1, 2, 50])[np.repeat([0, 1, 2, 3], [300, 300, 8, 160])], "1"),
+        (np.where(np.arange(NPIX) < 60, 9.0, np.where(np.arange(NPIX) < 65, 2.0, 1.0)), "K_RJ"),
     ],
 )
 def test_maps_without_missing_pixels_are_read(tmp_path, values, unit):

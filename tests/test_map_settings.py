@@ -241,6 +241,31 @@ def test_too_many_columns_or_others(tmp_path):
     np.testing.assert_allclose(band(tmp_path, {"file": "m.fits", "fields": ["Q", "X"]})[0][1], Q)
 
 
+def test_units_that_are_none_are_named_with_their_key(tmp_path):
+    write(tmp_path / "m.fits", table({"Q": Q, "U": U, "HITS": 9 + 0 * I}, ["K", "K", "count"]))
+    entry = {"file": "m.fits", "unit": "K"}
+    with pytest.raises(SettingsError, match=r"bands.b.unit: Unit 'K' does not convert to 'uK_RJ'"):
+        band(tmp_path, entry)
+    spec = {"law": "dust", "nu_ref": 353.0} | entry
+    with pytest.raises(SettingsError, match=r"templates.t.unit: Unit 'K' does not convert"):
+        read_templates(tmp_path, {"t": TemplateFile(**spec)})
+    entry = {"file": "m.fits", "unit": "K_RJ"}
+    with pytest.raises(SettingsError, match=r"leakage.unit: Unit 'K' does not convert"):
+        band(tmp_path, entry | {"leakage": {"file": "m.fits", "unit": "K"}})
+    write(
+        tmp_path / "m.fits", table({"Q": Q, "U": U, "HITS": 9 + 0 * I}, ["uK_RJ"] * 2 + ["count"])
+    )
+    hits = {"fields": ["HITS"], "sigma0": 3.0}
+    noise = band(tmp_path, {"file": "m.fits", "noise": {"hits": hits}})[1].noise
+    np.testing.assert_allclose(noise[0, 0], 1.0, rtol=1e-6)
+    for change, words in (
+        ({"fields": ["Q"]}, "column Q is in uK_RJ"),
+        ({"unit": "s"}, "is s, but column HITS is"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            band(tmp_path, {"file": "m.fits", "noise": {"hits": hits | change}})
+
+
 # Maps of parameters
 
 
@@ -362,6 +387,9 @@ def test_the_other_sign_of_beta_syn_is_named_with_its_key(table_):
         raw = {"templates": templates, "experiment": {"instrument": "wmap"}} | table_
         with pytest.raises(ValueError, match=words):
             Experiment.model_validate(raw)
+    twice = {"fixed": {"synchrotron.nu_ref": 23.0}}
+    with pytest.raises(ValueError, match=r"fixed.synchrotron.nu_ref: nu_ref is given twice"):
+        PaperSettings.model_validate({"templates": templates, "bands": [entry]} | twice)
     offset = {"free": {"synchrotron.beta_syn.offset": {"start": -0.1, "uniform": [-1.0, 0.5]}}}
     PaperSettings.model_validate({"templates": templates, "bands": [entry]} | offset)
 

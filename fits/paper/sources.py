@@ -17,12 +17,11 @@ from fits.paper.settings import IndexFile, PaperSettings
 from jaxsky import AME, Dust, Synchrotron
 from jaxsky.experiment.settings import SmallScalesTable
 from jaxsky.galaxy import EmbeddedSky, embedded_sky
-from jaxsky.inputs import Template, read, read_templates, set_parameters_of
+from jaxsky.inputs import Template, read, read_templates, set_parameters_of, uK_RJ_per
 from jaxsky.settings import SettingsError, TemplateFile
 from jaxsky.small_scales import Continued, SmallScales, continue_templates
 from jaxsky.streams import stream
 from jaxsky.templates import dust_index, polarization_template
-from jaxsky.units import conversion
 
 __all__ = ["NSIDE", "PAPER_FWHM", "Ame", "Layer", "Sources", "listed"]
 
@@ -226,7 +225,7 @@ class Sources:
                 )
             if missing := int(np.sum(~np.asarray(found.mask))):
                 raise SettingsError(f"paper.ame: {missing} pixels have no value.")
-            factor = np.asarray(conversion(found.unit, "uK_RJ", spec.nu_ref))
+            factor = uK_RJ_per(found.unit, spec.nu_ref, "paper.ame")
             intensity = jnp.asarray(found.maps[0] * factor)
             nu_ref, own = spec.nu_ref, spec.fwhm
             origin = f"the intensity of AME is {spec.label}"

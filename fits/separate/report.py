@@ -13,6 +13,7 @@ from fits.separate.separate import SAMPLED, Separation
 from fits.separate.settings import SeparateSettings
 from fits.separation.maps import ComponentMaps
 from jaxsky.io import write_maps
+from jaxsky.parameter_maps import parameter_unit
 
 __all__ = ["result_json", "tables", "warnings", "write_report"]
 
@@ -197,7 +198,8 @@ def _write_maps(out: Path, found: Separation, settings: SeparateSettings) -> lis
         both = (found.fit.best_fit, found.sigma)
         rows = [found.of_pixel(name, values) for name in varying for values in both]
         titles = [t for n in varying for t in (n.upper(), f"{n.upper()}_SIGMA")]
-        write_maps(written[-1], np.stack(rows), names=titles, unit="", **options)
+        units = [parameter_unit(name) for name in varying for _ in both]
+        write_maps(written[-1], np.stack(rows), names=titles, unit=units, **options)
     return written
 
 

@@ -124,6 +124,17 @@ def _ask_about_values(tables: Sequence[Columns], zeros_are_data: bool) -> None:
         )
 
 
+def _mark(columns: Sequence[Float[np.ndarray, " pix"]], marks: Sequence[float]) -> bool:
+    """Set values that mark missing pixels to NaN, in place; True if there are any."""
+    found = False
+    for values in columns:
+        for mark in marks:
+            marked = equals(values, mark, 1e-6)
+            found |= bool(marked.any())
+            values[marked] = np.nan
+    return found
+
+
 def read_maps(
     path: str | Path | Sequence[str | Path],
     *,
@@ -199,16 +210,15 @@ def read_maps(
     names = [name for table in tables for name in table.names]
     kinds = _kinds(tables, stokes)
     rows = None if first.coordinates == "G" else blocks(first.where, names, kinds)
-    found = False
-    for values in (column for table in tables for column in table.values):
-        for mark in marks or ():
-            marked = equals(values, mark, 1e-6)
-            found |= bool(marked.any())
-            values[marked] = np.nan
-    if marks is None or (marks and not found):
+    columns = [column for table in tables for column in table.values]
+    if not (_mark(columns, marks or []) or marks == []):
         _ask_about_values(tables, zeros_are_data)
-    maps = np.stack([column for table in tables for column in table.values])
-    mask = np.isfinite(maps).all(axis=0)
+    for table in tables:
+        table.values.clear()
+    maps = np.empty((len(names), healpy.nside2npix(first.nside)))
+    for row in range(len(names)):
+        maps[row] = columns.pop(0)  # and given back: maps may be large
+    mask = np.asarray(np.isfinite(maps).all(axis=0))
     if not mask.any():
         raise InputError(f"{first.where}: no pixel has values in {', '.join(names)}.")
     maps[:, ~mask] = 0

@@ -48,10 +48,11 @@ def sentinels(
     ----------
     values : of a column, NaN where they are known to be missing
     lowest : what the lowest stored integer of the column stands for; None for other types
-    zero : zero may be a mark
+    zero : zero is a usual number, too, rather than none
     """
     rest = values[np.isfinite(values)]
     usual = {sign * number for number in USUAL for sign in (1.0, -1.0)} | {lowest}
+    usual |= {0.0} if zero else set()
     found: list[tuple[float, int]] = []
     while rest.size:
         for extreme in (float(rest.min()), float(rest.max())):
@@ -73,13 +74,19 @@ def _marks(rest: np.ndarray, extreme: float, count: int, usual: bool) -> np.ndar
     others = rest[rest != extreme]
     if not others.size:
         return None
-    near, end = (others.min(), others.max())[:: 1 if extreme < others.min() else -1]
+    near = others.min() if extreme < others.min() else others.max()
     far = abs(near - extreme) > abs(np.median(others) - near)
     often = max(REPEATED, 1 + MORE_OFTEN * int(np.count_nonzero(others == near)))
-    is_mark = far and (usual or abs(extreme) >= HUGE or (count >= often and near != end))
+    is_mark = far and (usual or abs(extreme) >= HUGE or (count >= often and _is_continuous(others)))
     if usual and count > 1 and not is_mark:
         is_mark = not np.array_equal(others, np.round(others))
     return others if is_mark else None
+
+
+def _is_continuous(values: np.ndarray) -> bool:
+    """True if most values are there once, unlike labels, steps and rings."""
+    some = values[:: max(1, values.size // 1000)]
+    return np.unique(some).size > some.size / 2
 
 
 def zeros(columns: Sequence[Float[np.ndarray, " pix"]]) -> float:

@@ -14,6 +14,7 @@ from jaxsky.units import UNITS, conversion, parse_unit
 __all__ = ["from_quantity", "is_ambiguous", "unit_factor", "unit_name"]
 
 _DIMENSIONLESS = {"", "1", "none", "n/a", "na", "unitless", "dimensionless", "index", "ratio"}
+_DIMENSIONLESS |= {"count", "counts", "ct", "hit", "hits", "n_obs", "samples", "number"}
 _SQUARE = r"(?P<square>(?:\^|\*\*)?2)?"
 _KELVIN = re.compile(r"(?P<prefix>mu|micro|[mun\u00b5\u03bc])?K(?P<kind>[a-zA-Z]*)" + _SQUARE)
 _KINDS = {

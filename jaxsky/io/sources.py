@@ -86,7 +86,8 @@ def _unit(table: HealpixTable, columns: list[int], given: str | None) -> str:
             )
         if given is not None and found is not None and not _agree(given, found):
             raise InputError(
-                f"{table.where}: argument `unit` is {given}, but column {name} is in {found}."
+                f"{table.where}: argument `unit` is {given or 'that of a pure number'}, but column "
+                f"{name} is {f'in {found}' if found else 'a pure number'}."
             )
         units.append(found if given is None else given)
     if len(set(units)) > 1:

@@ -5,6 +5,7 @@ import warnings
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 
 import healpy
@@ -321,12 +322,16 @@ class HealpixTable:
                 f"are {npix if self._pixels is None else self._pixels.size} pixels."
             )
         if self._pixels is None:
-            nested = ordering == "NESTED"
-            return column[healpy.ring2nest(self.nside, np.arange(npix))] if nested else column
+            return column[self._nested] if ordering == "NESTED" else column
         pixels = self._pixels
         full = np.full(npix, np.nan)
         full[healpy.nest2ring(self.nside, pixels) if ordering == "NESTED" else pixels] = column
         return full
+
+    @cached_property
+    def _nested(self) -> Int[np.ndarray, " pix"]:
+        """NESTED numbers of the pixels in RING order."""
+        return healpy.ring2nest(self.nside, np.arange(healpy.nside2npix(self.nside)))
 
     def _real(self, index: int) -> Float[np.ndarray, " row"]:
         """A column of real numbers, NaN where it has none."""

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import sys
 from types import SimpleNamespace
 
@@ -16,6 +17,7 @@ from jaxsky import cli, montecarlo
 from jaxsky.experiment import DEFAULT, EXAMPLE, build, load_experiment, setup
 from jaxsky.harmonics import alm_ell, expand, gaussian_beam, synthesis
 from jaxsky.io import read_maps, write_maps
+from jaxsky.io.folders import occupied
 from jaxsky.simulate import simulate
 
 NSIDE = 8
@@ -301,6 +303,64 @@ def test_a_realisation_does_not_depend_on_the_order(three, tmp_path, monkeypatch
     assert "5 maps were there already" in said
     assert content(out) == expected
     assert [p for p, t in times.items() if p.stat().st_mtime_ns != t] == [lost]
+
+
+def test_a_monte_carlo_is_split_over_processes(three, tmp_path, monkeypatch, capsys):
+    """In one folder, at once or one after the other; each makes its own part."""
+    path, expected = three
+    out = tmp_path / "out"
+    with occupied(out, range(1)):  # another process makes the first realisation
+        for options in (["--nsims", 3], ["--overwrite", "--first", 1]):
+            assert command(monkeypatch, path, "--out", out, *options) == 2
+            assert "is being written to by another command (process" in one_sentence(capsys)
+        assert command(monkeypatch, path, "--out", out, "--first", 2) == 0
+        capsys.readouterr()
+        assert command(monkeypatch, path, "--out", out, "--first", 1, "--seed", 4) == 2
+        assert "holds a simulation with other settings" in one_sentence(capsys)
+        assert command(monkeypatch, path, "--out", out, "--first", 1) == 0
+    capsys.readouterr()
+    assert command(monkeypatch, path, "--out", out, "--first", 2) == 2
+    assert "holds a simulation already" in one_sentence(capsys)
+    assert command(monkeypatch, path, "--out", out) == 0
+    assert content(out) == expected
+    assert not list(out.glob(".*"))
+
+
+def test_processes_with_other_settings_do_not_meet(three, tmp_path, monkeypatch, capsys):
+    """Both began in an empty folder, and one left its log before the other had a map."""
+    path, _ = three
+    out, observe = tmp_path / "out", montecarlo.observe_bands
+
+    def meanwhile(*arguments, **options):
+        monkeypatch.setattr(montecarlo, "observe_bands", observe)
+        montecarlo._claim(out, load_experiment(path, {"experiment": {"seed": 4}}), False)
+        return observe(*arguments, **options)
+
+    monkeypatch.setattr(montecarlo, "observe_bands", meanwhile)
+    assert command(monkeypatch, path, "--out", out) == 2
+    assert "holds a simulation with other settings" in one_sentence(capsys)
+    assert list(content(out)) == []
+
+
+def test_a_removed_folder_or_log_stops_the_run(three, tmp_path, monkeypatch, capsys):
+    path, _ = three
+    out, write_file = tmp_path / "out", montecarlo.write_maps
+
+    def remove(what):
+        def removing(*arguments, **options):
+            write_file(*arguments, **options)
+            monkeypatch.setattr(montecarlo, "write_maps", write_file)
+            shutil.rmtree(what) if what.is_dir() else what.unlink()
+
+        monkeypatch.setattr(montecarlo, "write_maps", removing)
+
+    remove(out)
+    assert command(monkeypatch, path, "--out", out, "--nsims", 3) == 2
+    assert f"{out}: was removed while the command worked in it" in one_sentence(capsys)
+    assert not out.exists()
+    remove(out / montecarlo.LOG)
+    assert command(monkeypatch, path, "--out", out, "--nsims", 3) == 2
+    assert "simulation.json: was removed while the simulation ran" in one_sentence(capsys)
 
 
 def test_a_stopped_run_goes_on(three, tmp_path, monkeypatch, capsys):

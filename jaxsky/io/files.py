@@ -40,13 +40,22 @@ def whole(path: Path) -> Iterator[Path]:
         beside.replace(path)
     except OSError as error:
         check_guards()
-        reason = error.strerror or str(error).rstrip(".")
         raise OSError(
-            f"{path}: cannot be written ({reason}); what was complete before is kept."
+            f"{path}: cannot be written ({_reason(error)}); what was complete before is kept."
         ) from error
     finally:
         with suppress(OSError):
             beside.unlink(missing_ok=True)
+
+
+def _reason(error: OSError) -> str:
+    """The system's own words; libraries put theirs on top."""
+    first: BaseException | None = error
+    while first is not None:
+        if isinstance(first, OSError) and first.strerror:
+            return first.strerror
+        first = first.__context__
+    return str(error).rstrip(".")
 
 
 def _to_disk(path: Path) -> None:

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from jaxsky.io import InputError, MissingFileError, check_file
 from jaxsky.settings import NamedFile, SettingsFile, expand
 
-__all__ = ["find_file", "found_files"]
+__all__ = ["find_file", "found_files", "named_files"]
 
 
 def find_file(folder: Path, name: str) -> Path:
@@ -70,7 +70,7 @@ def _missing(path: Path, cache: Path | None) -> str:
 def found_files(settings: SettingsFile) -> dict[str, str]:
     """The files that settings name and that are there: name -> path."""
     found = {}
-    for name in _names(settings):
+    for name in named_files(settings):
         try:
             found[str(name)] = str(find_file(Path(settings.data_dir), name))
         except InputError:
@@ -78,13 +78,13 @@ def found_files(settings: SettingsFile) -> dict[str, str]:
     return found
 
 
-def _names(value: Any) -> Iterator[str]:
+def named_files(value: Any) -> Iterator[str]:
     """All names of files among the values of settings."""
     if isinstance(value, NamedFile):
         yield value
     elif isinstance(value, BaseModel | dict):
         for _, entry in value if isinstance(value, BaseModel) else value.items():
-            yield from _names(entry)
+            yield from named_files(entry)
     elif isinstance(value, list | tuple):
         for entry in value:
-            yield from _names(entry)
+            yield from named_files(entry)

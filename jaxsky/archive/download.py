@@ -59,6 +59,8 @@ def fetch(
     jaxsky.io.InputError
         If the file that is there is not the product, or the record of hashes is damaged; both are
         left as they are.
+    ValueError
+        If the mirror is no http or https address.
     """
     folder = cache_folder() if folder is None else folder
     path, part = folder / product.name, folder / f"{product.name}.part"

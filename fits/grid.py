@@ -16,6 +16,8 @@ __all__ = ["grid_fit", "grid_is_possible"]
 
 #: The grid is narrowed to where the posterior exceeds exp(-NARROW/2) of its maximum (6 sigma).
 NARROW = 36.0
+#: A posterior that changes by less over the whole prior, in its logarithm, is flat.
+FLAT = 1e-6
 #: Probability of one standard deviation to either side.
 ONE_SIGMA = 0.6826894921370859
 
@@ -107,7 +109,8 @@ def grid_fit(
     KeyError, ValueError
         For unknown parameters, more than two of them, or one without a uniform prior.
     """
-    free = tuple(sorted(like.check(start)))
+    params = like.check(start)
+    free = tuple(sorted(params))
     priors = check_priors(priors, free)
     if len(free) > 2:
         raise ValueError(
@@ -132,7 +135,8 @@ def grid_fit(
         if min(shrunk) > 0.8:
             break
         ranges = narrowed
-    return _summary(free, axes, log_posterior, chi2s, limits)
+    result = _summary(free, axes, log_posterior, chi2s, limits)
+    return result.judged(result.chi2, like.dof(len(free)), params)
 
 
 def _summary(
@@ -161,6 +165,7 @@ def _summary(
         "marginals": marginals,
     }
     values_at_best = {name: float(mesh[i, best]) for i, name in enumerate(free)}
+    flat = log_posterior.min() > -FLAT
     edges = [name for name, value in values_at_best.items() if value in limits[name]]
     return FitResult(
         method="grid",
@@ -169,9 +174,11 @@ def _summary(
         interval_68=intervals,
         covariance=np.atleast_2d(np.cov(mesh, aweights=weights / weights.sum(), ddof=0)),
         chi2=float(chi2s.ravel()[best]),
-        converged=not edges,
+        converged=not edges and not flat,
         message=(
-            f"The highest point lies at the edge of the uniform prior of {', '.join(edges)}."
+            f"The posterior is flat: the data do not constrain {', '.join(free)}."
+            if flat
+            else f"The highest point lies at the edge of the uniform prior of {', '.join(edges)}."
             if edges
             else "integrated"
         ),

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from fits.compress import gram, square_root
 from jaxsky import Bandpass, Sky, observe_components, parameter_names, set_parameters
@@ -79,6 +79,10 @@ class Likelihood(eqx.Module):
         """Residuals at values of any of the parameters by name; the others keep theirs."""
         raise TypeError(f"{type(self).__name__} must define `residuals`.")
 
+    def dof(self, free: int) -> int:
+        """Degrees of freedom of chi^2: data with weight, less amplitudes and free parameters."""
+        return int(self.values) - free  # type: ignore[attr-defined]  # a field of each
+
     def check(self, params: Mapping[str, Numeric]) -> dict[str, Array]:
         """The parameters as numbers.
 
@@ -118,6 +122,8 @@ class TemplateLikelihood(Likelihood):
     """
 
     matrix: Float[Array, "row vector"]
+    #: number of data, those of no weight left out: pixels, or amplitudes for the exact form
+    values: Int[Array, ""]
 
     def residuals(self, params):
         sky = set_parameters(self.sky, self.bands.sky_parameters(params))
@@ -138,6 +144,7 @@ class PixelLikelihood(Likelihood):
     #: rows of inner products and their whitening, for the exact form; None for the diagonal one
     rows: Float[Array, "band row stokes pix"] | None
     whitening: Float[Array, "row row"] | None
+    values: Int[Array, ""]
 
     def residuals(self, params):
         sky = set_parameters(self.sky, self.bands.sky_parameters(params))
@@ -268,14 +275,15 @@ def likelihood(
     products = gram(data, templates, weights)[:, keep]
     if covariance_of is None:
         root = square_root(products)
-        return TemplateLikelihood(_unit_sky(sky), own, _matrix(None, root, keep, len(labels)))
+        matrix = _matrix(None, root, keep, len(labels))
+        return TemplateLikelihood(_unit_sky(sky), own, matrix, jnp.sum(weights[:, keep] > 0))
     used = slice(1, None if offsets else -1)  # a constant row tells offsets from templates
     if offsets:
         templates = jnp.concatenate([templates, jnp.ones_like(templates[:1])])
     rows = _one_stokes_each(_weighted_templates(templates, weights), keep)
     whitening = _whitening(covariance_of(rows))
     matrix = _matrix(whitening, products[:, :, used], keep, len(labels))
-    return TemplateLikelihood(_unit_sky(sky), own, matrix)
+    return TemplateLikelihood(_unit_sky(sky), own, matrix, jnp.array(len(whitening)))
 
 
 @jax.jit
@@ -334,9 +342,11 @@ def _pixel_likelihood(at_start, sky, bands, data, weights, keep, covariance_of, 
     plan = interpolation_nodes(at_start, bands.bandpasses, 1e-10)
     nodes = tuple(n and NodeCounts(tuple(k + 2 for k in n.counts)) for n in plan)
     rows = whitening = None
+    values = jnp.sum(weights > 0)
     if covariance_of is not None:
         seen = observe_components(at_start, bands.bandpasses, nodes=nodes)
         maps = [*seen.values(), *([jnp.ones_like(data)] if constant else [])]
         rows = _one_stokes_each(weights[:, None] * jnp.stack(maps, axis=1), keep)
         whitening = _whitening(covariance_of(rows))
-    return PixelLikelihood(sky, bands, data, jnp.sqrt(weights), nodes, rows, whitening)
+        values = jnp.array(len(whitening))
+    return PixelLikelihood(sky, bands, data, jnp.sqrt(weights), nodes, rows, whitening, values)

@@ -20,7 +20,7 @@ from fits.priors import (
     prior_residuals,
     to_unbounded,
 )
-from fits.results import FitResult
+from fits.results import FitResult, help_by_prior
 from jaxsky.types import Numeric
 
 __all__ = ["MAX_STEPS", "Solver", "best_fit", "search"]
@@ -29,6 +29,8 @@ __all__ = ["MAX_STEPS", "Solver", "best_fit", "search"]
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 #: Steps of a search, by default.
 MAX_STEPS = 500
+#: A search has reached an optimum this close to it, in standard deviations.
+REACHED = 0.01
 
 
 def _unscaled(unbounded, priors, scale):
@@ -88,14 +90,20 @@ def _residuals(params, args):
 
 
 @jax.jit
-def _half_hessian(like, params, priors):
+def _derivatives(like, params, priors):
+    """Gradient and Hessian of -log posterior."""
     flat, unravel = ravel_pytree(params)
 
     def objective(theta):
         named = unravel(theta)
         return chi2(like, named) / 2 - log_prior(named, priors)
 
-    return jax.hessian(objective)(flat)
+    def gradient(theta):
+        first = jax.grad(objective)(theta)
+        return first, first
+
+    hessian, first = jax.jacfwd(gradient, has_aux=True)(flat)
+    return first, hessian
 
 
 def best_fit(
@@ -126,7 +134,9 @@ def best_fit(
     KeyError, ValueError
         For unknown parameters, or start values outside their prior.
     FitError
-        If it did not converge, unless throw=False; the result is in its `.result`.
+        If it did not converge, unless throw=False; the result is in its `.result`. It has not
+        where the solver failed or stopped away from an optimum, its start included, where the
+        data do not constrain a parameter, and where chi^2 is that of no fit (`fits.results`).
     """
     params = like.check(start)
     priors = check_priors(priors, params)
@@ -144,32 +154,42 @@ def best_fit(
     )
     values = {name: float(found[name]) for name in free}
 
-    hessian = np.asarray(_half_hessian(like, found, priors))
+    gradient, hessian = map(np.asarray, _derivatives(like, found, priors))
     positive = bool(np.isfinite(hessian).all()) and np.linalg.eigvalsh(hessian)[0] > 0
     covariance = np.linalg.inv(hessian) if positive else np.full(hessian.shape, np.nan)
     sigma = dict(zip(free, np.sqrt(np.diagonal(covariance)), strict=True))
-    converged = solution.result == optx.RESULTS.successful
-    message = "converged" if converged else f"The solver stopped: {solution.result}."
-    if converged and not positive:
-        converged = False
+    distance = float(np.sqrt(gradient @ covariance @ gradient))
+    converged, message = False, "converged"
+    if solution.result != optx.RESULTS.successful:
+        message = f"The solver stopped: {solution.result}."
+    elif not positive:
         message = (
             "The Hessian at the optimum is not positive definite: the data do not constrain "
-            + (", ".join(free) + ".")
+            f"{', '.join(free)}; {help_by_prior(free)}."
         )
+    elif not distance < REACHED * np.sqrt(len(free)):
+        still = all(values[name] == float(params[name]) for name in free)
+        message = (
+            f"The search {'did not leave its start' if still else 'stopped'}, {distance:.2g} "
+            "sigma from the optimum."
+        )
+    else:
+        converged = True
     for name, value in values.items():
         low, high = bounds(name, priors)
         if at_edge(value, low, high):
             converged = False
             edge = low if value - low < high - value else high
             message = f"The best fit of {name!r} lies at the edge {edge:g} of its uniform prior."
-    return FitResult(
+    result = FitResult(
         method="gradient",
         free=free,
         best_fit=values,
         interval_68={n: (values[n] - float(sigma[n]), values[n] + float(sigma[n])) for n in free},
         covariance=covariance,
         chi2=float(chi2(like, found)),
-        converged=bool(converged),
+        converged=converged,
         message=message,
         details={"steps": int(solution.stats["num_steps"])},
-    ).checked(throw)
+    )
+    return result.judged(result.chi2, like.dof(len(free)), params).checked(throw)

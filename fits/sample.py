@@ -148,10 +148,12 @@ def sample(
         For unknown parameters, start values outside their prior, or fewer than twice as many
         walkers as parameters.
     FitError
-        If the chain is too short, unless throw=False; the result is in its `.result`.
+        If the chain is too short, chi^2 is that of no fit, or the data do not constrain a
+        parameter (`fits.results`), unless throw=False; the result is in its `.result`.
     """
     check_seed("seed", seed)
-    free = tuple(sorted(like.check(start)))
+    params = like.check(start)
+    free = tuple(sorted(params))
     priors = check_priors(priors, free)
     sampler = ensemble(
         lambda theta: np.asarray(_log_probs(theta, like, priors, free)),
@@ -165,7 +167,8 @@ def sample(
         backend=backend,
         progress=progress,
     )
-    return ensemble_summary(sampler, free, lambda values: float(chi2(like, values))).checked(throw)
+    result = ensemble_summary(sampler, free, lambda values: float(chi2(like, values)))
+    return result.judged(result.chi2, like.dof(len(free)), params).checked(throw)
 
 
 def ensemble_summary(

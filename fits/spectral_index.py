@@ -110,6 +110,7 @@ def fit_pixels(
         )
     values = {method: float(chi2(diagonal, r.best_fit)) for method, r in results.items()}
     dof = int(used.sum()) * len(prepared.bands) * len(stokes) - len(start)
+    results = {method: r.judged(values[method], dof, start) for method, r in results.items()}
     return Fit(region, stokes, results, values, dof, dof_amplitudes)
 
 

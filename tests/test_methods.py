@@ -11,7 +11,7 @@ from fits.grid import grid_fit
 from fits.likelihood import likelihood
 from fits.optimize import best_fit
 from fits.priors import Gaussian, Uniform, from_unbounded, log_prior, to_unbounded
-from fits.results import FitError
+from fits.results import FitError, FitResult, misfit
 from fits.sample import sample
 from jaxsky import Dust, Sky, observe, set_parameters
 from test_likelihood import BANDS, START, fluctuations, problem
@@ -231,3 +231,88 @@ def test_samples_stay_inside_the_prior(like):
     values = chain.details["chain"][..., chain.free.index("dust.beta_dust")]
     assert values.min() >= 1.9
     assert bool(jnp.isfinite(chain.details["log_prob"]).all())
+
+
+def quick(data=None, sigma=None, start=START, sky=None):
+    known, clean, noise = problem()
+    sky = known if sky is None else sky
+    data = clean if data is None else data
+    return likelihood(sky, BANDS, data, noise if sigma is None else sigma, start)
+
+
+def by_each(like, start):
+    """Gradient, grid and, as far as it goes, chain."""
+    yield best_fit(like, start, priors=PRIORS, throw=False)
+    yield grid_fit(like, start, priors=PRIORS, points=50)
+    yield sample(like, start, priors=PRIORS, nsteps=4000, progress=False, throw=False)
+
+
+def test_a_chi2_that_is_astronomical_is_no_fit():
+    """Missing values of integer columns, -32768, in one pixel of a hundred."""
+    _, data, sigma = problem()
+    marred = np.array(data)
+    marred[0, :, ::100] = -32768.0
+    for result in by_each(quick(data=marred), START):
+        assert not result.converged
+        assert "missing values that are read as data, a wrong unit" in result.message
+    with pytest.raises(FitError, match="degrees of freedom, so the model does not describe"):
+        best_fit(quick(data=marred), START, priors=PRIORS)
+    # Errors three times too small, and bright pixels that no law describes, are those of real maps.
+    for other in (quick(sigma=np.asarray(sigma) / 3), quick(data=np.asarray(data) * 1.02)):
+        assert best_fit(other, START, priors=PRIORS).converged
+
+
+@pytest.mark.parametrize(
+    ("chi2", "dof", "fits"),
+    [(730.0 * 24, 24, False), (730.0 * 6000, 6000, False), (60.0 * 6000, 6000, True),
+     (3000.0, 2, True), (1e5, 0, False), (np.nan, 10, False), (np.inf, 10, False)],
+)  # fmt: skip
+def test_what_is_astronomical(chi2, dof, fits):
+    assert (misfit(chi2, dof) is None) == fits
+
+
+def test_degrees_of_freedom_are_data_with_weight():
+    _, data, sigma = problem()
+    masked = np.array(np.broadcast_to(sigma, data.shape))
+    masked[0, 0, :7] = np.inf
+    for pixelwise in (False, True):
+        one = likelihood(problem()[0], BANDS, data, masked, START, pixelwise=pixelwise)
+        assert one.dof(2) == data.size - 7 - 2
+        U = likelihood(problem()[0], BANDS, data, masked, START, stokes="U", pixelwise=pixelwise)
+        assert U.dof(2) == data.size // 2 - 2
+
+
+def test_a_start_at_the_optimum_is_told_from_a_search_that_does_not_move():
+    sky, _, _ = problem()
+    truth = {"dust.beta_dust": 1.7, "synchrotron.beta_syn": 2.8}
+    data = observe(set_parameters(sky, truth), list(BANDS.values()))
+    assert best_fit(quick(data=data), truth, priors=PRIORS).converged
+    # Steps of nothing, which optimistix takes for success.
+    still = optx.GradientDescent(learning_rate=0.0, rtol=1e-3, atol=1e-3)
+    with pytest.raises(FitError, match=r"did not leave its start, .* sigma from the optimum"):
+        best_fit(quick(data=data), START, solver=still)
+
+
+def test_weights_of_nothing_are_no_fit():
+    flat = quick(sigma=np.asarray(problem()[2]) * 1e12)
+    with pytest.raises(FitError, match=r"do not constrain .*a Gaussian prior on .* would help"):
+        best_fit(flat, START)
+    grid = grid_fit(flat, START, priors=PRIORS)
+    assert not grid.converged
+    assert "The posterior is flat" in grid.message
+
+
+def test_a_parameter_that_runs_away_is_no_fit():
+    """Data in proportion to the frequency squared times more: the hotter, the better."""
+    sky, _, sigma = problem()
+    dust = Sky({"dust": Dust(sky["dust"].amplitude, T_dust=19.6)})
+    data = observe(set_parameters(dust, {"dust.T_dust": 1e12}), list(BANDS.values()))
+    like = likelihood(dust, BANDS, data, np.asarray(sigma) / 1e6, {"dust.T_dust": 19.6})
+    result = best_fit(like, {"dust.T_dust": 19.6}, throw=False)
+    assert not result.converged
+    away = result._replace(converged=True, best_fit={"dust.T_dust": 1e12})
+    judged = away.judged(1.0, 10, {"dust.T_dust": 19.6})
+    assert "do not constrain 'dust.T_dust': from 19.6 it went to 1e+12" in judged.message
+    offset = FitResult("gradient", ("offset.44.Q",), {"offset.44.Q": 900.0}, {}, np.eye(1), 1.0,
+                       True, "converged", {})  # fmt: skip
+    assert offset.judged(1.0, 10, {"offset.44.Q": 0.0}).converged

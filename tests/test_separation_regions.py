@@ -16,6 +16,7 @@ from fits.separation import (
     fit_spectra,
     latitude_bands,
     mixing,
+    sample_spectra,
     spectral_likelihood,
     superpixels,
 )
@@ -321,3 +322,43 @@ def test_a_delta_band_and_a_curved_law():
     assert float(chi2(like, {"s.beta_syn": 3.0, "s.curvature": -0.05})) < 1e-12
     fit = fit_spectra(like)
     assert fit.best_fit["s.curvature"] == pytest.approx(-0.05, abs=1e-8)
+
+
+def test_pixels_that_fail_are_counted_with_the_prior_that_helps():
+    _, data, given, _ = problem("full")
+    dark = np.array(data)
+    dark[..., :3] = 0.0
+    start, labels = {"dust.beta_dust": 1.6}, {"dust.beta_dust": np.arange(NPIX)}
+    like = spectral_likelihood(random_sky(), BANDS, dark, given, start, labels=labels)
+    words = (
+        rf"dust.beta_dust in \d+ of {NPIX} regions \(\d+ of {NPIX} pixels\).*; "
+        r"a Gaussian prior on dust.beta_dust \(mean, standard deviation\) would help"
+    )
+    with pytest.raises(FitError, match=words) as caught:
+        fit_spectra(like)
+    assert not caught.value.result.converged
+    held = fit_spectra(like, priors={"dust.beta_dust": Gaussian(1.6, 0.1)})
+    np.testing.assert_allclose(held.best_fit["dust.beta_dust"][:3], 1.6, atol=1e-6)
+
+
+def test_a_chi2_that_is_astronomical_is_no_fit():
+    _, data, given, _ = problem("full")
+    marred = np.array(data)
+    marred[0, 0, :2] = -32768.0
+    like = spectral_likelihood(random_sky(), BANDS, marred, given, START)
+    with pytest.raises(FitError, match="does not describe the data: look for missing values"):
+        fit_spectra(like)
+    result = sample_spectra(like, nsteps=8, nwarmup=8, progress=False, throw=False)
+    assert not result.converged
+
+
+def test_a_temperature_that_runs_away_is_no_fit():
+    """At low frequencies dust has no temperature."""
+    bands = {str(nu): Bandpass.delta(float(nu)) for nu in (5, 10, 20, 30, 40)}
+    sky = {"dust": Dust(np.ones((2, 4))), "s": Synchrotron(np.ones((2, 4)))}
+    data = np.asarray(observe(Sky(sky), list(bands.values())))
+    data = data + 0.1 * np.random.default_rng(0).normal(size=data.shape)
+    like = spectral_likelihood(sky, bands, data, np.full(5, 0.1), {"dust.T_dust": 19.6})
+    with pytest.raises(FitError, match=r"do not constrain dust.T_dust; a Gaussian prior") as caught:
+        fit_spectra(like)
+    assert caught.value.result.best_fit["dust.T_dust"] > 1e4

@@ -135,7 +135,9 @@ def warnings(found: Separation, settings: SeparateSettings) -> list[str]:
     """What a user should know before using the numbers, a sentence each."""
     sentences = []
     fit, ratio, simulated = found.fit, found.tensors, found.simulated
-    if fit.dof > 0 and abs(fit.chi2 / fit.dof - 1) > 0.1:
+    if not fit.converged:
+        sentences.append(fit.message)
+    elif fit.dof > 0 and abs(fit.chi2 / fit.dof - 1) > 0.1:
         sentences.append(
             f"chi2 / dof is {fit.chi2 / fit.dof:.3g}: the laws do not describe the maps, or the "
             "noise is not what it is said to be."

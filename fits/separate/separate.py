@@ -12,7 +12,7 @@ from fits.chains import kept_chain
 from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra
 from fits.realisations import realisations
 from fits.record import fingerprint
-from fits.results import FitResult
+from fits.results import FitResult, misfit
 from fits.separate.domains import PixelDomain
 from fits.separate.settings import SeparateSettings, Tensors
 from fits.separate.setup import Setup
@@ -119,7 +119,9 @@ def separate(
     assert cmb is not None  # as the settings see to
     report("spectral parameters")
     like = domain.likelihood(setup.data)
-    fit = fit_spectra(like, priors=priors)
+    fit = fit_spectra(like, priors=priors, throw=False)
+    # What no law describes is separated nevertheless, and said.
+    fit.checked(throw=fit.message != misfit(fit.chi2, fit.dof))
     response = Response(like, fit.best_fit, priors)
     report("components")
     best = like.named(jnp.asarray(response.theta))

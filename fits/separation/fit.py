@@ -14,10 +14,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from fits.optimize import MAX_STEPS, Solver, search
 from fits.priors import Prior, check_priors, prior_residuals, to_unbounded
+from fits.results import astray, help_by_prior, misfit
 from fits.separation import newton
 from fits.separation.algebra import Factor, assembled, degenerate, variances
 from fits.separation.likelihood import SpectralLikelihood
@@ -157,8 +158,9 @@ def fit_spectra(
         For unknown parameters, start values outside their prior, something that is no solver, and
         priors that are neither uniform nor Gaussian with a least-squares solver.
     FitError
-        If it did not converge, or data and priors do not determine the parameters, unless
-        throw=False; the result is in its `.result`.
+        If it did not converge, data and priors do not determine the parameters, or chi^2 is that
+        of no fit (`fits.results`), unless throw=False; the result is in its `.result`. The message
+        says in how many regions and pixels, and which prior would help.
     """
     if not (solver is None or isinstance(solver, Solver)):
         raise TypeError(
@@ -166,7 +168,7 @@ def fit_spectra(
             f"not {type(solver).__name__}."
         )
     priors = check_priors(priors, like.free)
-    theta = start_vector(like, start, priors)
+    theta = start_theta = start_vector(like, start, priors)
     problem = Problem(like, priors)
     if max_steps is None:
         max_steps = NEWTON_STEPS if solver is None else MAX_STEPS
@@ -187,18 +189,33 @@ def fit_spectra(
     slope = problem.value(theta)[1][keep]
     distance = float(np.sqrt(slope @ factor.solve(slope))) if factor.positive else np.inf
     close = REACHED * np.sqrt(max(len(keep), 1))
+    chi2 = 2 * float(problem.derivatives(theta).value.sum())
+    dof = like.dof(int(problem.present.sum()))
+    far = np.zeros(len(theta), bool)
+    far[keep] = ~(np.abs(slope) <= close * np.sqrt(np.abs(matrix.diagonal())))
+    lost = problem.present & _astray(problem, theta, sigma, start_theta)
     message = "converged"
-    if unknown and np.all(np.abs(slope) <= close * np.sqrt(np.abs(matrix.diagonal()))):
-        shown = ", ".join(unknown[:6]) + (f" and {len(unknown) - 6} more" if unknown[6:] else "")
-        message = f"The data do not determine {shown}: parameters are degenerate."
-    elif unknown:
-        message = f"The search stopped after {steps} steps, and not at an optimum."
-    elif not distance < close:
-        message = f"The search stopped after {steps} steps, {distance:.2g} sigma from the optimum."
+    if lost.any():
+        message = f"The data do not constrain {problem.where(lost)}{_help(problem, lost)}"
+    if unknown and not far.any():
+        open_ = np.isin(labels, unknown)
+        message = (
+            f"The data do not determine {problem.where(open_)}: parameters are degenerate"
+            f"{_help(problem, open_)}"
+        )
+    elif unknown or not distance < close:
+        off = "and not at an optimum" if unknown else f"{distance:.2g} sigma from the optimum"
+        which = f": {problem.where(far)}{_help(problem, far)}" if far.any() else "."
+        message = f"The search stopped after {steps} steps, {off}{which}"
     if edges.any():
         message = _edge_message(problem, edges)
-    if not np.isfinite(theta[problem.present]).all():
-        message = f"The search left the finite numbers within {steps} steps."
+    if (wrong := problem.present & ~np.isfinite(theta)).any():
+        message = (
+            f"The search left the finite numbers within {steps} steps: {problem.where(wrong)}"
+            f"{_help(problem, wrong)}"
+        )
+    if wrong_inputs := misfit(chi2, dof):
+        message = wrong_inputs if message == "converged" else f"{wrong_inputs} {message}"
     dense = isinstance(matrix, np.ndarray)
     return SpectralFit(
         free=like.free,
@@ -208,8 +225,8 @@ def fit_spectra(
         covariance=covariance,
         hessian=_widened(matrix, keep, len(theta)) if dense else None,
         fisher=_widened(scatter, keep, len(theta)) if dense else None,
-        chi2=2 * float(problem.derivatives(theta).value.sum()),
-        dof=like.values - int(problem.present.sum()),
+        chi2=chi2,
+        dof=dof,
         converged=message == "converged",
         message=message,
         details={
@@ -250,17 +267,28 @@ def _errors(problem, matrix, factor, scatter, keep, determined):
     return covariance, np.sqrt(np.diagonal(covariance))
 
 
+def _astray(
+    problem: Problem, theta: np.ndarray, sigma: np.ndarray, start: np.ndarray
+) -> Bool[np.ndarray, " par"]:
+    return np.concatenate(
+        [
+            astray(name, theta[own], sigma[own], start[own])
+            for i, name in enumerate(problem.like.free)
+            for own in [problem.owner == i]
+        ]
+    )
+
+
+def _help(problem: Problem, bad: np.ndarray) -> str:
+    return f"; {help_by_prior(tuple(dict.fromkeys(np.array(problem.names)[bad])))}."
+
+
 def _edge_message(problem: Problem, edges: np.ndarray) -> str:
     first = int(np.argmax(edges))
-    name, label = problem.names[first], problem.labels[first]
-    owned = problem.owner == problem.owner[first]
     low, high = problem.low[first], problem.high[first]
-    count = int(edges[owned].sum())
-    where = f"in {count} of {int(owned.sum())} regions" if label != name else ""
+    own = edges & (problem.owner == problem.owner[first])
+    where = problem.where(own).removeprefix(problem.names[first])
     return (
-        " ".join(
-            f"The best fit of {name!r} lies at the edge of its uniform prior {low:g} ... {high:g} "
-            f"{where}".split()
-        )
-        + "."
+        f"The best fit of {problem.names[first]!r} lies at the edge of its uniform prior "
+        f"{low:g} ... {high:g}{where}{_help(problem, own)}"
     )

@@ -99,6 +99,25 @@ class Problem:
             labels += [name if single else f"{name}[{k}]" for k in regions]
         return tuple(labels)
 
+    def where(self, bad: Bool[np.ndarray, " par"]) -> str:
+        """Names of parameters, with the regions and pixels that they are of."""
+        of_cell = np.zeros(len(self.index), int)
+        if self.like.of_pixel is not None:
+            of_pixel = np.asarray(self.like.of_pixel)
+            of_cell = np.bincount(of_pixel[of_pixel >= 0], minlength=len(self.index))
+        pixels = np.zeros(len(self.owner), int)
+        np.add.at(pixels, self.index, of_cell[:, None])
+        named = []
+        for i, name in enumerate(self.like.free):
+            own = self.present & (self.owner == i)
+            if not (bad & own).any():
+                continue
+            if self.like.start[name].ndim:
+                counts = f"{(bad & own).sum()} of {own.sum()} regions"
+                name += f" in {counts} ({pixels[bad & own].sum()} of {pixels[own].sum()} pixels)"
+            named.append(name)
+        return ", ".join(named[:6]) + (f" and {len(named) - 6} more" if named[6:] else "")
+
     def derivatives(self, theta: np.ndarray) -> Derivatives:
         """-ln L of each cell and its derivatives, as arrays of numpy; priors left out."""
         key = theta.tobytes()

@@ -21,7 +21,7 @@ from fits.priors import Prior, check_priors
 from fits.results import FitResult
 from fits.sample import ensemble, ensemble_summary, summary
 from fits.separation.agreement import agreement
-from fits.separation.fit import fit_spectra
+from fits.separation.fit import fit_spectra, start_vector
 from fits.separation.likelihood import SpectralLikelihood
 from fits.separation.posterior import scaled_posterior
 from fits.separation.problem import Problem, value_and_gradient
@@ -268,8 +268,9 @@ def sample_spectra(
     FitError
         If data and priors do not determine the parameters, R-hat is 1.01 or more, there are fewer
         than 100 effective samples for each chain, or more than one in a thousand steps diverged;
-        with "emcee", if the chain is shorter than 50 autocorrelation times. Not if throw=False;
-        the result is in its `.result`.
+        with "emcee", if the chain is shorter than 50 autocorrelation times. If chi^2 is that of
+        no fit, or a parameter is left open (`fits.results`). Not if throw=False; the result is in
+        its `.result`.
     """
     check_seed("seed", seed)
     options = _options(
@@ -296,9 +297,13 @@ def sample_spectra(
         theta = posterior.theta.at[posterior.present].set(jnp.array(list(values.values())))
         return 2 * float(value_and_gradient(like, theta)[0])
 
+    def judged(result: FitResult) -> FitResult:
+        begun = start_vector(like, start, priors)[problem.present]
+        return result.judged(result.chi2, fit.dof, dict(zip(labels, begun, strict=True)))
+
     if sampler == "nuts":
         result = _nuts(posterior, labels, chi2_of, seed=seed, progress=progress, **options)
-        return result.checked(throw)
+        return judged(result).checked(throw)
     walkers = options["nwalkers"]
     chains = ensemble(
         lambda values: np.asarray(_log_probs(posterior, values)),
@@ -308,4 +313,4 @@ def sample_spectra(
         progress=progress,
         **options,
     )
-    return ensemble_summary(chains, labels, chi2_of).checked(throw)
+    return judged(ensemble_summary(chains, labels, chi2_of)).checked(throw)

@@ -20,6 +20,7 @@ from ducc0.misc.experimental import coupling_matrix_rect
 from jaxtyping import Array, Float
 
 from fits.discs import zonal, zonal_products
+from jaxsky.checks import check_finite, is_concrete
 from jaxsky.correlated import realisation
 from jaxsky.harmonics import analysis, expand, lmax_of, power_spectrum, synthesis
 
@@ -293,7 +294,15 @@ def band_powers(
     spectra : from `masked_spectra`
     maps : Q and U, RING, values outside the mask do not matter
     other : Q and U of another map, for cross-spectra, which noise of its own does not bias
+
+    Raises
+    ------
+    ValueError
+        If values inside the mask are not finite or UNSEEN.
     """
+    for name, values in {"maps": maps, "other": maps if other is None else other}.items():
+        if is_concrete(values):
+            check_finite(name, np.where(np.asarray(spectra.mask) > 0, np.asarray(values), 0))
     alms = [
         _masked_alm(spectra.mask, spectra.derivatives, jnp.asarray(m), spectra.lmax)
         for m in (maps, maps if other is None else other)

@@ -319,13 +319,15 @@ def estimate_variance(
     Raises
     ------
     ValueError
-        If no complete group is left.
+        If no complete group is left, or values in one are not finite or UNSEEN.
     """
     nside = healpy.npix2nside(maps.shape[-1])
     whole = children(used, nside // 2).all(axis=-1)
     if not bool(whole.any()):
         raise ValueError("Estimating the noise needs groups of four pixels that are all used.")
-    scatter = jnp.var(children(maps, nside // 2), axis=-1, ddof=1)
+    groups = children(maps, nside // 2)
+    check_finite("maps", groups[:, whole])
+    scatter = jnp.var(groups, axis=-1, ddof=1)
     return jnp.sum(scatter * whole, axis=-1) / jnp.sum(whole)
 
 

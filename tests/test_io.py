@@ -398,3 +398,9 @@ def test_real_masks(data_dir):
     assert read_mask(path, key="GAL040").mean() == pytest.approx(0.4, abs=0.01)
     path = data_dir / "wmap7" / "wmap_temperature_analysis_mask_r9_7yr_v4_udgraded32.fits"
     assert 0.5 < read_mask(path, nside=32).mean() < 0.8
+
+
+def test_a_column_is_not_two(tmp_path):
+    healpy.write_map(tmp_path / "m.fits", np.ones((3, 12)), dtype=np.float64)
+    with pytest.raises(InputError, match=r"m.fits, HDU 1: `fields` names a column twice"):
+        read_maps(tmp_path / "m.fits", fields=["Q_POLARISATION", "Q_POLARISATION"], unit="K_CMB")

@@ -214,6 +214,7 @@ def test_wavenumbers_and_wavelengths(tmp_path, content, arguments):
         (b"weight nu\n1 28\n2 30\n", {}, r"the first of 2 columns \(weight nu\) may not be"),
         (b"28 30 1\n30 31 1\n", {"fields": [1, 3]}, "no column 3; it has 0 to 2"),
         (b"28 30 1\n30 31 1\n", {"fields": ["w", 1]}, "no column 'w'; it has 0 to 2"),
+        (b"28 30 1\n30 31 1\n", {"fields": [1, 1]}, "`fields` names column 1 twice"),
         (b"28 30 1\n30 31 1\n", {"fields": [1]}, "`fields` must name two columns, not 1"),
         (b" ".join([b"1"] * 3000) + b"\n", {}, "3000 columns; give `fields`"),
         (b"28000 1\n30000 1\n", {}, "middle of the band is at 29000 GHz, .* give `unit`"),

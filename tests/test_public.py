@@ -15,11 +15,14 @@ from pydantic import BaseModel, ValidationError
 
 import fits
 import jaxsky
+from fits.pseudo_cl import band_powers, masked_spectra
 from fits.settings import Analysis
 from jaxsky import Bandpass, Sky, Synchrotron, observe, set_parameters
 from jaxsky.checks import as_array
+from jaxsky.harmonics import smooth
 from jaxsky.io import Maps, unit_factor
 from jaxsky.montecarlo import realisation_key
+from jaxsky.noise import estimate_variance
 
 #: Annotations of arguments that may be numbers, or hold some.
 NUMERIC = re.compile(
@@ -84,6 +87,7 @@ def test_the_sweep_sees_the_packages():
 
 
 QUANTITY = 2 * u.GHz
+UNSEEN, NPIX = -1.6375e30, 768
 
 
 def call(function, parameter, value):
@@ -166,3 +170,25 @@ def test_arrays_of_other_packages_are_refused():
 
     with pytest.raises(TypeError, match="carries the unit gigahertz"):
         Bandpass.delta(Pint())
+
+
+@pytest.mark.parametrize("value", [UNSEEN, np.nan, np.inf])
+def test_missing_pixels_are_no_values(value):
+    used = np.arange(NPIX) >= 200
+    maps = np.ones((2, NPIX))
+    spectra = masked_spectra(used.astype(float), (2, 9, 16), lmax=15)
+    calls = {
+        "smooth": lambda: smooth(maps, 600.0),
+        "band_powers": lambda: band_powers(spectra, maps),
+        "cross": lambda: band_powers(spectra, np.ones((2, NPIX)), maps),
+        "variance": lambda: estimate_variance(maps, used),
+    }
+    for function in calls.values():
+        function()
+    maps[:, 5] = value  # outside of the mask
+    calls["band_powers"]()
+    maps[0, 400] = value
+    for name, function in calls.items():
+        argument = "other" if name == "cross" else "maps"
+        with pytest.raises(ValueError, match=rf"Argument `{argument}` has . of .* \(or UNSEEN\)"):
+            function()

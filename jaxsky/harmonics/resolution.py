@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxsky.checks import is_concrete
+from jaxsky.checks import check_finite, is_concrete
 from jaxsky.harmonics.beams import beam_ratio, needed_lmax
 from jaxsky.harmonics.packing import expand, resize
 from jaxsky.harmonics.transforms import analysis, synthesis
@@ -70,8 +70,9 @@ def smooth(
     Raises
     ------
     ValueError
-        If the target is finer than the maps' own beam.
+        If the target is finer than the maps' own beam, or values are not finite or UNSEEN.
     """
+    check_finite("maps", maps)
     nside = healpy.npix2nside(maps.shape[-1])
     window = beam_ratio(fwhm, own, 2 * nside if lmax is None else lmax)
     if lmax is None and is_concrete(window):

@@ -215,6 +215,8 @@ def _columns(path: Path, table: TextTable, fields: Sequence[int | str] | None) -
         if isinstance(column, str) or not 0 <= column < width:
             known = ", ".join(names) or f"0 to {width - 1}"
             raise InputError(f"{path}: no column {column!r}; it has {known}.")
+    if columns[0] == columns[1]:
+        raise InputError(f"{path}: argument `fields` names column {fields[0]!r} twice.")
     return [int(column) for column in columns]
 
 

@@ -151,6 +151,8 @@ def read_columns(
             wanted = default_fields(table)
         else:
             wanted = [table.index(field) for field in source.fields]
+            if len(set(wanted)) < len(wanted):
+                raise InputError(f"{table.where}: `fields` names a column twice: {source.fields}.")
         unit = _unit(table, wanted, unit)
         order = table.state("ordering", ordering, ("ORDERING",), ORDERINGS)
         return Columns(

@@ -446,3 +446,12 @@ def test_fits_take_hits_and_six_columns(folder, matrices, hits):
     np.testing.assert_allclose(bands["W"].noise[..., others()], expected, rtol=1e-12)
     expected = matrices[1:, 1:, others()] * FACTOR**2
     np.testing.assert_allclose(bands["P"].noise[..., others()], expected, rtol=1e-12)
+
+
+def test_bandpasses_with_unit_and_columns_from_settings(tmp_path):
+    (tmp_path / "b.txt").write_text("0 28000 1\n1 30000 1\n")
+    spec = {"file": "b.txt", "convention": "RJ", "unit": "MHz", "fields": [1, 2]}
+    band = read_bandpass_spec(tmp_path, BandpassSpec(**spec))
+    np.testing.assert_allclose(band.nu, [28, 30])
+    with pytest.raises(ValueError, match="unit, fields: of the file of a bandpass, not of center"):
+        BandpassSpec(center=30.0, unit="MHz", fields=[1, 2])

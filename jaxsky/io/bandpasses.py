@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
-from astropy import units as u
 from astropy.io import fits as pyfits
 
 from jaxsky.bandpass import CONVENTIONS, Bandpass
 from jaxsky.constants import GHZ_PER_INVERSE_CM
+from jaxsky.io.frequencies import check_plausible, frequency_unit, to_GHz
 from jaxsky.io.spectra import is_fits
 from jaxsky.io.tables import InputError, open_fits, select_hdu
 from jaxsky.io.text import TextTable, number, read_text
@@ -23,20 +23,7 @@ Samples: TypeAlias = tuple[np.ndarray, np.ndarray]
 #: Unit of a RIMO's WAVENUMBER -> (factor to GHz, convention). The LFI column holds frequencies,
 #: and its weights act on antenna temperature; those of HFI act on power.
 _RIMO = {"GHz": (1.0, "RJ"), "1/cm": (GHZ_PER_INVERSE_CM, "power")}
-#: astropy's name of a unit -> how it is spelt; wavenumbers and wavelengths are converted.
-_UNITS = {
-    **{f"{prefix}Hz": re.compile(f"{prefix}hz", re.I) for prefix in ("", "k", "M", "G", "T")},
-    "1/cm": re.compile(r"1/cm|cm(\^|\*\*)?[({]?-1[)}]?", re.I),
-    "um": re.compile(r"microns?|micrometers?|[u\u00b5\u03bc]m", re.I),
-    "mm": re.compile("mm"),
-}
-_UNIT = re.compile(
-    rf"(?<![a-z0-9])(?:{'|'.join(f'(?:{x.pattern})' for x in _UNITS.values())})(?![a-z0-9^*/-])",
-    re.I,
-)
-#: Words of a header: what has a unit that is divided by, what is no frequency in GHz.
-_FREQUENCY = re.compile(r"(nu|\u03bd|f|freq\w*|wavenumbers?|wavelengths?|lambda)\s*/$", re.I)
-_NO_UNIT = re.compile(r"wave(number|length)|lambda", re.I)
+#: Names of columns that hold no frequencies.
 _NO_FREQUENCY = re.compile(
     r"index|idx|i|n|no\.?|number|row|sample|channel|id|weights?|w|t|trans\w*|response|bandpass",
     re.I,
@@ -45,8 +32,6 @@ _NO_FREQUENCY = re.compile(
 _NO_WEIGHT = 1e-6
 #: A band has more columns than these only if its table is something else, or lies on its side.
 _WIDEST = 8
-#: Middle of a band [GHz]: where no unit is stated, and where one is.
-_BARE, _STATED = (1.0, 3000.0), (0.01, 30000.0)
 
 
 def _checked(path: Path, nu: np.ndarray, weights: np.ndarray) -> Samples:
@@ -155,41 +140,6 @@ def _read_rimo(
     return _mean([samples for samples, _ in found]), found[0][1]
 
 
-def _stated_units(table: TextTable) -> list[str]:
-    """Units of frequencies that an IPAC header or the words above the rows state."""
-    if table.bars:
-        unit = table.bars[2].split("|")[0].strip() if len(table.bars) > 2 else ""
-        return [_known_unit(unit)] if unit else []
-    found: dict[str, None] = {}  # a set that keeps its order
-    for line in table.header:
-        for match in _UNIT.finditer(line):
-            before = line[: match.start()].rstrip(" ([")
-            of_weights = before.endswith("/") and not _FREQUENCY.search(before)
-            # "the 30 GHz band" is a name; weights may be per GHz.
-            if not (before[-1:].isdigit() or of_weights or before.lower().endswith("per")):
-                found[_known_unit(match[0])] = None
-    return list(found)
-
-
-def _known_unit(text: str) -> str:
-    """astropy's spelling of a unit, whose case files do not respect; as it is if there is none."""
-    word = text.strip()
-    return next((name for name, spelling in _UNITS.items() if spelling.fullmatch(word)), word)
-
-
-def _to_GHz(path: Path, samples: np.ndarray, unit: str) -> np.ndarray:
-    """Samples of a table with frequencies, wavenumbers or wavelengths turned to GHz."""
-    known = _known_unit(unit)
-    if known not in _UNITS:
-        raise InputError(
-            f"{path}: the frequencies' unit is {unit!r}, not one of {', '.join(_UNITS)}."
-        )
-    with np.errstate(divide="ignore"):
-        nu = u.Quantity(samples[0], known).to_value(u.GHz, equivalencies=u.spectral())
-    falls = u.Unit(known).physical_type == "length"
-    return np.array([nu, samples[1]])[:, :: -1 if falls else 1]
-
-
 def _columns(path: Path, table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
     """Numbers of the columns of frequency and weight."""
     width = len(table.rows[0].cells)
@@ -208,16 +158,18 @@ def _columns(path: Path, table: TextTable, fields: Sequence[int | str] | None) -
                 "`fields`, the columns of frequency and weight, such as [1, 2]."
             )
         return [0, 1]
-    if len(fields) != 2:
-        raise InputError(f"{path}: argument `fields` must name two columns, not {len(fields)}.")
-    columns = [names.index(f) if isinstance(f, str) and f in names else f for f in fields]
-    for column in columns:
-        if isinstance(column, str) or not 0 <= column < width:
+    if isinstance(fields, str) or len(fields) != 2:
+        raise InputError(f"{path}: argument `fields` must name two columns, not {fields!r}.")
+    columns = []
+    for field in fields:
+        column = names.index(field) if isinstance(field, str) and field in names else field
+        if not isinstance(column, int) or isinstance(column, bool) or not 0 <= column < width:
             known = ", ".join(names) or f"0 to {width - 1}"
-            raise InputError(f"{path}: no column {column!r}; it has {known}.")
+            raise InputError(f"{path}: no column {field!r}; it has {known}.")
+        columns.append(column)
     if columns[0] == columns[1]:
         raise InputError(f"{path}: argument `fields` names column {fields[0]!r} twice.")
-    return [int(column) for column in columns]
+    return columns
 
 
 def _read_text(
@@ -233,24 +185,9 @@ def _read_text(
             raise InputError(f"{path}, line {line}: not two numbers: {text!r}.")
         rows.append(values)
     samples = np.array(rows, np.float64).T
-    stated = _stated_units(table)
-    words = " ".join([*table.bars[:1], *table.header])
-    if given and len(stated) == 1 and _known_unit(given) not in stated:
-        raise InputError(f"{path}: argument `unit` is {given!r}, but the file says {stated[0]!r}.")
-    if not given and len(stated) > 1:
-        raise InputError(f"{path}: the header names the units {', '.join(stated)}; give `unit`.")
-    unit = given or next(iter(stated), None)
-    if unit is None and (table.bars or _NO_UNIT.search(words)):
-        raise InputError(f"{path}: the unit of the frequencies is missing; give `unit`.")
-    nu, weights = _checked(path, *_to_GHz(path, samples, unit or "GHz"))
-    low, high = _BARE if unit is None else _STATED
-    center = float(np.average(nu, weights=np.abs(weights)))
-    if not low <= center <= high:
-        asked = "" if unit else "; give `unit`, such as MHz or THz, or GHz if it is right"
-        raise InputError(
-            f"{path}: in {unit or 'GHz'}, the middle of the band is at {center:g} GHz, outside of "
-            f"{low:g} to {high:g} GHz{asked}."
-        )
+    unit = frequency_unit(path, table, columns[0], given)
+    nu, weights = _checked(path, *to_GHz(path, samples, unit or "GHz"))
+    check_plausible(path, float(np.average(nu, weights=np.abs(weights))), unit)
     return (nu, weights), "power" if table.bars else None
 
 
@@ -306,6 +243,8 @@ def read_bandpass(
     if convention is not None and convention not in CONVENTIONS:
         known = ", ".join(CONVENTIONS)
         raise ValueError(f"Argument `convention` must be one of {known}, not {convention!r}.")
+    if unit is not None and not isinstance(unit, str):
+        raise TypeError(f"Argument `unit` must be the name of a unit, not {unit!r}.")
     if not 0 <= trim < 1:
         raise ValueError(f"Argument `trim` must be within [0, 1), but is {trim}.")
     found: str | None

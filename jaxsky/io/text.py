@@ -17,6 +17,8 @@ _TRAILING = re.compile(r"\s(?:[#!%\\]|//).*")
 _NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:[ed][+-]?\d+)?|nan|inf|infinity)", re.I | re.ASCII
 )
+#: A field that begins as a number does, if not as a word.
+_DAMAGED = re.compile(r"[\"'(\[+-]*\.?\d")
 
 
 class Row(NamedTuple):
@@ -87,7 +89,8 @@ def read_text(path: Path) -> TextTable:
     r"""The lines of a text table; UTF-8, or UTF-16 with its mark.
 
     Comments start with # ; % ! \ | // or *. Columns are separated by blanks, commas or semicolons.
-    A line before the first row is a header if none of its fields is a number.
+    A line before the first row is a header if none of its fields is a number, and they do not all
+    begin with a digit.
 
     Raises
     ------
@@ -102,12 +105,15 @@ def read_text(path: Path) -> TextTable:
         if text.startswith("|") and table.rows:
             raise InputError(f"{path}, line {line}: a header among the rows: {text!r}.")
         if text.startswith(COMMENTS):
-            (table.bars if text.startswith("|") else table.header).append(
-                text.lstrip("".join(COMMENTS)).strip()
-            )
+            if text.startswith("|"):
+                table.bars.append(text)
+            elif not table.rows:
+                table.header.append(text.lstrip("".join(COMMENTS)).strip())
             continue
         cells = _cells(path, line, _TRAILING.sub("", text))
         if not table.rows and all(number(cell) is None for cell in cells):
+            if all(_DAMAGED.match(cell) for cell in cells):
+                raise InputError(f"{path}, line {line}: not a row of numbers: {text!r}.")
             table.header.append(text)
         else:
             table.rows.append(Row(line, text, cells))

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from fits.settings import Settings
-from jaxsky.io import InputError, degrade_mask, read_mask
+from jaxsky.inputs import mask_at
+from jaxsky.io import InputError, read_mask
 from jaxsky.lookup import find_file
 from jaxsky.settings import SettingsError
 
@@ -39,7 +40,8 @@ def region_masks(settings: Settings) -> dict[str, Bool[np.ndarray, " pix"]]:
     if analysis.mask is not None:
         mask = analysis.mask
         path = find_file(folder, mask.file)
-        common = degrade_mask(read_mask(path, key=mask.key, ordering=mask.ordering), analysis.nside)
+        found = read_mask(path, key=mask.key, ordering=mask.ordering)
+        common = mask_at(found, analysis.nside, "analysis.mask")
     regions = {}
     for name in analysis.regions:
         label = name if name in known_regions() else _label(name)
@@ -50,7 +52,8 @@ def region_masks(settings: Settings) -> dict[str, Bool[np.ndarray, " pix"]]:
         elif name == "full":
             region = np.ones(npix, bool)
         else:
-            region = degrade_mask(read_mask(_mask_file(folder, name)), analysis.nside)
+            found = read_mask(_mask_file(folder, name))
+            region = mask_at(found, analysis.nside, f"analysis.regions: {name}")
         if label in regions:
             raise SettingsError(f"analysis.regions: two regions are called {label!r}.")
         regions[label] = np.asarray(region & common)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import AME, Component, Dust, Synchrotron
-from jaxsky.io import InputError, Maps, read_bandpass, read_maps, unit_factor
+from jaxsky.io import InputError, Maps, degrade_mask, read_bandpass, read_maps, unit_factor
 from jaxsky.io.columns import stokes as stokes_of
 from jaxsky.lookup import find_file
 from jaxsky.noise import (
@@ -37,6 +37,7 @@ __all__ = [
     "LAWS",
     "Template",
     "check_stokes",
+    "mask_at",
     "read",
     "read_bandpass_spec",
     "read_noise",
@@ -190,6 +191,20 @@ def set_parameters_of(
         component = set_parameters(Sky({name: templates[name].component}), values)[name]
         changed[name] = templates[name]._replace(component=component)
     return changed
+
+
+def mask_at(mask: Bool[np.ndarray, " pix"], nside: int, where: str) -> Bool[np.ndarray, " pix"]:
+    """A mask at the resolution at which it is used; see `jaxsky.io.degrade_mask`.
+
+    Raises
+    ------
+    SettingsError
+        If it is coarser, or has an nside that is no power of two; `where` is its key.
+    """
+    try:
+        return np.asarray(degrade_mask(mask, nside))
+    except ValueError as error:
+        raise SettingsError(f"{where}: {error}") from None
 
 
 def uK_RJ_per(unit: str, at: Bandpass | float, where: str) -> float:

@@ -8,6 +8,7 @@ from astropy.io import fits as pyfits
 from fits import settings as fit_settings
 from fits.inputs import read_band, read_inputs
 from fits.paper.settings import PaperSettings
+from fits.regions import region_masks
 from fits.separate.settings import SeparateSettings
 from fits.separate.setup import build
 from jaxsky.experiment.settings import Experiment
@@ -223,6 +224,19 @@ def test_footprints_and_marks_in_settings(tmp_path):
 def test_mistakes_in_map_entries(entry, words):
     with pytest.raises(ValueError, match=words):
         MapFile.model_validate({"file": "m.fits"} | entry)
+
+
+def test_masks_that_are_coarser_are_named_with_their_key(tmp_path):
+    write(tmp_path / "mask.fits", table({"M": np.ones(48)}, ["1"]))
+    mask = {"mask": {"file": "mask.fits"}, "nside": NSIDE}
+    words = "`nside` must be a power of 2 up to that of the mask, 2, not 8"
+    for analysis, key in ((mask, "mask"), ({"nside": NSIDE, "regions": ["mask.fits"]}, "regions")):
+        raw = {"data_dir": str(tmp_path), "embedded": {}, "analysis": analysis}
+        with pytest.raises(SettingsError, match=rf"analysis.{key}: .*{words}"):
+            region_masks(fit_settings.Settings.model_validate(raw))
+    main = {"sampler": "none"} | mask
+    with pytest.raises(SettingsError, match=rf"separation.mask: .*{words}"):
+        build(separation(tmp_path, separation=main))
 
 
 def test_too_many_columns_or_others(tmp_path):

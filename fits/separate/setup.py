@@ -22,9 +22,9 @@ from fits.separation.regions import clusters, latitude_bands, superpixels
 from jaxsky import CMB, Component, Sky, get_parameters, observe, parameter_names, set_parameters
 from jaxsky.galaxy import embedded_sky
 from jaxsky.harmonics import gaussian_beam, resample
-from jaxsky.inputs import LAWS, read, read_parameter
+from jaxsky.inputs import LAWS, mask_at, read, read_parameter
 from jaxsky.instrument import load_instrument
-from jaxsky.io import degrade_mask, read_mask
+from jaxsky.io import read_mask
 from jaxsky.lookup import find_file
 from jaxsky.parameter_maps import one_column
 from jaxsky.settings import MapFile, SettingsError
@@ -101,10 +101,7 @@ def _inside(settings: SeparateSettings) -> Bool[np.ndarray, " pix"]:
     if main.mask is not None:
         path = find_file(Path(settings.data_dir), main.mask.file)
         found = read_mask(path, key=main.mask.key, ordering=main.mask.ordering)
-        try:
-            inside &= np.asarray(degrade_mask(found, main.nside))
-        except ValueError as error:
-            raise SettingsError(f"separation.mask: {error}") from None
+        inside &= mask_at(found, main.nside, "separation.mask")
     if not inside.any():
         raise SettingsError("separation.mask: leaves no pixel.")
     return inside

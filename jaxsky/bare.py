@@ -13,8 +13,8 @@ from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from types import ModuleType
 from typing import Any, TypeVar
 
+import jax
 import numpy as np
-from pydantic import BaseModel
 
 __all__ = ["refuse_unit", "takes_quantities"]
 
@@ -34,7 +34,7 @@ def _unit(value: object) -> object:
 
 def refuse_unit(name: str, value: object) -> None:
     """Raise TypeError if a value, or an entry of a list or dict, carries a unit."""
-    if type(value) in PLAIN:
+    if type(value) in PLAIN or isinstance(value, jax.Array):
         return
     if isinstance(value, dict):
         for key, entry in value.items():
@@ -92,7 +92,8 @@ def _guard(module: ModuleType) -> None:
         if getattr(value, "__module__", None) != module.__name__:
             continue
         if inspect.isclass(value):
-            if not issubclass(value, BaseModel | BaseException):
+            # Settings, of pydantic, have types of their own.
+            if not issubclass(value, BaseException) and not hasattr(value, "model_fields"):
                 _guard_class(value)
         elif callable(value) and not hasattr(value, "takes_quantities"):
             setattr(module, name, _guarded(value))

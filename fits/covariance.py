@@ -10,6 +10,7 @@ import equinox as eqx
 import healpy
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from fits.preparation import Preparation
@@ -42,7 +43,7 @@ class Fluctuations(eqx.Module):
     cmb_windows: Float[Array, "band ell"] | None
     cmb_factors: Float[Array, " band"]
 
-    @eqx.filter_jit
+    # Not one program: XLA would hold the maps of all rows and bands at once.
     def covariance(
         self, rows: Float[Array, "band row stokes pix"]
     ) -> Float[Array, "bandrow bandrow"]:
@@ -50,8 +51,7 @@ class Fluctuations(eqx.Module):
         bands, count = rows.shape[:2]
         total = jnp.zeros((bands, count, bands, count))
         for b, (preparation, noise) in enumerate(zip(self.preparations, self.noise, strict=True)):
-            before = jnp.stack([preparation.transpose(row) for row in rows[b]])
-            block = jnp.einsum("isp,stp,jtp->ij", before, noise, before)
+            block = _products(preparation, noise, rows[b])
             if (spectrum := self.correlated[b]) is not None:
                 modes = _modes(rows[b], jnp.stack([spectrum, spectrum]))
                 block = block + modes @ modes.T
@@ -74,7 +74,8 @@ class Fluctuations(eqx.Module):
         """Noise of all bands at the common resolution [uK_RJ]."""
         maps = []
         for b, (preparation, noise) in enumerate(zip(self.preparations, self.noise, strict=True)):
-            total = preparation.of_noise(draw(stream(key, "noise", str(b)), noise))
+            drawn = draw(stream(key, "noise", str(b)), jnp.asarray(noise, float))
+            total = preparation.of_noise(drawn)
             if (spectrum := self.correlated[b]) is not None:
                 white = jax.random.normal(stream(key, "correlated", str(b)), (2, spectrum.size**2))
                 total = total + synthesis(white * expand(jnp.sqrt(spectrum)), preparation.nside)
@@ -110,7 +111,7 @@ class Fluctuations(eqx.Module):
         for preparation, noise, spectrum in zip(
             self.preparations, self.noise, self.correlated, strict=True
         ):
-            variance = preparation.variance(jnp.diagonal(noise, axis1=0, axis2=1).T)
+            variance = preparation.variance([noise[s, s] for s in range(len(noise))])
             if spectrum is not None:
                 modes = 2 * jnp.arange(spectrum.size) + 1
                 variance = variance + jnp.sum(modes * spectrum) / (4 * jnp.pi)
@@ -119,6 +120,33 @@ class Fluctuations(eqx.Module):
         return jnp.sqrt(jnp.where(total > 0, total, jnp.nan))
 
 
+def _products(
+    preparation: Preparation,
+    noise: Float[Array, "stokes stokes pix"],
+    rows: Float[Array, "row stokes pix"],
+) -> Float[np.ndarray, "row row"]:
+    """Covariance of the inner products of rows with the prepared noise of a band."""
+    block = np.zeros((len(rows), len(rows)))
+    before: list[Array] = []
+    for i, row in enumerate(rows):
+        before.append(preparation.transpose(row).block_until_ready())
+        for j, other in enumerate(before):
+            block[i, j] = block[j, i] = _product(before[i], noise, other)
+    return block
+
+
+@jax.jit
+def _product(
+    one: Float[Array, "stokes pix"],
+    noise: Float[Array, "stokes stokes pix"],
+    other: Float[Array, "stokes pix"],
+) -> Float[Array, ""]:
+    """Covariance of the inner products of two maps with noise, without maps in between."""
+    n = len(one)
+    return jnp.sum(sum(one[s] * noise[s, t] * other[t] for s in range(n) for t in range(n)))
+
+
+@jax.jit
 def _modes(
     rows: Float[Array, "row stokes pix"], spectra: Float[Array, "stokes ell"]
 ) -> Float[Array, "row mode"]:

@@ -1,6 +1,8 @@
 """What an analysis starts from: templates and observed maps, from files or embedded."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import healpy
@@ -11,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from fits.settings import Band as BandSettings
 from fits.settings import Settings
+from fits.template_noise import TemplateNoise, read_template_noise
 from jaxsky import (
     CMB,
     Bandpass,
@@ -27,6 +30,7 @@ from jaxsky.harmonics import gaussian_beam, resample, synthesis
 from jaxsky.inputs import (
     Template,
     check_stokes,
+    narrow,
     read,
     read_bandpass_spec,
     read_noise,
@@ -84,7 +88,8 @@ class Inputs(NamedTuple):
     """Templates and bands by name, and what is known about them.
 
     `r` is the tensor-to-scalar ratio of the CMB, None where there is no CMB, `truth` holds the
-    parameters of a simulation, and `description` says what the maps are.
+    parameters of a simulation, and `description` says what the maps are. Templates whose noise is
+    not known are missing in `template_noise`.
     """
 
     templates: dict[str, Template]
@@ -92,6 +97,7 @@ class Inputs(NamedTuple):
     r: float | None
     truth: dict[str, float] | None
     description: str
+    template_noise: Mapping[str, TemplateNoise] = MappingProxyType({})
 
 
 def inputs_of(settings: Settings, galaxy: EmbeddedSky | None = None) -> Inputs:
@@ -141,7 +147,8 @@ def embedded_inputs(settings: Settings, galaxy: EmbeddedSky | None = None) -> In
     known = parameter_names(sky)
     free = get_parameters(sky, [name for name in settings.free if name in known])
     truth = {name: float(value) for name, value in free.items()}
-    return Inputs(templates, bands, r, truth, galaxy.description)
+    exact = dict.fromkeys(templates, TemplateNoise())
+    return Inputs(templates, bands, r, truth, galaxy.description, exact)
 
 
 def leak(intensity: Float[Array, " pix"]) -> Float[Array, "2 pix"]:
@@ -170,8 +177,13 @@ def read_inputs(settings: Settings) -> Inputs:
     folder = Path(settings.data_dir)
     sky = set_parameters_of(read_templates(folder, settings.templates), settings.fixed)
     bands = {spec.name: read_band(folder, spec) for spec in settings.bands}
+    noise = {
+        name: read_template_noise(folder, name, spec, sky[name])
+        for name, spec in settings.templates.items()
+        if spec.noise is not None
+    }
     r = settings.cmb.r if settings.cmb.include else None
-    return Inputs(sky, bands, r, None, settings.title)
+    return Inputs(sky, bands, r, None, settings.title, noise)
 
 
 def read_band(folder: Path, spec: BandSettings) -> Band:
@@ -185,8 +197,9 @@ def read_band(folder: Path, spec: BandSettings) -> Band:
     found = read(folder, spec)
     check_stokes(f"bands.{spec.name}", found, "QU")
     bandpass = read_bandpass_spec(folder, spec.bandpass)
-    factor = uK_RJ_per(found.unit, bandpass, f"bands.{spec.name}")
-    maps, used = jnp.asarray(found.maps[-2:]) * factor, np.asarray(found.mask)
+    maps = narrow(found.maps[-2:] * uK_RJ_per(found.unit, bandpass, f"bands.{spec.name}"))
+    used, unit = np.asarray(found.mask), found.unit
+    del found  # as large as all else
     leakage = _read_leakage(folder, spec, bandpass) if spec.leakage else None
     if spec.noise.estimate_above is not None:
         noise, correlated = _estimated_noise(spec.noise, maps, used)
@@ -195,12 +208,14 @@ def read_band(folder: Path, spec: BandSettings) -> Band:
         folder,
         spec.noise,
         bandpass,
-        found.nside,
+        healpy.npix2nside(used.size),
         where=f"bands.{spec.name}.noise",
-        unit=found.unit,
+        unit=unit,
         own=spec,
+        maps=maps,
+        used=used,
     )
-    maps = jnp.where(known, maps, 0)
+    maps = maps if known.all() else jnp.where(known, maps, 0)
     return Band(maps, used & known, bandpass, spec.fwhm, noise, leakage=leakage)
 
 
@@ -209,7 +224,7 @@ def _read_leakage(folder: Path, spec: BandSettings, bandpass: Bandpass) -> Leaka
     found = read(folder, spec.leakage, zeros_are_data=True)
     check_stokes(f"bands.{spec.name}.leakage", found, "QU")
     factor = uK_RJ_per(found.unit, bandpass, f"bands.{spec.name}.leakage")
-    maps = jnp.asarray(found.maps[-2:]) * factor
+    maps = narrow(found.maps[-2:] * factor)
     return Leakage(maps, np.asarray(found.mask), spec.leakage.fwhm)
 
 

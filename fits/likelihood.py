@@ -125,11 +125,15 @@ class TemplateLikelihood(Likelihood):
     #: number of data, those of no weight left out: pixels, or amplitudes for the exact form
     values: Int[Array, ""]
 
-    def residuals(self, params):
+    def coefficients(self, params: Mapping[str, Array]) -> Float[Array, "band stokes template"]:
+        """What each template is multiplied with in each band."""
         sky = set_parameters(self.sky, self.bands.sky_parameters(params))
         seen = observe_components(sky, self.bands.bandpasses)
-        coefficients = jnp.stack([maps[..., 0] for maps in seen.values()], axis=-1)
-        coefficients = coefficients * self.bands.calibration(params)[:, None, None]
+        factors = jnp.stack([maps[..., 0] for maps in seen.values()], axis=-1)
+        return factors * self.bands.calibration(params)[:, None, None]
+
+    def residuals(self, params):
+        coefficients = self.coefficients(params)
         offset = self.bands.offset(params)[..., None]
         vector = jnp.concatenate([jnp.ones_like(offset), -coefficients, -offset], axis=-1)
         return self.matrix @ vector.ravel()
@@ -280,8 +284,8 @@ def likelihood(
     used = slice(1, None if offsets else -1)  # a constant row tells offsets from templates
     if offsets:
         templates = jnp.concatenate([templates, jnp.ones_like(templates[:1])])
-    rows = _one_stokes_each(_weighted_templates(templates, weights), keep)
-    whitening = _whitening(covariance_of(rows))
+    rows = _weighted_templates(templates, weights)
+    whitening = _whitening(_covariance(covariance_of, rows, keep))
     matrix = _matrix(whitening, products[:, :, used], keep, len(labels))
     return TemplateLikelihood(_unit_sky(sky), own, matrix, jnp.array(len(whitening)))
 
@@ -305,11 +309,25 @@ def _matrix(whitening, blocks, keep, stokes):
 
 
 @jax.jit
-def _one_stokes_each(rows: Array, keep: Array) -> Float[Array, "band row stokes pix"]:
+def _one_stokes_each(rows: Array) -> Float[Array, "band row stokes pix"]:
     """Rows (band, template, stokes, pix) split so that each holds one Stokes parameter."""
     bands, templates, stokes, npix = rows.shape
-    split = jnp.eye(stokes)[keep][None, :, None, :, None] * rows[:, None]
-    return split.reshape(bands, len(keep) * templates, stokes, npix)
+    split = jnp.eye(stokes)[None, :, None, :, None] * rows[:, None]
+    return split.reshape(bands, stokes * templates, stokes, npix)
+
+
+def _covariance(
+    covariance_of: CovarianceOf, rows: Float[Array, "band template stokes pix"], keep: Array
+) -> Float[Array, "row row"]:
+    """Covariance of the products of rows with the data, one for each of the Stokes parameters kept.
+
+    Cut out of that of all Stokes parameters, which is the same whatever is kept.
+    """
+    bands, templates, stokes, _ = rows.shape
+    total = covariance_of(_one_stokes_each(rows))
+    total = total.reshape(2 * (bands, stokes, templates))
+    size = bands * len(keep) * templates
+    return total[:, keep][:, :, :, :, keep].reshape(size, size)
 
 
 def _whitening(covariance: Float[Array, "row row"]) -> Float[Array, "row row"]:
@@ -336,6 +354,7 @@ def _whitening(covariance: Float[Array, "row row"]) -> Float[Array, "row row"]:
 
 
 def _pixel_likelihood(at_start, sky, bands, data, weights, keep, covariance_of, constant):
+    every = weights
     weights = jnp.zeros_like(weights).at[:, keep].set(weights[:, keep])
     data = jnp.where(weights > 0, data, 0)
     # Two spare nodes: a shift of a map moves its range, hardly its width.
@@ -346,7 +365,9 @@ def _pixel_likelihood(at_start, sky, bands, data, weights, keep, covariance_of, 
     if covariance_of is not None:
         seen = observe_components(at_start, bands.bandpasses, nodes=nodes)
         maps = [*seen.values(), *([jnp.ones_like(data)] if constant else [])]
-        rows = _one_stokes_each(weights[:, None] * jnp.stack(maps, axis=1), keep)
-        whitening = _whitening(covariance_of(rows))
+        whole = every[:, None] * jnp.stack(maps, axis=1)
+        whitening = _whitening(_covariance(covariance_of, whole, keep))
+        kept = (keep[:, None] * len(maps) + jnp.arange(len(maps))).ravel()
+        rows = _one_stokes_each(whole)[:, kept]
         values = jnp.array(len(whitening))
     return PixelLikelihood(sky, bands, data, jnp.sqrt(weights), nodes, rows, whitening, values)

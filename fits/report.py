@@ -10,8 +10,9 @@ from rich.table import Table
 from fits import plots
 from fits.inputs import Inputs
 from fits.record import write_json, write_log
-from fits.settings import Settings
+from fits.settings import Settings, leaks
 from fits.spectral_index import Fit, all_free
+from fits.template_noise import unknown_noise
 
 __all__ = ["result_table", "warnings", "write_report"]
 
@@ -37,6 +38,10 @@ def _result(fit: Fit, method: str) -> dict[str, Any]:
             "dof_amplitudes": fit.dof_amplitudes,
             "pte_amplitudes": fit.probability_to_exceed(method),
         }
+    if fit.weightless:
+        numbers["bands_without_weight"] = list(fit.weightless)
+    if fit.attenuation is not None:
+        numbers["template_noise"] = fit.attenuation._asdict()
     for key in ("tau", "acceptance", "discard", "steps"):
         if key in result.details:
             numbers[key] = result.details[key]
@@ -53,6 +58,7 @@ def result_json(inputs: Inputs, settings: Settings, fits: Sequence[Fit]) -> dict
         "description": inputs.description,
         "likelihood": settings.analysis.likelihood,
         "truth": inputs.truth,
+        "warnings": warnings(inputs, settings, fits),
         "results": results,
     }
 
@@ -92,13 +98,22 @@ def result_table(fits: Sequence[Fit]) -> Table:
     return table
 
 
-def warnings(fits: Sequence[Fit], methods: Sequence[str]) -> list[str]:
-    """What a user should know before using the numbers, a sentence each."""
-    sentences = []
-    if "grid" in methods and not any("grid" in fit.results for fit in fits):
+def warnings(inputs: Inputs, settings: Settings, fits: Sequence[Fit]) -> list[str]:
+    """What a user should know before using the numbers, a sentence each, the gravest first."""
+    sentences = leaks(settings.bands)
+    if unknown := [name for name in inputs.templates if name not in inputs.template_noise]:
+        sentences.append(unknown_noise(unknown))
+    for band in dict.fromkeys(name for fit in fits for name in fit.weightless):
+        where = ", ".join(f"{f.region} {f.stokes}" for f in fits if band in f.weightless)
+        sentences.append(
+            f"Band {band} carries no weight ({where}): its noise is too large, so the fit is one "
+            "of the other bands alone. It is not counted in degrees of freedom."
+        )
+    if "grid" in settings.analysis.methods and not any("grid" in fit.results for fit in fits):
         sentences.append(
             "The grid was left out: it takes one or two free parameters with uniform priors."
         )
+    sentences += filter(None, map(_attenuated, fits))
     for fit in fits:
         where = f"{fit.region}, {fit.stokes}"
         for method, result in fit.results.items():
@@ -113,6 +128,23 @@ def warnings(fits: Sequence[Fit], methods: Sequence[str]) -> list[str]:
                 f"{probability:.1g}); by chance, or its errors are too small."
             )
     return sentences
+
+
+def _attenuated(fit: Fit) -> str | None:
+    """What the noise of the templates does to a fit, if it does anything."""
+    lost = fit.attenuation
+    if lost is None or not any(lost.shares.values()):
+        return None
+    shares = ", ".join(f"{name} by {100 * share:.2g} %" for name, share in lost.shares.items())
+    sentence = f"{fit.region}, {fit.stokes}: the noise of the templates attenuates {shares}"
+    if not lost.shifts:
+        return f"{sentence}; what this does to parameters with maps of values is not known."
+    result = next(iter(fit.results.values()))
+    shifts = ", ".join(
+        f"{name} by {lost.shifts[name]:+.2g} ({lost.shifts[name] / error:+.1f} sigma)"
+        for name, error in zip(result.free, np.sqrt(np.diag(result.covariance)), strict=True)
+    )
+    return f"{sentence}, which moves {shifts}, to first order; the fit is not corrected for it."
 
 
 def write_report(

@@ -10,8 +10,10 @@ from jaxtyping import Array, Bool, Float
 
 from fits.covariance import Fluctuations
 from fits.inputs import Inputs
-from fits.likelihood import Likelihood, likelihood
+from fits.likelihood import CovarianceOf, Likelihood, likelihood
 from fits.preparation import Preparation, prepare_component
+from fits.record import fingerprint
+from fits.template_noise import prepared_variance
 from jaxsky import Bandpass, Sky, observe
 from jaxsky.cmb import camb_spectra
 from jaxsky.harmonics import gaussian_beam, pixel_window
@@ -27,7 +29,9 @@ class Prepared(NamedTuple):
     """Templates and maps at the common resolution.
 
     `sky` is None where there are no templates. `leakage` is what was subtracted from the data, by
-    band, and `sources` the nside of each template and map as they were given.
+    band, and `sources` the nside of each template and map as they were given. `covariance_of` is
+    that of the fluctuations, which remembers what it was asked for last, `template_variances` that
+    of the noise of each template where it is known.
     """
 
     sky: Sky | None
@@ -38,6 +42,8 @@ class Prepared(NamedTuple):
     fluctuations: Fluctuations
     leakage: dict[str, Float[Array, "stokes pix"]]
     sources: dict[str, int]
+    covariance_of: CovarianceOf
+    template_variances: dict[str, Float[Array, "stokes pix"]]
 
     def model(self) -> Float[Array, "band stokes pix"]:
         """What the templates show in the bands [uK_RJ]."""
@@ -77,7 +83,7 @@ class Prepared(NamedTuple):
             jnp.where(used, self.sigma, jnp.inf),
             start,
             stokes=stokes,
-            covariance_of=self.fluctuations.covariance if kind == "exact" else None,
+            covariance_of=self.covariance_of if kind == "exact" else None,
         )
 
 
@@ -134,17 +140,18 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
         for name, template in inputs.templates.items()
     }
     preparations = tuple(operators[f"band {name!r}"] for name in inputs.bands)
-    whole = [holes.get(op.nside_in, np.ones(1, bool)) for op in preparations]
+    whole = [holes.get(op.nside_in) for op in preparations]
     leakage = {
         name: operators[f"leakage of band {name!r}"](
-            band.leakage.maps * holes.get(healpy.npix2nside(band.leakage.used.size), np.ones(1))
+            _without(band.leakage.maps, holes.get(healpy.npix2nside(band.leakage.used.size)))
         )
         for name, band in inputs.bands.items()
         if band.leakage is not None
     }
     data = jnp.stack(
         [
-            op(band.maps * kept) - leakage.get(name, 0.0)
+            # Band by band: JAX would make what all of them need ahead of their transforms.
+            (op(_without(band.maps, kept)) - leakage.get(name, 0.0)).block_until_ready()
             for op, (name, band), kept in zip(
                 preparations, inputs.bands.items(), whole, strict=True
             )
@@ -162,7 +169,8 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
             windows = windows * pixel_window(nside, lmax)
         spectra = jnp.asarray(camb_spectra(lmax, inputs.r)[1:3])
     noise = tuple(
-        band.noise * kept for band, kept in zip(inputs.bands.values(), whole, strict=True)
+        band.noise if kept is None else band.noise * kept
+        for band, kept in zip(inputs.bands.values(), whole, strict=True)
     )
     correlated = tuple(
         _prepared_spectrum(band.correlated, op, lmax)
@@ -180,7 +188,28 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
         fluctuations,
         leakage,
         nsides,
+        _remembered(fluctuations.covariance),
+        {
+            name: prepared_variance(
+                noise, inputs.templates[name].fwhm, operators[f"template {name!r}"], fwhm
+            )
+            for name, noise in inputs.template_noise.items()
+        },
     )
+
+
+def _remembered(covariance_of: CovarianceOf) -> CovarianceOf:
+    """A covariance that is made once for rows that come again, as for each choice of Stokes."""
+    last: dict[str, Float[Array, "row row"]] = {}
+
+    def remembered(rows: Float[Array, "band row stokes pix"]) -> Float[Array, "row row"]:
+        mark = fingerprint(rows)
+        if mark not in last:
+            last.clear()
+            last[mark] = covariance_of(rows)
+        return last[mark]
+
+    return remembered
 
 
 def _common_holes(maps: Sequence[Bool[np.ndarray, " pix"]]) -> dict[int, np.ndarray]:
@@ -198,6 +227,11 @@ def _common_holes(maps: Sequence[Bool[np.ndarray, " pix"]]) -> dict[int, np.ndar
         )
         for nside in nsides
     }
+
+
+def _without(maps: Float[Array, "stokes pix"], kept: np.ndarray | None) -> Array:
+    """Maps in double precision, zero outside the pixels that are kept; None keeps all."""
+    return jnp.asarray(maps, float) if kept is None else jnp.asarray(maps, float) * kept
 
 
 def _prepared_spectrum(

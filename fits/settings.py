@@ -1,13 +1,14 @@
 """The settings of an analysis: a TOML file, validated with a sentence for each mistake."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
 from fits.priors import Gaussian, Prior, Uniform
+from jaxsky import settings as shared
 from jaxsky.settings import (
     BandpassSpec,
     FileName,
@@ -16,7 +17,6 @@ from jaxsky.settings import (
     NoiseFile,
     SettingsFile,
     Table,
-    TemplateFile,
     check_angles,
     load,
 )
@@ -32,7 +32,7 @@ from jaxsky.settings_types import (
 )
 from jaxsky.settings_values import check_signs
 
-__all__ = ["Settings", "load_settings"]
+__all__ = ["Settings", "leaks", "load_settings"]
 
 EMBEDDED = Path(__file__).with_name("embedded.toml")
 EMBEDDED_COMPARISON = Path(__file__).with_name("comparison") / "embedded.toml"
@@ -99,6 +99,24 @@ class Noise(NoiseFile):
         return self
 
 
+class LevelNoise(NoiseFile):
+    """Noise of a template: as that of a band, or a level seen through its beam [unit arcmin].
+
+    A level or an rms of zero states that the template is exact.
+    """
+
+    KINDS = ("level", *NoiseFile.KINDS)
+
+    level: float | None = Field(None, ge=0)
+    rms: float | None = Field(None, ge=0)
+
+
+class TemplateFile(shared.TemplateFile):
+    """A template of a fit; what is not said about its noise is not known."""
+
+    noise: LevelNoise | None = None
+
+
 class Leakage(MapFile):
     """What leaked from intensity into Q and U, to be subtracted; in the map's unit."""
 
@@ -107,6 +125,9 @@ class Leakage(MapFile):
 
 #: Release and correction in the names of Planck's files.
 _RELEASE = re.compile(r"_R(\d)\.\d\d")
+#: Maps of LFI's second and third release that are as they were observed: of the whole mission,
+#: years, surveys and half rings, whole or compressed.
+_LEAKY = re.compile(r"LFI_SkyMap_(0\d\d)(?![-_]BPassCorr)(.*_R[23]\.\d\d.*)", re.IGNORECASE)
 
 
 class Band(MapFile):
@@ -117,6 +138,25 @@ class Band(MapFile):
     fwhm: float = Field(0.0, ge=0)
     noise: Noise
     leakage: Leakage | None = None
+
+    def leak(self) -> str | None:
+        """A warning if the map is known by its name to hold leakage that is not subtracted."""
+        found = [_LEAKY.fullmatch(Path(file).name) for file in self.files]
+        leaky = [match for match in found if match and "bpasscorr" not in match[2].lower()]
+        if self.leakage is not None or not leaky:
+            return None
+        name, channel, rest = leaky[0].group(0, 1, 2)
+        corrected = f"LFI_SkyMap_{channel}-BPassCorrected{rest}"
+        correction = f"LFI_CorrMap_{channel}-BPassCorr{rest.replace('-field-IQU', '')}"
+        if "_R2." in rest.upper():  # corrected at nside 256 and 1 degree only
+            corrected = f"LFI_SkyMap_{channel}-BPassCorrected_1024_R3.00_full.fits"
+            correction = f"LFI_CorrMap_{channel}-BPassCorr_0256_R2.01_full.fits"
+        return (
+            f"bands.{self.name}: {name} holds intensity that has leaked into Q and U through "
+            "the bandpasses, and nothing is subtracted; indices fitted to it are wrong by many "
+            f"sigma. Take {corrected}, or subtract it: "
+            f'leakage = {{ file = "{correction}", fwhm = ... }}.'
+        )
 
     @model_validator(mode="after")
     def _one_release(self) -> "Band":
@@ -133,6 +173,11 @@ class Band(MapFile):
                 f"of release {found[0]}"
             )
         return self
+
+
+def leaks(bands: Sequence[Band]) -> list[str]:
+    """Warnings about maps that are known to hold leakage; see `Band.leak`."""
+    return [warning for band in bands if (warning := band.leak()) is not None]
 
 
 class Embedded(Table):

@@ -4,7 +4,7 @@ Templates and data are brought to a common resolution; the parameters are then f
 region, to Q, to U and to both, on a grid, by gradient and by MCMC.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,9 +21,14 @@ from fits.resolution import Prepared
 from fits.results import FitResult
 from fits.sample import sample
 from fits.settings import Settings
+from fits.template_noise import Attenuation, attenuation
+from jaxsky import observe_components, parameter_names, set_parameters
 from jaxsky.settings import SettingsError
 
 __all__ = ["Fit", "all_free", "run"]
+
+#: A band in which each template has less than this part of its weight has none.
+WEIGHTLESS = 1e-6
 
 
 class Fit(NamedTuple):
@@ -31,7 +36,8 @@ class Fit(NamedTuple):
 
     `chi2` is the paper's sum over pixels at the best fit of each method, with `dof` degrees of
     freedom; `chi2_amplitudes` and `dof_amplitudes` are those of the exact likelihood, which
-    compares the amplitudes of the templates only.
+    compares the amplitudes of the templates only. Bands without weight (`weightless`) are not
+    counted in either. `attenuation` is what the noise of the templates does, where it is known.
     """
 
     region: str
@@ -40,6 +46,8 @@ class Fit(NamedTuple):
     chi2: dict[str, float]
     dof: int
     dof_amplitudes: int | None
+    weightless: tuple[str, ...] = ()
+    attenuation: Attenuation | None = None
 
     def probability_to_exceed(self, method: str) -> float | None:
         """Probability of a larger chi^2 of the amplitudes; None for the diagonal likelihood."""
@@ -75,9 +83,11 @@ def fit_pixels(
     report(f"{region}, {stokes}: inner products")
     diagonal = prepared.likelihood(start, stokes=stokes, region=used, kind="diagonal")
     like, dof_amplitudes = diagonal, None
+    nothing = weightless(prepared, start, used, stokes)
+    weighty = 1 - len(nothing) / len(prepared.bands)
     if settings.analysis.likelihood == "exact":
         like = prepared.likelihood(start, stokes=stokes, region=used)
-        dof_amplitudes = like.residuals(start).size - len(start)
+        dof_amplitudes = round(like.residuals(start).size * weighty) - len(start)
     results: dict[str, FitResult] = {}
     for method in settings.analysis.methods:
         report(f"{region}, {stokes}: {method}")
@@ -109,9 +119,39 @@ def fit_pixels(
             "analysis.methods: a grid alone takes one or two free parameters with uniform priors."
         )
     values = {method: float(chi2(diagonal, r.best_fit)) for method, r in results.items()}
-    dof = int(used.sum()) * len(prepared.bands) * len(stokes) - len(start)
+    number = len(prepared.bands) - len(nothing)
+    dof = int(used.sum()) * number * len(stokes) - len(start)
     results = {method: r.judged(values[method], dof, start) for method, r in results.items()}
-    return Fit(region, stokes, results, values, dof, dof_amplitudes)
+    lost = None
+    if prepared.template_variances and prepared.sky is not None:
+        variances, result = prepared.template_variances, next(iter(results.values()))
+        sky, sigma = prepared.sky, prepared.sigma
+        lost = attenuation(like, result, sky, variances, sigma, used, stokes)
+    return Fit(region, stokes, results, values, dof, dof_amplitudes, nothing, lost)
+
+
+def weightless(
+    prepared: Prepared,
+    params: Mapping[str, float],
+    used: Bool[np.ndarray, " pix"],
+    stokes: str,
+) -> tuple[str, ...]:
+    """Bands in which no template is seen with any weight, compared with the other bands."""
+    assert prepared.sky is not None  # there are templates
+    known = parameter_names(prepared.sky)
+    values = {name: value for name, value in params.items() if name in known}
+    sky = set_parameters(prepared.sky, values)
+    seen = observe_components(sky, list(prepared.bands.values()))
+    keep = np.array(["QU".index(s) for s in stokes])
+    power = np.stack(
+        [
+            np.sum(np.where(used, maps / prepared.sigma, 0.0)[:, keep] ** 2, axis=(1, 2))
+            for maps in seen.values()
+        ]
+    )
+    total = power.sum(axis=1, keepdims=True)
+    share = np.max(power / np.where(total > 0, total, 1.0), axis=0)
+    return tuple(n for n, part in zip(prepared.bands, share, strict=True) if part < WEIGHTLESS)
 
 
 def run(

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import AME, Component, Dust, Synchrotron
@@ -38,6 +38,7 @@ __all__ = [
     "Template",
     "check_stokes",
     "mask_at",
+    "narrow",
     "read",
     "read_bandpass_spec",
     "read_noise",
@@ -47,15 +48,21 @@ __all__ = [
     "uK_RJ_per",
 ]
 
+#: Maps with at least so many pixels are kept in single precision, which is that of their files.
+LARGE = 12 * 512**2
+#: Noise outside of this range, relative to the rms of its map, is a mistake unless it is meant.
+PLAUSIBLE = (1e-6, 10.0)
+
 LAWS: dict[str, type[Component]] = {"dust": Dust, "synchrotron": Synchrotron, "ame": AME}
 
 
 class Template(NamedTuple):
-    """A component at the resolution of its map."""
+    """A component at the resolution of its map; `unit` is that of the map's file."""
 
     component: Component
     fwhm: float
     used: Bool[np.ndarray, " pix"]
+    unit: str = "uK_RJ"
 
 
 def read(
@@ -106,6 +113,13 @@ def read_parameter(
     """
     found = read(folder, spec, stokes="", zeros_are_data=True)
     return parameter_map(found, name, nside, where, of=of, stated=spec.missing is not None)
+
+
+def narrow(values: ArrayLike) -> Array:
+    """Values as an array, of a large map in single precision."""
+    values = np.asarray(values)
+    large = values.ndim and values.shape[-1] >= LARGE
+    return jnp.asarray(values, jnp.float32 if large else float)
 
 
 def read_templates(
@@ -166,7 +180,7 @@ def _read_template(
             component = LAWS[spec.law](maps[-len(stokes) :], **parameters)
     except (TypeError, ValueError) as error:
         raise SettingsError(f"templates.{name}: {error}") from None
-    return Template(component, spec.fwhm, used)
+    return Template(component, spec.fwhm, used, found.unit)
 
 
 def set_parameters_of(
@@ -251,13 +265,15 @@ def read_bandpass_spec(folder: Path, spec: BandpassSpec) -> Bandpass:
 def read_noise(
     folder: Path,
     noise: NoiseFile,
-    bandpass: Bandpass,
+    at: Bandpass | float,
     nside: int,
     stokes: str = "QU",
     *,
     where: str,
     unit: str,
     own: MapFile | None = None,
+    maps: Float[Array, "stokes pix"] | None = None,
+    used: Bool[np.ndarray, " pix"] | None = None,
 ) -> tuple[Float[Array, "stokes stokes pix"], Bool[np.ndarray, " pix"]]:
     """Covariance of each pixel [uK_RJ^2], and where it is known; 0 elsewhere.
 
@@ -265,64 +281,89 @@ def read_noise(
     ----------
     folder : of the files
     noise : what the settings say; pixels without hits are not known
-    bandpass : of the map
+    at : bandpass of the map, or its frequency [GHz]
     nside : resolution of the map
     stokes : "QU" or "IQU"
     where : key of the noise in the settings, for the messages
     unit : unit of the map, and so of rms and sigma0
     own : the map that has the noise, if its columns are in the same file
+    maps, used : the map that has the noise [uK_RJ] and its pixels, against whose rms it is checked
 
     Raises
     ------
     jaxsky.io.InputError, SettingsError
-        For files that cannot be read as what they should be, another nside, and noise that is
-        not positive definite.
+        For files that cannot be read as what they should be, another nside, noise that is not
+        positive definite, and noise far from the rms of the map.
     """
     try:
-        covariance, known = _covariance(folder, noise, bandpass, nside, stokes, where, unit, own)
-        check_covariance("noise", covariance[..., known])
+        covariance, known = _covariance(folder, noise, at, nside, stokes, where, unit, own)
+        check_covariance("noise", covariance if known.all() else covariance[..., known])
     except (InputError, SettingsError):
         raise
     except ValueError as error:
         raise SettingsError(f"{where}: {error}") from None
-    return jnp.where(known, covariance, 0.0), known
+    if maps is not None and not noise.plausible:
+        factor = float(unit_factor(unit, "uK_RJ", at))
+        inside = known if used is None else known & used
+        _check_plausible(where, covariance, maps, inside, factor, unit)
+    return covariance if known.all() else jnp.where(known, covariance, 0.0), known
 
 
-def _covariance(folder, noise, bandpass, nside, stokes, where, unit, own):
+def _check_plausible(where, covariance, maps, inside, factor, unit):
+    """Refuse noise of a Stokes parameter that is far from the rms of the map."""
+    if not inside.any():
+        return
+    rms = np.sqrt(np.mean(np.square(np.asarray(maps)[:, inside], dtype=float)))
+    for s in range(len(covariance)):
+        own = np.sqrt(np.mean(np.asarray(covariance[s, s])[inside], dtype=float))
+        low, high = (limit * rms for limit in PLAUSIBLE)
+        if rms and not low <= own <= high:
+            raise SettingsError(
+                f"{where}: the noise of a pixel is {own / factor:.3g} {unit} (rms), but the rms of "
+                f"the map in the same pixels is {rms / factor:.3g} {unit}; noise is in the map's "
+                'unit where it has none of its own. Write "plausible = true" if this is meant.'
+            )
+
+
+def _covariance(folder, noise, at, nside, stokes, where, unit, own):
     """See `read_noise`; with any values where the covariance is not known."""
     n, npix = len(stokes), 12 * nside**2
     if noise.rms is not None:
-        rms = noise.rms * unit_factor(unit, "uK_RJ", bandpass)
-        return rms_covariance(jnp.full((n, npix), rms)), np.ones(npix, bool)
+        rms = noise.rms * unit_factor(unit, "uK_RJ", at)
+        return rms_covariance(narrow(np.full((n, npix), rms))), np.ones(npix, bool)
     kinds = ("map", "covariance", "hits", "weights")
     kind = next(k for k in kinds if getattr(noise, k) is not None)
     spec, where = getattr(noise, kind), f"{where}.{kind}"
     found = _read_columns(folder, _file(spec, own, where), kind, where)
     if found.nside != nside:
         raise SettingsError(f"{where}: nside is {found.nside}, but that of the map is {nside}.")
-    maps, known = jnp.asarray(found.maps), np.asarray(found.mask)
+    given, known = found.unit, np.asarray(found.mask)
+    maps = narrow(found.maps)
+    del found  # as large as all else
     if kind == "map":
         _check_number(f"{where}.fields", len(maps), stokes)
-        rms = maps[-n:] * unit_factor(found.unit, "uK_RJ", bandpass)
+        rms = maps[-n:] * float(unit_factor(given, "uK_RJ", at))
         return rms_covariance(jnp.broadcast_to(rms, (n, npix))), known
     if kind == "covariance":
         if len(maps) == 3 and n == 3:
             raise SettingsError(f"{where}: I, Q and U need six columns, II, IQ, IU, QQ, QU, UU.")
-        columns = maps * unit_factor(found.unit, "uK_RJ^2", bandpass)
+        columns = maps * float(unit_factor(given, "uK_RJ^2", at))
         return covariance_from_columns(columns)[-n:, -n:], known
     if found.unit:
         raise SettingsError(
             f"{where}.unit: {kind} are pure numbers, but are said to be {found.unit}."
         )
     _check_number(f"{where}.sigma0", len(spec.sigma0), stokes)
-    sigma0 = jnp.array(spec.sigma0)[-n:] * unit_factor(spec.sigma0_unit or unit, "uK_RJ", bandpass)
+    factor = float(unit_factor(spec.sigma0_unit or unit, "uK_RJ", at))
+    sigma0 = jnp.array(spec.sigma0, maps.dtype)[-n:] * factor
     if kind == "weights":
         if n != 2:
             raise SettingsError(f"{where}: weights are those of Q and U, not of {stokes}.")
-        known = known & (maps[0] * maps[2] > 0)
-        weights = jnp.where(known, maps, jnp.array([1.0, 0.0, 1.0])[:, None])
+        known = known & np.asarray(maps[0] * maps[2] > 0)
+        nothing = jnp.array([1.0, 0.0, 1.0], maps.dtype)[:, None]
+        weights = jnp.where(known, maps, nothing)
         return weights_covariance(jnp.broadcast_to(sigma0, (n,)), weights), known
-    known = known & (found.maps[0] != 0)
+    known = known & np.asarray(maps[0] != 0)
     hits = jnp.where(known, maps[0], 1.0)
     return hits_covariance(jnp.broadcast_to(sigma0, (n,)), hits, n), known
 

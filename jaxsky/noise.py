@@ -30,6 +30,8 @@ __all__ = [
     "weights_covariance",
 ]
 
+#: Pixels that are checked at once.
+_PIECE = 1 << 20
 #: Columns of a covariance by their number, in the order of Planck's maps.
 _COLUMNS = {3: ("QQ", "QU", "UU"), 6: ("II", "IQ", "IU", "QQ", "QU", "UU")}
 
@@ -265,13 +267,14 @@ def check_covariance(name: str, covariance: Float[Array, "stokes stokes pix"]) -
         )
     if not is_concrete(covariance):
         return
-    # A root of a negative number is NaN, and NaN is not positive.
-    pivots = jnp.einsum("ssp->sp", cholesky(covariance))
-    good = jnp.all((pivots > 0) & jnp.isfinite(pivots), axis=0)
-    if bad := int(jnp.sum(~good)):
-        raise ValueError(
-            f"Argument `{name}` is not positive definite in {bad} of {good.size} pixels."
-        )
+    bad, npix = 0, covariance.shape[-1]
+    for start in range(0, npix, _PIECE):
+        # A root of a negative number is NaN, and NaN is not positive.
+        factor = cholesky(jnp.asarray(covariance[..., start : start + _PIECE], float))
+        pivots = jnp.einsum("ssp->sp", factor)
+        bad += int(jnp.sum(~jnp.all((pivots > 0) & jnp.isfinite(pivots), axis=0)))
+    if bad:
+        raise ValueError(f"Argument `{name}` is not positive definite in {bad} of {npix} pixels.")
 
 
 @partial(jax.jit, static_argnames="diagonal")

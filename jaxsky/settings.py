@@ -222,7 +222,10 @@ class Weights(Hits):
 
 
 class NoiseFile(Table):
-    """Noise of a map: exactly one of these; per pixel of the map as it is in the file."""
+    """Noise of a map: exactly one of these; per pixel of the map as it is in the file.
+
+    `plausible` says that noise is meant which is far from the rms of its map.
+    """
 
     KINDS: ClassVar[tuple[str, ...]] = ("rms", "map", "covariance", "hits", "weights")
 
@@ -231,6 +234,7 @@ class NoiseFile(Table):
     covariance: CovarianceColumns | None = None
     hits: Hits | None = None
     weights: Weights | None = None
+    plausible: bool = False
 
     @model_validator(mode="after")
     def _one_kind(self) -> "NoiseFile":

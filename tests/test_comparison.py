@@ -236,7 +236,7 @@ def test_missing_pixels_leave_spectra_out(settings, prepared, model, regions, si
         compare_spectra(holes, model, simulated, 8)
     found = compare(settings, holes, regions)
     assert not found.spectra
-    assert "3 of 3072 pixels have no value" in warnings(found)[0]
+    assert "3 of 3072 pixels have no value" in warnings(found, settings)[0]
     assert found.scatter("K", "outside", "Q").pixels == int(regions["outside"].sum()) - 3
 
 
@@ -328,7 +328,7 @@ def test_command_line(tmp_path, monkeypatch, capsys):
 
 def test_a_model_that_is_wrong_is_pointed_out(settings, prepared, regions):
     bright = prepared._replace(data=1.5 * prepared.data)
-    sentences = " ".join(warnings(compare(settings, bright, regions)))
+    sentences = " ".join(warnings(compare(settings, bright, regions), settings))
     assert "44, strip: the slope is 1.5" in sentences
     assert "more than in any of 30 realisations of noise and CMB" in sentences
     found = compare(settings, bright, regions).scatter("K", "strip", "QU")

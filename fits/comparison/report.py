@@ -11,7 +11,7 @@ from fits.comparison.compare import Comparison
 from fits.comparison.patches import PatchComparison
 from fits.inputs import Inputs
 from fits.record import probability, with_error, write_json, write_log
-from fits.settings import Settings
+from fits.settings import Settings, leaks
 
 __all__ = ["comparison_json", "comparison_table", "warnings", "write_report"]
 
@@ -84,9 +84,9 @@ def comparison_table(comparison: Comparison) -> Table:
     return table
 
 
-def warnings(comparison: Comparison) -> list[str]:
+def warnings(comparison: Comparison, settings: Settings) -> list[str]:
     """What a user should know before using the numbers, a sentence each."""
-    sentences = []
+    sentences = leaks(settings.bands)
     if not comparison.spectra:
         missing = int((~comparison.prepared.used).sum())
         sentences.append(
@@ -124,7 +124,8 @@ def write_report(
 ) -> list[Path]:
     """Write comparison.json, pictures and log.json to a folder; returns what was written."""
     written = [out / "comparison.json", out / "log.json"]
-    write_json(written[0], comparison_json(comparison, inputs, patches))
+    numbers = {"warnings": warnings(comparison, settings)}
+    write_json(written[0], comparison_json(comparison, inputs, patches) | numbers)
     bands, title = list(comparison.prepared.bands), settings.title
     for region in comparison.regions:
         written.append(out / f"scatter_{region}.png")

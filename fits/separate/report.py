@@ -12,6 +12,7 @@ from fits.separate import plots
 from fits.separate.separate import SAMPLED, Separation
 from fits.separate.settings import SeparateSettings
 from fits.separation.maps import ComponentMaps
+from fits.settings import leaks
 from jaxsky.io import write_maps
 from jaxsky.parameter_maps import parameter_unit
 
@@ -39,6 +40,7 @@ def result_json(found: Separation, settings: SeparateSettings) -> dict[str, Any]
     bands = list(found.setup.domain.bands)
     results: dict[str, Any] = {
         "description": found.setup.description,
+        "warnings": warnings(found, settings),
         "domain": settings.separation.domain,
         "components": found.components,
         "bands": bands,
@@ -133,7 +135,7 @@ def tables(found: Separation) -> list[Table]:
 
 def warnings(found: Separation, settings: SeparateSettings) -> list[str]:
     """What a user should know before using the numbers, a sentence each."""
-    sentences = []
+    sentences = leaks(settings.bands)
     fit, ratio, simulated = found.fit, found.tensors, found.simulated
     if not fit.converged:
         sentences.append(fit.message)

@@ -110,6 +110,6 @@ def compare(
         written = report.write_report(out, inputs, settings, found, seconds, patches)
     console.print(inputs.description)
     print_tables(report.comparison_table(found))
-    for sentence in report.warnings(found):
+    for sentence in report.warnings(found, settings):
         warn(sentence)
     print_written(written)

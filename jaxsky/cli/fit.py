@@ -92,7 +92,7 @@ def fit(
         written = report.write_report(out, inputs, settings, fits, seconds)
     console.print(inputs.description)
     print_tables(report.result_table(fits))
-    for sentence in report.warnings(fits, settings.analysis.methods):
+    for sentence in report.warnings(inputs, settings, fits):
         warn(sentence)
     written += [chains] if chains.exists() else []
     print_written(written)

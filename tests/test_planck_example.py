@@ -1,0 +1,385 @@
+"""The analysis of Planck's 44 and 70 GHz maps: its traps, the noise of templates, large maps."""
+
+from pathlib import Path
+
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fits import settings as fit_settings
+from fits.inputs import Band, Inputs, embedded_inputs, read_band, read_inputs
+from fits.paper.settings import EXAMPLE as PAPER
+from fits.paper.settings import load_paper
+from fits.preparation import Preparation
+from fits.report import result_json, warnings
+from fits.resolution import prepare
+from fits.separate.settings import EXAMPLE as SEPARATE
+from fits.separate.settings import load_separate
+from fits.settings import EXAMPLE, leaks, load_settings
+from fits.spectral_index import run
+from fits.template_noise import TemplateNoise, prepared_variance
+from jaxsky import Bandpass, Dust, Sky, Synchrotron, inputs, observe
+from jaxsky.harmonics import alm_ell, gaussian_beam, resample, synthesis
+from jaxsky.inputs import Template
+from jaxsky.io import write_maps
+from jaxsky.noise import draw, uniform_covariance
+from jaxsky.settings import SettingsError
+
+NSIDE = 8
+NPIX = healpy.nside2npix(NSIDE)
+START = {"dust.beta_dust": 1.5, "synchrotron.beta_syn": 3.0}
+SHIPPED = Path(__file__).parents[1] / "examples" / "planck_44_70.toml"
+
+
+def test_the_example_is_what_init_writes():
+    assert SHIPPED.read_text() == EXAMPLE.read_text()
+    settings = load_settings(SHIPPED)
+    assert settings.analysis.regions == ["strip", "full"]
+    assert settings.analysis.methods == ["grid", "gradient", "mcmc"]
+    assert settings.fixed == {"dust.T_dust": 21.0}
+    for band, channel in zip(settings.bands, ("044", "070"), strict=True):
+        assert band.file == f"LFI_SkyMap_{channel}-BPassCorrected_1024_R3.00_full.fits"
+        assert (band.bandpass.file, band.bandpass.band) == ("LFI_RIMO_R3.31.fits", channel)
+        assert band.noise.covariance.fields == ["QQ_COV", "QU_COV", "UU_COV"]
+
+
+@pytest.mark.parametrize(
+    "bands",
+    [load_settings(EXAMPLE).bands, load_separate(SEPARATE).bands, load_paper(PAPER).bands],
+    ids=["fit", "separate", "paper"],
+)
+def test_no_example_has_noise_in_a_unit_of_its_own_or_leakage(bands):
+    assert len(bands) >= 2
+    assert all(band.noise.rms is None for band in bands)
+    assert leaks(bands) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "corrected", "correction"),
+    [
+        (
+            "LFI_SkyMap_044_1024_R3.00_full.fits",
+            "LFI_SkyMap_044-BPassCorrected_1024_R3.00_full.fits",
+            "LFI_CorrMap_044-BPassCorr_1024_R3.00_full.fits",
+        ),
+        (
+            "maps/LFI_SkyMap_070_1024_R3.00_full-ringhalf-1.fits.gz",
+            "LFI_SkyMap_070-BPassCorrected_1024_R3.00_full-ringhalf-1.fits.gz",
+            "LFI_CorrMap_070-BPassCorr_1024_R3.00_full-ringhalf-1.fits.gz",
+        ),
+        (
+            "LFI_SkyMap_030-field-IQU_1024_R3.00_full.fits",
+            "LFI_SkyMap_030-BPassCorrected-field-IQU_1024_R3.00_full.fits",
+            "LFI_CorrMap_030-BPassCorr_1024_R3.00_full.fits",
+        ),
+        (
+            "LFI_SkyMap_044_1024_R2.01_full.fits",
+            "LFI_SkyMap_044-BPassCorrected_1024_R3.00_full.fits",
+            "LFI_CorrMap_044-BPassCorr_0256_R2.01_full.fits",
+        ),
+    ],
+)
+def test_maps_that_hold_leakage_are_known_by_name(name, corrected, correction):
+    (warning,) = leaks([band_of(name)])
+    for word in ("bands.x", Path(name).name, corrected, correction):
+        assert word in warning
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "LFI_SkyMap_044-BPassCorrected_1024_R3.00_full.fits",
+        "LFI_SkyMap_030-BPassCorrected-field-IQU_1024_R3.00_full.fits",
+        "LFI_SkyMap_044_2048_R4.00_full.fits",
+        "HFI_SkyMap_353-psb_2048_R3.01_full.fits",
+        "wmap_band_iqumap_r9_7yr_V_v4.fits",
+        "my_map.fits",
+    ],
+)
+def test_other_maps_are_not(name):
+    assert leaks([band_of(name)]) == []
+
+
+def test_a_leakage_that_is_subtracted_is_no_leak():
+    band = band_of(
+        "LFI_SkyMap_044_1024_R3.00_full.fits",
+        leakage={"file": "LFI_CorrMap_044-BPassCorr_1024_R3.00_full.fits"},
+    )
+    assert leaks([band]) == []
+
+
+def band_of(file: str, **more) -> fit_settings.Band:
+    noise = more.pop("noise", {"rms": 1.0})
+    return fit_settings.Band(name="x", file=file, bandpass={"center": 44.0}, noise=noise, **more)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A map with an rms of 1e-4 K_CMB, and columns about its noise."""
+    folder = tmp_path_factory.mktemp("noise")
+    rng = np.random.default_rng(1)
+    unit = np.ones(NPIX)
+    columns = {
+        "Q_STOKES": 1e-4 * rng.normal(size=NPIX),
+        "U_STOKES": 1e-4 * rng.normal(size=NPIX),
+        "RMS": 5e-5 * unit,
+        "RMS_BIG": 1e-2 * unit,
+        "QQ_COV": 2.5e-9 * unit,
+        "QU_COV": 0 * unit,
+        "UU_COV": 2.5e-9 * unit,
+        "UU_BIG": 2.5e-6 * unit,
+        "HITS": 4 * unit,
+        "QQ": 4 * unit,
+        "QU": 0 * unit,
+        "UU": 4 * unit,
+    }
+    units = ["K_CMB"] * 4 + ["K_CMB^2"] * 4 + [""] * 4
+    write_maps(folder / "map.fits", list(columns.values()), names=list(columns), unit=units)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("noise", "wrong"),
+    [
+        ({"rms": 5e-5}, {"rms": 160.0}),
+        ({"rms": 9e-4}, {"rms": 1.2e-3}),
+        ({"rms": 2e-10}, {"rms": 5e-11}),
+        (
+            {"map": {"file": "map.fits", "fields": ["RMS"]}},
+            {"map": {"file": "map.fits", "fields": ["RMS_BIG"]}},
+        ),
+        (
+            {"covariance": ["QQ_COV", "QU_COV", "UU_COV"]},
+            {"covariance": ["QQ_COV", "QU_COV", "UU_BIG"]},
+        ),
+        (
+            {"hits": {"fields": ["HITS"], "sigma0": 1e-4}},
+            {"hits": {"fields": ["HITS"], "sigma0": 100.0}},
+        ),
+        (
+            {"hits": {"fields": ["HITS"], "sigma0": 0.1, "sigma0_unit": "mK_CMB"}},
+            {"hits": {"fields": ["HITS"], "sigma0": 0.1}},
+        ),
+        (
+            {"weights": {"fields": ["QQ", "QU", "UU"], "sigma0": [1e-4]}},
+            {"weights": {"fields": ["QQ", "QU", "UU"], "sigma0": [1e-4, 1e-12]}},
+        ),
+    ],
+)
+def test_noise_far_from_the_rms_of_its_map_is_refused(folder, noise, wrong):
+    fields = ["Q_STOKES", "U_STOKES"]
+    assert read_band(folder, band_of("map.fits", fields=fields, noise=noise)).used.all()
+    with pytest.raises(SettingsError) as refused:
+        read_band(folder, band_of("map.fits", fields=fields, noise=wrong))
+    sentence = str(refused.value)
+    assert sentence.startswith("bands.x.noise: the noise of a pixel is ")
+    assert sentence.count("K_CMB (rms)") == 1
+    assert "of the map in the same pixels is 0.000101 K_CMB" in sentence
+    meant = band_of("map.fits", fields=fields, noise=wrong | {"plausible": True})
+    assert read_band(folder, meant).used.all()
+
+
+def sky_of(seed: int, scale: float = 100.0) -> Sky:
+    rng = np.random.default_rng(seed)
+    ell = alm_ell(2 * NSIDE)
+
+    def maps():
+        alm = scale * rng.normal(size=(2, ell.size)) / (1 + ell)
+        return synthesis(jnp.asarray(np.where(ell > 1, alm, 0)), NSIDE)
+
+    return Sky({"dust": Dust(maps()), "synchrotron": Synchrotron(maps())})
+
+
+def settings_of(**analysis) -> fit_settings.Settings:
+    return fit_settings.Settings(
+        analysis={"methods": ["gradient"], "nside": NSIDE, "fwhm": 0.0} | analysis,
+        free={name: {"start": value} for name, value in START.items()},
+        embedded={},
+    )
+
+
+def inputs_of(sky: Sky, seen: dict[str, tuple[float, float]], noise=(), templates=None) -> Inputs:
+    """Bands by name with their frequency and noise, of a sky whose templates may be others."""
+    used = np.ones(NPIX, bool)
+    bands = {}
+    for name, (nu, level) in seen.items():
+        covariance = uniform_covariance(level, NSIDE)
+        maps = observe(sky, [Bandpass.delta(nu)])[0] + draw(jax.random.key(int(nu)), covariance)
+        bands[name] = Band(maps, used, Bandpass.delta(nu), 0.0, covariance)
+    given = {n: Template(c, 0.0, used) for n, c in (templates or sky).components.items()}
+    return Inputs(given, bands, None, None, "", dict(noise))
+
+
+def test_a_band_without_weight_is_named_and_not_counted():
+    inside = {"all": np.ones(NPIX, bool)}
+    bands = {"30": (30.0, 10.0), "353": (353.0, 10.0)}
+    settings, sky = settings_of(stokes=["QU"]), sky_of(2)
+    (plain,) = run(settings, prepare(inputs_of(sky, bands), NSIDE, 0.0), inside)
+    made = inputs_of(sky, bands | {"70": (70.0, 1e12)})
+    (fit,) = run(settings, prepare(made, NSIDE, 0.0), inside)
+    assert (plain.weightless, fit.weightless) == ((), ("70",))
+    assert (fit.dof, fit.dof_amplitudes) == (plain.dof, plain.dof_amplitudes) == (3070, 6)
+    said = " ".join(warnings(made, settings, [fit]))
+    assert "Band 70 carries no weight (all QU)" in said
+    found = result_json(made, settings, [fit])
+    assert found["results"]["all"]["QU"]["gradient"]["bands_without_weight"] == ["70"]
+    assert found["warnings"] == warnings(made, settings, [fit])
+
+
+def test_noise_of_templates_moves_a_fit_as_computed():
+    """The mean over many noisy templates, against the first order from one of them."""
+    sky, settings, inside = sky_of(3), settings_of(stokes=["QU"]), {"all": np.ones(NPIX, bool)}
+    bands = {str(nu): (nu, 1.0) for nu in (30.0, 44.0, 353.0)}
+    covariance = uniform_covariance(2000.0, NSIDE)
+    noise = {"dust": TemplateNoise(), "synchrotron": TemplateNoise(covariance=covariance)}
+    clean = fitted(inputs_of(sky, bands, noise), settings, inside)
+    moved, computed = [], []
+    for seed in range(30):
+        noisy = sky["synchrotron"].amplitude + draw(jax.random.key(seed), covariance)
+        templates = Sky({"dust": sky["dust"], "synchrotron": Synchrotron(noisy)})
+        fit = fitted(inputs_of(sky, bands, noise, templates), settings, inside)
+        result = fit.results["gradient"]
+        moved.append([result.best_fit[n] - clean.results["gradient"].best_fit[n] for n in START])
+        computed.append([fit.attenuation.shifts[n] for n in START])
+        assert fit.attenuation.shares["dust"] == 0
+    mean, error = np.mean(moved, axis=0), np.std(moved, axis=0) / np.sqrt(len(moved))
+    assert abs(mean[1]) > 10 * error[1]
+    np.testing.assert_allclose(mean[1], np.mean(computed, axis=0)[1], rtol=0.1)
+    np.testing.assert_allclose(mean[0], np.mean(computed, axis=0)[0], atol=4 * error[0])
+
+
+def fitted(made, settings, inside):
+    (fit,) = run(settings, prepare(made, NSIDE, 0.0), inside)
+    return fit
+
+
+def test_a_level_is_seen_through_the_beam():
+    """White noise of a level, smoothed by a template's beam, and its variance when prepared."""
+    lmax, own, fwhm = 23, 300.0, 600.0
+    preparation = Preparation.smoothing(16, own, NSIDE, fwhm, lmax)
+    variance = prepared_variance(TemplateNoise(1000.0), own, preparation, fwhm)
+    ell = alm_ell(48)
+    level = np.radians(1000.0 / 60)
+    maps = []
+    for seed in range(20):
+        alm = level * np.random.default_rng(seed).normal(size=(2, ell.size)) * (ell > 1)
+        seen = synthesis(jnp.asarray(alm) * gaussian_beam(own, 48)[ell], 16)
+        maps.append(preparation(seen))
+    np.testing.assert_allclose(np.var(maps), variance[0, 0], rtol=0.05)
+
+
+def test_templates_without_a_word_on_their_noise_are_warned_of():
+    sky, settings, inside = sky_of(4), settings_of(stokes=["QU"]), {"all": np.ones(NPIX, bool)}
+    bands = {"30": (30.0, 10.0), "353": (353.0, 10.0)}
+    made = inputs_of(sky, bands)
+    fit = fitted(made, settings, inside)
+    assert "noise of the templates (dust and synchrotron)" in warnings(made, settings, [fit])[0]
+    made = inputs_of(sky, bands, {"dust": TemplateNoise()})
+    fit = fitted(made, settings, inside)
+    assert "noise of the templates (synchrotron)" in warnings(made, settings, [fit])[0]
+    exact = dict.fromkeys(("dust", "synchrotron"), TemplateNoise())
+    made = inputs_of(sky, bands, exact)
+    assert warnings(made, settings, [fitted(made, settings, inside)]) == []
+    noisy = dict.fromkeys(("dust", "synchrotron"), TemplateNoise(level=300.0))
+    made = inputs_of(sky, bands, noisy)
+    (said,) = warnings(made, settings, [fitted(made, settings, inside)])
+    assert said.startswith("all, QU: the noise of the templates attenuates dust by ")
+    assert "sigma), to first order; the fit is not corrected for it." in said
+
+
+def test_the_embedded_templates_are_exact():
+    settings = fit_settings.Settings(embedded={"nside": 16})
+    made = embedded_inputs(settings)
+    assert list(made.template_noise) == list(made.templates)
+    assert not any(n.level for n in made.template_noise.values())
+
+
+TEMPLATES = """
+[analysis]
+nside = 8
+fwhm = 0
+[cmb]
+include = false
+[templates.dust]
+law = "dust"
+file = "map.fits"
+fields = ["Q_STOKES", "U_STOKES"]
+nu_ref = 353.0
+noise = {noise}
+[[bands]]
+name = "44"
+file = "map.fits"
+fields = ["Q_STOKES", "U_STOKES"]
+bandpass = {{ center = 44.0 }}
+noise = {{ rms = 5e-5 }}
+"""
+
+
+@pytest.mark.parametrize(
+    ("noise", "level", "variance"),
+    [
+        ("{ rms = 0.0 }", 0.0, None),
+        ("{ level = 0 }", 0.0, None),
+        ("{ level = 1e-4 }", 1e-4, None),
+        ("{ rms = 5e-5 }", 0.0, 2.5e-9),
+        ('{ map = { file = "map.fits", fields = ["RMS"] } }', 0.0, 2.5e-9),
+        ('{ covariance = ["QQ_COV", "QU_COV", "UU_COV"] }', 0.0, 2.5e-9),
+    ],
+)
+def test_noise_of_templates_from_settings(folder, noise, level, variance):
+    path = folder / "templates.toml"
+    path.write_text(TEMPLATES.format(noise=noise))
+    found = read_inputs(load_settings(path)).template_noise["dust"]
+    factor = float(Bandpass.delta(353.0).conversion("K_CMB", "uK_RJ"))
+    assert found.level == pytest.approx(level * factor)
+    if variance is None:
+        assert found.covariance is None
+    else:
+        np.testing.assert_allclose(found.covariance[0, 0], variance * factor**2)
+        np.testing.assert_allclose(found.covariance[0, 1], 0)
+
+
+@pytest.mark.parametrize(
+    ("noise", "words"),
+    [
+        ("{ rms = 160.0 }", r"templates.dust.noise: the noise of a pixel is 160 K_CMB"),
+        ("{ rms = -1.0 }", r"templates.dust.noise.rms: .*greater than or equal to 0"),
+        ("{ level = 1.0, rms = 1.0 }", r"templates.dust.noise: give the noise as exactly one of"),
+        ("{}", r"templates.dust.noise: give the noise as exactly one of level, rms"),
+    ],
+)
+def test_noise_of_templates_that_cannot_be(folder, noise, words):
+    path = folder / "wrong.toml"
+    path.write_text(TEMPLATES.format(noise=noise))
+    with pytest.raises(SettingsError, match=words):
+        read_inputs(load_settings(path))
+
+
+def test_large_maps_are_kept_in_single_precision(folder, monkeypatch):
+    noise = {"covariance": ["QQ_COV", "QU_COV", "UU_COV"]}
+    spec = band_of("map.fits", fields=["Q_STOKES", "U_STOKES"], noise=noise)
+    double = read_band(folder, spec)
+    monkeypatch.setattr(inputs, "LARGE", NPIX)
+    single = read_band(folder, spec)
+    assert (double.maps.dtype, single.maps.dtype) == (np.float64, np.float32)
+    assert single.noise.dtype == np.float32
+    np.testing.assert_allclose(single.maps, double.maps, rtol=1e-6)
+    np.testing.assert_allclose(single.noise, double.noise, rtol=1e-6)
+    data = [prepare(Inputs({}, {"x": b}, None, None, ""), 4, 900.0) for b in (double, single)]
+    assert data[1].data.dtype == np.float64
+    np.testing.assert_allclose(data[1].data, data[0].data, atol=1e-6 * float(data[0].data.std()))
+    np.testing.assert_allclose(data[1].sigma, data[0].sigma, rtol=1e-6)
+
+
+def test_fine_pixels_need_no_steps():
+    """Quadrature alone, against the refined analysis; and its transpose is exact."""
+    fine = Preparation.smoothing(64, 100.0, NSIDE, 600.0, 16)
+    alm = np.random.default_rng(6).normal(size=(2, alm_ell(48).size)) / (1 + alm_ell(48))
+    maps = synthesis(jnp.asarray(alm), 64)
+    refined = resample(maps, fine.window, NSIDE)
+    np.testing.assert_allclose(fine(maps), refined, atol=3e-6 * float(maps.std()))
+    other = jnp.asarray(np.random.default_rng(7).normal(size=(2, NPIX)))
+    left, right = jnp.vdot(fine(maps), other), jnp.vdot(maps, fine.transpose(other))
+    assert float(left) == pytest.approx(float(right), rel=1e-10)

@@ -20,6 +20,7 @@ from benchmarks.table import Row, conditions, markdown, rich_table
 RESULTS = Path(__file__).with_name("RESULTS.md")
 BENCHMARKS = {
     "command": command.fit,
+    "planck": command.planck,
     "beta-map": band_averages.beta_map,
     "beta-and-T-maps": band_averages.beta_and_T_maps,
     "samples": band_averages.samples,
@@ -46,7 +47,7 @@ BENCHMARKS = {
     "commands": comparisons.commands,
 }
 #: These take minutes: they are run by name, and when the table is kept.
-LONG = ("nside-2048", "separation-pixels", "commands")
+LONG = ("planck", "nside-2048", "separation-pixels", "commands")
 
 
 def _arguments() -> argparse.Namespace:

@@ -1,0 +1,68 @@
+"""Pulls of the spectral indices over files in the structure of the official ones.
+
+The files are those of `official/make_files.py` next to the folder of the sample sky; without it
+there is nothing to test.
+"""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fits.inputs import read_inputs
+from fits.optimize import best_fit
+from fits.regions import region_masks
+from fits.resolution import prepare
+from fits.settings import EXAMPLE, load_settings
+
+TRUTH = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1}
+SEEDS = range(1, 51)
+
+
+@pytest.fixture(scope="module")
+def maker(data_dir):
+    path = data_dir.parent / "official" / "make_files.py"
+    if not path.is_file():
+        pytest.skip(f"{path} is not there")
+    spec = importlib.util.spec_from_file_location("make_files", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    whole = module.write
+
+    def needed(path, *arguments, **more):
+        if "BPassCorrected" in path.name or path.name.startswith("COM_"):
+            whole(path, *arguments, **more)
+
+    module.write = needed  # the maps with leakage and its corrections are not read
+    return module
+
+
+@pytest.fixture(scope="module")
+def settings(data_dir, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("official")
+    (folder / "LFI_RIMO_R3.31.fits").symlink_to(data_dir / "bandpass" / "LFI_RIMO_R3.31.fits")
+    path = folder / "planck_44_70.toml"
+    path.write_text(Path(EXAMPLE).read_text())
+    return load_settings(path)
+
+
+def test_pulls_over_fifty_skies(maker, settings, monkeypatch):
+    folder, start, pulls = settings.data_dir, settings.start(), []
+    for seed in SEEDS:
+        line = ["make_files.py", folder, "--nside", "128", "--seed", str(seed)]
+        monkeypatch.setattr(sys, "argv", line)
+        maker.main()
+        prepared = prepare(read_inputs(settings), settings.analysis.nside, settings.analysis.fwhm)
+        row = []
+        for inside in region_masks(settings).values():
+            fit = best_fit(prepared.likelihood(start, region=inside), start)
+            row.append([(fit.best_fit[n] - truth) / fit.sigma(n) for n, truth in TRUTH.items()])
+        pulls.append(row)
+    means, deviations = np.mean(pulls, axis=0), np.std(pulls, axis=0, ddof=1)
+    print(
+        f"regions x indices: mean pulls {means.round(2)}, standard deviations {deviations.round(2)}"
+    )
+    assert np.all(np.abs(means) < 3 / np.sqrt(len(SEEDS)))
+    assert np.all(np.abs(deviations - 1) < 3 / 10)

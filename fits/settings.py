@@ -125,9 +125,28 @@ class Leakage(MapFile):
 
 #: Release and correction in the names of Planck's files.
 _RELEASE = re.compile(r"_R(\d)\.\d\d")
-#: Maps of LFI's second and third release that are as they were observed: of the whole mission,
-#: years, surveys and half rings, whole or compressed.
-_LEAKY = re.compile(r"LFI_SkyMap_(0\d\d)(?![-_]BPassCorr)(.*_R[23]\.\d\d.*)", re.IGNORECASE)
+#: Maps of LFI's second and third release, and of HFI's second, that are as they were observed: of
+#: the whole mission, years, surveys and half rings, whole or compressed.
+_LEAKY = re.compile(
+    r"(LFI_SkyMap_0\d\d|HFI_SkyMap_(?:100|143|217|353)(?=.*_R2))(.*_R[23]\.\d\d.*)", re.IGNORECASE
+)
+
+
+def _without_leakage(name: str) -> str | None:
+    """What to take in place of a map that holds leakage, or None if it is not known to."""
+    match = _LEAKY.fullmatch(name)
+    if match is None or "bpasscorr" in name.lower():
+        return None
+    start, rest = match.groups()
+    if start.upper().startswith("HFI"):  # corrected as it was mapped since the third release
+        return f"Take {start}_2048_R3.01_full.fits"
+    corrected, beam = f"{start}-BPassCorrected{rest}", "fwhm = ..."
+    channel = start.rsplit("_", 1)[1]
+    correction = f"LFI_CorrMap_{channel}-BPassCorr{rest.replace('-field-IQU', '')}"
+    if "_R2." in rest.upper():  # corrected at nside 256 and 1 degree only
+        corrected, beam = f"{start}-BPassCorrected_1024_R3.00_full.fits", "fwhm = 60.0"
+        correction = f"LFI_CorrMap_{channel}-BPassCorr_0256_R2.01_full.fits"
+    return f'Take {corrected}, or subtract it: leakage = {{ file = "{correction}", {beam} }}'
 
 
 class Band(MapFile):
@@ -141,21 +160,15 @@ class Band(MapFile):
 
     def leak(self) -> str | None:
         """A warning if the map is known by its name to hold leakage that is not subtracted."""
-        found = [_LEAKY.fullmatch(Path(file).name) for file in self.files]
-        leaky = [match for match in found if match and "bpasscorr" not in match[2].lower()]
-        if self.leakage is not None or not leaky:
+        names = [Path(file).name for file in self.files]
+        advice = {name: words for name in names if (words := _without_leakage(name)) is not None}
+        if self.leakage is not None or not advice:
             return None
-        name, channel, rest = leaky[0].group(0, 1, 2)
-        corrected = f"LFI_SkyMap_{channel}-BPassCorrected{rest}"
-        correction = f"LFI_CorrMap_{channel}-BPassCorr{rest.replace('-field-IQU', '')}"
-        if "_R2." in rest.upper():  # corrected at nside 256 and 1 degree only
-            corrected = f"LFI_SkyMap_{channel}-BPassCorrected_1024_R3.00_full.fits"
-            correction = f"LFI_CorrMap_{channel}-BPassCorr_0256_R2.01_full.fits"
+        name, words = next(iter(advice.items()))
         return (
             f"bands.{self.name}: {name} holds intensity that has leaked into Q and U through "
-            "the bandpasses, and nothing is subtracted; indices fitted to it are wrong by many "
-            f"sigma. Take {corrected}, or subtract it: "
-            f'leakage = {{ file = "{correction}", fwhm = ... }}.'
+            "the bandpasses, and nothing is subtracted; indices fitted to it may be wrong by many "
+            f"sigma. {words}."
         )
 
     @model_validator(mode="after")

@@ -77,8 +77,9 @@ def test_no_example_has_noise_in_a_unit_of_its_own_or_leakage(bands):
         (
             "LFI_SkyMap_044_1024_R2.01_full.fits",
             "LFI_SkyMap_044-BPassCorrected_1024_R3.00_full.fits",
-            "LFI_CorrMap_044-BPassCorr_0256_R2.01_full.fits",
+            'leakage = { file = "LFI_CorrMap_044-BPassCorr_0256_R2.01_full.fits", fwhm = 60.0 }',
         ),
+        ("HFI_SkyMap_353_2048_R2.02_full.fits", "HFI_SkyMap_353_2048_R3.01_full.fits", "Take"),
     ],
 )
 def test_maps_that_hold_leakage_are_known_by_name(name, corrected, correction):
@@ -94,6 +95,7 @@ def test_maps_that_hold_leakage_are_known_by_name(name, corrected, correction):
         "LFI_SkyMap_030-BPassCorrected-field-IQU_1024_R3.00_full.fits",
         "LFI_SkyMap_044_2048_R4.00_full.fits",
         "HFI_SkyMap_353-psb_2048_R3.01_full.fits",
+        "HFI_SkyMap_545_2048_R2.02_full.fits",
         "wmap_band_iqumap_r9_7yr_V_v4.fits",
         "my_map.fits",
     ],

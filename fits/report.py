@@ -133,7 +133,7 @@ def warnings(inputs: Inputs, settings: Settings, fits: Sequence[Fit]) -> list[st
 def _attenuated(fit: Fit) -> str | None:
     """What the noise of the templates does to a fit, if it does anything."""
     lost = fit.attenuation
-    if lost is None or not any(lost.shares.values()):
+    if lost is None:
         return None
     shares = ", ".join(f"{name} by {100 * share:.2g} %" for name, share in lost.shares.items())
     sentence = f"{fit.region}, {fit.stokes}: the noise of the templates attenuates {shares}"

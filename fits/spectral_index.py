@@ -123,8 +123,9 @@ def fit_pixels(
     dof = int(used.sum()) * number * len(stokes) - len(start)
     results = {method: r.judged(values[method], dof, start) for method, r in results.items()}
     lost = None
-    if prepared.template_variances and prepared.sky is not None:
-        variances, result = prepared.template_variances, next(iter(results.values()))
+    variances = prepared.template_variances
+    if any(bool(values.any()) for values in variances.values()) and prepared.sky is not None:
+        result = next(iter(results.values()))
         sky, sigma = prepared.sky, prepared.sigma
         lost = attenuation(like, result, sky, variances, sigma, used, stokes)
     return Fit(region, stokes, results, values, dof, dof_amplitudes, nothing, lost)

@@ -349,10 +349,8 @@ def _covariance(folder, noise, at, nside, stokes, where, unit, own):
             raise SettingsError(f"{where}: I, Q and U need six columns, II, IQ, IU, QQ, QU, UU.")
         columns = maps * float(unit_factor(given, "uK_RJ^2", at))
         return covariance_from_columns(columns)[-n:, -n:], known
-    if found.unit:
-        raise SettingsError(
-            f"{where}.unit: {kind} are pure numbers, but are said to be {found.unit}."
-        )
+    if given:
+        raise SettingsError(f"{where}.unit: {kind} are pure numbers, but are said to be {given}.")
     _check_number(f"{where}.sigma0", len(spec.sigma0), stokes)
     factor = float(unit_factor(spec.sigma0_unit or unit, "uK_RJ", at))
     sigma0 = jnp.array(spec.sigma0, maps.dtype)[-n:] * factor

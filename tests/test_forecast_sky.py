@@ -325,7 +325,7 @@ def one_sentence(capsys) -> str:
     [
         ("center = 40.0\n", "", "bands.0.center: is missing"),
         ("width = 10.0", "width = 90.0", "bands.0: Argument `center - width / 2` must be positive"),
-        ('name = "100"', 'name = "40"', "Channels must have different names"),
+        ('name = "100"', 'name = "40"', "the names of the bands must differ, but are"),
         ('"mK_CMB"', '"MJy/sr"', "bands.2.noise_unit: must be a temperature"),
         ("[[bands]]", '[experiment]\ninstrument = "core"\n[[bands]]', "either experiment.instr"),
         ("[templates.dust]", "[embedded]\n[templates.dust]", "either templates or the table"),
@@ -342,7 +342,7 @@ def one_sentence(capsys) -> str:
         ("fit = [2, 60]", "fit = [60, 2]", "fit must increase, but is 60, 2"),
         ("lmax = 60", 'lmax = 60\nbands = ["44"]', "A small sky has no channel '44'"),
         ('["r", "dust.beta_dust"', '["q", "dust.beta_dust"', "Unknown parameter 'q'; known"),
-        ('["r", "dust.beta_dust"', '["r", "r"', "fisher: free has a name twice"),
+        ('["r", "dust.beta_dust"', '["r", "r"', "fisher.free: has 'r' twice"),
         ('"dust.beta_dust" = 0.5', '"dust.T_dust" = 0.5', "prior of 'dust.T_dust' has no effect"),
         ('"dust.beta_dust" = 0.5', '"dust.beta_dust" = 0', "fisher.priors.dust.beta_dust"),
         ('"synchrotron.beta_syn"]', '"synchrotron.nu_ref"]',

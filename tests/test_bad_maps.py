@@ -443,6 +443,8 @@ def test_columns_in_the_table_by_name(tmp_path):
     for odd in (True, -1, 7):
         with pytest.raises(InputError, match=f"no column {odd}; it has beta, BETA"):
             read_maps(path, fields=[odd])
+    with pytest.raises(InputError, match="no HDU True"):
+        read_maps(path, hdu=True, fields="BETA")
     cube = save(tmp_path / "c.fits", {"I": np.ones((NPIX, 4))}, formats={"I": "4D"}, NSIDE=None)
     assert read_maps(cube, nside=16).nside == 16  # packed by rows, as HEALPix writes
     with pytest.raises(InputError, match="NSIDE is 8, but its columns have 3072 pixels"):

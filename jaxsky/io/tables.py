@@ -119,6 +119,8 @@ def equals(
 def select_hdu(path: Path, hdus: pyfits.HDUList, hdu: int | str) -> pyfits.BinTableHDU:
     """The table `hdu` (number or name) of an open file."""
     try:
+        if isinstance(hdu, bool):
+            raise KeyError(hdu)  # True is no 1
         found = hdus[hdu]
     except (IndexError, KeyError):
         names = ", ".join(f"{i} ({h.name})" for i, h in enumerate(hdus))

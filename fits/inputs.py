@@ -46,6 +46,7 @@ from jaxsky.noise import (
     knee_spectrum,
     uniform_covariance,
 )
+from jaxsky.settings_keys import at_key
 
 __all__ = [
     "Band",
@@ -114,12 +115,14 @@ def embedded_inputs(settings: Settings, galaxy: EmbeddedSky | None = None) -> In
     embedded, seed = settings.embedded, settings.analysis.seed
     assert embedded is not None
     galaxy = galaxy or embedded_sky(embedded.nside)
-    sky = set_parameters(galaxy.sky("QU"), settings.fixed)
-    channels = [
-        channel
-        for name, chosen in embedded.channels.items()
-        for channel in load_instrument(name).select(chosen)
-    ]
+    with at_key("fixed"):
+        sky = set_parameters(galaxy.sky("QU"), settings.fixed)
+    with at_key("embedded.channels"):
+        channels = [
+            channel
+            for name, chosen in embedded.channels.items()
+            for channel in load_instrument(name).select(chosen)
+        ]
     bandpasses = [channel.band() for channel in channels]
     lmax = 2 * embedded.nside  # what the pixels resolve without aliasing
     r = settings.cmb.r if settings.cmb.include else None
@@ -175,7 +178,9 @@ def read_inputs(settings: Settings) -> Inputs:
         For files that cannot be read as what they should be.
     """
     folder = Path(settings.data_dir)
-    sky = set_parameters_of(read_templates(folder, settings.templates), settings.fixed)
+    templates = read_templates(folder, settings.templates)
+    with at_key("fixed"):
+        sky = set_parameters_of(templates, settings.fixed)
     bands = {spec.name: read_band(folder, spec) for spec in settings.bands}
     noise = {
         name: read_template_noise(folder, name, spec, sky[name])
@@ -196,13 +201,15 @@ def read_band(folder: Path, spec: BandSettings) -> Band:
     """
     found = read(folder, spec)
     check_stokes(f"bands.{spec.name}", found, "QU")
-    bandpass = read_bandpass_spec(folder, spec.bandpass)
+    with at_key(f"bands.{spec.name}.bandpass"):
+        bandpass = read_bandpass_spec(folder, spec.bandpass)
     maps = narrow(found.maps[-2:] * uK_RJ_per(found.unit, bandpass, f"bands.{spec.name}"))
     used, unit = np.asarray(found.mask), found.unit
     del found  # as large as all else
     leakage = _read_leakage(folder, spec, bandpass) if spec.leakage else None
     if spec.noise.estimate_above is not None:
-        noise, correlated = _estimated_noise(spec.noise, maps, used)
+        with at_key(f"bands.{spec.name}.noise.estimate_above"):
+            noise, correlated = _estimated_noise(spec.noise, maps, used)
         return Band(maps, used, bandpass, spec.fwhm, noise, correlated, leakage)
     noise, known = read_noise(
         folder,

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import AME, Component, Dust, Synchrotron
-from jaxsky.io import InputError, Maps, degrade_mask, read_bandpass, read_maps, unit_factor
+from jaxsky.io import Maps, degrade_mask, read_bandpass, read_maps, unit_factor
 from jaxsky.io.columns import stokes as stokes_of
 from jaxsky.lookup import find_file
 from jaxsky.noise import (
@@ -31,6 +31,7 @@ from jaxsky.settings import (
     SettingsError,
     TemplateFile,
 )
+from jaxsky.settings_keys import at_key
 from jaxsky.sky import Sky
 
 __all__ = [
@@ -169,7 +170,7 @@ def _read_template(
             parameters[key], used = jnp.asarray(column), used & known
         else:
             parameters[key] = tuple(value) if isinstance(value, list) else value
-    try:
+    with at_key(f"templates.{name}"):
         if spec.angles:
             if len(maps) != 1:
                 raise ValueError(f"fields must name one intensity map, not {len(maps)} maps")
@@ -178,8 +179,6 @@ def _read_template(
             )
         else:
             component = LAWS[spec.law](maps[-len(stokes) :], **parameters)
-    except (TypeError, ValueError) as error:
-        raise SettingsError(f"templates.{name}: {error}") from None
     return Template(component, spec.fwhm, used, found.unit)
 
 
@@ -295,13 +294,9 @@ def read_noise(
         For files that cannot be read as what they should be, another nside, noise that is not
         positive definite, and noise far from the rms of the map.
     """
-    try:
+    with at_key(where):
         covariance, known = _covariance(folder, noise, at, nside, stokes, where, unit, own)
         check_covariance("noise", covariance if known.all() else covariance[..., known])
-    except (InputError, SettingsError):
-        raise
-    except ValueError as error:
-        raise SettingsError(f"{where}: {error}") from None
     if maps is not None and not noise.plausible:
         factor = float(unit_factor(unit, "uK_RJ", at))
         inside = known if used is None else known & used

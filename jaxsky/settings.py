@@ -370,6 +370,8 @@ def load(path: Path, model: type[S], overrides: Mapping[str, Mapping[str, Any]] 
         raise SettingsError(f"{path}: cannot be read ({error.strerror}).") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SettingsError(f"{path}: is not valid TOML ({error}).") from None
+    except RecursionError:
+        raise SettingsError(f"{path}: is nested too deeply.") from None
     for table, values in (overrides or {}).items():
         given = {key: value for key, value in values.items() if value is not None}
         if given and isinstance(raw.get(table, {}), dict):

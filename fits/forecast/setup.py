@@ -17,6 +17,7 @@ from jaxsky.instrument import Channel, Instrument, load_instrument
 from jaxsky.io import degrade_mask, read_mask
 from jaxsky.lookup import find_file
 from jaxsky.settings import SettingsError
+from jaxsky.settings_keys import at_key
 
 __all__ = ["Setup", "apodize", "build"]
 
@@ -56,7 +57,8 @@ def build(settings: ForecastSettings) -> Setup:
     """
     instrument = _instrument(settings)
     shown = settings.spectra.bands or _few(instrument.names)
-    instrument.select(shown)
+    with at_key("spectra.bands"):
+        instrument.select(shown)
     templates, description = _templates(settings)
     fwhm = max(template.fwhm for template in templates.values())
     nside = min(healpy.npix2nside(template.used.size) for template in templates.values())
@@ -92,14 +94,14 @@ def apodize(used: Bool[np.ndarray, " pix"], width: float) -> Float[np.ndarray, "
 def _instrument(settings: ForecastSettings) -> Instrument:
     main = settings.experiment
     if main.instrument is not None:
-        instrument = load_instrument(main.instrument)
-        return instrument if main.channels is None else instrument.select(main.channels)
+        with at_key("experiment.instrument"):
+            instrument = load_instrument(main.instrument)
+        with at_key("experiment.channels"):
+            return instrument if main.channels is None else instrument.select(main.channels)
     channels = []
     for i, band in enumerate(settings.bands):
-        try:
+        with at_key(f"bands.{i}"):
             channels.append(Channel(**band.model_dump()))
-        except ValueError as error:
-            raise SettingsError(f"bands.{i}: {error}") from None
     return Instrument(settings.title or "bands of the settings", channels)
 
 
@@ -119,7 +121,8 @@ def _templates(settings: ForecastSettings) -> tuple[dict[str, Template], str]:
         used = np.ones(sky.shape[1], bool)
         templates = {name: Template(sky[name], 0.0, used) for name in sky}
         description = galaxy.description
-    return set_parameters_of(templates, settings.fixed), description
+    with at_key("fixed"):
+        return set_parameters_of(templates, settings.fixed), description
 
 
 def _check_resolution(lmax: int, nside: int, fwhm: float) -> None:

@@ -28,6 +28,7 @@ from jaxsky.io import read_mask
 from jaxsky.lookup import find_file
 from jaxsky.parameter_maps import one_column
 from jaxsky.settings import MapFile, SettingsError
+from jaxsky.settings_keys import at_key
 
 __all__ = ["Setup", "build"]
 
@@ -124,11 +125,9 @@ def _sky(settings: SeparateSettings) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
                 numbers[key], known = jnp.asarray(column), known & has
             else:
                 numbers[key] = tuple(value) if isinstance(value, list) else value
-        try:
+        with at_key(f"components.{name}"):
             law = CMB if spec.law == "cmb" else LAWS[spec.law]
             components[name] = law(amplitude, **numbers)
-        except (TypeError, ValueError) as error:
-            raise SettingsError(f"components.{name}: {error}") from None
     return Sky(components), known
 
 
@@ -149,12 +148,8 @@ def _labels(settings: SeparateSettings, used: Bool[np.ndarray, " pix"]) -> dict[
     for name, parameter in settings.free.items():
         if parameter.regions is None:
             continue
-        try:
+        with at_key(f"free.{name}.regions"):
             labels[name] = _regions(settings, parameter.regions, used, f"free.{name}.regions")
-        except SettingsError:
-            raise
-        except ValueError as error:
-            raise SettingsError(f"free.{name}.regions: {error}") from None
     return labels
 
 
@@ -182,9 +177,11 @@ def _observed(settings: SeparateSettings) -> tuple[Inputs, list[Array]]:
     """The embedded sky in all bands, and its foregrounds alone [uK_RJ]."""
     embedded, main = settings.embedded, settings.separation
     assert embedded is not None  # as called
-    instrument = load_instrument(embedded.instrument)
+    with at_key("embedded.instrument"):
+        instrument = load_instrument(embedded.instrument)
     if embedded.channels is not None:
-        instrument = instrument.select(embedded.channels)
+        with at_key("embedded.channels"):
+            instrument = instrument.select(embedded.channels)
     galaxy = embedded_sky(embedded.nside)
     inputs = embedded_inputs(
         analysis_settings.Settings(

@@ -15,6 +15,7 @@ from jaxsky.cli.console import (
     write_example,
 )
 from jaxsky.cli.results import results_folder
+from jaxsky.settings_keys import of_file
 
 __all__ = ["compare"]
 
@@ -72,12 +73,14 @@ def compare(
     started = time.perf_counter()
     # Files on the command line are relative to the folder one is in, not to the settings.
     files = [str(Path(r).resolve()) if Path(r).is_file() else r for r in region or []]
+    settings_file = settings_file or fit_settings.EMBEDDED_COMPARISON
     settings = fit_settings.load_settings(
-        settings_file or fit_settings.EMBEDDED_COMPARISON,
+        settings_file,
         {"seed": seed, "regions": files or None, "nside": nside},
         {"nsims": nsims},
     )
     with (
+        of_file(settings_file),
         results_folder(out, RESULTS, resume=resume, overwrite=overwrite) as folder,
         progress_bar() as progress,
     ):

@@ -9,6 +9,7 @@ from rich.text import Text
 
 from jaxsky.cli.console import console, print_tables, print_written, warn, write_example
 from jaxsky.cli.results import results_folder
+from jaxsky.settings_keys import of_file
 
 __all__ = ["fit"]
 
@@ -59,8 +60,10 @@ def fit(
     # Files on the command line are relative to the folder one is in, not to the settings.
     files = [str(Path(r).resolve()) if Path(r).is_file() else r for r in region or []]
     overrides = {"seed": seed, "regions": files or None, "stokes": stokes, "nside": nside}
-    settings = fit_settings.load_settings(settings_file or fit_settings.EMBEDDED, overrides)
+    settings_file = settings_file or fit_settings.EMBEDDED
+    settings = fit_settings.load_settings(settings_file, overrides)
     with (
+        of_file(settings_file),
         results_folder(out, RESULTS, resume=resume, overwrite=overwrite) as folder,
         console.status("starting") as status,
     ):

@@ -15,6 +15,7 @@ from jaxsky.cli.console import (
     write_example,
 )
 from jaxsky.cli.results import results_folder
+from jaxsky.settings_keys import of_file
 
 __all__ = ["forecast"]
 
@@ -44,8 +45,10 @@ def forecast(
     if init:
         write_example(settings_file or Path("forecast.toml"), forecast_settings.EXAMPLE)
         return
-    settings = forecast_settings.load_forecast(settings_file or forecast_settings.DEFAULT)
+    settings_file = settings_file or forecast_settings.DEFAULT
+    settings = forecast_settings.load_forecast(settings_file)
     with (
+        of_file(settings_file),
         results_folder(out, RESULTS, resume=None, overwrite=overwrite) as folder,
         console.status("starting") as status,
     ):

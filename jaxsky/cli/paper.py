@@ -8,6 +8,7 @@ import typer
 
 from jaxsky.cli.console import console, progress_bar, warn, write_example
 from jaxsky.cli.results import results_folder
+from jaxsky.settings_keys import of_file
 
 __all__ = ["paper"]
 
@@ -41,8 +42,10 @@ def paper(
     if init:
         write_example(settings_file or Path("paper.toml"), paper_settings.EXAMPLE)
         return
-    settings = paper_settings.load_paper(settings_file or paper_settings.EMBEDDED)
+    settings_file = settings_file or paper_settings.EMBEDDED
+    settings = paper_settings.load_paper(settings_file)
     with (
+        of_file(settings_file),
         results_folder(out, resume=resume, overwrite=overwrite),
         progress_bar() as progress,
     ):

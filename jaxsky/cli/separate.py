@@ -15,6 +15,7 @@ from jaxsky.cli.console import (
     write_example,
 )
 from jaxsky.cli.results import results_folder
+from jaxsky.settings_keys import of_file
 
 __all__ = ["separate"]
 
@@ -76,10 +77,10 @@ def separate(
         write_example(settings_file or Path("separation.toml"), separate_settings.EXAMPLE)
         return
     overrides = {"seed": seed, "nside": nside, "domain": domain, "nsims": nsims}
-    settings = separate_settings.load_separate(
-        settings_file or separate_settings.EMBEDDED, {"separation": overrides}
-    )
+    settings_file = settings_file or separate_settings.EMBEDDED
+    settings = separate_settings.load_separate(settings_file, {"separation": overrides})
     with (
+        of_file(settings_file),
         results_folder(out, RESULTS, resume=resume, overwrite=overwrite) as folder,
         progress_bar() as progress,
     ):

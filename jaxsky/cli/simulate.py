@@ -11,6 +11,7 @@ import typer
 from jaxsky.cli.console import console, progress_bar, warn, write_example
 from jaxsky.cli.results import results_folder
 from jaxsky.io.folders import ALL
+from jaxsky.settings_keys import of_file
 
 __all__ = ["simulate"]
 
@@ -59,8 +60,9 @@ def simulate(
         return
     if only is not None and only not in ONLY:
         raise ValueError(f"--only must be one of {', '.join(ONLY)}, not {only!r}.")
+    experiment_file = experiment_file or experiment.DEFAULT
     settings = experiment.load_experiment(
-        experiment_file or experiment.DEFAULT, {"experiment": {"seed": seed, "nside": nside}}
+        experiment_file, {"experiment": {"seed": seed, "nside": nside}}
     )
     if only is not None:
         main = {"include": ONLY[only](settings.foregrounds())}
@@ -72,6 +74,7 @@ def simulate(
     # With --overwrite all realisations are removed, so nobody else may be making any.
     part = ALL if overwrite else indices
     with (
+        of_file(experiment_file),
         results_folder(out, resume=resume, overwrite=overwrite, part=part) as folder,
         progress_bar() as progress,
     ):

@@ -22,10 +22,11 @@ from jaxsky.inputs import (
     set_parameters_of,
 )
 from jaxsky.instrument import load_instrument
-from jaxsky.io import InputError, read_beam, read_spectra
+from jaxsky.io import read_beam, read_spectra
 from jaxsky.lookup import find_file
 from jaxsky.observation import DTYPES, Observation, ObservedBand, Source
 from jaxsky.settings import SettingsError
+from jaxsky.settings_keys import at_key
 from jaxsky.small_scales import SmallScales
 
 __all__ = ["Setup", "build"]
@@ -141,16 +142,15 @@ def _templates(settings: Experiment) -> tuple[dict[str, Template], str]:
         known = GalaxyModel.__dataclass_fields__
         for name in set(numbers) - set(known):
             raise SettingsError(f"embedded.model: {name!r} is none of {', '.join(known)}.")
-        try:
+        with at_key("embedded.model"):
             model = GalaxyModel(**numbers)
-        except (TypeError, ValueError) as error:
-            raise SettingsError(f"embedded.model: {error}") from None
         galaxy = embedded_sky(embedded.nside, embedded.seed, model)
         sky = galaxy.sky(stokes)
         used = np.ones(sky.shape[1], bool)
         templates = {name: Template(sky[name], 0.0, used) for name in sky}
         description = galaxy.description
-    return set_parameters_of(templates, settings.fixed), description
+    with at_key("fixed"):
+        return set_parameters_of(templates, settings.fixed), description
 
 
 def _check_templates(
@@ -184,10 +184,8 @@ def _source(settings: Experiment, name: str, template: Template) -> Source:
     if spec is None:
         return Source(template.component, template.fwhm)
     numbers = spec.model_dump(exclude={"correlated_with"})
-    try:
+    with at_key(f"small_scales.{name}"):
         small = SmallScales(**numbers)
-    except ValueError as error:
-        raise SettingsError(f"small_scales.{name}: {error}") from None
     return Source(template.component, template.fwhm, small, spec.correlated_with)
 
 
@@ -198,10 +196,13 @@ def _channels(settings: Experiment) -> dict[str, ObservedBand]:
     noisy = "noise" in settings.included()
     channels = {}
     if main.instrument is not None:
-        instrument = load_instrument(main.instrument)
+        with at_key("experiment.instrument"):
+            instrument = load_instrument(main.instrument)
         if main.channels is not None:
-            instrument = instrument.select(main.channels)
-        observed = instrument.observed(target, main.samples)
+            with at_key("experiment.channels"):
+                instrument = instrument.select(main.channels)
+        with at_key("experiment.samples"):
+            observed = instrument.observed(target, main.samples)
         if noisy:
             return observed
         return {name: dataclasses.replace(seen, noise=None) for name, seen in observed.items()}
@@ -210,7 +211,8 @@ def _channels(settings: Experiment) -> dict[str, ObservedBand]:
         noise = None
         if noisy and spec.noise is not None:
             if spec.noise.level is not None:
-                noise = spec.noise.level * band.conversion(spec.noise.unit, "uK_RJ")
+                with at_key(f"bands.{spec.name}.noise.unit"):
+                    noise = spec.noise.level * band.conversion(spec.noise.unit, "uK_RJ")
             else:
                 noise, known = read_noise(
                     folder,
@@ -229,26 +231,22 @@ def _channels(settings: Experiment) -> dict[str, ObservedBand]:
         if spec.beam is None:
             beam = jnp.asarray(spec.fwhm)
         else:
-            beam = jnp.asarray(read_beam(find_file(folder, spec.beam), 2 * main.nside))
+            with at_key(f"bands.{spec.name}.beam"):
+                beam = jnp.asarray(read_beam(find_file(folder, spec.beam), 2 * main.nside))
         channels[spec.name] = ObservedBand(band, beam, target, noise, main.diagonal_noise)
     return channels
 
 
 def _band(folder: Path, spec: BandTable) -> Bandpass:
-    try:
+    with at_key(f"bands.{spec.name}.bandpass"):
         return read_bandpass_spec(folder, spec.bandpass)
-    except InputError:
-        raise
-    except ValueError as error:
-        raise SettingsError(f"bands.{spec.name}.bandpass: {error}") from None
 
 
 def _cmb(settings: Experiment, lmax: int) -> Float[np.ndarray, "4 ell"]:
     spec = settings.cmb
     if spec.spectra is None:
-        try:
+        with at_key("cmb.cosmology"):
             return camb_spectra(lmax, spec.r, **spec.cosmology)
-        except ValueError as error:
-            raise SettingsError(f"cmb.cosmology: {error}") from None
-    path = find_file(Path(settings.data_dir), spec.spectra)
-    return read_spectra(path, lmax, format=spec.format, unit=spec.unit)
+    with at_key("cmb.spectra"):
+        path = find_file(Path(settings.data_dir), spec.spectra)
+        return read_spectra(path, lmax, format=spec.format, unit=spec.unit)

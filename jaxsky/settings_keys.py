@@ -1,0 +1,45 @@
+"""Errors that values of settings lead to: named with their key, and with the file."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from jaxsky.io import InputError
+from jaxsky.settings import SettingsError
+
+__all__ = ["at_key", "of_file"]
+
+
+@contextmanager
+def at_key(name: str) -> Iterator[None]:
+    """Have an error of the numerics name the key of the value that led to it.
+
+    Raises
+    ------
+    SettingsError
+        For what is raised in here, unless it names its place already.
+    """
+    try:
+        yield
+    except (InputError, SettingsError):
+        raise
+    except (ValueError, TypeError, KeyError, ArithmeticError) as error:
+        message = error.args[0] if isinstance(error, KeyError) else error
+        raise SettingsError(f"{name}: {message}") from error
+
+
+@contextmanager
+def of_file(path: Path) -> Iterator[None]:
+    """Have errors about settings name their file.
+
+    Raises
+    ------
+    SettingsError
+        For one that is raised in here, with the file.
+    """
+    try:
+        yield
+    except SettingsError as error:
+        if str(error).startswith(f"{path}: "):
+            raise
+        raise SettingsError(f"{path}: {error}") from error

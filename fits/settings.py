@@ -27,6 +27,7 @@ from jaxsky.settings_types import (
     Pair,
     Seed,
     Several,
+    TensorRatio,
     Word,
     check_names,
 )
@@ -218,7 +219,7 @@ class CMBSettings(Table):
     """The CMB in the maps: part of their covariance, and of the embedded observation."""
 
     include: bool = True
-    r: float = Field(0.0, ge=0)
+    r: TensorRatio = 0.0
 
 
 class Grid(Table):

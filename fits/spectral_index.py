@@ -24,6 +24,7 @@ from fits.settings import Settings
 from fits.template_noise import Attenuation, attenuation
 from jaxsky import observe_components, parameter_names, set_parameters
 from jaxsky.settings import SettingsError
+from jaxsky.settings_keys import at_key
 
 __all__ = ["Fit", "all_free", "run"]
 
@@ -81,7 +82,8 @@ def fit_pixels(
     }
     priors = {name: prior for name, prior in settings.priors().items() if name in start}
     report(f"{region}, {stokes}: inner products")
-    diagonal = prepared.likelihood(start, stokes=stokes, region=used, kind="diagonal")
+    with at_key("free"):
+        diagonal = prepared.likelihood(start, stokes=stokes, region=used, kind="diagonal")
     like, dof_amplitudes = diagonal, None
     nothing = weightless(prepared, start, used, stokes)
     weighty = 1 - len(nothing) / len(prepared.bands)

@@ -15,6 +15,7 @@ __all__ = [
     "Seed",
     "SeparatedName",
     "Several",
+    "TensorRatio",
     "Word",
     "check_names",
 ]
@@ -54,6 +55,8 @@ def _name(value: str, characters: str, reserved: Collection[str] = ()) -> str:
     return value
 
 
+#: The largest leaves the tensors far above all else.
+TensorRatio = Annotated[float, Field(ge=0, le=1000)]
 Nside = Annotated[int, Field(gt=0, le=8192), AfterValidator(_power_of_two)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Word = Annotated[str, Field(min_length=1)]

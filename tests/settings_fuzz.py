@@ -19,7 +19,7 @@ import fits.settings
 from jaxsky import experiment
 from jaxsky.io import InputError
 from jaxsky.settings import SettingsError
-from jaxsky.settings_keys import of_file
+from jaxsky.settings_keys import at_key, of_file
 
 VALUES = (-1, 0, 1.5, 1e30, -1e300, 2**40, True, "", "unknown", "[/] $x_$", [], [1], [-1, "a"], {},
           {"unknown": 1})  # fmt: skip
@@ -36,7 +36,8 @@ class Kind(NamedTuple):
 def _fit(settings) -> None:
     fits.regions.region_masks(settings)
     inputs = fits.inputs.inputs_of(settings)
-    fits.resolution.prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
+    with at_key("analysis"):
+        fits.resolution.prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
 
 
 KINDS = {
@@ -99,13 +100,16 @@ def toml(value: Any) -> str:
     return json.dumps(value)
 
 
-def fault(kind: str, raw: dict[str, Any], at: tuple, path: Path) -> str | None:
+def fault(kind: str, raw: dict[str, Any], at: tuple, path: Path, build: bool = True) -> str | None:
     """What is wrong with the answer to settings; None if they work or are refused well."""
     path.write_text("".join(f"{json.dumps(key)} = {toml(v)}\n" for key, v in raw.items()))
-    known = (str(key) for key in at if not isinstance(key, int))
+    known = [str(key) for key in at if not isinstance(key, int)]
+    known += [f"{other[0]}.{other[1]}" for other in paths(raw) if len(other) > 1]
     try:
         with of_file(path):
-            KINDS[kind].build(KINDS[kind].load(path))
+            settings = KINDS[kind].load(path)
+            if build:
+                KINDS[kind].build(settings)
     except (SettingsError, InputError) as error:
         said = str(error)
         if "\n" in said or not said.startswith(str(path)):
@@ -117,12 +121,12 @@ def fault(kind: str, raw: dict[str, Any], at: tuple, path: Path) -> str | None:
     return None
 
 
-def faults(kind: str, path: Path, every: int = 1, first: int = 0) -> list[str]:
+def faults(kind: str, path: Path, every: int = 1, build: bool = True) -> list[str]:
     """What is wrong with the answers to one of so many mutations of a format's settings."""
     raw = small(kind)
     mutations = [(at, value) for at in paths(raw) for value in VALUES]
     found = []
-    for at, value in mutations[first::every]:
-        if what := fault(kind, changed(raw, at, value), at, path):
+    for at, value in mutations[::every]:
+        if what := fault(kind, changed(raw, at, value), at, path, build):
             found.append(f"{kind}: {'.'.join(map(str, at))} = {toml(value)}: {what}")
     return found

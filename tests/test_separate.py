@@ -308,8 +308,16 @@ def test_settings_that_contradict_themselves_are_refused(changes, words):
     [
         ({"separation": {"fwhm": 30.0}}, ValueError, "target beam of 30 arcmin is finer than"),
         ({"separation": {"nside": 32}}, ValueError, "common nside 32 is larger than that of"),
-        ({"embedded": {"channels": ["40", "41"]}}, KeyError, "has no channel '41'"),
-        ({"embedded": {"truth": {"dust.beta": 1.0}}}, KeyError, "Unknown parameter 'dust.beta'"),
+        (
+            {"embedded": {"channels": ["40", "41"]}},
+            SettingsError,
+            "embedded.channels: .* has no channel '41'",
+        ),
+        (
+            {"embedded": {"truth": {"dust.beta": 1.0}}},
+            SettingsError,
+            "embedded.truth: Unknown parameter 'dust.beta'",
+        ),
         (
             {"components": LAWS | {"dust": {"law": "dust", "parameters": {"beta": 1.5}}}},
             SettingsError,

@@ -23,6 +23,7 @@ from fits.pseudo_cl import (
 from jaxsky.checks import check_double
 from jaxsky.cmb import camb_spectra, tensor_spectra
 from jaxsky.harmonics import gaussian_beam
+from jaxsky.settings_keys import at_key
 
 __all__ = ["FIELDS", "Forecast", "forecast"]
 
@@ -151,7 +152,8 @@ def _errors(
     spec = settings.fisher
     nuisance = foreground_names(model.sky, model.fields, spec.foregrounds)
     free = list(dict.fromkeys((*spec.free, *nuisance)))
-    errors = fisher_errors(model, parameters, free, spec.priors)
+    with at_key("fisher"):
+        errors = fisher_errors(model, parameters, free, spec.priors)
     if "r" not in spec.free:
         return errors, None
     none = {n: 0.0 if n.endswith(".amplitude") else v for n, v in parameters.items()}

@@ -14,6 +14,7 @@ from jaxsky.settings_types import (
     Pair,
     Seed,
     Several,
+    TensorRatio,
     Word,
     check_names,
 )
@@ -108,7 +109,7 @@ class Fisher(Table):
     spectra: Several[Literal["EE", "BB"]] = Field(["BB"])
     lmin: Multipole = 2
     lmax: Annotated[int, Field(ge=2, le=3000)] = 300
-    r: float = Field(0.0, ge=0)
+    r: TensorRatio = 0.0
     A_lens: float = Field(1.0, ge=0)
 
     @model_validator(mode="after")

@@ -9,7 +9,15 @@ from pydantic import Field, model_validator
 from fits.priors import Gaussian, Prior
 from fits.settings import Band, Parameter, check_free
 from jaxsky.settings import MapFile, MaskFile, SettingsFile, Table, load
-from jaxsky.settings_types import Nside, Seed, SeparatedName, Several, Word, check_names
+from jaxsky.settings_types import (
+    Nside,
+    Seed,
+    SeparatedName,
+    Several,
+    TensorRatio,
+    Word,
+    check_names,
+)
 from jaxsky.settings_values import check_reference, check_signs
 
 __all__ = [
@@ -105,7 +113,7 @@ class Embedded(Table):
     channels: Annotated[Several[Word], Field(min_length=2)] | None = None
     nside: Nside = 64
     truth: dict[str, float] = Field(default={})
-    r: float = Field(0.0, ge=0)
+    r: TensorRatio = 0.0
 
     @model_validator(mode="after")
     def _signs(self) -> "Embedded":

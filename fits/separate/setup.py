@@ -183,6 +183,8 @@ def _observed(settings: SeparateSettings) -> tuple[Inputs, list[Array]]:
         with at_key("embedded.channels"):
             instrument = instrument.select(embedded.channels)
     galaxy = embedded_sky(embedded.nside)
+    with at_key("embedded.truth"):
+        sky = set_parameters(galaxy.sky("QU"), embedded.truth)
     inputs = embedded_inputs(
         analysis_settings.Settings(
             embedded=analysis_settings.Embedded(
@@ -194,7 +196,6 @@ def _observed(settings: SeparateSettings) -> tuple[Inputs, list[Array]]:
         ),
         galaxy,
     )
-    sky = set_parameters(galaxy.sky("QU"), embedded.truth)
     seen = observe(sky, [band.bandpass for band in inputs.bands.values()])
     foregrounds = [
         resample(maps, gaussian_beam(band.fwhm, 2 * embedded.nside), embedded.nside)
@@ -219,7 +220,8 @@ def _factors(settings: SeparateSettings, inputs: Inputs) -> Float[np.ndarray, " 
 
 def _pixels(settings, sky, inputs, foregrounds, inside):
     main = settings.separation
-    prepared = prepare(inputs, main.nside, main.fwhm)
+    with at_key("separation"):
+        prepared = prepare(inputs, main.nside, main.fwhm)
     used = prepared.used & inside
     if not used.any():
         raise SettingsError("separation.mask: leaves no pixel.")

@@ -15,7 +15,7 @@ from jaxsky.cli.console import (
     write_example,
 )
 from jaxsky.cli.results import results_folder
-from jaxsky.settings_keys import of_file
+from jaxsky.settings_keys import at_key, of_file
 
 __all__ = ["compare"]
 
@@ -99,7 +99,8 @@ def compare(
 
         regions = region_masks(settings)
         inputs = inputs_of(settings)
-        prepared = prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
+        with at_key("analysis"):
+            prepared = prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
         check_comparison(settings, prepared, regions)
         if overwrite:
             folder.remove(RESULTS)

@@ -9,7 +9,7 @@ from rich.text import Text
 
 from jaxsky.cli.console import console, print_tables, print_written, warn, write_example
 from jaxsky.cli.results import results_folder
-from jaxsky.settings_keys import of_file
+from jaxsky.settings_keys import at_key, of_file
 
 __all__ = ["fit"]
 
@@ -78,7 +78,8 @@ def fit(
         status.update("reading and preparing maps")
         regions = region_masks(settings)
         inputs = inputs_of(settings)
-        prepared = prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
+        with at_key("analysis"):
+            prepared = prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
         if overwrite:
             folder.remove(RESULTS)
         chains = out / "chain.h5"

@@ -23,6 +23,7 @@ from jaxsky.settings_types import (
     Pair,
     Seed,
     Several,
+    TensorRatio,
     Word,
     check_names,
 )
@@ -94,7 +95,7 @@ class SmallScalesTable(Table):
 class CMBTable(Table):
     """The CMB: from CAMB, or from a file of spectra."""
 
-    r: float = Field(0.0, ge=0)
+    r: TensorRatio = 0.0
     cosmology: dict[str, float] = Field(default={})
     spectra: FileName | None = None
     format: Literal["camb", "planck"] | None = None

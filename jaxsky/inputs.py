@@ -214,10 +214,8 @@ def mask_at(mask: Bool[np.ndarray, " pix"], nside: int, where: str) -> Bool[np.n
     SettingsError
         If it is coarser, or has an nside that is no power of two; `where` is its key.
     """
-    try:
+    with at_key(where):
         return np.asarray(degrade_mask(mask, nside))
-    except ValueError as error:
-        raise SettingsError(f"{where}: {error}") from None
 
 
 def uK_RJ_per(unit: str, at: Bandpass | float, where: str) -> float:
@@ -228,10 +226,8 @@ def uK_RJ_per(unit: str, at: Bandpass | float, where: str) -> float:
     SettingsError
         If the unit is none of a brightness; `where` is the table of the map in the settings.
     """
-    try:
+    with at_key(f"{where}.unit"):
         return float(unit_factor(unit, "uK_RJ", at))
-    except ValueError as error:
-        raise SettingsError(f"{where}.unit: {error}") from None
 
 
 def check_stokes(where: str, found: Maps, wanted: str) -> None:

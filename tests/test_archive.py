@@ -2,9 +2,14 @@
 
 import hashlib
 import sys
+from pathlib import Path
 
 import pytest
 
+from fits import settings as fit_settings
+from fits.paper import settings as paper_settings
+from fits.separate import settings as separate_settings
+from fits.settings import load_settings
 from jaxsky import cli
 from jaxsky.archive import (
     Product,
@@ -17,9 +22,11 @@ from jaxsky.archive import (
     verify,
 )
 from jaxsky.io import InputError
+from jaxsky.lookup import named_files
 from jaxsky.units import parse_unit
 from misbehaving import CONTENT, NAME, Handler, fits_bytes, serving
 
+EXAMPLES = Path(__file__).parents[1] / "examples"
 SHA = "sha256:" + hashlib.sha256(CONTENT).hexdigest()
 
 
@@ -76,6 +83,20 @@ def test_sets_are_files_of_the_catalogue():
     assert total_size(find(["wmap9"])) == "503 MB"
     assert total_size(find(["haslam"])) == "of unknown size"
     assert total_size(find(["planck-ancillary"])) == "more than 19 MB"
+
+
+@pytest.mark.parametrize(
+    ("name", "path", "load"),
+    [
+        ("planck-44-70", EXAMPLES / "planck_44_70.toml", load_settings),
+        ("planck-44-70", fit_settings.EXAMPLE, load_settings),
+        ("paper", paper_settings.EXAMPLE, paper_settings.load_paper),
+        ("separate", separate_settings.EXAMPLE, separate_settings.load_separate),
+    ],
+)
+def test_sets_are_the_files_of_examples(name, path, load):
+    files = {file for file in named_files(load(path)) if "." in file}  # others are regions
+    assert files == {product.name for product in find([name])}
 
 
 def test_products_are_found_by_group_name_and_part():

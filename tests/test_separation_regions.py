@@ -362,3 +362,22 @@ def test_a_temperature_that_runs_away_is_no_fit():
     with pytest.raises(FitError, match=r"do not constrain dust.T_dust; a Gaussian prior") as caught:
         fit_spectra(like)
     assert caught.value.result.best_fit["dust.T_dust"] > 1e4
+
+
+@pytest.mark.parametrize("kind", ["bands", "full", "covariance"])
+def test_a_band_without_weight_is_named_and_not_counted(kind):
+    _, data, given, _ = problem("full")
+    noise = np.array(given)
+    if kind == "bands":
+        noise = noise[:, 0, 0]
+    if kind == "covariance":
+        noise = np.einsum("bsp,st->bstp", noise**2, np.eye(2))
+    without = spectral_likelihood(
+        random_sky(), dict(list(BANDS.items())[1:]), data[1:], noise[1:], START
+    )
+    whole = spectral_likelihood(random_sky(), BANDS, data, noise, START)
+    assert whole.weightless == without.weightless == ()
+    noise[0] *= 1e12 if kind == "covariance" else 1e6
+    light = spectral_likelihood(random_sky(), BANDS, data, noise, START)
+    assert light.weightless == (next(iter(BANDS)),)
+    assert light.dof(3) == without.dof(3) == whole.dof(3) - data[0].size

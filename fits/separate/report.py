@@ -137,6 +137,11 @@ def warnings(found: Separation, settings: SeparateSettings) -> list[str]:
     """What a user should know before using the numbers, a sentence each."""
     sentences = leaks(settings.bands)
     fit, ratio, simulated = found.fit, found.tensors, found.simulated
+    sentences += [
+        f"Band {band} carries no weight: its noise is too large. It is not counted in degrees of "
+        "freedom."
+        for band in found.like.weightless
+    ]
     if not fit.converged:
         sentences.append(fit.message)
     elif fit.dof > 0 and abs(fit.chi2 / fit.dof - 1) > 0.1:

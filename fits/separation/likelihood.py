@@ -55,6 +55,7 @@ class SpectralLikelihood(Likelihood):
     layout : Stokes parameters of `pixels`
     unit : of the data
     values : number of data less that of amplitudes
+    weightless : bands that add nothing to what the others tell, and are not counted
     """
 
     samples: Samples
@@ -67,6 +68,7 @@ class SpectralLikelihood(Likelihood):
     layout: tuple[Layout, ...] = eqx.field(static=True)
     unit: str = eqx.field(static=True)
     values: int = eqx.field(static=True)
+    weightless: tuple[str, ...] = eqx.field(static=True)
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -334,9 +336,12 @@ def spectral_likelihood(
         None if cells.of_pixel is None else jnp.asarray(cells.of_pixel),
         layouts(data.shape[1], angles or noise.covariance is not None),
         unit,
-        _count(noise, used, data.shape) - components * data.shape[1] * int(used.sum()),
+        0,
+        (),
     )
-    _check_matrices(like)
+    matrix = _check_matrices(like)[:, : len(data), :components]
+    heavy = noise.heavy(used, np.mean(matrix**2, axis=0))
+    number = noise.number(used, heavy, data.shape[1])
     rows = [len(data) * len(layout.groups[0]) for layout in like.layout]
     fewer = cells.number * max(rows) < used.sum()
     if compress and not noise.separable:
@@ -349,7 +354,13 @@ def spectral_likelihood(
         else:
             pixels, block_cell = gathered(data, noise, cells, used, layout)
             parts.append(pixels)
-    return dataclasses.replace(like, pixels=tuple(parts), block_cell=block_cell)
+    return dataclasses.replace(
+        like,
+        pixels=tuple(parts),
+        block_cell=block_cell,
+        values=number - components * data.shape[1] * int(used.sum()),
+        weightless=tuple(name for name, some in zip(bands, heavy, strict=True) if not some),
+    )
 
 
 def _first_pixels(cells: Cells, used: np.ndarray) -> np.ndarray:
@@ -369,24 +380,15 @@ def _index(values: Mapping[str, Array], cells: Cells) -> Array:
     return jnp.asarray(np.stack(columns, axis=1) if columns else np.zeros((cells.number, 0), int))
 
 
-def _count(noise: Noise, used: np.ndarray, shape: tuple[int, ...]) -> int:
-    """Number of data that are used."""
-    if noise.separable:
-        return int(used.sum()) * shape[0] * shape[1]
-    if noise.covariance is not None:
-        return 2 * int(np.isfinite(noise.covariance[:, 0, 0]).sum())
-    return int(np.isfinite(noise.sigma).sum())  # type: ignore[arg-type]
-
-
 @jax.jit
 def _start_matrices(like):
     return like.matrices(like.flat({})[like.index])[0]
 
 
-def _check_matrices(like: SpectralLikelihood) -> None:
-    """Raise ValueError if two components have the same law at the start values."""
-    matrix = np.asarray(_start_matrices(like))
-    matrix = matrix / np.linalg.norm(matrix, axis=1, keepdims=True)
+def _check_matrices(like: SpectralLikelihood) -> np.ndarray:
+    """The matrices at the start values; ValueError if two components have the same law there."""
+    given = np.asarray(_start_matrices(like))
+    matrix = given / np.linalg.norm(given, axis=1, keepdims=True)
     if not np.isfinite(matrix).all():
         raise ValueError("The laws are not finite at the start values.")
     if np.linalg.svd(matrix, compute_uv=False)[:, -1].min() < 1e-7:
@@ -394,3 +396,4 @@ def _check_matrices(like: SpectralLikelihood) -> None:
             f"The components {', '.join(like.sky)} cannot be told apart at the start values: "
             "their laws are the same in these bands."
         )
+    return given

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxsky.bare import refuse_unit, takes_quantities
 from jaxsky.types import Numeric
@@ -15,6 +15,8 @@ __all__ = ["Noise", "as_noise", "bare", "chunks"]
 CHUNK = 1 << 15
 #: Ratios of sigma between bands that are constant to this accuracy make noise separable.
 ROUNDING = 1e-12
+#: A band that has less than this share of the weight of any component has none.
+LEAST_SHARE = 1e-6
 
 
 def chunks(npix: int, size: int = CHUNK) -> Iterator[slice]:
@@ -85,6 +87,26 @@ class Noise(NamedTuple):
             return None
         _, determinant, QU = self._elements(pixels)
         return -QU / determinant
+
+    def heavy(
+        self, used: Bool[np.ndarray, " pix"], squares: Float[np.ndarray, "band component"]
+    ) -> Bool[np.ndarray, " band"]:
+        """Bands that carry weight, from the pixels used and the squares of the laws."""
+        weights = np.zeros(len(squares))
+        for part in chunks(used.size):
+            weights += (self.weights(part) * used[part]).sum(axis=(0, 2))
+        share = weights[:, None] * squares
+        return (share >= LEAST_SHARE * share.sum(axis=0)).any(axis=1)
+
+    def number(
+        self, used: Bool[np.ndarray, " pix"], bands: Bool[np.ndarray, " band"], stokes: int
+    ) -> int:
+        """Number of data in some bands and the pixels used."""
+        if self.separable:
+            return int(used.sum()) * int(bands.sum()) * stokes
+        if self.covariance is not None:
+            return 2 * int(np.isfinite(self.covariance[bands, 0, 0]).sum())
+        return int(np.isfinite(self.sigma[bands]).sum())  # type: ignore[index]
 
     def _elements(self, pixels):
         assert self.covariance is not None

@@ -125,11 +125,14 @@ def _products(
     noise: Float[Array, "stokes stokes pix"],
     rows: Float[Array, "row stokes pix"],
 ) -> Float[np.ndarray, "row row"]:
-    """Covariance of the inner products of rows with the prepared noise of a band."""
+    """Covariance of the inner products of rows with the prepared noise of a band.
+
+    The rows at the resolution of the noise are kept in its precision.
+    """
     block = np.zeros((len(rows), len(rows)))
     before: list[Array] = []
     for i, row in enumerate(rows):
-        before.append(preparation.transpose(row).block_until_ready())
+        before.append(preparation.transpose(row).astype(noise.dtype).block_until_ready())
         for j, other in enumerate(before):
             block[i, j] = block[j, i] = _product(before[i], noise, other)
     return block
@@ -142,6 +145,7 @@ def _product(
     other: Float[Array, "stokes pix"],
 ) -> Float[Array, ""]:
     """Covariance of the inner products of two maps with noise, without maps in between."""
+    one, noise, other = (maps.astype(float) for maps in (one, noise, other))
     n = len(one)
     return jnp.sum(sum(one[s] * noise[s, t] * other[t] for s in range(n) for t in range(n)))
 

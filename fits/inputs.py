@@ -33,7 +33,6 @@ from jaxsky.inputs import (
     narrow,
     read,
     read_bandpass_spec,
-    read_noise,
     read_templates,
     set_parameters_of,
     uK_RJ_per,
@@ -46,6 +45,7 @@ from jaxsky.noise import (
     knee_spectrum,
     uniform_covariance,
 )
+from jaxsky.noise_inputs import read_noise
 from jaxsky.settings_keys import at_key
 
 __all__ = [

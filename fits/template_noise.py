@@ -22,7 +22,8 @@ from fits.results import FitResult
 from fits.settings import TemplateFile
 from jaxsky import Sky
 from jaxsky.harmonics import gaussian_beam, pixel_window
-from jaxsky.inputs import Template, read_noise
+from jaxsky.inputs import Template
+from jaxsky.noise_inputs import read_noise
 from jaxsky.settings import SettingsError
 from jaxsky.units import conversion
 

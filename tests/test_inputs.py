@@ -11,11 +11,11 @@ from jaxsky.bandpass import Bandpass
 from jaxsky.inputs import (
     read,
     read_bandpass_spec,
-    read_noise,
     read_templates,
     set_parameters_of,
 )
 from jaxsky.io import InputError
+from jaxsky.noise_inputs import read_noise
 from jaxsky.settings import (
     BandpassSpec,
     MapFile,

@@ -17,13 +17,13 @@ from jaxsky.galaxy import GalaxyModel, embedded_sky
 from jaxsky.inputs import (
     Template,
     read_bandpass_spec,
-    read_noise,
     read_templates,
     set_parameters_of,
 )
 from jaxsky.instrument import load_instrument
 from jaxsky.io import read_beam, read_spectra
 from jaxsky.lookup import find_file
+from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import DTYPES, Observation, ObservedBand, Source
 from jaxsky.settings import SettingsError
 from jaxsky.settings_keys import at_key

@@ -1,0 +1,169 @@
+"""The noise that settings state, read: a covariance of each pixel, and where it is known."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxsky.bandpass import Bandpass
+from jaxsky.inputs import narrow, read
+from jaxsky.io import Maps, unit_factor
+from jaxsky.io.columns import stokes as stokes_of
+from jaxsky.noise import (
+    check_covariance,
+    covariance_from_columns,
+    hits_covariance,
+    rms_covariance,
+    weights_covariance,
+)
+from jaxsky.settings import Hits, MapFile, NoiseColumns, NoiseFile, SettingsError
+from jaxsky.settings_keys import at_key
+
+__all__ = ["read_noise"]
+
+#: Noise outside of this range, relative to the rms of its map, is a mistake unless it is meant.
+PLAUSIBLE = (1e-6, 10.0)
+
+
+def read_noise(
+    folder: Path,
+    noise: NoiseFile,
+    at: Bandpass | float,
+    nside: int,
+    stokes: str = "QU",
+    *,
+    where: str,
+    unit: str,
+    own: MapFile | None = None,
+    maps: Float[Array, "stokes pix"] | None = None,
+    used: Bool[np.ndarray, " pix"] | None = None,
+) -> tuple[Float[Array, "stokes stokes pix"], Bool[np.ndarray, " pix"]]:
+    """Covariance of each pixel [uK_RJ^2], and where it is known; 0 elsewhere.
+
+    Parameters
+    ----------
+    folder : of the files
+    noise : what the settings say; pixels without hits are not known
+    at : bandpass of the map, or its frequency [GHz]
+    nside : resolution of the map
+    stokes : "QU" or "IQU"
+    where : key of the noise in the settings, for the messages
+    unit : unit of the map, and so of rms and sigma0
+    own : the map that has the noise, if its columns are in the same file
+    maps, used : the map that has the noise [uK_RJ] and its pixels, against whose rms it is checked
+
+    Raises
+    ------
+    jaxsky.io.InputError, SettingsError
+        For files that cannot be read as what they should be, another nside, noise that is not
+        positive definite, and noise far from the rms of the map.
+    """
+    with at_key(where):
+        covariance, known = _covariance(folder, noise, at, nside, stokes, where, unit, own)
+        check_covariance("noise", covariance if known.all() else covariance[..., known])
+    if maps is not None and not noise.plausible:
+        factor = float(unit_factor(unit, "uK_RJ", at))
+        inside = known if used is None else known & used
+        _check_plausible(where, covariance, maps, inside, factor, unit)
+    return covariance if known.all() else jnp.where(known, covariance, 0.0), known
+
+
+def _check_plausible(where, covariance, maps, inside, factor, unit):
+    """Refuse noise of a Stokes parameter that is far from the rms of the map."""
+    if not inside.any():
+        return
+    rms = np.sqrt(np.mean(np.square(np.asarray(maps)[:, inside], dtype=float)))
+    for s in range(len(covariance)):
+        own = np.sqrt(np.mean(np.asarray(covariance[s, s])[inside], dtype=float))
+        low, high = (limit * rms for limit in PLAUSIBLE)
+        if rms and not low <= own <= high:
+            raise SettingsError(
+                f"{where}: the noise of a pixel is {own / factor:.3g} {unit} (rms), but the rms of "
+                f"the map in the same pixels is {rms / factor:.3g} {unit}; noise is in the map's "
+                'unit where it has none of its own. Write "plausible = true" if this is meant.'
+            )
+
+
+def _covariance(folder, noise, at, nside, stokes, where, unit, own):
+    """See `read_noise`; with any values where the covariance is not known."""
+    n, npix = len(stokes), 12 * nside**2
+    if noise.rms is not None:
+        rms = noise.rms * unit_factor(unit, "uK_RJ", at)
+        return rms_covariance(narrow(np.full((n, npix), rms))), np.ones(npix, bool)
+    kinds = ("map", "covariance", "hits", "weights")
+    kind = next(k for k in kinds if getattr(noise, k) is not None)
+    spec, where = getattr(noise, kind), f"{where}.{kind}"
+    found = _read_columns(folder, _file(spec, own, where), kind, where)
+    if found.nside != nside:
+        raise SettingsError(f"{where}: nside is {found.nside}, but that of the map is {nside}.")
+    given, known = found.unit, np.asarray(found.mask)
+    maps = narrow(found.maps)
+    del found  # as large as all else
+    if kind == "map":
+        _check_number(f"{where}.fields", len(maps), stokes)
+        rms = maps[-n:] * float(unit_factor(given, "uK_RJ", at))
+        return rms_covariance(jnp.broadcast_to(rms, (n, npix))), known
+    if kind == "covariance":
+        if len(maps) == 3 and n == 3:
+            raise SettingsError(f"{where}: I, Q and U need six columns, II, IQ, IU, QQ, QU, UU.")
+        columns = maps * float(unit_factor(given, "uK_RJ^2", at))
+        return covariance_from_columns(columns)[-n:, -n:], known
+    if given:
+        raise SettingsError(f"{where}.unit: {kind} are pure numbers, but are said to be {given}.")
+    _check_number(f"{where}.sigma0", len(spec.sigma0), stokes)
+    factor = float(unit_factor(spec.sigma0_unit or unit, "uK_RJ", at))
+    sigma0 = jnp.array(spec.sigma0, maps.dtype)[-n:] * factor
+    if kind == "weights":
+        if n != 2:
+            raise SettingsError(f"{where}: weights are those of Q and U, not of {stokes}.")
+        known = known & np.asarray(maps[0] * maps[2] > 0)
+        nothing = jnp.array([1.0, 0.0, 1.0], maps.dtype)[:, None]
+        weights = jnp.where(known, maps, nothing)
+        return weights_covariance(jnp.broadcast_to(sigma0, (n,)), weights), known
+    known = known & np.asarray(maps[0] != 0)
+    hits = jnp.where(known, maps[0], 1.0)
+    return hits_covariance(jnp.broadcast_to(sigma0, (n,)), hits, n), known
+
+
+def _read_columns(folder: Path, spec: MapFile, kind: str, where: str) -> Maps:
+    """Columns about the noise, with the Stokes parameters that their place in the settings says."""
+    tables = max(len(spec.files), len(spec.hdu) if isinstance(spec.hdu, list) else 1)
+    number = max(tables, len(spec.fields or []))
+    if kind == "map" and spec.fields is None and tables == 1:
+        number = len(read(folder, spec).names)
+    pairs: dict[str, dict[int, tuple[str, ...]]] = {
+        "map": {1: (), 2: ("QQ", "UU"), 3: ("II", "QQ", "UU")},
+        "covariance": {3: ("QQ", "QU", "UU"), 6: ("II", "IQ", "IU", "QQ", "QU", "UU")},
+        "weights": {3: ("QQ", "QU", "UU")},
+    }
+    wanted = pairs.get(kind, {}).get(number, ())
+    fields = spec.fields or []
+    said = [stokes_of(name) if isinstance(name, str) else None for name in fields]
+    if any(s is not None and w not in (s, s * 2) for s, w in zip(said, wanted, strict=False)):
+        listed = ", ".join(w[0] if kind == "map" else w for w in wanted)
+        raise SettingsError(
+            f"{where}.fields: {', '.join(map(str, fields))} are not {listed} by their names."
+        )
+    return read(folder, spec, stokes=wanted or "")
+
+
+def _file(spec: MapFile | NoiseColumns, own: MapFile | None, where: str) -> MapFile:
+    """The columns to read; those without a file are in that of the map."""
+    said = spec.model_dump(include=set(MapFile.model_fields), exclude_none=True)
+    if isinstance(spec, Hits):
+        said.setdefault("unit", "")  # a number, whatever the header calls it
+    if "file" not in said:
+        if own is None:
+            raise SettingsError(f"{where}: file is missing.")
+        if len(own.files) > 1 or (isinstance(own.hdu, list) and "hdu" not in said):
+            raise SettingsError(f"{where}: the map has several files or HDUs; give file and hdu.")
+        taken = set(MapFile.model_fields) - {"fields", "unit", "stokes", "missing"}
+        said = own.model_dump(include=taken, exclude_none=True) | said
+    return MapFile(**said)
+
+
+def _check_number(where: str, number: int, stokes: str) -> None:
+    """Refuse other numbers than one for all, one for each, or one for I, too."""
+    if number not in (1, len(stokes), 3):
+        raise SettingsError(f"{where}: one or {len(stokes)} are needed, not {number}.")

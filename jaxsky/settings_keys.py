@@ -1,5 +1,6 @@
 """Errors that values of settings lead to: named with their key, and with the file."""
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,8 +25,10 @@ def at_key(name: str) -> Iterator[None]:
     except (InputError, SettingsError):
         raise
     except (ValueError, TypeError, KeyError, ArithmeticError) as error:
-        message = error.args[0] if isinstance(error, KeyError) else error
-        raise SettingsError(f"{name}: {message}") from error
+        message = str(error.args[0] if isinstance(error, KeyError) else error)
+        if (unknown := re.search(r"unexpected keyword argument ('\w+')", message)) is not None:
+            message = f"there is no parameter {unknown[1]}"
+        raise SettingsError(f"{name}: {message.rstrip('.')}.") from error
 
 
 @contextmanager

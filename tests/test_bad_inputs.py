@@ -654,7 +654,7 @@ STRICT += [
     file_of_settings("no TOML", "this is not TOML", "TOML"),
     file_of_settings("a key twice", "title = 'a'\ntitle = 'b'\n", "TOML"),
     file_of_settings("bytes", b"\xff\xfe\x00", "TOML"),
-    file_of_settings("deeper than Python counts", "a = " + "[" * 20000 + "]" * 20000, "TOML"),
+    file_of_settings("deeper than Python counts", "a = " + "[" * 20000 + "]" * 20000, "nested"),
     file_of_settings("nothing", "", "templates"),
 ]
 

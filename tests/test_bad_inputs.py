@@ -512,7 +512,7 @@ BASES: dict[str, tuple[dict[str, Any], Callable[[Path], Any]]] = {
     ),
     "paper": ({"embedded": {}, "free": FREE}, load_paper),
 }
-REMOVED = object()
+REMOVED = type("Removed", (), {"__repr__": lambda self: "nothing"})()
 
 
 def changed(base: Any, key: str, value: Any) -> Any:

@@ -203,7 +203,8 @@ class Killing:
 
     def stop(self, how: int, changes: int, seconds: float) -> bool:
         """Begin or resume, and stop at a moment; False if the end came before."""
-        process = start(self.name, self.out, *(["--resume"] if self.out.exists() else []))
+        began, fresh = time.monotonic(), not self.out.exists()
+        process = start(self.name, self.out, *([] if fresh else ["--resume"]))
         if how == signal.SIGINT:  # when Python is there to hear it
             watch(process, self.out, 1, 600)
         watch(process, self.out, changes, seconds)
@@ -215,6 +216,8 @@ class Killing:
             process.kill()
         if ended or code == 0:
             self.check_whole(process)
+            if fresh:  # the machine was busier before
+                self.seconds = min(self.seconds, time.monotonic() - began)
             for path in sorted(self.out.rglob("*"), reverse=True):
                 path.rmdir() if path.is_dir() else path.unlink()
             self.out.rmdir()

@@ -171,3 +171,13 @@ def test_ctrl_c_ends_a_command(tmp_path, how):
 
 def test_ctrl_c_before_there_is_a_folder(monkeypatch, capsys):
     assert run(monkeypatch, capsys, raises(KeyboardInterrupt())) == (130, "Stopped. ")
+
+
+def test_ctrl_c_at_the_end_of_the_interpreter_says_nothing():
+    code = (
+        "import atexit, signal, sys; atexit.register(signal.raise_signal, signal.SIGINT)\n"
+        "from jaxsky import cli; sys.argv = ['jaxsky', 'data', 'list', 'wmap9']; cli.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    assert "wmap_band" in done.stdout

@@ -1,6 +1,7 @@
 """Ctrl-C ends a command within seconds, whatever it is doing."""
 
 import _thread
+import atexit
 import os
 import signal
 import socket
@@ -77,6 +78,8 @@ def prompt() -> Iterator[None]:
         with interruptible():
             yield
     finally:
+        # At the end of the interpreter nothing is left to stop, and nobody to catch an exception.
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
         if not interrupts.pressed.is_set():
             signal.set_wakeup_fd(descriptor)
             sys.unraisablehook = before

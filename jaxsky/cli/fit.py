@@ -80,6 +80,7 @@ def fit(
         inputs = inputs_of(settings)
         with at_key("analysis"):
             prepared = prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
+        inputs = inputs._replace(bands={})  # their maps have served
         if overwrite:
             folder.remove(RESULTS)
         chains = out / "chain.h5"

@@ -19,6 +19,7 @@ import pytest
 
 from fits.chains import ChainFile, kept_chain
 from fits.realisations import realisations
+from fits.record import fingerprint
 from jaxsky import cli
 from jaxsky.io import InputError, whole, write_maps, write_text
 from jaxsky.io.folders import ALL, Owner, alone, occupied
@@ -329,3 +330,13 @@ def test_realisations_go_on_after_a_full_disk(tmp_path, monkeypatch):
         np.savez(file, mark="mark", a=np.zeros((3, 100)), b=np.zeros(2))
     with pytest.raises(InputError, match="npz: is damaged"):
         run()
+
+
+def test_marks_are_the_same_in_all_processes():
+    """What results depend on are arrays; where objects are in memory does not count."""
+    arrays = {"a": np.arange(3.0), "b": [True, 1]}
+    marks = {fingerprint((arrays, function)) for function in (len, max, fingerprint)}
+    assert marks == {fingerprint(arrays)}
+    assert fingerprint({"a": np.arange(4.0), "b": [True, 1]}) not in marks
+    with pytest.raises(TypeError, match="is neither an array nor a function"):
+        fingerprint([object()])

@@ -21,6 +21,9 @@ from jaxsky.streams import stream
 
 __all__ = ["Fluctuations"]
 
+#: Pixels whose products are added up at once; few enough to stay in cache.
+CHUNK = 1 << 16
+
 
 class Fluctuations(eqx.Module):
     """Noise and CMB of Q, U maps in several bands.
@@ -129,25 +132,18 @@ def _products(
 
     The rows at the resolution of the noise are kept in its precision.
     """
-    block = np.zeros((len(rows), len(rows)))
-    before: list[Array] = []
-    for i, row in enumerate(rows):
-        before.append(preparation.transpose(row).astype(noise.dtype).block_until_ready())
-        for j, other in enumerate(before):
-            block[i, j] = block[j, i] = _product(before[i], noise, other)
-    return block
-
-
-@jax.jit
-def _product(
-    one: Float[Array, "stokes pix"],
-    noise: Float[Array, "stokes stokes pix"],
-    other: Float[Array, "stokes pix"],
-) -> Float[Array, ""]:
-    """Covariance of the inner products of two maps with noise, without maps in between."""
-    one, noise, other = (maps.astype(float) for maps in (one, noise, other))
-    n = len(one)
-    return jnp.sum(sum(one[s] * noise[s, t] * other[t] for s in range(n) for t in range(n)))
+    before = [
+        np.asarray(preparation.transpose(row).astype(noise.dtype).block_until_ready())
+        for row in rows
+    ]
+    count, npix, covariance = len(rows), noise.shape[-1], np.asarray(noise)
+    block = np.zeros((count, count))
+    for start in range(0, npix, CHUNK):
+        cut = slice(start, start + CHUNK)
+        maps = np.stack([row[:, cut] for row in before]).astype(float)
+        seen = np.einsum("stp,jtp->jsp", covariance[..., cut].astype(float), maps)
+        block += maps.reshape(count, -1) @ seen.reshape(count, -1).T
+    return (block + block.T) / 2
 
 
 @jax.jit

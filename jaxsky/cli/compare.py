@@ -46,9 +46,7 @@ def compare(
     ] = False,
     seed: Annotated[
         int | None,
-        typer.Option(
-            min=0, max=2**32 - 1, help="Seed of realisations, and of the maps of the embedded sky."
-        ),
+        typer.Option(help="Seed of realisations, and of the maps of the embedded sky."),
     ] = None,
     region: Annotated[
         list[str] | None, typer.Option(help="strip, outside, full or a mask file; repeatable.")

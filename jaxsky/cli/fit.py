@@ -35,9 +35,7 @@ def fit(
     init: Annotated[
         bool, typer.Option("--init", help="Write a commented example of the settings and stop.")
     ] = False,
-    seed: Annotated[
-        int | None, typer.Option(min=0, max=2**32 - 1, help="Seed of simulated maps and chains.")
-    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of simulated maps and chains.")] = None,
     region: Annotated[
         list[str] | None, typer.Option(help="strip, outside, full or a mask file; repeatable.")
     ] = None,

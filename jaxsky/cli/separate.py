@@ -51,9 +51,7 @@ def separate(
     ] = False,
     seed: Annotated[
         int | None,
-        typer.Option(
-            min=0, max=2**32 - 1, help="Seed of simulations, chains, and maps of the embedded sky."
-        ),
+        typer.Option(help="Seed of simulations, chains, and maps of the embedded sky."),
     ] = None,
     nside: Annotated[int | None, typer.Option(help="Common nside of the maps.")] = None,
     domain: Annotated[

@@ -37,13 +37,11 @@ def simulate(
         bool, typer.Option("--init", help="Write a commented example of the settings and stop.")
     ] = False,
     nsims: Annotated[int, typer.Option(min=1, help="Number of realisations.")] = 1,
-    first: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Number of the first one.")] = 0,
+    first: Annotated[int, typer.Option(help="Number of the first one.")] = 0,
     only: Annotated[
         str | None, typer.Option(help=f"Simulate one thing only: {', '.join(ONLY)}.")
     ] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, max=2**32 - 1, help="Seed of all realisations.")
-    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of all realisations.")] = None,
     nside: Annotated[int | None, typer.Option(help="Resolution of the maps.")] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Keep the files in --out and make what is missing.")

@@ -378,7 +378,7 @@ def load(path: Path, model: type[S], overrides: Mapping[str, Mapping[str, Any]] 
             raw[table] = raw.get(table, {}) | given
     try:
         settings = model.model_validate(raw)
-        folder = (path.resolve().parent / expand(settings.data_dir)).resolve()
+        folder = (path.absolute().parent / expand(settings.data_dir)).resolve()
         if folder.exists() and not folder.is_dir():
             raise ValueError(f"{folder} is not a folder")
     except ValidationError as error:

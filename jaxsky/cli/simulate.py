@@ -37,7 +37,7 @@ def simulate(
         bool, typer.Option("--init", help="Write a commented example of the settings and stop.")
     ] = False,
     nsims: Annotated[int, typer.Option(min=1, help="Number of realisations.")] = 1,
-    first: Annotated[int, typer.Option(help="Number of the first one.")] = 0,
+    first: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Number of the first one.")] = 0,
     only: Annotated[
         str | None, typer.Option(help=f"Simulate one thing only: {', '.join(ONLY)}.")
     ] = None,

@@ -223,7 +223,7 @@ def test_the_example_is_written(tmp_path, monkeypatch, capsys):
     assert separate(monkeypatch, "--init", path) == 2
     capsys.readouterr()
     assert separate(monkeypatch, path, "--out", tmp_path / "out") == 2
-    assert "LFI_SkyMap_030_1024_R3.00_full.fits" in one_sentence(capsys)
+    assert "LFI_SkyMap_030-BPassCorrected_1024_R3.00_full.fits" in one_sentence(capsys)
 
 
 def test_noise_that_varies(folder, tmp_path, monkeypatch):

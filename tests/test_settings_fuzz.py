@@ -42,7 +42,7 @@ def test_a_key_is_named_once():
         with pytest.raises(type(error), match=f"^{error}$"), at_key("a"):
             raise error
     for error in (ValueError("x"), KeyError("x"), TypeError("x"), ZeroDivisionError("x")):
-        with pytest.raises(SettingsError, match=r"^a\.b: x$"), at_key("a.b"):
+        with pytest.raises(SettingsError, match=r"^a\.b: x\.$"), at_key("a.b"):
             raise error
 
 

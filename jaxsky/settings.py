@@ -313,7 +313,7 @@ def _key(raw: Any, place: Sequence[str | int], missing: bool) -> str:
     return ".".join(keys)
 
 
-def _sentence(path: Path, raw: Any, error: ValidationError) -> str:
+def _sentence(path: Path, raw: Any, error: ValidationError, options: Mapping[str, str]) -> str:
     wrong: dict[str, list[str]] = {}
     types: dict[str, str] = {}
     for item in error.errors():
@@ -339,7 +339,9 @@ def _sentence(path: Path, raw: Any, error: ValidationError) -> str:
     for where, what in types.items():
         if where not in wrong and not any(place.startswith(f"{where}.") for place in places):
             wrong[where] = [what]
-    sentences = [": ".join(filter(None, (k, " or ".join(w)))) for k, w in wrong.items()]
+    sentences = [
+        ": ".join(filter(None, (k, " or ".join(w)))) + options.get(k, "") for k, w in wrong.items()
+    ]
     return f"{path}: {'; '.join(sentences)}."
 
 
@@ -353,7 +355,8 @@ def load(path: Path, model: type[S], overrides: Mapping[str, Mapping[str, Any]] 
     ----------
     path : the file; relative paths in it are relative to its `data_dir`, and that to its folder
     model : what the settings are
-    overrides : by table, values that replace those of the file; None is ignored
+    overrides : by table, values of options with the key's name, which replace those of the file;
+        None is ignored
 
     Returns
     -------
@@ -372,8 +375,14 @@ def load(path: Path, model: type[S], overrides: Mapping[str, Mapping[str, Any]] 
         raise SettingsError(f"{path}: is not valid TOML ({error}).") from None
     except RecursionError:
         raise SettingsError(f"{path}: is nested too deeply.") from None
+    options = {}
     for table, values in (overrides or {}).items():
         given = {key: value for key, value in values.items() if value is not None}
+        options |= {
+            f"{table}.{key}": f" (given as --{key})"
+            for key, value in given.items()
+            if not isinstance(value, list)
+        }
         if given and isinstance(raw.get(table, {}), dict):
             raw[table] = raw.get(table, {}) | given
     try:
@@ -382,7 +391,7 @@ def load(path: Path, model: type[S], overrides: Mapping[str, Mapping[str, Any]] 
         if folder.exists() and not folder.is_dir():
             raise ValueError(f"{folder} is not a folder")
     except ValidationError as error:
-        raise SettingsError(_sentence(path, raw, error)) from None
+        raise SettingsError(_sentence(path, raw, error, options)) from None
     except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: links in a circle
         raise SettingsError(f"{path}: data_dir: {error}.") from None
     return settings.model_copy(update={"data_dir": str(folder)})

@@ -1,6 +1,7 @@
 """A local server of one file, which misbehaves in the way that the address names."""
 
 import contextlib
+import hashlib
 import http.server
 import io
 import socket
@@ -12,6 +13,8 @@ import time
 
 import numpy as np
 from astropy.io import fits as pyfits
+
+from jaxsky.archive import Product
 
 NAME = "map.fits"
 OLD, NEW = '"1"', '"2"'
@@ -29,6 +32,7 @@ def fits_bytes(nside=4, names=("Q_STOKES", "U_STOKES"), unit="K_CMB", scale=1.0)
 
 
 CONTENT = fits_bytes()
+SHA = "sha256:" + hashlib.sha256(CONTENT).hexdigest()
 #: Another version of the same length.
 REISSUED = fits_bytes(scale=2.0)
 #: What comes of a file that is cut.
@@ -201,6 +205,12 @@ class Handler(http.server.BaseHTTPRequestHandler):
 
     def log_message(self, *arguments):
         pass
+
+
+def product(*addresses, **changes):
+    """The file as the catalogue would have it."""
+    common = {"nside": 4, "unit": "K_CMB", "columns": ("Q_STOKES",)}
+    return Product(NAME, "test", "A test", "a map", addresses, **(common | changes))
 
 
 @contextlib.contextmanager

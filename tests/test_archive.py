@@ -1,6 +1,5 @@
 """Official data products: the catalogue, the command, and checks."""
 
-import hashlib
 import sys
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from fits.separate import settings as separate_settings
 from fits.settings import load_settings
 from jaxsky import cli
 from jaxsky.archive import (
-    Product,
     ProductSet,
     catalogue,
     fetch,
@@ -24,10 +22,9 @@ from jaxsky.archive import (
 from jaxsky.io import InputError
 from jaxsky.lookup import named_files
 from jaxsky.units import parse_unit
-from misbehaving import CONTENT, NAME, Handler, fits_bytes, serving
+from misbehaving import CONTENT, NAME, SHA, Handler, fits_bytes, product, serving
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-SHA = "sha256:" + hashlib.sha256(CONTENT).hexdigest()
 
 
 @pytest.fixture(scope="module")
@@ -40,11 +37,6 @@ def server():
 def log():
     Handler.log.clear()
     return Handler.log
-
-
-def product(*addresses, **changes):
-    common = {"nside": 4, "unit": "K_CMB", "columns": ("Q_STOKES",)}
-    return Product(NAME, "test", "A test", "a map", addresses, **(common | changes))
 
 
 def test_the_catalogue_is_complete():

@@ -260,7 +260,7 @@ def test_seeds_out_of_bounds(command, seed, tmp_path, monkeypatch, capsys):
         cli.main()
     assert stop.value.code == 2
     said = capsys.readouterr().err
-    assert "seed" in said
+    assert "--seed" in said
     assert not isinstance(seed, int) or str(seed) in said
     assert not out.exists()
 

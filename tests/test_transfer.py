@@ -1,7 +1,6 @@
 """Transfers from a server that misbehaves: the right file, or a sentence and nothing else."""
 
 import errno
-import hashlib
 import json
 import multiprocessing
 import os
@@ -21,13 +20,13 @@ from misbehaving import (
     NAME,
     OLD,
     REISSUED,
+    SHA,
     Handler,
     fetch_command,
     kill_fetches,
+    product,
     serving,
 )
-
-SHA = "sha256:" + hashlib.sha256(CONTENT).hexdigest()
 
 
 @pytest.fixture(scope="module")
@@ -40,11 +39,6 @@ def server():
 def log():
     Handler.log.clear()
     return Handler.log
-
-
-def product(*addresses, **changes):
-    common = {"nside": 4, "unit": "K_CMB", "columns": ("Q_STOKES",)}
-    return Product(NAME, "test", "A test", "a map", addresses, **(common | changes))
 
 
 def refused(wanted, folder, **options):

@@ -72,6 +72,7 @@ def preset(name: str, amplitude: ArrayLike, **maps: ArrayLike) -> Component:
 
     Examples
     --------
+    >>> import jax.numpy as jnp
     >>> dust = preset("d1", jnp.ones((2, 12)), beta_dust=jnp.full(12, 1.6), T_dust=20.0)
     >>> float(dust.nu_ref)
     353.0

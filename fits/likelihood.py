@@ -107,9 +107,15 @@ class Likelihood(eqx.Module):
         return {name: as_array(name, value) for name, value in params.items()}
 
 
-@jax.jit
 def chi2(like: Likelihood, params: Mapping[str, Numeric]) -> Float[Array, ""]:
     """Sum of squares of the residuals: chi^2, or -2 log L up to a constant."""
+    # All of one type, or it would be compiled again for Python's numbers.
+    values = {name: as_array(name, value).astype(float) for name, value in params.items()}
+    return _chi2(like, values)
+
+
+@jax.jit
+def _chi2(like, params):
     return jnp.sum(like.residuals(params) ** 2)
 
 

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from functools import partial
+from functools import partial, reduce
 
 import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxsky.checks import as_array, check_finite, is_concrete
 from jaxsky.harmonics import alm_ell, analysis, children, expand
@@ -250,6 +250,16 @@ def cholesky(covariance: Float[Array, "stokes stokes pix"]) -> Float[Array, "sto
     return jnp.stack([jnp.stack(row) for row in lower])
 
 
+@jax.jit
+def _number_indefinite(covariance: Float[Array, "stokes stokes pix"]) -> Int[Array, ""]:
+    """The number of pixels whose covariance is not positive definite."""
+    factor = cholesky(covariance.astype(float))
+    # A root of a negative number is NaN, and NaN is not positive. One pivot after the other, the
+    # pixels are gone through once.
+    definite = [(factor[s, s] > 0) & jnp.isfinite(factor[s, s]) for s in range(len(factor))]
+    return jnp.sum(~reduce(jnp.logical_and, definite))
+
+
 def check_covariance(name: str, covariance: Float[Array, "stokes stokes pix"]) -> None:
     """Raise ValueError if the covariance of a pixel is not positive definite; says of how many.
 
@@ -269,10 +279,7 @@ def check_covariance(name: str, covariance: Float[Array, "stokes stokes pix"]) -
         return
     bad, npix = 0, covariance.shape[-1]
     for start in range(0, npix, _PIECE):
-        # A root of a negative number is NaN, and NaN is not positive.
-        factor = cholesky(jnp.asarray(covariance[..., start : start + _PIECE], float))
-        pivots = jnp.einsum("ssp->sp", factor)
-        bad += int(jnp.sum(~jnp.all((pivots > 0) & jnp.isfinite(pivots), axis=0)))
+        bad += int(_number_indefinite(covariance[..., start : start + _PIECE]))
     if bad:
         raise ValueError(f"Argument `{name}` is not positive definite in {bad} of {npix} pixels.")
 

@@ -375,7 +375,7 @@ def load(path: Path, model: type[S], overrides: Mapping[str, Mapping[str, Any]] 
         raise SettingsError(f"{path}: is not valid TOML ({error}).") from None
     except RecursionError:
         raise SettingsError(f"{path}: is nested too deeply.") from None
-    options = {}
+    options: dict[str, str] = {}
     for table, values in (overrides or {}).items():
         given = {key: value for key, value in values.items() if value is not None}
         options |= {

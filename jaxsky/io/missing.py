@@ -50,7 +50,8 @@ def sentinels(
     lowest : what the lowest stored integer of the column stands for; None for other types
     zero : zero is a usual number, too, rather than none
     """
-    rest = values[np.isfinite(values)]
+    known = np.isfinite(values)
+    rest = values if known.all() else values[known]
     usual = {sign * number for number in USUAL for sign in (1.0, -1.0)} | {lowest}
     usual |= {0.0} if zero else set()
     found: list[tuple[float, int]] = []

@@ -113,7 +113,8 @@ def equals(
     values: Float[np.ndarray, " pix"], number: float, rtol: float
 ) -> Bool[np.ndarray, " pix"]:
     """Where values are a number, to a relative difference; zero is exact."""
-    return np.abs(values - number) <= rtol * abs(number)
+    apart = rtol * abs(number)
+    return (values >= number - apart) & (values <= number + apart)
 
 
 def select_hdu(path: Path, hdus: pyfits.HDUList, hdu: int | str) -> pyfits.BinTableHDU:
@@ -155,7 +156,10 @@ class HealpixTable:
         self.where = f"{path}, HDU {hdu!r}"
         self._table = select_hdu(path, hdus, hdu)
         self._primary = hdus[0].header
+        # Both before the data are looked at: astropy copies all columns of a file that is closed
+        # while its HDU holds them.
         names = self._table.columns.names
+        self._formats = [str(each) for each in self._table.columns.formats]
         if None in names:
             number = names.index(None) + 1
             raise InputError(f"{self.where}: column {number} has no name, TTYPE{number}.")
@@ -262,20 +266,20 @@ class HealpixTable:
 
     def _kind(self, index: int) -> str:
         """The letter of a column's format."""
-        return str(self._table.columns[index].format).lstrip("0123456789")[:1]
+        return self._formats[index].lstrip("0123456789")[:1]
 
-    def _stored(self, index: int) -> np.ndarray:
-        """A column of numbers as it is, one after the other."""
+    def _stored(self, index: int, dtype: type | None = None) -> np.ndarray:
+        """A copy of a column of numbers, one after the other, as it is or of a type."""
         kind, name = self._kind(index), self.names[index]
         if kind not in NUMBERS:
             raise InputError(
                 f"{self.where}: column {name} holds {KINDS.get(kind, kind)}, not real numbers."
             )
-        found = np.asarray(self._table.data.field(index))
+        found = self._table.data.field(index)
         if found.ndim > 2:
             shape = " x ".join(map(str, found.shape[1:]))
             raise InputError(f"{self.where}: column {name} has a table of {shape} in each row.")
-        return found.ravel()
+        return np.array(found, dtype=dtype).ravel()
 
     def _null(self, index: int) -> int | None:
         """TNULL of a column: a stored integer, before it is scaled."""
@@ -337,7 +341,7 @@ class HealpixTable:
 
     def _real(self, index: int) -> Float[np.ndarray, " row"]:
         """A column of real numbers, NaN where it has none."""
-        column = np.array(self._stored(index), dtype=np.float64)
+        column = self._stored(index, np.float64)
         bad = ~np.isfinite(column) | equals(column, healpy.UNSEEN, 1e-5)
         if (text := self.keyword("BAD_DATA")) is not None and text != "UNSEEN":
             stated = _number(text)

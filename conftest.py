@@ -1,6 +1,8 @@
 """Double precision for all tests and slow checks, and the real sky data where it is to be had."""
 
+import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -17,3 +19,15 @@ def data_dir() -> Path:
     if not DATA.is_dir():
         pytest.skip(f"no sky data at {DATA} (set JAXSKY_DATA)")
     return DATA
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _programs() -> Iterator[None]:
+    """Forget the compiled programs of a file at its end.
+
+    Each holds pieces of memory that the system counts, 65530 for a process by default: all of
+    them at once are more, which is a segmentation fault in the compiler.
+    """
+    yield
+    jax.clear_caches()
+    gc.collect()

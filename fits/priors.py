@@ -66,7 +66,7 @@ class Gaussian(Prior):
     Raises
     ------
     ValueError
-        If sigma is not positive.
+        If the mean is not finite, or sigma not positive.
 
     Examples
     --------
@@ -80,7 +80,9 @@ class Gaussian(Prior):
     def __init__(self, mean: float, sigma: float) -> None:
         self.mean, self.sigma = float(mean), float(sigma)
         if not (np.isfinite([self.mean, self.sigma]).all() and self.sigma > 0):
-            raise ValueError(f"A Gaussian prior needs a positive sigma, not {sigma}.")
+            raise ValueError(
+                f"A Gaussian prior needs a finite mean and positive sigma, not {mean} and {sigma}."
+            )
 
     def log_density(self, value):
         return -0.5 * ((value - self.mean) / self.sigma) ** 2

@@ -317,7 +317,7 @@ def _sentence(path: Path, raw: Any, error: ValidationError, options: Mapping[str
     wrong: dict[str, list[str]] = {}
     types: dict[str, str] = {}
     for item in error.errors():
-        what = item["msg"].removeprefix("Value error, ")
+        what = item["msg"].removeprefix("Value error, ").rstrip(".")
         where = _key(raw, item["loc"], item["type"] == "missing")
         if item["type"] == "extra_forbidden":
             what = "unknown key"

@@ -140,7 +140,7 @@ def _products(
     block = np.zeros((count, count))
     for start in range(0, npix, CHUNK):
         cut = slice(start, start + CHUNK)
-        maps = np.stack([row[:, cut] for row in before]).astype(float)
+        maps = np.array([row[:, cut] for row in before], dtype=float)
         seen = np.einsum("stp,jtp->jsp", covariance[..., cut].astype(float), maps)
         block += maps.reshape(count, -1) @ seen.reshape(count, -1).T
     return (block + block.T) / 2

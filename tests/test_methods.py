@@ -121,7 +121,8 @@ def test_unbounded_numbers_and_ranges_are_inverse():
     [
         (lambda: Uniform(2, 1), "low < high, not 2 and 1"),
         (lambda: Uniform(-np.inf, 1), "finite low < high"),
-        (lambda: Gaussian(0, 0), "a positive sigma, not 0"),
+        (lambda: Gaussian(0, 0), "positive sigma, not 0 and 0"),
+        (lambda: Gaussian(np.nan, 1), "finite mean .* not nan and 1"),
     ],
 )
 def test_priors_that_make_no_sense_are_refused(make, words):

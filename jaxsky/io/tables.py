@@ -5,7 +5,7 @@ import warnings
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import cached_property
+from functools import lru_cache
 from pathlib import Path
 
 import healpy
@@ -133,6 +133,12 @@ def select_hdu(path: Path, hdus: pyfits.HDUList, hdu: int | str) -> pyfits.BinTa
             f"{path}: HDU {hdu!r} holds no binary table; HEALPix maps are columns of one."
         )
     return found
+
+
+@lru_cache(maxsize=1)
+def _nested(nside: int) -> Int[np.ndarray, " pix"]:
+    """NESTED numbers of the pixels in RING order; the files of an analysis often share them."""
+    return healpy.ring2nest(nside, np.arange(healpy.nside2npix(nside))).astype(np.int32)
 
 
 class HealpixTable:
@@ -328,16 +334,11 @@ class HealpixTable:
                 f"are {npix if self._pixels is None else self._pixels.size} pixels."
             )
         if self._pixels is None:
-            return column[self._nested] if ordering == "NESTED" else column
+            return column[_nested(self.nside)] if ordering == "NESTED" else column
         pixels = self._pixels
         full = np.full(npix, np.nan)
         full[healpy.nest2ring(self.nside, pixels) if ordering == "NESTED" else pixels] = column
         return full
-
-    @cached_property
-    def _nested(self) -> Int[np.ndarray, " pix"]:
-        """NESTED numbers of the pixels in RING order."""
-        return healpy.ring2nest(self.nside, np.arange(healpy.nside2npix(self.nside)))
 
     def _real(self, index: int) -> Float[np.ndarray, " row"]:
         """A column of real numbers, NaN where it has none."""

@@ -253,11 +253,9 @@ def cholesky(covariance: Float[Array, "stokes stokes pix"]) -> Float[Array, "sto
 @jax.jit
 def _number_indefinite(covariance: Float[Array, "stokes stokes pix"]) -> Int[Array, ""]:
     """The number of pixels whose covariance is not positive definite."""
-    factor = cholesky(covariance.astype(float))
-    # A root of a negative number is NaN, and NaN is not positive. One pivot after the other, the
-    # pixels are gone through once.
-    definite = [(factor[s, s] > 0) & jnp.isfinite(factor[s, s]) for s in range(len(factor))]
-    return jnp.sum(~reduce(jnp.logical_and, definite))
+    # A root of a negative number is NaN, and NaN is not positive; each pixel is read once.
+    pivots = [row[s] for s, row in enumerate(cholesky(covariance.astype(float)))]
+    return jnp.sum(~reduce(jnp.logical_and, [(p > 0) & jnp.isfinite(p) for p in pivots]))
 
 
 def check_covariance(name: str, covariance: Float[Array, "stokes stokes pix"]) -> None:
@@ -277,10 +275,9 @@ def check_covariance(name: str, covariance: Float[Array, "stokes stokes pix"]) -
         )
     if not is_concrete(covariance):
         return
-    bad, npix = 0, covariance.shape[-1]
-    for start in range(0, npix, _PIECE):
-        bad += int(_number_indefinite(covariance[..., start : start + _PIECE]))
-    if bad:
+    npix = covariance.shape[-1]
+    pieces = (covariance[..., start : start + _PIECE] for start in range(0, npix, _PIECE))
+    if bad := sum(int(_number_indefinite(piece)) for piece in pieces):
         raise ValueError(f"Argument `{name}` is not positive definite in {bad} of {npix} pixels.")
 
 
@@ -391,7 +388,6 @@ def fit_knee(
     measured = jnp.asarray(power[2:] / fraction)
     modes = 2 * (2 * jnp.arange(2, lmax + 1) + 1) * fraction
     level = jnp.median(measured[-lmax // 4 :])
-
     start = jnp.log(jnp.array([1.0, 10.0, 1.5]))
     solver: optx.AbstractMinimiser = optx.BFGS(1e-6, 1e-6)
     args = (measured / level, modes)

@@ -162,10 +162,10 @@ class HealpixTable:
         self.where = f"{path}, HDU {hdu!r}"
         self._table = select_hdu(path, hdus, hdu)
         self._primary = hdus[0].header
-        # Both before the data are looked at: astropy copies all columns of a file that is closed
-        # while its HDU holds them.
+        # Before the data are read: astropy copies the columns of a closed file that its HDU holds.
         names = self._table.columns.names
-        self._formats = [str(each) for each in self._table.columns.formats]
+        #: The letter of each column's format.
+        self._kinds = [f.lstrip("0123456789")[:1] for f in map(str, self._table.columns.formats)]
         if None in names:
             number = names.index(None) + 1
             raise InputError(f"{self.where}: column {number} has no name, TTYPE{number}.")
@@ -217,8 +217,7 @@ class HealpixTable:
             )
         if explicit and stated is not None:
             return stated
-        kinds = (i for i in range(len(self.names)) if self._kind(i) in NUMBERS)
-        first = next(kinds, 0)
+        first = next((i for i, kind in enumerate(self._kinds) if kind in NUMBERS), 0)
         npix = 0 if not self.names else self._table.data.field(first).size
         if not npix or not healpy.isnpixok(npix):
             raise InputError(
@@ -270,13 +269,9 @@ class HealpixTable:
         """TUNIT of a column; None if it is missing or blank."""
         return str(self._table.header.get(f"TUNIT{index + 1}", "")).strip() or None
 
-    def _kind(self, index: int) -> str:
-        """The letter of a column's format."""
-        return self._formats[index].lstrip("0123456789")[:1]
-
     def _stored(self, index: int, dtype: type | None = None) -> np.ndarray:
         """A copy of a column of numbers, one after the other, as it is or of a type."""
-        kind, name = self._kind(index), self.names[index]
+        kind, name = self._kinds[index], self.names[index]
         if kind not in NUMBERS:
             raise InputError(
                 f"{self.where}: column {name} holds {KINDS.get(kind, kind)}, not real numbers."
@@ -298,7 +293,7 @@ class HealpixTable:
 
     def lowest(self, index: int) -> float | None:
         """What the lowest integer stands for that a column can store; None for other types."""
-        if self._kind(index) not in "IJK":
+        if self._kinds[index] not in "IJK":
             return None
         raw = self._table.data.view(np.ndarray)
         least = float(np.iinfo(raw.dtype[index].base).min)
@@ -324,18 +319,19 @@ class HealpixTable:
                 f"{self.where}: ordering is NESTED, but nside is {self.nside}, no power of 2."
             )
         npix = healpy.nside2npix(self.nside)
-        if logical and self._kind(index) == "L":
+        if logical and self._kinds[index] == "L":
             column = np.array(self._table.data.field(index), dtype=np.float64).ravel()
         else:
             column = self._real(index)
-        if column.size != (npix if self._pixels is None else self._pixels.size):
+        pixels = self._pixels
+        expected = npix if pixels is None else pixels.size
+        if column.size != expected:
             raise InputError(
                 f"{self.where}: column {self.names[index]} has {column.size} values, but there "
-                f"are {npix if self._pixels is None else self._pixels.size} pixels."
+                f"are {expected} pixels."
             )
-        if self._pixels is None:
+        if pixels is None:
             return column[_nested(self.nside)] if ordering == "NESTED" else column
-        pixels = self._pixels
         full = np.full(npix, np.nan)
         full[healpy.nest2ring(self.nside, pixels) if ordering == "NESTED" else pixels] = column
         return full

@@ -11,6 +11,7 @@ from getdist import MCSamples, chains, plots
 
 from fits.results import FitResult
 from fits.spectral_index import Fit, all_free
+from jaxsky.components import parameter_declaration
 from jaxsky.plots import STYLE, draw_title, in_formula, plain, save
 
 __all__ = ["label", "plot_chains", "plot_grids", "plot_marginals", "plot_posterior"]
@@ -21,21 +22,7 @@ chains.print_load_details = False  # getdist otherwise prints about burn-in
 COLORS = {"Q": "#0072B2", "U": "#D55E00", "QU": "#222222"}
 REGION_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 TRUTH = {"color": "#CC79A7", "linewidth": 1.6}
-#: What the fields of components are called in the literature.
-SYMBOLS = {
-    "beta_dust": r"\beta_{\rm dust}",
-    "T_dust": r"T_{\rm dust}\ [{\rm K}]",
-    "E_dust": r"E_{\rm dust}",
-    "beta_syn": r"\beta_{\rm syn}",
-    "curvature": r"C",
-    "nu_piv": r"\nu_{\rm piv}\ [{\rm GHz}]",
-    "nu_ref": r"\nu_{\rm ref}\ [{\rm GHz}]",
-    "nu_pivot": r"\nu_{\rm pivot}\ [{\rm GHz}]",
-    "polarization_fraction": r"f_{\rm p}",
-    "m60": r"m_{60}",
-    "nu_max": r"\nu_{\rm max}\ [{\rm GHz}]",
-}
-#: Those of bands, with their unit.
+#: What parameters of bands are called, and their unit.
 BAND_SYMBOLS = {
     "calibration": ("g", ""),
     "gain": ("g", ""),
@@ -57,7 +44,9 @@ def label(name: str) -> str:
         return rf"o_{in_formula(parts[1])}^{in_formula(parts[2])}\ [\mu{{\rm K}}_{{\rm RJ}}]"
     shift = r"\Delta " if parts[-1] == "offset" else ""
     number = "".join(rf"\ ({int(p) + 1})" for p in parts[2:] if p.isdigit())
-    return shift + SYMBOLS.get(parts[1], in_formula(parts[1])) + number
+    known = parameter_declaration(parts[1])
+    unit = rf"\ [{{\rm {known['unit']}}}]" if known.get("unit") else ""
+    return shift + (known.get("symbol") or in_formula(parts[1])) + number + unit
 
 
 def _tex(name: str) -> str:

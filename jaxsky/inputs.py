@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxsky.bandpass import Bandpass
-from jaxsky.components import AME, Component, Dust, Synchrotron
+from jaxsky.components import AME, Component, component_class
 from jaxsky.io import Maps, degrade_mask, read_bandpass, read_maps, unit_factor
 from jaxsky.lookup import find_file
 from jaxsky.parameter_maps import parameter_map
@@ -24,7 +24,6 @@ from jaxsky.settings_keys import at_key
 from jaxsky.sky import Sky
 
 __all__ = [
-    "LAWS",
     "Template",
     "check_stokes",
     "mask_at",
@@ -39,8 +38,6 @@ __all__ = [
 
 #: Maps with at least so many pixels are kept in single precision, which is that of their files.
 LARGE = 12 * 512**2
-
-LAWS: dict[str, type[Component]] = {"dust": Dust, "synchrotron": Synchrotron, "ame": AME}
 
 
 class Template(NamedTuple):
@@ -144,7 +141,9 @@ def _read_template(
     dtype: type[np.floating],
 ) -> Template:
     found = read(folder, spec)
-    check_stokes(f"templates.{name}", found, "I" if spec.angles else stokes)
+    law = component_class(spec.law)
+    padded = not law.polarized and stokes == "IQU"
+    check_stokes(f"templates.{name}", found, "I" if spec.angles or padded else stokes)
     factor = uK_RJ_per(found.unit, spec.nu_ref, f"templates.{name}")
     maps = jnp.asarray((found.maps * factor).astype(dtype))
     used = np.asarray(found.mask)
@@ -164,7 +163,9 @@ def _read_template(
                 maps[0], others[spec.angles].component.amplitude, **parameters
             )
         else:
-            component = LAWS[spec.law](maps[-len(stokes) :], **parameters)
+            if padded:
+                maps = jnp.pad(maps[:1], ((0, 2), (0, 0)))
+            component = law(maps[-len(stokes) :], **parameters)
     return Template(component, spec.fwhm, used, found.unit)
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxsky.components import parameter_declaration
 from jaxsky.io import Maps, unit_factor
 from jaxsky.io.missing import sentinels
 from jaxsky.settings import SettingsError
@@ -10,16 +11,10 @@ from jaxsky.settings_values import check_sign
 
 __all__ = ["one_column", "parameter_map", "parameter_unit"]
 
-#: Units of the parameters that are not pure numbers.
-_UNITS = {
-    **dict.fromkeys(("T_dust", "T_cmb"), "K"),
-    **dict.fromkeys(("nu_ref", "nu_piv", "nu_pivot", "nu_max"), "GHz"),
-}
-
 
 def parameter_unit(name: str) -> str:
     """Unit of a spectral parameter by its name, dotted or not; "" for a pure number."""
-    return _UNITS.get(name.split(".")[-1], "")
+    return parameter_declaration(name.split(".")[-1]).get("unit", "")
 
 
 def parameter_map(
@@ -64,8 +59,8 @@ def parameter_map(
                 f"{found.names[0]} is in {found.unit or 'no unit'}."
             ) from None
     known = values[used]
-    # An index or a temperature is not zero; a curvature or a fraction may be.
-    marks = sentinels(known, zero=True) if not stated and name.startswith(("beta", "T_")) else []
+    zero = parameter_declaration(name).get("zero", True)
+    marks = [] if stated or zero else sentinels(known, zero=True)
     if marks:
         raise SettingsError(
             f"{where}: column {found.names[0]} is {marks[0][0]:g} in {marks[0][1]} pixels, far "

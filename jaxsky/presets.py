@@ -13,12 +13,10 @@ from typing import Any
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.checks import as_array
-from jaxsky.components import Component, Dust, Synchrotron
+from jaxsky.components import Component, component_class
 from jaxsky.sky import Sky
 
 __all__ = ["baseline", "from_pysm_beta", "preset", "preset_names"]
-
-_COMPONENTS: dict[str, Callable[..., Component]] = {"Dust": Dust, "Synchrotron": Synchrotron}
 
 
 @cache
@@ -81,7 +79,7 @@ def preset(name: str, amplitude: ArrayLike, **maps: ArrayLike) -> Component:
     if name not in presets:
         raise KeyError(f"Unknown preset {name!r}; known are {', '.join(presets)}.")
     constants = dict(presets[name])
-    component = _COMPONENTS[constants.pop("component")]
+    component: Callable[..., Component] = component_class(constants.pop("law"))
     needed = constants.pop("maps", [])
     for key in needed:
         if key not in maps:

@@ -20,7 +20,8 @@ from pydantic import (
     model_validator,
 )
 
-from jaxsky.settings_types import Several, Word
+from jaxsky.components import AME, component_class
+from jaxsky.settings_types import Law, Several, Word
 from jaxsky.settings_values import (
     check_reference,
     check_signs,
@@ -127,7 +128,7 @@ class MaskFile(Table):
 class TemplateFile(MapFile):
     """A component: its map at a reference frequency, its law, parameters that are not default."""
 
-    law: Literal["dust", "synchrotron", "ame"]
+    law: Law
     nu_ref: float = Field(gt=0)
     fwhm: float = Field(0.0, ge=0)
     angles: str | None = None
@@ -135,7 +136,7 @@ class TemplateFile(MapFile):
 
     @model_validator(mode="after")
     def _angles(self) -> "TemplateFile":
-        if self.angles and self.law != "ame":
+        if self.angles and component_class(self.law) is not AME:
             raise ValueError("angles are for the law 'ame' only")
         return self
 

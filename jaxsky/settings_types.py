@@ -6,10 +6,13 @@ from typing import Annotated, TypeVar
 
 from pydantic import AfterValidator, Field, Strict
 
+from jaxsky.components import component_class
+
 __all__ = [
     "BandName",
     "ComponentName",
     "Distinct",
+    "Law",
     "Nside",
     "Pair",
     "Seed",
@@ -41,6 +44,11 @@ def _distinct(values: list[T]) -> list[T]:
     return values
 
 
+def _law(value: str) -> str:
+    component_class(value)
+    return value
+
+
 def _name(value: str, characters: str, reserved: Collection[str] = ()) -> str:
     if value.lower() in reserved:
         raise ValueError(f"the name {value!r} has a meaning of its own in results; choose another")
@@ -65,6 +73,8 @@ Distinct = Annotated[list[T], AfterValidator(_distinct)]
 Several = Annotated[list[T], Field(min_length=1), AfterValidator(_distinct)]
 #: Two values; a list in TOML.
 Pair = Annotated[tuple[T, T], Strict(False)]
+#: The law of a component: a name, or "module:Class" (`jaxsky.components.component_class`).
+Law = Annotated[str, AfterValidator(_law)]
 BandName = Annotated[str, AfterValidator(lambda value: _name(value, "."))]
 #: A component of what is separated; one of them is the CMB.
 SeparatedName = Annotated[str, AfterValidator(lambda value: _name(value, "", RESERVED))]

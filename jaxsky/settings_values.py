@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from jaxsky.components import REFERENCES
+from jaxsky.components import component_class, declared
 
 __all__ = [
     "check_reference",
@@ -23,9 +23,12 @@ def check_reference(law: str, nu_ref: float | None, parameters: Mapping[str, Any
             f"nu_ref is given twice, {nu_ref:g} and in parameters; leave one of them out"
         )
     given = parameters.get("nu_ref", nu_ref)
-    if law not in REFERENCES or not isinstance(given, int | float):
+    known = declared(component_class(law), "nu_ref")
+    if given is not None and not known:
+        raise ValueError(f"the law {law!r} has no nu_ref: its maps are in uK_CMB")
+    if not isinstance(given, int | float) or known["within"] is None:
         return
-    least, most = REFERENCES[law]
+    least, most = known["within"]
     if not least <= given <= most:
         raise ValueError(
             f"nu_ref is in GHz, for the law {law!r} from {least:g} to {most:g}, not {given:g}"

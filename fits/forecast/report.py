@@ -12,7 +12,7 @@ from fits.forecast.forecast import Forecast
 from fits.forecast.settings import ForecastSettings
 from fits.pseudo_cl import sky_fraction
 from fits.record import write_json, write_log
-from jaxsky.components import is_positive
+from jaxsky.components import declared
 
 __all__ = ["forecast_json", "tables", "warnings", "write_report"]
 
@@ -92,7 +92,7 @@ def warnings(found: Forecast) -> list[str]:
     errors, sky = found.errors, found.setup.sky
     for name in errors.free:
         component, *field = name.split(".")
-        if component not in sky or not is_positive(type(sky[component]), field[0]):
+        if component not in sky or not declared(type(sky[component]), field[0])["positive"]:
             continue
         if errors.sigma(name) > errors.fiducial[name]:
             sentences.append(

@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from fits.plots import label
 from fits.record import with_error
 from fits.separate.separate import Separation
-from jaxsky import CMB
 from jaxsky.plots import COLORS, STYLE, UNITS, draw_map, draw_title, plain, save
 
 __all__ = ["plot_components", "plot_parameters", "plot_ratio", "plot_residuals", "plot_spectra"]
@@ -25,12 +24,12 @@ CLEANED, NOISE, RESIDUAL, LEFT, LENSING, TRUTH = (*COLORS[:4], "0.5", COLORS[3])
 
 def _unit(found: Separation, name: str) -> str:
     """Of a component's amplitude."""
-    return UNITS["uK_CMB" if isinstance(found.like.sky[name], CMB) else "uK_RJ"]
+    return UNITS[found.like.sky[name].unit]
 
 
 def _title(found: Separation, name: str) -> str:
     component: Any = found.like.sky[name]
-    if isinstance(component, CMB):
+    if component.unit == "uK_CMB":
         return name.upper() if name == "cmb" else name
     return f"{name}, {float(component.nu_ref):g} GHz"
 

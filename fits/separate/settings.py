@@ -10,6 +10,7 @@ from fits.priors import Gaussian, Prior
 from fits.settings import Band, Parameter, check_free
 from jaxsky.settings import MapFile, MaskFile, SettingsFile, Table, load
 from jaxsky.settings_types import (
+    Law,
     Nside,
     Seed,
     SeparatedName,
@@ -60,14 +61,12 @@ class ComponentTable(Table):
     CMB: "cmb". The amplitudes are free in each pixel.
     """
 
-    law: Literal["cmb", "dust", "synchrotron", "ame"]
+    law: Law
     nu_ref: float | None = Field(None, gt=0)
     parameters: dict[str, float | list[float] | MapFile] = Field(default={})
 
     @model_validator(mode="after")
     def _no_reference(self) -> "ComponentTable":
-        if self.law == "cmb" and self.nu_ref is not None:
-            raise ValueError("the law 'cmb' has no nu_ref: its maps are in uK_CMB")
         check_reference(self.law, self.nu_ref, self.parameters)
         check_signs("parameters", self.parameters)
         return self

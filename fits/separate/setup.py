@@ -19,10 +19,11 @@ from fits.separation.harmonic import harmonic_coefficients
 from fits.separation.mixing import NOMINAL
 from fits.separation.noise import Noise, as_noise
 from fits.separation.regions import clusters, latitude_bands, superpixels
-from jaxsky import CMB, Component, Sky, get_parameters, observe, parameter_names, set_parameters
+from jaxsky import Component, Sky, get_parameters, observe, parameter_names, set_parameters
+from jaxsky.components import component_class
 from jaxsky.galaxy import embedded_sky
 from jaxsky.harmonics import gaussian_beam, resample
-from jaxsky.inputs import LAWS, mask_at, read, read_parameter
+from jaxsky.inputs import mask_at, read, read_parameter
 from jaxsky.instrument import load_instrument
 from jaxsky.io import read_mask
 from jaxsky.lookup import find_file
@@ -126,8 +127,7 @@ def _sky(settings: SeparateSettings) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
             else:
                 numbers[key] = tuple(value) if isinstance(value, list) else value
         with at_key(f"components.{name}"):
-            law = CMB if spec.law == "cmb" else LAWS[spec.law]
-            components[name] = law(amplitude, **numbers)
+            components[name] = component_class(spec.law)(amplitude, **numbers)
     return Sky(components), known
 
 

@@ -1,0 +1,45 @@
+"""Components of the sky: template maps times a spectral law, a file for each.
+
+A component is its parameters. Each spectral parameter is a number or a map of shape (pix,); the
+law is written once, for a frequency, in `sed`, and everything else (band averages, gradients,
+parameter names, keys of settings, symbols in pictures) follows from the fields. All modules of
+this folder are imported, so that a new one is complete as it is.
+"""
+
+import importlib
+import pkgutil
+
+from jaxsky.components.ame import AME
+from jaxsky.components.base import (
+    Component,
+    check_value,
+    component_class,
+    declared,
+    parameter,
+    parameter_declaration,
+    reference,
+    template,
+)
+from jaxsky.components.cmb import CMB
+from jaxsky.components.dust import Dust
+from jaxsky.components.synchrotron import Synchrotron
+
+__all__ = [
+    "AME",
+    "CMB",
+    "Component",
+    "Dust",
+    "Synchrotron",
+    "check_value",
+    "component_class",
+    "declared",
+    "parameter",
+    "parameter_declaration",
+    "reference",
+    "template",
+]
+
+for _module in pkgutil.iter_modules(__path__):
+    _found = importlib.import_module(f"{__name__}.{_module.name}")
+    globals().update({name: getattr(_found, name) for name in _found.__all__})
+    __all__ += [name for name in _found.__all__ if name not in __all__]

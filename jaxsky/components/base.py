@@ -1,0 +1,246 @@
+"""What a component of the sky is, and the registry in which its law has a name."""
+
+import dataclasses
+import importlib
+import os
+import sys
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxsky.checks import as_array, check_finite, check_positive, is_concrete
+
+__all__ = [
+    "Component",
+    "check_value",
+    "component_class",
+    "declared",
+    "parameter",
+    "parameter_declaration",
+    "reference",
+    "template",
+]
+
+#: Components by the name of their law, or module and class, from the moment a class is defined.
+_LAWS: dict[str, type["Component"]] = {}
+
+
+def template() -> Any:
+    """Field of a component for its amplitude, (stokes, pix)."""
+    return eqx.field(converter=_converted)
+
+
+def parameter(
+    default: Any = dataclasses.MISSING,
+    *,
+    positive: bool = False,
+    within: tuple[float, float] | None = None,
+    hint: str = "",
+    symbol: str = "",
+    unit: str = "",
+    zero: bool = True,
+) -> Any:
+    """Field of a component for a spectral parameter: a number, or a map of shape (pix,).
+
+    Parameters
+    ----------
+    default : value if none is given; without, the parameter is required
+    positive : refuse values that are not positive
+    within : refuse a number, or a map by its median, outside of this range
+    hint : what to do about that
+    symbol : in TeX, for pictures; by default the name
+    unit : "" for a pure number
+    zero : an exact zero in a map of it can be data; if not, it is taken to mark a missing value
+    """
+    metadata = {
+        "positive": positive,
+        "within": within,
+        "hint": hint,
+        "symbol": symbol,
+        "unit": unit,
+        "zero": zero,
+    }
+    if default is dataclasses.MISSING:
+        return eqx.field(converter=_converted, metadata=metadata)
+    return eqx.field(converter=_converted, metadata=metadata, default=default)
+
+
+def reference(default: float, within: tuple[float, float]) -> Any:
+    """Field for the reference frequency of a law [GHz], and where it may lie."""
+    return parameter(
+        default,
+        positive=True,
+        within=within,
+        hint="it has to be in GHz",
+        symbol=r"\nu_{\rm ref}",
+        unit="GHz",
+    )
+
+
+def _converted(value: Any) -> Any:
+    """An array, or several in a tuple; what cannot be one is left for the check by name."""
+    if value is None or isinstance(value, tuple):
+        return value and tuple(map(_converted, value))
+    try:
+        return as_array("value", value)
+    except TypeError:
+        return value
+
+
+class Component(eqx.Module):
+    """Base class: `amplitude` (stokes, pix) times `sed(nu)`.
+
+    Stokes parameters are I, Q, U (3 rows) or Q, U (2 rows), in uK_RJ at the component's
+    reference frequency, HEALPix RING order, Galactic coordinates, COSMO sign of U.
+
+    A subclass declares its fields with `template` and `parameter`, and writes `sed`. With a name
+    for its law, or as `law = "module:Class"`, it can be used in the settings of every command.
+
+    Attributes
+    ----------
+    law : name of the law in settings, given with the class; by default "module:Class"
+    polarized : whether there is anything in Q and U; if not, an amplitude has to be I, Q, U
+    unit : of the amplitude
+
+    Raises
+    ------
+    TypeError, ValueError
+        On construction, for units, wrong shapes, values that are not finite, or not positive
+        where they have to be; for a beta_syn with the other sign, and a nu_ref that is not in GHz.
+
+    Examples
+    --------
+    >>> import jax.numpy as jnp
+    >>> from jaxsky import sed
+    >>> class Steep(Component, law="steep"):
+    ...     amplitude: Array = template()
+    ...     beta: Array = parameter(2.0)
+    ...     nu_ref: Array = reference(30.0, within=(0.1, 1e3))
+    ...
+    ...     def sed(self, nu):
+    ...         return sed.power_law(nu, self.beta, self.nu_ref)
+    >>> round(float(component_class("steep")(jnp.ones((2, 12))).sed(60.0)), 4)
+    0.25
+    """
+
+    law: ClassVar[str] = ""
+    polarized: ClassVar[bool] = True
+    unit: ClassVar[str] = "uK_RJ"
+
+    amplitude: eqx.AbstractVar[Float[Array, "stokes pix"]]
+
+    def __init_subclass__(cls, law: str = "", **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls.law = law or f"{cls.__module__}:{cls.__qualname__}"
+        known = _LAWS.get(cls.law, cls)
+        if (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
+            raise ValueError(f"Law {law!r} is that of {known.__module__}:{known.__qualname__}.")
+        _LAWS[cls.law] = cls
+
+    def sed(self, nu: ArrayLike) -> Float[Array, ""] | Float[Array, " pix"]:
+        """The spectral law at one frequency [GHz]; a map if any parameter is one."""
+        raise TypeError(f"{type(self).__name__} must define `sed`.")
+
+    @property
+    def template(self) -> Float[Array, "stokes pix"]:
+        """What the law multiplies; the amplitude, unless parameters other than spectral act."""
+        return self.amplitude
+
+    def __check_init__(self) -> None:
+        amplitude = as_array("amplitude", self.amplitude)
+        if amplitude.ndim != 2 or amplitude.shape[0] not in (2, 3):
+            raise ValueError(
+                "Argument `amplitude` must have shape (stokes, pix) with Stokes Q, U or I, Q, U, "
+                f"but has shape {amplitude.shape}."
+            )
+        if len(amplitude) == 2 and not self.polarized:
+            raise ValueError(
+                f"{type(self).__name__} is not polarized: it takes part in I, Q, U only, and has "
+                "no maps of Q and U."
+            )
+        check_finite("amplitude", amplitude)
+        if not self.polarized and is_concrete(amplitude) and bool((amplitude[1:] != 0).any()):
+            raise ValueError(f"{type(self).__name__} is not polarized: Q and U must be zero.")
+        for field in dataclasses.fields(self):
+            if field.name == "amplitude" or field.metadata.get("static"):
+                continue
+            value = getattr(self, field.name)
+            for entry in value if isinstance(value, tuple) else (value,):
+                if entry is not None:
+                    _check(field.name, entry, amplitude.shape[-1], field.metadata)
+
+
+def _check(name: str, value: object, npix: int, metadata: Any) -> None:
+    array = as_array(name, value)
+    if array.shape not in ((), (npix,)):
+        raise ValueError(
+            f"Argument `{name}` must be a number or a map of shape ({npix},), "
+            f"but has shape {array.shape}."
+        )
+    if "positive" not in metadata:
+        raise TypeError(f"Field `{name}` must be declared with jaxsky.components.parameter.")
+    _check_value(name, array, metadata)
+
+
+def _check_value(name: str, value: Array, metadata: Any) -> None:
+    (check_positive if metadata.get("positive") else check_finite)(name, value)
+    within = metadata.get("within")
+    if within is None or not is_concrete(value):
+        return
+    (low, high), middle = within, float(np.median(value))
+    if not low <= middle <= high:
+        what = "is" if value.ndim == 0 else "its median is"
+        raise ValueError(
+            f"Argument `{name}` must be from {low:g} to {high:g}, but {what} {middle:g}; "
+            f"{metadata['hint']}."
+        )
+
+
+def declared(component: type[Component], field: str) -> Mapping[str, Any]:
+    """What a component declares about a field with `parameter`; nothing if it has no such field."""
+    return next((f.metadata for f in dataclasses.fields(component) if f.name == field), {})
+
+
+def parameter_declaration(field: str) -> Mapping[str, Any]:
+    """What the first law with a parameter of this name declares about it; nothing if none has."""
+    found = (declared(component, field) for component in _LAWS.values())
+    return next((metadata for metadata in found if "symbol" in metadata), {})
+
+
+def check_value(component: type[Component], field: str, name: str, value: Array) -> None:
+    """Raise ValueError if a concrete value, called `name`, is none that a field may have."""
+    _check_value(name, value, declared(component, field))
+
+
+def component_class(law: str) -> type[Component]:
+    """The component with a law, by its name or as "module:Class" from a package of one's own.
+
+    Such a module is looked for where Python does, and in the current folder.
+
+    Raises
+    ------
+    ValueError
+        If there is no such law, module or class.
+    """
+    if ":" not in law:
+        if law not in _LAWS:
+            known = sorted(name for name in _LAWS if ":" not in name)
+            raise ValueError(
+                f"there is no law {law!r}; laws are {', '.join(known)}, or 'module:Class' for a "
+                "class of your own"
+            )
+        return _LAWS[law]
+    module, _, name = law.partition(":")
+    sys.path.insert(0, os.getcwd())
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except Exception as error:  # whatever a module of the user's does
+        raise ValueError(f"{law!r} cannot be imported ({type(error).__name__}: {error})") from error
+    finally:
+        sys.path.pop(0)
+    if not (isinstance(found, type) and issubclass(found, Component)):
+        raise ValueError(f"{law!r} is not a subclass of jaxsky.Component")
+    return found

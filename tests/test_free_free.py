@@ -1,0 +1,217 @@
+"""Free-free emission, and components from outside of jaxsky in the commands."""
+
+import json
+import re
+import sys
+
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jaxsky import Bandpass, Component, Sky, cli, observe, set_parameters
+from jaxsky.components import FreeFree, amplitude_from_emission_measure
+from jaxsky.io import read_maps, write_maps
+from jaxsky.settings import SettingsError
+
+NSIDE = 8
+NPIX = 12 * NSIDE**2
+#: A component as a user writes it, without a name for its law.
+MODULE = """
+from jaxsky import sed
+from jaxsky.components import Component, parameter, reference, template
+
+class Steep(Component):
+    amplitude: object = template()
+    slope: object = parameter(2.5, symbol="s")
+    nu_ref: object = reference(30.0, within=(1.0, 1e3))
+
+    def sed(self, nu):
+        return sed.power_law(nu, self.slope, self.nu_ref)
+"""
+SIMULATION = """
+[experiment]
+nside = 8
+fwhm = 1200.0
+stokes = "IQU"
+include = ["x"]
+sheet = false
+[templates.x]
+law = "free_free"
+file = "intensity.fits"
+nu_ref = 30.0
+fwhm = 900.0
+parameters = { T_e = 8000.0 }
+[[bands]]
+name = "70"
+bandpass = { center = 70.0, width = 0.0 }
+fwhm = 900.0
+"""
+FIT = """
+[analysis]
+nside = 8
+fwhm = 1200.0
+regions = ["full"]
+stokes = ["QU"]
+methods = ["gradient"]
+[free]
+"x.slope" = { start = 2.0, uniform = [1.0, 4.0] }
+[templates.x]
+law = "steep_law:Steep"
+file = "qu.fits"
+nu_ref = 30.0
+fwhm = 900.0
+noise = { rms = 0.0 }
+[[bands]]
+name = "70"
+file = "seen.fits"
+bandpass = { center = 70.0, width = 0.0 }
+fwhm = 900.0
+noise = { rms = 0.02 }
+[cmb]
+include = false
+"""
+
+
+def gaunt(nu, T_e):
+    return np.log(np.exp(5.960 - np.sqrt(3) / np.pi * np.log(nu * (T_e / 1e4) ** -1.5)) + np.e)
+
+
+def component(T_e=7000.0, **more):
+    maps = jnp.zeros((3, 12)).at[0].set(jnp.arange(1.0, 13.0))
+    return FreeFree(maps, T_e, **more)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Maps, and a module of the user's, in the current folder."""
+    rng = np.random.default_rng(4)
+    np.random.seed(4)  # which healpy draws from
+    lmax = 2 * NSIDE
+    window = healpy.gauss_beam(np.radians(15.0), lmax)
+    alm = [healpy.synalm(1e4 * window**2 / (1 + np.arange(lmax + 1.0)) ** 2) for _ in range(3)]
+    maps = np.array(healpy.alm2map(alm, NSIDE, lmax=lmax))
+    write_maps(tmp_path / "intensity.fits", maps[0], names="I", unit="uK_RJ")
+    write_maps(tmp_path / "qu.fits", maps[1:], names=["Q", "U"], unit="uK_RJ")
+    seen = maps[1:] * (70 / 30) ** -2.5 + 0.02 * rng.normal(size=(2, NPIX))
+    write_maps(tmp_path / "seen.fits", seen, names=["Q", "U"], unit="uK_RJ")
+    (tmp_path / "steep_law.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def command(monkeypatch, *arguments) -> int:
+    monkeypatch.setattr(sys, "argv", ["jaxsky", *map(str, arguments)])
+    try:
+        cli.main()
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    return 0
+
+
+def test_the_law_is_the_papers():
+    """Closed form, and the index of about -2.1 that free-free emission is known for."""
+    nu, T_e = 70.0, 8000.0
+    expected = (nu / 30) ** -2 * gaunt(nu, T_e) / gaunt(30.0, T_e)
+    assert float(component(T_e).sed(nu)) == pytest.approx(expected, rel=1e-13)
+    assert float(component().sed(30.0)) == 1.0
+    index = np.log(float(component().sed(33.0))) / np.log(1.1)
+    assert -2.16 < index < -2.10
+
+
+def test_emission_measure():
+    """0.05468 T_e^-3/2 nu^-2 EM g_ff T_e, and the same temperature at another frequency."""
+    EM, T_e = 50.0, 6000.0
+    at_30 = float(amplitude_from_emission_measure(EM, T_e, 30.0))
+    assert at_30 == pytest.approx(
+        1e6 * T_e * 0.05468 * T_e**-1.5 / 900 * EM * gaunt(30.0, T_e), rel=1e-13
+    )
+    at_70 = float(amplitude_from_emission_measure(EM, T_e, 70.0))
+    assert at_70 == pytest.approx(at_30 * float(component(T_e).sed(70.0)), rel=1e-12)
+
+
+def test_jit_and_gradients():
+    sky, bands = Sky({"ff": component()}), [Bandpass.top_hat(44.0, 10.0)]
+    seen = observe(sky, bands)
+    np.testing.assert_allclose(jax.jit(observe)(sky, bands), seen, rtol=1e-13)
+    assert float(jnp.abs(seen[:, 1:]).max()) == 0
+
+    def moved(x):
+        return observe(set_parameters(sky, {"ff.T_e": 7000 * x[0], "ff.nu_ref": 30 * x[1]}), bands)
+
+    check_grads(moved, (jnp.ones(2),), order=1, modes=["fwd", "rev"], rtol=1e-6)
+
+
+def test_maps_of_Q_and_U_are_refused():
+    with pytest.raises(ValueError, match="not polarized: it takes part in I, Q, U only"):
+        FreeFree(jnp.ones((2, 12)))
+    with pytest.raises(ValueError, match="Q and U must be zero"):
+        FreeFree(jnp.ones((3, 12)))
+
+
+def test_simulate_scales_an_intensity(folder, monkeypatch):
+    (folder / "s.toml").write_text(SIMULATION)
+    assert command(monkeypatch, "simulate", "s.toml", "--out", "sims") == 0
+    (path,) = (folder / "sims").rglob("*.fits")
+    found = np.asarray(read_maps(path).maps)
+    template = np.asarray(read_maps(folder / "intensity.fits").maps)[0]
+    smooth = healpy.smoothing(template, fwhm=np.radians(np.sqrt(1200**2 - 900**2) / 60), iter=10)
+    law = float(component(8000.0).sed(70.0))
+    # Written in single precision; healpy leaks a little from beyond the map's multipoles.
+    np.testing.assert_allclose(found[0], law * smooth, rtol=0, atol=1e-3 * np.std(found[0]))
+    assert np.abs(found[1:]).max() == 0
+
+
+@pytest.mark.parametrize(
+    ("law", "sentence"),
+    [
+        ("free_free", "templates.x: FreeFree is not polarized"),
+        ("free-free", "templates.x.law: there is no law 'free-free'; laws are ame, cmb, dust"),
+        ("cmb", "templates.x: the law 'cmb' has no nu_ref"),
+        ("steep_law:Stepe", "'steep_law:Stepe' cannot be imported (AttributeError: module"),
+        ("nowhere:Steep", "'nowhere:Steep' cannot be imported (ModuleNotFoundError"),
+        ("json:loads", "'json:loads' is not a subclass of jaxsky.Component"),
+    ],
+)
+def test_laws_that_cannot_be(folder, monkeypatch, capsys, law, sentence):
+    text = FIT.replace("steep_law:Steep", law).replace('"x.slope"', '"x.nu_ref"')
+    (folder / "f.toml").write_text(text)
+    assert command(monkeypatch, "fit", "f.toml", "--out", "fit") == 2
+    printed = " ".join(capsys.readouterr().err.split())
+    assert sentence in printed, printed
+    assert "Traceback" not in printed
+
+
+def test_a_class_of_ones_own_is_fitted(folder, monkeypatch):
+    (folder / "f.toml").write_text(FIT)
+    assert command(monkeypatch, "fit", "f.toml", "--out", "fit") == 0
+    found = json.loads((folder / "fit" / "result.json").read_text())["results"]["full"]["QU"]
+    value = found["gradient"]["best_fit"]["x.slope"]
+    sigma = found["gradient"]["covariance"][0][0] ** 0.5
+    assert abs(value - 2.5) < 4 * sigma < 0.1
+
+
+def test_a_law_has_one_class():
+    with pytest.raises(ValueError, match=re.escape("'dust' is that of jaxsky.components.dust:")):
+
+        class Another(Component, law="dust"):
+            """Takes the name of jaxsky's."""
+
+
+def test_separate_refuses_what_has_no_polarization():
+    from fits.separate.settings import SeparateSettings
+    from fits.separate.setup import build
+
+    laws = {"cmb": {"law": "cmb"}, "dust": {"law": "dust"}, "ff": {"law": "free_free"}}
+    settings = SeparateSettings.model_validate(
+        {
+            "separation": {"nside": NSIDE},
+            "embedded": {"nside": NSIDE},
+            "components": laws,
+            "free": {"dust.beta_dust": {"start": 1.5}},
+        }
+    )
+    with pytest.raises(SettingsError, match="components.ff: FreeFree is not polarized"):
+        build(settings)

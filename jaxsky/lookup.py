@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from jaxsky.io import InputError, MissingFileError, check_file
+from jaxsky.io.folders import cache_folder
 from jaxsky.settings import NamedFile, SettingsFile, expand
 
 __all__ = ["find_file", "found_files", "named_files"]
@@ -38,9 +39,6 @@ def find_file(folder: Path, name: str) -> Path:
             raise InputError(f"{name}: {error}.") from None
     path, cache = folder / name, None
     if not os.path.dirname(name) and not os.path.lexists(path):
-        # The archive's modules are slow to import, and most files are where they are named.
-        from jaxsky.archive import cache_folder
-
         cache = cache_folder()
         if os.path.lexists(cache / name):
             path = cache / name
@@ -53,7 +51,7 @@ def find_file(folder: Path, name: str) -> Path:
 
 def _missing(path: Path, cache: Path | None) -> str:
     """Why a file is not there, and how it comes."""
-    from jaxsky.archive import cache_folder, catalogue, product_sets
+    from jaxsky.archive import catalogue, product_sets  # slow to import, and seldom needed
 
     said = "no such file" if path.parent.is_dir() else "no such file, nor folder"
     if cache is not None:

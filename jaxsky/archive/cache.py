@@ -19,7 +19,6 @@ __all__ = [
     "CHECKSUMS",
     "DownloadError",
     "alone",
-    "cache_folder",
     "checksums",
     "file_hash",
     "known_hash",
@@ -36,12 +35,6 @@ _FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used
 
 class DownloadError(ValueError):
     """A file that could not be had; one sentence."""
-
-
-def cache_folder() -> Path:
-    """Where products are kept: $JAXSKY_CACHE, or the platform's folder for caches."""
-    given = os.environ.get("JAXSKY_CACHE")
-    return Path(given or pooch.os_cache("jaxsky")).expanduser().absolute()
 
 
 def checksums(folder: Path) -> dict[str, str]:

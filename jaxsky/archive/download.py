@@ -12,7 +12,6 @@ from jaxsky.archive import transfer
 from jaxsky.archive.cache import (
     DownloadError,
     alone,
-    cache_folder,
     checksums,
     file_hash,
     remember,
@@ -21,6 +20,7 @@ from jaxsky.archive.cache import (
 from jaxsky.archive.checking import check_size, check_structure
 from jaxsky.archive.products import Product
 from jaxsky.io import InputError
+from jaxsky.io.folders import cache_folder
 
 __all__ = ["fetch"]
 

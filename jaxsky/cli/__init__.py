@@ -12,6 +12,8 @@ from jaxsky.cli import compare, data, fit, forecast, paper, separate, simulate
 from jaxsky.cli.console import replace_unprintable
 from jaxsky.cli.errors import print_error
 from jaxsky.cli.interrupt import prompt
+from jaxsky.io.folders import cache_folder
+from jaxsky.programs import keep_programs
 
 __all__ = ["app", "main"]
 
@@ -70,6 +72,7 @@ def main() -> None:
             import jax
 
             jax.config.update("jax_enable_x64", True)
+            keep_programs(cache_folder() / "programs")
             app()
     except Exception as error:
         print_error(error)

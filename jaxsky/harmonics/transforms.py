@@ -2,6 +2,7 @@
 
 from functools import cache, partial
 from importlib.resources import files
+from typing import Any
 
 import ducc0
 import healpy
@@ -9,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from astropy.io import fits as pyfits
-from jaxbind import get_linear_call, load_kwargs
+from jax.interpreters import mlir
+from jaxbind import get_linear_call, jaxbind, load_kwargs
 from jaxbind.contrib.jaxducc0 import get_healpix_sht
 from jaxtyping import Array, Float, Int
 
@@ -23,6 +25,19 @@ __all__ = ["ENGINES", "adjoint_synthesis", "analysis", "rotate", "synthesis"]
 ENGINES = ("ducc", "healpy")
 #: Coordinates between which coefficients are rotated.
 COORDINATES = ("G", "E", "C")
+
+
+def _lower(ctx: Any, *operands: Any, **parameters: Any) -> Any:
+    """Lower a transform, and say that it calls Python: JAX keeps no such program on disk.
+
+    jaxbind writes the address of a Python object into the program, which is another one in the
+    next process, where something else may be at this place.
+    """
+    ctx.module_context.add_host_callback(lambda *_: ())
+    return jaxbind._lowering(ctx, *operands, **parameters)
+
+
+mlir.register_lowering(jaxbind._prim, _lower, platform="cpu")
 
 
 @cache

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import filelock
+import platformdirs
 
 from jaxsky.io.files import PARTIAL, guards
 
-__all__ = ["ALL", "Folder", "alone", "occupied"]
+__all__ = ["ALL", "Folder", "alone", "cache_folder", "occupied"]
 
 #: Locked for moments only, while it is seen who works in a folder.
 GATE = ".lock"
@@ -25,6 +26,12 @@ OWNER = ".running"
 ALL = range(sys.maxsize)
 #: How a file system says that it has no locks.
 NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EPROTONOSUPPORT}
+
+
+def cache_folder() -> Path:
+    """What can be had again is kept here: $JAXSKY_CACHE, or the platform's folder for caches."""
+    given = os.environ.get("JAXSKY_CACHE")
+    return Path(given or platformdirs.user_cache_path("jaxsky")).expanduser().absolute()
 
 
 class Owner(NamedTuple):

@@ -1,0 +1,90 @@
+"""Compiled programs, kept on disk from one process to the next by JAX's own cache.
+
+Compilation takes longer than most commands compute. Programs with a transform are not kept, see
+`jaxsky.harmonics.transforms`.
+"""
+
+import hashlib
+import os
+import platform
+from pathlib import Path
+
+import jax
+import jaxlib
+from jax._src import compilation_cache, lru_cache
+
+__all__ = ["keep_programs", "program_folder"]
+
+#: Most that is kept [bytes], and how many kinds of processor and versions of JAX it is kept for.
+LARGEST, KINDS = 2**30, 4
+
+
+class _Cache(lru_cache.LRUCache):
+    """JAX's cache, with entries that appear complete or not at all."""
+
+    def put(self, key: str, value: bytes) -> None:
+        final = Path(self._path) / f"{key}-cache"
+        part = final.with_name(f".partial-{os.getpid()}-{key}")
+        part.write_bytes(value)
+        part.replace(final)
+
+
+def _processor() -> str:
+    """What the processor can do: a program for one may not run on another."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return f"{platform.machine()} {platform.processor()}"
+    return "\n".join(
+        dict.fromkeys(x for x in lines if x.startswith(("flags", "Features", "model")))
+    )
+
+
+def program_folder(folder: Path) -> Path:
+    """The folder for programs of this version of JAX and this processor, within another one."""
+    kind = hashlib.sha256(_processor().encode()).hexdigest()[:12]
+    return folder / f"{jax.__version__}-{jaxlib.__version__}-{kind}"
+
+
+def keep_programs(folder: Path) -> None:
+    """Keep compiled programs in a folder, and take those that are there.
+
+    JAX's own settings go first: with $JAX_ENABLE_COMPILATION_CACHE=0 nothing is kept, and with
+    $JAX_COMPILATION_CACHE_DIR it is there. A folder that cannot be written is done without.
+
+    Parameters
+    ----------
+    folder : of the programs for all versions and processors; the oldest go when it is too large
+    """
+    if not jax.config.read("jax_enable_compilation_cache"):
+        return
+    if not jax.config.read("jax_compilation_cache_dir"):
+        own = program_folder(folder)
+        try:
+            own.mkdir(parents=True, exist_ok=True)
+            own.touch()
+            _prune(folder)
+        except OSError:
+            return
+        jax.config.update("jax_compilation_cache_dir", str(own))
+    compilation_cache.LRUCache = _Cache  # type: ignore[misc]
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _prune(folder: Path) -> None:
+    """Remove the oldest programs, and all of the kinds that were not used for longest."""
+    kinds = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime)
+    old = [path for kind in kinds[:-KINDS] for path in kind.iterdir()]
+    kept = [path for kind in kinds[-KINDS:] for path in kind.iterdir()]
+    sizes = {path: path.stat().st_size for path in kept}
+    excess = sum(sizes.values()) - LARGEST
+    for path in sorted(sizes, key=lambda path: path.stat().st_mtime):
+        if excess <= 0:
+            break
+        excess -= sizes[path]
+        old.append(path)
+    for path in old:
+        path.unlink(missing_ok=True)
+    for kind in kinds[:-KINDS]:
+        kind.rmdir()

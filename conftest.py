@@ -13,7 +13,7 @@ from jaxsky.programs import keep_programs
 jax.config.update("jax_enable_x64", True)
 # Of the tests, and of the commands that they start.
 keep_programs(Path(__file__).parent / ".programs")
-if kept := jax.config.read("jax_compilation_cache_dir"):
+if kept := jax.config.jax_compilation_cache_dir:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = kept
 
 DATA = Path(os.environ.get("JAXSKY_DATA", Path(__file__).parents[1] / "shared" / "data"))

@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from jaxsky.checks import check_seed
 from jaxsky.io import InputError, whole
+from jaxsky.progress import QUIET
 
 __all__ = ["realisations"]
 
@@ -28,7 +29,7 @@ def realisations(
     seed: int,
     path: Path | None = None,
     mark: str = "",
-    report: Callable[[int], None] = lambda done: None,
+    report: Callable[[int, int], None] = QUIET.advance,
 ) -> list[np.ndarray]:
     """Results of a function of a random key, stacked over realisations.
 
@@ -39,7 +40,7 @@ def realisations(
     count, seed : number of realisations, and what their keys are made of
     path : file that keeps what is done; what it holds already is not made again
     mark : of all that the results depend on; a file with another one is refused
-    report : called with the number of realisations done
+    report : called with the number of realisations done, and that of all
 
     Raises
     ------
@@ -51,7 +52,7 @@ def realisations(
     held, saved = len(done), time.monotonic()
     try:
         for i in range(held, count):
-            report(i)
+            report(i, count)
             key = jax.random.fold_in(jax.random.key(seed), i)
             done.append([np.asarray(x) for x in make(key)])
             if path is not None and time.monotonic() - saved > SAVED_EVERY:
@@ -60,7 +61,7 @@ def realisations(
     finally:
         if path is not None and len(done) > held:
             _save(path, mark, names, done)
-    report(count)
+    report(count, count)
     return list(map(np.stack, zip(*done[:count], strict=True)))
 
 

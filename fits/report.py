@@ -1,10 +1,11 @@
 """What a fit leaves behind: a table, result.json, pictures and a log, each written whole."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich import box
 from rich.table import Table
 
 from fits import plots
@@ -77,11 +78,16 @@ def _short_names(names: Sequence[str]) -> list[str]:
     return [s if short.count(s) == 1 else name for name, s in zip(names, short, strict=True)]
 
 
-def result_table(fits: Sequence[Fit]) -> Table:
-    """The best fits and 68 % intervals for the terminal."""
+def result_table(fits: Sequence[Fit], truth: Mapping[str, float] | None = None) -> Table:
+    """The best fits and 68 % intervals for the terminal, and the truth if there is one."""
     free = all_free(fits)
-    table = Table(caption="best fit and central 68 % interval; chi2 is the sum over pixels")
-    for column in ("region", "Stokes", "method"):
+    table = Table(
+        box=box.SIMPLE,
+        pad_edge=False,
+        collapse_padding=True,
+        caption="best fit and central 68 % interval; chi2 is the sum over pixels",
+    )
+    for column in ("region", "", "method"):
         table.add_column(column)
     for column in (*_short_names(free), "chi2/dof"):
         table.add_column(column, justify="right", overflow="fold")
@@ -95,6 +101,9 @@ def result_table(fits: Sequence[Fit]) -> Table:
             chi2 = f"{fit.chi2[method] / fit.dof:.3f}"
             table.add_row(fit.region, fit.stokes, method + mark, *cells, chi2)
         table.add_section()
+    if truth is not None:
+        known = [f"{truth[name]:g}" if name in truth else "" for name in free]
+        table.add_row("truth", "", "", *known, "")
     return table
 
 

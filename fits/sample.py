@@ -68,7 +68,7 @@ def ensemble(
     nsteps: int,
     seed: int,
     backend: ChainFile | None = None,
-    progress: bool | str = True,
+    progress: bool | Callable[[int, int], None] = True,
 ) -> emcee.EnsembleSampler:
     """Steps of emcee's ensemble; those that a file already holds are not made again.
 
@@ -102,10 +102,15 @@ def ensemble(
             random_state=np.random.RandomState(rng.integers(2**32)).get_state(),
         )
     try:
-        if done < nsteps:
-            sampler.run_mcmc(
-                state, nsteps - done, progress=progress, progress_kwargs={"leave": False}
-            )
+        steps = sampler.sample(
+            sampler.get_last_sample() if state is None else state,
+            iterations=max(0, nsteps - done),
+            progress=progress is True,
+            progress_kwargs={"leave": False},
+        )
+        for i, _ in enumerate(steps, done + 1):
+            if callable(progress):
+                progress(i, nsteps)
     finally:
         if backend is not None:
             backend.flush()
@@ -121,7 +126,7 @@ def sample(
     nsteps: int = 5000,
     seed: int = 0,
     backend: ChainFile | None = None,
-    progress: bool | str = True,
+    progress: bool | Callable[[int, int], None] = True,
     throw: bool = True,
 ) -> FitResult:
     """Samples of the posterior by emcee's affine-invariant ensemble.
@@ -135,7 +140,7 @@ def sample(
     seed : of the start positions and the proposals
     backend : file of the chain; one that already holds steps is gone on with up to `nsteps`,
         with the very steps an uninterrupted run would have made
-    progress : show a progress bar
+    progress : show a progress bar, or call a function with the steps done and those in all
     throw : raise if the chain is shorter than 50 autocorrelation times
 
     Returns

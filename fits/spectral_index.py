@@ -4,7 +4,7 @@ Templates and data are brought to a common resolution; the parameters are then f
 region, to Q, to U and to both, on a grid, by gradient and by MCMC.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +23,7 @@ from fits.sample import sample
 from fits.settings import Settings
 from fits.template_noise import Attenuation, attenuation
 from jaxsky import observe_components, parameter_names, set_parameters
+from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import SettingsError
 from jaxsky.settings_keys import at_key
 
@@ -69,8 +70,7 @@ def fit_pixels(
     region: str,
     stokes: str,
     chains: Path | None = None,
-    report: Callable[[str], None] = lambda message: None,
-    progress: bool = False,
+    progress: Progress = QUIET,
 ) -> Fit:
     """The fits of one region and choice of Stokes parameters; see `run`."""
     # An offset of a Stokes parameter that is not looked at has no effect.
@@ -81,7 +81,7 @@ def fit_pixels(
         if not (name.startswith("offset.") and name.endswith(other))
     }
     priors = {name: prior for name, prior in settings.priors().items() if name in start}
-    report(f"{region}, {stokes}: inner products")
+    progress.step(f"{region}, {stokes}: inner products")
     with at_key("free"):
         diagonal = prepared.likelihood(start, stokes=stokes, region=used, kind="diagonal")
     like, dof_amplitudes = diagonal, None
@@ -92,7 +92,7 @@ def fit_pixels(
         dof_amplitudes = round(like.residuals(start).size * weighty) - len(start)
     results: dict[str, FitResult] = {}
     for method in settings.analysis.methods:
-        report(f"{region}, {stokes}: {method}")
+        progress.step(f"{region}, {stokes}: {method}")
         if method == "grid" and not grid_is_possible(start, priors):
             continue
         if method == "grid":
@@ -113,7 +113,7 @@ def fit_pixels(
                 nsteps=settings.mcmc.nsteps,
                 seed=settings.analysis.seed,
                 backend=chain,
-                progress=progress,
+                progress=progress.advance,
                 throw=False,
             )
     if not results:
@@ -162,8 +162,7 @@ def run(
     prepared: Prepared,
     regions: dict[str, Bool[np.ndarray, " pix"]],
     chains: Path | None = None,
-    report: Callable[[str], None] = lambda message: None,
-    progress: bool = False,
+    progress: Progress = QUIET,
 ) -> list[Fit]:
     """All fits that the settings ask for.
 
@@ -173,8 +172,7 @@ def run(
     prepared : templates and maps at the common resolution
     regions : pixels of each region by name
     chains : file of the chains; steps that it already holds are not made again
-    report : called with a line before each step of the work
-    progress : show a progress bar for chains
+    progress : told of each step of the work
 
     Raises
     ------
@@ -188,7 +186,7 @@ def run(
         if not pixels.any():
             raise SettingsError(f"analysis.regions: region {region!r} leaves no pixel.")
     return [
-        fit_pixels(settings, prepared, pixels, region, stokes, chains, report, progress)
+        fit_pixels(settings, prepared, pixels, region, stokes, chains, progress)
         for region, pixels in used.items()
         for stokes in settings.analysis.stokes
     ]

@@ -244,13 +244,11 @@ def _jobs(
     seen: Iterator[tuple[str, dict[str, Array]]],
     files: Mapping[str, Path],
     index: int,
-    report: Callable[[str], None],
     claim: Callable[[], None],
 ) -> Iterator[tuple[str, Callable[[], None]]]:
     """What writes each band of a realisation; `claim` is called when a map is ready."""
     main = settings.experiment
     for name, maps in seen:
-        report(f"band {name}")
         band = setup.observation.channels[name].band
         columns = _columns(maps, main.stokes, float(band.conversion("uK_RJ", main.unit)))
         claim()
@@ -267,7 +265,6 @@ def run(
     out: Path,
     indices: range,
     overwrite: bool = False,
-    report: Callable[[str], None] = lambda message: None,
     note: Callable[[str], None] = lambda message: None,
     begun: Callable[[], None] = lambda: None,
 ) -> Iterator[Written]:
@@ -282,7 +279,6 @@ def run(
     out : folder, see `check_folder`
     indices : numbers of the realisations
     overwrite : remove all maps that are in the folder
-    report : called with a line before each step of the work
     note : called with sentences that a user should know
     begun : called when the folder has its log, and what was to be removed from it is
 
@@ -315,7 +311,6 @@ def run(
             continue
         key = realisation_key(main.seed, index)
         if prepared is None or random:
-            report("templates")
             terms = plan(setup.sources, observation) if terms is None else terms
             small = key if random else jax.random.key(main.small_scales_seed or 0)
             correlated = [n for n, source in setup.sources.items() if source.correlated_with]
@@ -330,7 +325,5 @@ def run(
         seen = observe_bands(
             key, prepared, observation, setup.cmb, components=components, names=missing
         )
-        for name, seconds in _write_behind(
-            _jobs(settings, setup, seen, files, index, report, claim)
-        ):
+        for name, seconds in _write_behind(_jobs(settings, setup, seen, files, index, claim)):
             yield Written(index, name, files[name], seconds)

@@ -56,9 +56,9 @@ def keep_programs(folder: Path) -> None:
     ----------
     folder : of the programs for all versions and processors; the oldest go when it is too large
     """
-    if not jax.config.read("jax_enable_compilation_cache"):
+    if not jax.config.jax_enable_compilation_cache:  # type: ignore[attr-defined]
         return
-    if not jax.config.read("jax_compilation_cache_dir"):
+    if not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
         own = program_folder(folder)
         try:
             own.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,6 @@
 """Settings in TOML files: what commands share, validated with a sentence for each mistake."""
 
+import json
 import os
 import re
 import reprlib
@@ -349,7 +350,48 @@ def _sentence(path: Path, raw: Any, error: ValidationError, options: Mapping[str
 S = TypeVar("S", bound=SettingsFile)
 
 
-def load(path: Path, model: type[S], overrides: Mapping[str, Mapping[str, Any]] | None = None) -> S:
+def _assigned(assignment: str) -> dict[str, Any]:
+    """The tables of `key=value`, where the value is TOML, or text as it is.
+
+    Raises
+    ------
+    SettingsError
+        If it is none.
+    """
+    key, equals, value = assignment.partition("=")
+    for line in (assignment, f"{key} = {json.dumps(value.strip())}"):
+        try:
+            return tomllib.loads(line)
+        except (tomllib.TOMLDecodeError, RecursionError):
+            continue
+    raise SettingsError(
+        f"--set {assignment}: must be KEY=VALUE, as in a settings file, with the table's name "
+        f"before the key{'' if equals else '; there is no ='}."
+    )
+
+
+def _merge(raw: Any, changes: Mapping[str, Any]) -> Any:
+    """Tables with changes in them; a number is the place in a list."""
+    if isinstance(raw, list):
+        merged = list(raw)
+        for key, value in changes.items():
+            if not key.isdecimal() or int(key) >= len(raw):
+                raise ValueError(f"{key}: is not among the {len(raw)} entries, 0 to {len(raw) - 1}")
+            known = raw[int(key)]
+            merged[int(key)] = _merge(known, value) if isinstance(value, dict) else value
+        return merged
+    if not isinstance(raw, dict):
+        return changes
+    into = [k for k, v in changes.items() if isinstance(v, dict) and k in raw]
+    return {**raw, **changes, **{k: _merge(raw[k], changes[k]) for k in into}}
+
+
+def load(
+    path: Path,
+    model: type[S],
+    overrides: Mapping[str, Mapping[str, Any]] | None = None,
+    assignments: Sequence[str] = (),
+) -> S:
     """Settings from a TOML file.
 
     Parameters
@@ -358,6 +400,8 @@ def load(path: Path, model: type[S], overrides: Mapping[str, Mapping[str, Any]] 
     model : what the settings are
     overrides : by table, values of options with the key's name, which replace those of the file;
         None is ignored
+    assignments : `key=value` with a dotted key, such as "analysis.nside=32", "bands.0.fwhm=30" or
+        "free.'dust.beta_dust'.start=1.5"; they are merged into the file's tables
 
     Returns
     -------
@@ -386,6 +430,13 @@ def load(path: Path, model: type[S], overrides: Mapping[str, Mapping[str, Any]] 
         }
         if given and isinstance(raw.get(table, {}), dict):
             raw[table] = raw.get(table, {}) | given
+    for assignment in assignments:
+        changes = _assigned(assignment)
+        try:
+            raw = _merge(raw, changes)
+        except ValueError as error:
+            raise SettingsError(f"{path}: --set {assignment}: {error}.") from None
+        options[assignment.partition("=")[0].strip()] = " (given with --set)"
     try:
         settings = model.model_validate(raw)
         folder = (path.absolute().parent / expand(settings.data_dir)).resolve()

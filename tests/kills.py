@@ -97,7 +97,7 @@ def start(name: str, out: Path, *options: str) -> subprocess.Popen:
     """The command in a process of its own, its words in a file beside the folder."""
     settings = out.with_name(f"{name}.toml")
     settings.write_text(SETTINGS[name])
-    code = "from jaxsky.cli import main; main()"
+    code = "from fits.app import main; main()"
     arguments = [name, str(settings), "--out", str(out), *OPTIONS.get(name, ()), *options]
     with said_by(out).open("w") as said:
         return subprocess.Popen(

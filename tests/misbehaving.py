@@ -225,7 +225,7 @@ def serving():
 
 def fetch_command(address, folder, name):
     """`jaxsky data fetch` as a process."""
-    code = "from jaxsky.cli import main; main()"
+    code = "from fits.app import main; main()"
     arguments = ["data", "fetch", name, "--mirror", f"{address}/slow", "--dir", str(folder)]
     return subprocess.Popen(
         [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True

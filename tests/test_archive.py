@@ -1,15 +1,14 @@
 """Official data products: the catalogue, the command, and checks."""
 
-import sys
 from pathlib import Path
 
 import pytest
 
+from commands import jaxsky
 from fits import settings as fit_settings
 from fits.paper import settings as paper_settings
 from fits.separate import settings as separate_settings
 from fits.settings import load_settings
-from jaxsky import cli
 from jaxsky.archive import (
     ProductSet,
     catalogue,
@@ -145,10 +144,7 @@ def test_what_verify_refuses(tmp_path):
 
 
 def command(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["jaxsky", "data", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    return ended.value.code
+    return jaxsky(monkeypatch, "data", *arguments)
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxsky import cli
-from jaxsky.cli import errors
-from jaxsky.cli.results import results_folder
+from fits import app as cli
+from fits.commands import errors
+from fits.commands.run import results_folder
 
 JAXSKY = Path(sys.executable).with_name("jaxsky")
 
@@ -109,8 +109,8 @@ STOPPED = """
 import gc, os, signal, sys, threading, time
 from pathlib import Path
 import jax, numpy as np
-from jaxsky import cli
-from jaxsky.cli.results import results_folder
+from fits import app as cli
+from fits.commands.run import results_folder
 
 def swallowed():  # by a callback of the garbage collector, as those of JAX
     def callback(phase, info):
@@ -176,7 +176,7 @@ def test_ctrl_c_before_there_is_a_folder(monkeypatch, capsys):
 def test_ctrl_c_at_the_end_of_the_interpreter_says_nothing():
     code = (
         "import atexit, signal, sys; atexit.register(signal.raise_signal, signal.SIGINT)\n"
-        "from jaxsky import cli; sys.argv = ['jaxsky', 'data', 'list', 'wmap9']; cli.main()"
+        "from fits import app as cli; sys.argv = ['jaxsky', 'data', 'list', 'wmap9']; cli.main()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == ""

@@ -1,7 +1,6 @@
 """Observed maps against the model: slopes and spectra with errors that simulations confirm."""
 
 import json
-import sys
 from pathlib import Path
 
 import healpy
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from commands import jaxsky
 from fits import settings as fit_settings
 from fits.comparison import compare
 from fits.comparison.pixels import compare_pixels
@@ -20,7 +20,6 @@ from fits.comparison.spectra import compare_spectra, cosmic_error, hotelling
 from fits.inputs import inputs_of
 from fits.regions import region_masks
 from fits.resolution import prepare
-from jaxsky import cli
 from jaxsky.io import InputError
 from jaxsky.settings import SettingsError
 
@@ -242,20 +241,24 @@ def test_missing_pixels_leave_spectra_out(settings, prepared, model, regions, si
 
 def test_realisations_are_kept(prepared, model, regions, tmp_path):
     path, counts = tmp_path / "sims.npz", []
+
+    def count(done, of):
+        counts.append(done)
+
     first = simulate(prepared, model, regions, 20, 2, 0, path, "a")
-    more = simulate(prepared, model, regions, 20, 3, 0, path, "a", counts.append)
+    more = simulate(prepared, model, regions, 20, 3, 0, path, "a", count)
     assert counts == [2, 3]
     np.testing.assert_array_equal(more.chi2[:2], first.chi2)
     fresh = simulate(prepared, model, regions, 20, 3, 0)
     np.testing.assert_allclose(more.spectra, fresh.spectra, rtol=1e-12)
 
-    def stop(done):
+    def stop(done, of):
         if done == 4:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         simulate(prepared, model, regions, 20, 9, 0, path, "a", stop)
-    simulate(prepared, model, regions, 20, 5, 0, path, "a", counts.append)
+    simulate(prepared, model, regions, 20, 5, 0, path, "a", count)
     assert counts == [2, 3, 4, 5]
     with pytest.raises(InputError, match="holds realisations of other data or settings"):
         simulate(prepared, model, regions, 20, 3, 0, path, "b")
@@ -293,17 +296,10 @@ def test_what_cannot_be_compared_is_refused(settings, prepared, regions):
         fit_settings.Embedded(channels={"planck": ["30"], "wmap": []} | {"core": ["30"]})
 
 
-def run(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["jaxsky", "compare", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    return stop.value.code or 0
-
-
 def test_command_line(tmp_path, monkeypatch, capsys):
     (tmp_path / "a.toml").write_text(SETTINGS)
     out = tmp_path / "out"
-    assert run(monkeypatch, tmp_path / "a.toml", "--out", out) == 0
+    assert jaxsky(monkeypatch, "compare", tmp_path / "a.toml", "--out", out) == 0
     pictures = {"scatter_strip", "scatter_outside", "maps_Q", "maps_U", "spectra", "leakage"}
     assert {p.stem for p in out.glob("*.png")} == pictures
     numbers = json.loads((out / "comparison.json").read_text())
@@ -311,18 +307,19 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     assert 0.8 < numbers["pixels"]["K"]["strip"]["QU"]["slope"] < 1.2
     assert len(numbers["spectra"]["70"]["chi2_bins"][1]) == 3
     assert "Model of the Galaxy (not data)" in capsys.readouterr().err
-    assert run(monkeypatch, tmp_path / "a.toml", "--out", out) == 2
+    assert jaxsky(monkeypatch, "compare", tmp_path / "a.toml", "--out", out) == 2
     assert "holds results already" in capsys.readouterr().err
-    assert run(monkeypatch, tmp_path / "a.toml", "--out", out, "--resume", "--nsims", 31) == 0
-    assert run(monkeypatch, tmp_path / "a.toml", "--out", out, "--resume", "--seed", 9) == 2
+    again = ["compare", tmp_path / "a.toml", "--out", out, "--resume"]
+    assert jaxsky(monkeypatch, *again, "--nsims", 31) == 0
+    assert jaxsky(monkeypatch, *again, "--seed", 9) == 2
     assert "holds realisations of other data" in capsys.readouterr().err
     # What cannot work removes nothing; what works leaves nothing of the old.
     (tmp_path / "bad.toml").write_text(SETTINGS.replace("lmax = 25", "lmax = 33"))
-    assert run(monkeypatch, tmp_path / "bad.toml", "--out", out, "--overwrite") == 2
+    assert jaxsky(monkeypatch, "compare", tmp_path / "bad.toml", "--out", out, "--overwrite") == 2
     assert (out / "comparison.json").exists()
     tight = SETTINGS.replace('leakage = { "70" = 0.2 }', "").replace('"strip", ', "")
     (tmp_path / "b.toml").write_text(tight)
-    assert run(monkeypatch, tmp_path / "b.toml", "--out", out, "--overwrite") == 0
+    assert jaxsky(monkeypatch, "compare", tmp_path / "b.toml", "--out", out, "--overwrite") == 0
     assert {p.stem for p in out.glob("*.png")} == pictures - {"scatter_strip", "leakage"}
 
 

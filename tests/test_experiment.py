@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import sys
 from types import SimpleNamespace
 
 import healpy
@@ -13,7 +12,8 @@ import pytest
 from astropy.io import fits as pyfits
 
 import systems
-from jaxsky import cli, montecarlo
+from commands import jaxsky, one_sentence
+from jaxsky import montecarlo
 from jaxsky.experiment import DEFAULT, EXAMPLE, build, load_experiment, setup
 from jaxsky.harmonics import alm_ell, expand, gaussian_beam, synthesis
 from jaxsky.io import read_maps, write_maps
@@ -102,20 +102,7 @@ def write(folder, *changes, text=SETTINGS, name="experiment"):
 
 
 def command(monkeypatch, *arguments) -> int:
-    monkeypatch.setattr(sys, "argv", ["jaxsky", "simulate", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    return 0
-
-
-def one_sentence(capsys) -> str:
-    """What was printed: one sentence, no traceback."""
-    printed = " ".join(capsys.readouterr().err.split())
-    assert "Traceback" not in printed
-    assert printed.startswith("jaxsky:"), printed
-    return printed
+    return jaxsky(monkeypatch, "simulate", *arguments)
 
 
 def content(out) -> dict[str, bytes]:

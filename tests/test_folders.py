@@ -17,29 +17,20 @@ import h5py
 import numpy as np
 import pytest
 
+from commands import jaxsky, said
 from fits.chains import ChainFile, kept_chain
 from fits.realisations import realisations
 from fits.record import fingerprint
-from jaxsky import cli
 from jaxsky.io import InputError, whole, write_maps, write_text
 from jaxsky.io.folders import ALL, Owner, alone, occupied
 
 COMMANDS = ("fit", "compare", "separate", "simulate", "forecast", "paper")
 
 
-def command(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["jaxsky", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    return 0
-
-
 def sentence(capsys):
-    said = " ".join(capsys.readouterr().err.split())
-    assert "Traceback" not in said
-    return said
+    printed = said(capsys)
+    assert "Traceback" not in printed
+    return printed
 
 
 def names(folder):
@@ -65,7 +56,7 @@ def test_a_second_command_is_refused(name, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     with occupied(out) as folder:
         for options in ([], ["--overwrite"]):
-            assert command(monkeypatch, name, "--out", out, *options) == 2
+            assert jaxsky(monkeypatch, name, "--out", out, *options) == 2
             said = sentence(capsys)
             assert f"{out}: is being written to by another command (process {os.getpid()}" in said
             assert f"started {str(folder._owner).split('started ')[1]}" in said
@@ -145,9 +136,9 @@ def test_file_systems_without_locks_are_said(tmp_path, monkeypatch, capsys):
         folder.clean()
         assert not folder.locked
     assert not out.exists()
-    assert command(monkeypatch, "simulate", tmp_path / "no.toml", "--out", out) == 2
+    assert jaxsky(monkeypatch, "simulate", tmp_path / "no.toml", "--out", out) == 2
     assert "no.toml: cannot be read" in sentence(capsys)
-    assert command(monkeypatch, "paper", "--out", out, "--only", "99") == 2
+    assert jaxsky(monkeypatch, "paper", "--out", out, "--only", "99") == 2
     said = sentence(capsys)
     assert f"{out}: this file system has no locks, so see to it" in said
     assert "--only: there is no '99'" in said
@@ -205,7 +196,7 @@ def test_what_cannot_be_written_is_one_sentence(tmp_path):
 
 def test_folders_that_cannot_be_made(tmp_path, monkeypatch, capsys):
     (tmp_path / "file").touch()
-    assert command(monkeypatch, "forecast", "--out", tmp_path / "file" / "x") == 2
+    assert jaxsky(monkeypatch, "forecast", "--out", tmp_path / "file" / "x") == 2
     assert "x: cannot be made (Not a directory); choose another --out" in sentence(capsys)
 
 

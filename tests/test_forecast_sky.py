@@ -1,18 +1,18 @@
 """Forecasts from maps: foreground spectra outside a mask, and the command on files."""
 
 import json
-import sys
 
 import healpy
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from commands import jaxsky, one_sentence
 from fits.forecast import DEFAULT, EXAMPLE, equal_r, fit_law, forecast, load_forecast
 from fits.forecast.b_modes import BandLaw, correlation, foreground_powers, to_D
 from fits.forecast.setup import apodize
 from fits.pseudo_cl import band_covariance, bin_edges, masked_spectra, sky_fraction
-from jaxsky import Bandpass, Dust, Sky, Synchrotron, cli, observe_band
+from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe_band
 from jaxsky.harmonics import alm_ell, gaussian_beam, power_spectrum, synthesis
 from jaxsky.io import write_maps
 
@@ -225,22 +225,13 @@ def written(folder, name, old="", new=""):
     return path
 
 
-def jaxsky(monkeypatch, *arguments) -> int:
-    monkeypatch.setattr(sys, "argv", ["jaxsky", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    return 0
-
-
 def test_command_on_files(folder, tmp_path, monkeypatch, capsys):
     path, out = written(folder, "whole"), tmp_path / "out"
     assert jaxsky(monkeypatch, "forecast", path, "--out", out) == 0
     printed = capsys.readouterr()
     assert "synchrotron.beta_syn" in printed.out
     assert "forecast.json" in printed.err
-    names = ["bb.png", "fisher.png", "forecast.json", "log.json"]
+    names = ["bb.png", "fisher.png", "forecast.json", "index.html", "log.json", "log.txt"]
     assert sorted(p.name for p in out.iterdir()) == names
     for picture in out.glob("*.png"):
         assert picture.read_bytes().startswith(b"\x89PNG")
@@ -310,14 +301,6 @@ def test_settings_that_come_along(tmp_path, monkeypatch, capsys):
     (tmp_path / "all.toml").write_text(text)
     said = load_forecast(tmp_path / "all.toml")
     assert said.model_dump(exclude={"data_dir"}) == example.model_dump(exclude={"data_dir"})
-
-
-def one_sentence(capsys) -> str:
-    """What was printed: one sentence, no traceback."""
-    printed = " ".join(capsys.readouterr().err.split())
-    assert "Traceback" not in printed
-    assert printed.startswith("jaxsky:"), printed
-    return printed
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import html.parser
 import json
-import sys
 from pathlib import Path
 
 import healpy
@@ -10,12 +9,12 @@ import jax
 import numpy as np
 import pytest
 
+import commands
 from fits.paper import STEPS, Impossible, Item, Number, Sources, Step, run
 from fits.paper.experiment import _observation, _prepared
 from fits.paper.item import NUMBERS
 from fits.paper.run import labels_of
 from fits.paper.settings import EMBEDDED, EXAMPLE, PaperSettings, load_paper
-from jaxsky import cli
 from jaxsky.harmonics import gaussian_beam, power_spectrum
 from jaxsky.io import read_maps
 from jaxsky.observation import Source
@@ -332,10 +331,7 @@ def test_example_is_valid():
 
 
 def jaxsky(monkeypatch, capsys, *arguments) -> tuple[int, str]:
-    monkeypatch.setattr(sys, "argv", ["jaxsky", "paper", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    return stop.value.code or 0, capsys.readouterr().err
+    return commands.jaxsky(monkeypatch, "paper", *arguments), capsys.readouterr().err
 
 
 def test_command_line(monkeypatch, capsys, tmp_path):

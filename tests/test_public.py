@@ -36,7 +36,7 @@ def modules():
     """All modules of the packages but those of the command line."""
     for package in (jaxsky, fits):
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            if not found.name.startswith("jaxsky.cli"):
+            if not found.name.startswith(("jaxsky.__main__", "fits.app", "fits.commands")):
                 yield importlib.import_module(found.name)
 
 

@@ -1,17 +1,16 @@
 """The spectral-index fit on the observed sky; skipped where the data are not to be had."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
+from commands import jaxsky
 from fits import settings as fit_settings
 from fits.inputs import read_inputs
 from fits.regions import region_masks
 from fits.resolution import prepare
 from fits.spectral_index import run
-from jaxsky import cli
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "wmap7_vw.toml"
 
@@ -23,11 +22,7 @@ def wmap(data_dir, monkeypatch):
 
 
 def test_wmap_from_the_command_line(wmap, tmp_path, monkeypatch):
-    arguments = ["jaxsky", "fit", str(EXAMPLE), "--out", str(tmp_path)]
-    monkeypatch.setattr(sys, "argv", arguments)
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert not stop.value.code
+    assert jaxsky(monkeypatch, "fit", EXAMPLE, "--out", tmp_path) == 0
     results = json.loads((tmp_path / "result.json").read_text())["results"]
     assert set(results) == {"strip", "full"}
     for region in results.values():

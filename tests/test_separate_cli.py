@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, cli, observe
-from jaxsky.cli.separate import RESULTS
+from commands import jaxsky, one_sentence
+from fits.commands.separate import RESULTS
+from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.harmonics import alm_ell, gaussian_beam, resample, synthesis
 from jaxsky.io import read_maps, write_maps
 
@@ -91,30 +92,13 @@ def settings(folder, name, regions="{ file = { file = 'labels.fits' } }", noise=
     return path
 
 
-def separate(monkeypatch, *arguments) -> int:
-    monkeypatch.setattr(sys, "argv", ["jaxsky", "separate", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    return 0
-
-
-def one_sentence(capsys) -> str:
-    error = capsys.readouterr().err.strip()
-    assert "Traceback" not in error
-    assert error.startswith("jaxsky: ")
-    assert error.endswith(".")
-    return error
-
-
 def test_maps_of_ones_own(folder, tmp_path, monkeypatch, capsys):
     path, out = settings(folder, "own"), tmp_path / "out"
-    assert separate(monkeypatch, path, "--out", out) == 0
+    assert jaxsky(monkeypatch, "separate", path, "--out", out) == 0
     printed = capsys.readouterr()
     assert "dust.beta_dust, median of 2 regions" in printed.out
     names = {p.name for p in out.iterdir()}
-    assert names == set(RESULTS)
+    assert names == {*RESULTS, "index.html", "log.txt"}
     for picture in out.glob("*.png"):
         assert picture.read_bytes().startswith(b"\x89PNG")
     result = json.loads((out / "result.json").read_text())
@@ -136,26 +120,26 @@ def test_maps_of_ones_own(folder, tmp_path, monkeypatch, capsys):
     assert read_maps(out / "residuals.fits", fields=["40_Q", "402_U"]).maps.shape == (2, 768)
     # Results are kept, gone on with, and replaced.
     before = (out / "result.json").read_bytes()
-    assert separate(monkeypatch, path, "--out", out) == 2
+    assert jaxsky(monkeypatch, "separate", path, "--out", out) == 2
     assert "holds results already; go on with --resume" in one_sentence(capsys)
-    assert separate(monkeypatch, path, "--out", out, "--resume") == 0
+    assert jaxsky(monkeypatch, "separate", path, "--out", out, "--resume") == 0
     again = json.loads((out / "result.json").read_text())
     assert again == json.loads(before)
-    assert separate(monkeypatch, path, "--out", out, "--resume", "--seed", "8") == 2
+    assert jaxsky(monkeypatch, "separate", path, "--out", out, "--resume", "--seed", "8") == 2
     capsys.readouterr()
 
 
 def test_multipoles_of_files(folder, tmp_path, monkeypatch):
     path = settings(folder, "harmonic", regions="REGIONS", **{", regions = REGIONS": ""})
     out = tmp_path / "out"
-    assert separate(monkeypatch, path, "--out", out, "--domain", "harmonic") == 0
+    assert jaxsky(monkeypatch, "separate", path, "--out", out, "--domain", "harmonic") == 0
     result = json.loads((out / "result.json").read_text())
     for name, truth in {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}.items():
         found = result["parameters"][name]
         assert abs(found["best_fit"] - truth) < 5 * found["sigma"]
     assert not (out / "parameters.png").exists()
     names = {p.name for p in out.iterdir()}
-    assert names == set(RESULTS) - {"parameters.fits", "parameters.png"}
+    assert names == {*RESULTS, "index.html", "log.txt"} - {"parameters.fits", "parameters.png"}
 
 
 def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
@@ -169,7 +153,7 @@ def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
     realisations, progress = module.realisations, []
 
     def stopped(*arguments):
-        def report(done):
+        def report(done, of):
             progress.append(done)
             if len(progress) == 8:
                 raise KeyboardInterrupt
@@ -177,10 +161,10 @@ def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
         return realisations(*arguments[:-1], report)
 
     monkeypatch.setattr(module, "realisations", stopped)
-    assert separate(monkeypatch, path, "--out", out) == 130
+    assert jaxsky(monkeypatch, "separate", path, "--out", out) == 130
     assert "Stopped; resume with --resume." in capsys.readouterr().err
     monkeypatch.undo()
-    assert separate(monkeypatch, path, "--out", out, "--resume") == 0
+    assert jaxsky(monkeypatch, "separate", path, "--out", out, "--resume") == 0
     assert progress[-1] == 7
     assert (out / "result.json").exists()
 
@@ -211,18 +195,18 @@ def test_mistakes_are_one_sentence(folder, tmp_path, monkeypatch, capsys, change
         options, changes = ["--domain", changes["domain"]], {}
         words = "separation.domain: input should be 'pixel' or 'harmonic'"
     path, out = settings(folder, "wrong", **changes), tmp_path / "out"
-    assert separate(monkeypatch, path, "--out", out, *options) == 2
+    assert jaxsky(monkeypatch, "separate", path, "--out", out, *options) == 2
     assert words in one_sentence(capsys)
     assert not (out / "result.json").exists()
 
 
 def test_the_example_is_written(tmp_path, monkeypatch, capsys):
     path = tmp_path / "separation.toml"
-    assert separate(monkeypatch, "--init", path) == 0
+    assert jaxsky(monkeypatch, "separate", "--init", path) == 0
     assert path.read_text().startswith("# Settings of `jaxsky separate`")
-    assert separate(monkeypatch, "--init", path) == 2
+    assert jaxsky(monkeypatch, "separate", "--init", path) == 2
     capsys.readouterr()
-    assert separate(monkeypatch, path, "--out", tmp_path / "out") == 2
+    assert jaxsky(monkeypatch, "separate", path, "--out", tmp_path / "out") == 2
     assert "LFI_SkyMap_030-BPassCorrected_1024_R3.00_full.fits" in one_sentence(capsys)
 
 
@@ -237,7 +221,7 @@ def test_noise_that_varies(folder, tmp_path, monkeypatch):
         **{'sampler = "emcee"': 'sampler = "none"'},
     )
     out = tmp_path / "out"
-    assert separate(monkeypatch, path, "--out", out) == 0
+    assert jaxsky(monkeypatch, "separate", path, "--out", out) == 0
     result = json.loads((out / "result.json").read_text())
     assert result["converged"]
     assert jax.config.read("jax_enable_x64")

@@ -15,6 +15,7 @@ from fits.pseudo_cl import bin_edges
 from fits.record import fingerprint
 from fits.resolution import Prepared
 from fits.settings import Settings
+from jaxsky.progress import QUIET
 from jaxsky.settings import SettingsError
 
 __all__ = ["Comparison", "check_comparison", "compare"]
@@ -96,7 +97,7 @@ def compare(
     prepared: Prepared,
     regions: Mapping[str, Bool[np.ndarray, " pix"]],
     simulations: Path | None = None,
-    report: Callable[[int, int], None] = lambda done, of: None,
+    report: Callable[[int, int], None] = QUIET.advance,
 ) -> Comparison:
     """Compare the maps with the model of foregrounds, CMB and noise.
 
@@ -127,7 +128,7 @@ def compare(
         settings.analysis.seed,
         simulations,
         f"{fingerprint((prepared, used))} {settings.analysis.seed} {how.lmax}",
-        lambda done: report(done, how.nsims),
+        report,
     )
     scatters = compare_pixels(prepared, model, used, simulated)
     spectra = []

@@ -13,6 +13,7 @@ from fits.realisations import realisations
 from fits.resolution import Prepared
 from jaxsky.checks import check_seed
 from jaxsky.harmonics import analysis, lmax_of, power_spectrum
+from jaxsky.progress import QUIET
 
 __all__ = ["Simulated", "full_sky_spectra", "simulate", "sums_of_squares"]
 
@@ -82,7 +83,7 @@ def simulate(
     seed: int,
     path: Path | None = None,
     mark: str = "",
-    report: Callable[[int], None] = lambda done: None,
+    report: Callable[[int, int], None] = QUIET.advance,
 ) -> Simulated:
     """Realisations of noise and CMB on top of the model's foregrounds.
 
@@ -95,7 +96,7 @@ def simulate(
     nsims, seed : number of realisations; each depends on the seed and its own number only
     path : file that keeps what is done; what it holds already is not made again
     mark : of data and settings; a file with another one is refused
-    report : called with the number of realisations done
+    report : called with the number of realisations done, and that of all
 
     Raises
     ------

@@ -1,7 +1,6 @@
 """A forecast, from its settings to numbers."""
 
 import itertools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -23,6 +22,7 @@ from fits.pseudo_cl import (
 from jaxsky.checks import check_double
 from jaxsky.cmb import camb_spectra, tensor_spectra
 from jaxsky.harmonics import gaussian_beam
+from jaxsky.progress import QUIET, Progress
 from jaxsky.settings_keys import at_key
 
 __all__ = ["FIELDS", "Forecast", "forecast"]
@@ -59,15 +59,13 @@ class Forecast(NamedTuple):
     without_foregrounds: float | None
 
 
-def forecast(
-    settings: ForecastSettings, report: Callable[[str], None] = lambda message: None
-) -> Forecast:
+def forecast(settings: ForecastSettings, progress: Progress = QUIET) -> Forecast:
     """Foreground B modes against primordial ones, and errors from the Fisher matrix.
 
     Parameters
     ----------
     settings : what is forecast
-    report : told what is being done
+    progress : told of each step of the work
 
     Raises
     ------
@@ -78,9 +76,9 @@ def forecast(
         `fits.forecast.fisher.fisher_errors`.
     """
     check_double("A forecast")
-    report("reading templates and mask")
+    progress.step("reading templates and mask")
     setup, spec = build(settings), settings.spectra
-    report("spectra outside the mask")
+    progress.step("spectra outside the mask")
     edges = bin_edges(spec.lmin, spec.lmax, spec.width)
     window = np.asarray(gaussian_beam(setup.fwhm, 2 * edges[-1]))
     spectra = masked_spectra(setup.mask, edges, window=window)
@@ -95,7 +93,7 @@ def forecast(
     equal = {
         name: b_modes.equal_r(spectra, powers[name], law, tensors) for name, law in laws.items()
     }
-    report("Fisher matrix")
+    progress.step("Fisher matrix")
     model, parameters = _model(settings, setup, spectra, tensors, lensed)
     errors, without = _errors(settings, model, parameters)
     return Forecast(

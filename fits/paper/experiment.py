@@ -5,7 +5,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from fits.paper.item import Item, Number, Table, picture_of
+from fits.commands.page import Table
+from fits.paper.item import Item, Number, picture_of
 from fits.paper.patches import disc, draw_patches
 from fits.paper.settings import PaperSettings
 from fits.paper.sources import PAPER_FWHM, Sources

@@ -3,7 +3,9 @@
 import re
 from typing import NamedTuple
 
-__all__ = ["NUMBERS", "Impossible", "Item", "Number", "Table", "key_of", "picture_of"]
+from fits.commands.page import Table
+
+__all__ = ["NUMBERS", "Impossible", "Item", "Number", "picture_of"]
 
 #: Label of the table that is collected from all items.
 NUMBERS = "Numbers of the text"
@@ -11,13 +13,6 @@ NUMBERS = "Numbers of the text"
 
 class Impossible(ValueError):
     """A figure that the settings do not allow, and why in one sentence: the others go on."""
-
-
-class Table(NamedTuple):
-    """A table as text; the first cell of a row is its heading."""
-
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
 
 
 class Number(NamedTuple):
@@ -52,17 +47,6 @@ class Item(NamedTuple):
     table: Table | None = None
     numbers: tuple[Number, ...] = ()
     seconds: float | None = None
-
-
-def key_of(label: str) -> str:
-    """A label as an anchor.
-
-    Examples
-    --------
-    >>> key_of("Figure 1")
-    'figure-1'
-    """
-    return label.lower().replace(" ", "-")
 
 
 def picture_of(label: str) -> str:

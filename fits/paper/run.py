@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
+from fits.commands.page import Section, Table, write_page
 from fits.paper import (
     comparisons,
     experiment,
@@ -13,16 +14,20 @@ from fits.paper import (
     spectral_index,
     templates,
 )
-from fits.paper.item import NUMBERS, Impossible, Item, Table
-from fits.paper.page import write_page
+from fits.paper.item import NUMBERS, Impossible, Item
 from fits.paper.settings import PaperSettings
 from fits.paper.sources import Sources
 from fits.paper.store import Store
 from fits.record import write_log
+from jaxsky.progress import QUIET, Progress
 
 __all__ = ["LOG", "STEPS", "Step", "labels_of", "run"]
 
 LOG = "log.json"
+PAPER = (
+    "Hervías-Caimapo, Bonaldi & Brown (2016), “A new model of the microwave polarized sky for CMB "
+    "experiments”"
+)
 
 
 class Step(NamedTuple):
@@ -112,7 +117,7 @@ def run(
     *,
     resume: bool = False,
     overwrite: bool = False,
-    report: Callable[[str, int, int], None] = lambda label, done, of: None,
+    progress: Progress = QUIET,
     steps: Iterable[Step] | None = None,
 ) -> list[Item]:
     """Make figures and tables, and `index.html`, which shows all that are in the folder.
@@ -125,7 +130,7 @@ def run(
     resume : keep what is in the folder and make what is missing
     overwrite : make again what is wanted; what else is in the folder is kept if it is of these
         settings
-    report : called before each item with its label, how many are done, and of how many
+    progress : told of each item
     steps : instead of `STEPS`
 
     Returns
@@ -145,7 +150,8 @@ def run(
     store, sources = Store(out, settings, resume, overwrite), Sources(settings)
     todo = [s for s in steps if s.label in wanted and (overwrite or not store.has(s.label))]
     for done, step in enumerate(todo):
-        report(step.label, done, len(todo))
+        progress.step(step.label)
+        progress.advance(done, len(todo))
         start = time.perf_counter()
         try:
             item = step.make(settings, sources, out)
@@ -163,5 +169,18 @@ def _show(settings: PaperSettings, sources: Sources, store: Store, order: list[s
     items = store.ordered(order)
     numbers = _numbers(items)
     items = [*items, numbers] if numbers else items
-    write_page(store.out / "index.html", settings.title, sources.description, items)
+    seconds = sum(item.seconds or 0 for item in items)
+    write_page(
+        store.out / "index.html",
+        f"A model of the microwave polarized sky: {settings.title}",
+        [sources.description, f"Figures and tables of {PAPER}, made again and numbered as there."],
+        [_section(item) for item in items],
+        f"Written by `jaxsky paper` in {seconds:.0f} s,",
+    )
     return items
+
+
+def _section(item: Item) -> Section:
+    note = item.differs if item.label == NUMBERS else f"Differs from the paper: {item.differs}"
+    title = f"{item.label}: {item.title}"
+    return Section(title, item.caption, item.picture, item.table, note)

@@ -5,7 +5,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from fits.paper.item import Item, Number, Table
+from fits.commands.page import Table
+from fits.paper.item import Item, Number
 from fits.paper.settings import PaperSettings
 from fits.record import write_json
 

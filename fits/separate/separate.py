@@ -1,6 +1,6 @@
 """A component separation, from its settings to the tensor-to-scalar ratio."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +26,7 @@ from fits.separation.tensor_ratio import TensorFit, fit_tensors, power_model
 from jaxsky.checks import check_double
 from jaxsky.cmb import camb_spectra, tensor_spectra
 from jaxsky.harmonics import gaussian_beam
+from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import SettingsError
 
 __all__ = ["SAMPLED", "Separation", "separate"]
@@ -91,8 +92,7 @@ def separate(
     settings: SeparateSettings,
     setup: Setup,
     out: Path | None = None,
-    report: Callable[[str], None] = lambda message: None,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: Progress = QUIET,
 ) -> Separation:
     """Fit the laws, separate the components, and measure r.
 
@@ -101,8 +101,7 @@ def separate(
     settings : how
     setup : what is separated, from `fits.separate.setup.build`
     out : folder that keeps simulations and chains; what it holds is not made again
-    report : told what is being done
-    progress : told the number of simulations done
+    progress : told of each step of the work
 
     Raises
     ------
@@ -117,19 +116,19 @@ def separate(
     main, domain, priors = settings.separation, setup.domain, settings.priors()
     cmb = settings.cmb
     assert cmb is not None  # as the settings see to
-    report("spectral parameters")
+    progress.step("spectral parameters")
     like = domain.likelihood(setup.data)
     fit = fit_spectra(like, priors=priors, throw=False)
     # What no law describes is separated nevertheless, and said.
     fit.checked(throw=fit.message != misfit(fit.chi2, fit.dof))
     response = Response(like, fit.best_fit, priors)
-    report("components")
+    progress.step("components")
     best = like.named(jnp.asarray(response.theta))
     found = domain.components(like, best, setup.data)
     maps = domain.maps(found)
     row = tuple(like.sky).index(cmb)
 
-    report("spectra")
+    progress.step("simulations")
     window, spectra = _spectra(settings.tensors, setup.mask, main.nside, main.fwhm)
     tensors = tensor_spectra(window.size - 1)
     # Simulated and modelled, lensing is what the settings say.
@@ -140,10 +139,10 @@ def separate(
     mark = _mark(settings, setup)
     simulated = Simulated(
         *realisations(
-            realisation.of, Simulated._fields, main.nsims, main.seed, kept, mark, progress
+            realisation.of, Simulated._fields, main.nsims, main.seed, kept, mark, progress.advance
         )
     )
-    report("tensor-to-scalar ratio")
+    progress.step("tensor-to-scalar ratio")
     # What the spectra know of E in B is part of the model.
     EE = lensed[1, : spectra.lmax + 1]
     leaked = simulated.leaked.mean(axis=0) - spectra.windows[1, :, 0] @ EE
@@ -164,8 +163,8 @@ def separate(
     sigma, covariance = _errors(settings, like, fit, simulated)
     chain = None
     if main.sampler != "none" and len(fit.labels) <= SAMPLED:
-        report("posterior")
-        chain = _chain(settings, setup, like, fit, simulated, out)
+        progress.step("posterior")
+        chain = _chain(settings, setup, like, fit, simulated, out, progress)
     return Separation(
         setup,
         like,
@@ -235,7 +234,7 @@ def _errors(settings, like, fit, simulated):
     return sizes, np.where(determined & determined[:, None], covariance, np.nan)
 
 
-def _chain(settings, setup, like, fit, simulated, out):
+def _chain(settings, setup, like, fit, simulated, out, progress):
     """Samples of the posterior; in pixels with the errors of the simulations."""
     main = settings.separation
     size = int(np.isfinite(np.asarray(like.flat(fit.best_fit))).sum())
@@ -252,7 +251,7 @@ def _chain(settings, setup, like, fit, simulated, out):
         nwalkers=nwalkers if main.sampler == "emcee" else None,
         seed=main.seed,
         backend=backend,
-        progress=False,
+        progress=progress.advance,
         throw=False,
     )
     if main.domain == "harmonic" or not samples.details:

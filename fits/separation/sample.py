@@ -5,7 +5,7 @@ few evaluations for a sample that does not depend on the last one, however many 
 are. It moves in the numbers of `fits.separation.posterior`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -99,7 +99,7 @@ def _advanced(posterior, begun, key, first, nwarmup, steps):
     return jax.lax.scan(step, begun, first + jnp.arange(steps))
 
 
-def _course(posterior, z, key, first, last, nwarmup, bar) -> dict[str, np.ndarray]:
+def _course(posterior, z, key, first, last, nwarmup, advance) -> dict[str, np.ndarray]:
     """The steps first ... last - 1 of chains that begin at z, in which the step size is tuned."""
     for _ in range(30):
         chains = _begun(posterior, z)
@@ -115,7 +115,7 @@ def _course(posterior, z, key, first, last, nwarmup, bar) -> dict[str, np.ndarra
     for number in range(first, last, BLOCK):
         state, course = _advanced(posterior, state, key, number, nwarmup, BLOCK)
         courses.append(jax.tree.map(np.asarray, course))
-        bar.update(min(BLOCK, last - number))
+        advance(min(number + BLOCK, last))
     return {k: np.concatenate([c[k] for c in courses])[: last - first] for k in courses[0]}
 
 
@@ -123,14 +123,20 @@ def _nuts(posterior, labels, chi2_of, *, seed, nsteps, nwarmup, nchains, progres
     z = SPREAD * np.random.default_rng(seed).normal(size=(nchains, len(labels)))
     key, total = jax.random.key(seed), nwarmup + nsteps
     pilot = nwarmup // 2 // BLOCK * BLOCK
-    with tqdm(total=total, disable=not progress, delay=2, leave=False) as bar:
+    with tqdm(total=total, disable=progress is not True, delay=2, leave=False) as bar:
+
+        def advance(done: int) -> None:
+            bar.update(done - bar.n)
+            if callable(progress):
+                progress(done, total)
+
         if pilot and posterior.root.ndim == 2:
-            chain = _course(posterior, z, key, 0, pilot, pilot, bar)["chain"]
+            chain = _course(posterior, z, key, 0, pilot, pilot, advance)["chain"]
             posterior = posterior.adapted(chain[pilot // 3 :].reshape(-1, len(labels)))
             z = posterior.coordinates(chain[-1])
         else:
             pilot = 0
-        course = _course(posterior, z, key, pilot, total, nwarmup, bar)
+        course = _course(posterior, z, key, pilot, total, nwarmup, advance)
     course = {name: values[nwarmup - pilot :] for name, values in course.items()}
     rhat, effective = agreement(course["chain"])
     worst, least = int(np.argmax(rhat)), float(np.min(effective))
@@ -222,7 +228,7 @@ def sample_spectra(
     nwalkers: int | None = None,
     seed: int = 0,
     backend: ChainFile | None = None,
-    progress: bool = True,
+    progress: bool | Callable[[int, int], None] = True,
     throw: bool = True,
 ) -> FitResult:
     """Samples of the posterior of spectral parameters.
@@ -247,7 +253,7 @@ def sample_spectra(
     nwalkers : "emcee": size of the ensemble (32)
     seed : of the start positions and the moves
     backend : "emcee": file of the chain, as for `fits.sample.sample`
-    progress : show a progress bar
+    progress : show a progress bar, or call a function with the steps done and those in all
     throw : raise if the chains are too short or do not agree
 
     Returns

@@ -8,10 +8,10 @@ from typing import Annotated
 import typer
 
 import jaxsky
-from jaxsky.cli import compare, data, fit, forecast, paper, separate, simulate
-from jaxsky.cli.console import replace_unprintable
-from jaxsky.cli.errors import print_error
-from jaxsky.cli.interrupt import prompt
+from fits.commands import compare, data, fit, forecast, paper, separate, simulate
+from fits.commands.console import replace_unprintable
+from fits.commands.errors import print_error
+from fits.commands.interrupt import prompt
 from jaxsky.io.folders import cache_folder
 from jaxsky.programs import keep_programs
 
@@ -20,20 +20,6 @@ __all__ = ["app", "main"]
 #: Parameters of glibc's mallopt: M_ARENA_MAX, M_MMAP_THRESHOLD.
 MALLOC = {-8: 1, -3: 8 * 2**20}
 
-app = typer.Typer(
-    help="A JAX-differentiable model of the polarized microwave sky, with the tools to fit it.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
-)
-app.command()(simulate.simulate)
-app.command()(fit.fit)
-app.command()(compare.compare)
-app.command()(separate.separate)
-app.command()(forecast.forecast)
-app.command()(paper.paper)
-app.add_typer(data.data, name="data")
-
 
 def _version(value: bool) -> None:
     if value:
@@ -41,13 +27,21 @@ def _version(value: bool) -> None:
         raise typer.Exit
 
 
+Version = Annotated[
+    bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+]
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
+
+
 @app.callback()
-def options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
-    ] = False,
-) -> None:
+def options(version: Version = False) -> None:
     """A JAX-differentiable model of the polarized microwave sky, with the tools to fit it."""
+
+
+for _command in (simulate, fit, compare, separate, forecast, paper):
+    _name = _command.__name__.rpartition(".")[2]
+    app.command(_name)(getattr(_command, _name))
+app.add_typer(data.data, name="data")
 
 
 def _return_memory() -> None:

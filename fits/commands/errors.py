@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import jaxsky
-from jaxsky.cli.console import console
+from fits.commands.console import console
 
 __all__ = ["logged", "print_error"]
 

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from jaxsky.cli.console import console
+from fits.commands.console import console
 
 __all__ = ["interruptible", "prompt"]
 

@@ -8,7 +8,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, Trans
 from rich.table import Table
 from rich.text import Text
 
-from jaxsky.cli.console import console, print_tables
+from fits.commands.console import console, print_tables
 
 __all__ = ["data"]
 
@@ -62,7 +62,7 @@ def list_products(products: Words = None, folder: Folder = None) -> None:
             count = sum((folder / p.name).is_file() for p in members)
             size = total_size(members)
             table.add_row(name, kept.title, "", "", size, f"{count} of {len(members)}")
-    print_tables(table, width=None if console.is_terminal else 200)
+    print_tables([table], width=None if console.is_terminal else 200)
 
 
 @data.command()

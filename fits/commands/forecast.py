@@ -1,0 +1,47 @@
+"""`jaxsky forecast`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fits.commands.run import (
+    Init,
+    Kind,
+    Options,
+    Overwrite,
+    Report,
+    Run,
+    SettingsPath,
+    Values,
+    run,
+)
+
+__all__ = ["forecast"]
+
+RESULTS = ("forecast.json", "log.json", "bb.png", "fisher.png")
+
+
+def forecast(
+    settings_file: SettingsPath = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/forecast"),
+    init: Init = False,
+    values: Values = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Forecast B modes: foregrounds against primordial ones, and errors on r and the laws."""
+    from fits.forecast.settings import DEFAULT, EXAMPLE, ForecastSettings
+
+    kind = Kind(ForecastSettings, DEFAULT, EXAMPLE, "forecast.toml", RESULTS, resumable=False)
+    run(kind, _work, Options(settings_file, out, init, values, overwrite=overwrite))
+
+
+def _work(settings, command: Run) -> Report:
+    from fits.forecast import report
+    from fits.forecast.forecast import forecast as forecast_errors
+
+    found = forecast_errors(settings, command.steps)
+    command.steps.step("drawing")
+    command.begin()
+    written = report.write_report(command.out, found, settings, command.steps.seconds)
+    return Report(found.setup.description, report.tables(found), report.warnings(found), written)

@@ -1,0 +1,154 @@
+"""The page that shows results: static, with nothing from outside its folder."""
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.table import Table as TerminalTable
+
+import jaxsky
+from jaxsky.io import write_text
+
+__all__ = ["Section", "Table", "table_of", "write_page"]
+
+STYLE = """
+body { font: 17px/1.5 Georgia, "Times New Roman", serif; color: #222; background: #fff;
+  max-width: 56rem; margin: 2rem auto 4rem; padding: 0 1rem; }
+h1 { font-size: 1.7rem; line-height: 1.2; margin-bottom: .3rem; }
+h2 { font-size: 1.15rem; margin: 0 0 .8rem; }
+nav ol { columns: 2; padding-left: 1.2rem; list-style: none; padding: 0; }
+section { border-top: 1px solid #ccc; margin-top: 2.2rem; padding-top: 1.2rem; }
+figure { margin: 0 0 1rem; text-align: center; }
+img { max-width: 100%; max-height: 48rem; }
+.note { background: #f4f1ea; border-left: 3px solid #e69f00; padding: .4rem .8rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font: 13.5px/1.4 "Helvetica Neue", Arial, sans-serif; }
+th, td { padding: .25rem .55rem; border-bottom: 1px solid #ddd; text-align: left;
+  vertical-align: top; }
+td.n { white-space: nowrap; font-variant-numeric: tabular-nums; }
+thead th { border-bottom: 2px solid #888; }
+a { color: #0072b2; }
+.small { color: #666; font-size: .85rem; }
+@media print { nav { display: none; } section { break-inside: avoid; } }
+"""
+
+
+class Table(NamedTuple):
+    """A table as text; the first cell of a row is its heading."""
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+class Section(NamedTuple):
+    """A part of a page.
+
+    Parameters
+    ----------
+    title, caption : heading, and what is shown
+    picture : file in the folder of the page
+    table : what is shown instead of a picture, or below it
+    note : what is to be known about it; before the first colon, if there is one, in bold
+    """
+
+    title: str
+    caption: str = ""
+    picture: str | None = None
+    table: Table | None = None
+    note: str = ""
+
+
+def table_of(table: TerminalTable) -> Table:
+    """A table of the terminal as one of a page."""
+    header = tuple(str(column.header) for column in table.columns)
+    cells = [[str(cell) for cell in column.cells] for column in table.columns]
+    return Table(header, tuple(zip(*cells, strict=True)))
+
+
+def key_of(title: str) -> str:
+    """A title as an anchor.
+
+    Examples
+    --------
+    >>> key_of("Figure 1: the sky")
+    'figure-1'
+    """
+    return title.partition(":")[0].lower().replace(" ", "-")
+
+
+def _table(table: Table) -> str:
+    """A table; cells that begin with a number do not break."""
+
+    def cell(text: str) -> str:
+        number = len(text) < 24 and text[:1] in "0123456789-" and bool(text)
+        return f'<td class="n">{escape(text)}</td>' if number else f"<td>{escape(text)}</td>"
+
+    head = "".join(f'<th scope="col">{escape(word)}</th>' for word in table.header)
+    rows = "\n".join(
+        f'<tr><th scope="row">{escape(row[0])}</th>{"".join(map(cell, row[1:]))}</tr>'
+        for row in table.rows
+    )
+    return (
+        f'<div class="wide"><table>\n<thead><tr>{head}</tr></thead>\n'
+        f"<tbody>\n{rows}\n</tbody></table></div>"
+    )
+
+
+def _section(section: Section) -> str:
+    title = escape(section.title)
+    parts = [f'<section id="{key_of(title)}">', f"<h2>{title}</h2>"]
+    if section.picture is not None:
+        picture = escape(section.picture)
+        parts.append(
+            f'<figure><a href="{picture}"><img src="{picture}" alt="{title}"></a></figure>'
+        )
+    if section.caption:
+        parts.append(f"<p>{escape(section.caption)}</p>")
+    if section.table is not None:
+        parts.append(_table(section.table))
+    if section.note:
+        what, colon, rest = section.note.partition(": ")
+        words = f"<b>{escape(what)}:</b> {escape(rest)}" if colon else escape(what)
+        parts.append(f'<p class="note">{words}</p>')
+    return "\n".join([*parts, "</section>"])
+
+
+def write_page(
+    path: Path, title: str, intro: Sequence[str], sections: Sequence[Section], end: str
+) -> None:
+    """Write the page, whole or not at all.
+
+    Parameters
+    ----------
+    path : of the page, in the folder of the pictures
+    title : its heading
+    intro : paragraphs below it
+    sections : in the order in which they are shown
+    end : a last line
+    """
+    links = "\n".join(
+        f'<li><a href="#{key_of(s.title)}">{escape(s.title)}</a></li>' for s in sections
+    )
+    write_text(
+        path,
+        f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{escape(title)}</title>
+<style>{STYLE}</style>
+</head>
+<body>
+<h1>{escape(title)}</h1>
+{"".join(f"<p>{escape(words)}</p>" for words in intro)}
+<nav><ol>
+{links}
+</ol></nav>
+{"".join(map(_section, sections))}
+<p class="small">{escape(end)} jaxsky {jaxsky.__version__}.</p>
+</body>
+</html>
+""",
+    )

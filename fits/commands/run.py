@@ -1,0 +1,256 @@
+"""What all commands do: settings, folder, steps, and the report of what was found.
+
+A command is a function from its settings to a `Report`; the rest is here, once.
+"""
+
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import typer
+from rich.table import Table
+
+from fits.commands.console import Steps, console, print_tables, print_written, warn
+from fits.commands.errors import logged
+from fits.commands.interrupt import interruptible
+from fits.commands.page import Section, table_of, write_page
+from jaxsky.io.folders import ALL, Folder, occupied
+from jaxsky.settings import SettingsFile, load
+from jaxsky.settings_keys import of_file
+
+__all__ = [
+    "Init",
+    "Kind",
+    "Options",
+    "Overwrite",
+    "Report",
+    "Resume",
+    "Run",
+    "SettingsPath",
+    "Values",
+    "results_folder",
+    "run",
+]
+
+#: Steps and their times, and the page that shows the results, in every folder.
+LOG, PAGE = "log.txt", "index.html"
+
+SettingsPath = Annotated[
+    Path | None,
+    typer.Argument(metavar="[SETTINGS.toml]", help="Settings; without, those of the embedded sky."),
+]
+Init = Annotated[
+    bool, typer.Option("--init", help="Write a commented example of the settings and stop.")
+]
+Values = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Any key of the settings; repeatable."),
+]
+Resume = Annotated[bool, typer.Option("--resume", help="Keep what is in --out, and go on with it.")]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace the results that are in --out.")
+]
+
+
+class Kind(NamedTuple):
+    """What a command works with.
+
+    Parameters
+    ----------
+    settings : their type
+    embedded, example : settings that are taken without a file, and those that --init writes
+    name : of the file that --init writes
+    results : patterns of what is in the folder of the results
+    resumable : whether a stopped command can be gone on with
+    """
+
+    settings: type[SettingsFile]
+    embedded: Path
+    example: Path
+    name: str
+    results: tuple[str, ...]
+    resumable: bool = True
+
+
+class Options(NamedTuple):
+    """What the command line says, to any command."""
+
+    settings_file: Path | None
+    out: Path
+    init: bool = False
+    values: Sequence[str] | None = None
+    resume: bool = False
+    overwrite: bool = False
+
+
+class Report(NamedTuple):
+    """What a command has found, to be shown.
+
+    Parameters
+    ----------
+    description : what was looked at, in a sentence
+    tables, warnings : results, and what a user should know before using them
+    written : files, but for log and page
+    remark : what else is said at the end
+    """
+
+    description: str
+    tables: Sequence[Table] = ()
+    warnings: Sequence[str] = ()
+    written: Sequence[Path] = ()
+    remark: str = ""
+
+
+class Run(NamedTuple):
+    """A command at work: what it may write, and to whom it says what it does."""
+
+    options: Options
+    kind: Kind
+    folder: Folder
+    steps: Steps
+
+    @property
+    def out(self) -> Path:
+        """Folder of the results."""
+        return self.options.out
+
+    def begin(self) -> None:
+        """Nothing is wrong with the input: what is to be replaced goes, and the log begins."""
+        if self.options.overwrite:
+            self.folder.remove(self.kind.results)
+        self.steps.keep(self.out / LOG)
+
+
+def run(
+    kind: Kind,
+    work: Callable[[Any, Run], Report],
+    options: Options,
+    overrides: Mapping[str, Mapping[str, Any]] | None = None,
+    part: range = ALL,
+) -> None:
+    """Run a command.
+
+    Parameters
+    ----------
+    kind : what it works with
+    work : from settings to what was found; calls `Run.begin` before it writes
+    options : of the command line
+    overrides : by table, values of options that are called as a key is
+    part : of the results that is made, see `jaxsky.io.folders.occupied`
+
+    Raises
+    ------
+    ValueError
+        For settings that cannot work, and for a folder with results that are neither to be kept
+        nor replaced, or in which another command works.
+    """
+    if options.init:
+        _write_example(options.settings_file or Path(kind.name), kind.example)
+        return
+    path, out = options.settings_file or kind.embedded, options.out
+    settings = load(path, kind.settings, overrides, options.values or ())
+    with (
+        of_file(path),
+        results_folder(
+            out,
+            kind.results,
+            resume=options.resume if kind.resumable else None,
+            overwrite=options.overwrite,
+            part=part,
+        ) as folder,
+        Steps() as steps,
+    ):
+        import matplotlib as mpl
+
+        mpl.use("Agg")  # pictures go to files
+        report = work(settings, Run(options, kind, folder, steps))
+        if kind.results:
+            _show(out, settings.title, report, steps.seconds)
+    console.print(report.description)
+    print_tables(report.tables)
+    for sentence in report.warnings:
+        warn(sentence)
+    if report.written:
+        pages = [out / PAGE] if kind.results else []
+        print_written([*pages, *report.written, out / LOG])
+    if report.remark:
+        console.print(report.remark, soft_wrap=True)
+
+
+@contextmanager
+def results_folder(
+    out: Path,
+    results: Sequence[str] = (),
+    *,
+    resume: bool | None,
+    overwrite: bool,
+    part: range = ALL,
+) -> Iterator[Folder]:
+    """The folder of the results, in which no other command writes the same meanwhile.
+
+    Parameters
+    ----------
+    out : the folder; made if it is not there, and removed again if nothing was written
+    results : patterns of what the command leaves in it
+    resume, overwrite : results that are there are kept or replaced, and refused if neither is
+        set. `resume` is None for commands that cannot be resumed.
+    part : what of the results is made, see `jaxsky.io.folders.occupied`
+
+    Raises
+    ------
+    ValueError
+        If another command works in the folder, or there are results that are not to be kept or
+        replaced.
+    """
+    if resume and overwrite:
+        raise ValueError("--resume and --overwrite exclude each other.")
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out}: is not a folder; choose another --out.")
+    stopped = interruptible("" if resume is None else "; resume with --resume")
+    with stopped, occupied(out, part) as folder, logged(out):
+        if not folder.locked:
+            warn(
+                f"{out}: this file system has no locks, so see to it that no other command writes "
+                "there meanwhile."
+            )
+        if not (resume or overwrite) and any(any(out.glob(name)) for name in results):
+            go_on = "" if resume is None else "go on with --resume, "
+            raise ValueError(
+                f"{out}: holds results already; {go_on}replace them with --overwrite, or choose "
+                "another --out."
+            )
+        folder.clean()
+        try:
+            yield folder
+        except Exception:
+            if [path.name for path in out.glob("[!.]*")] == [LOG]:
+                (out / LOG).unlink()  # of nothing that would be in the folder
+            raise
+
+
+def _show(out: Path, title: str, report: Report, seconds: float) -> None:
+    """Write the page of a command's tables and pictures."""
+    tables = [
+        Section(str(t.title or "Results"), str(t.caption or ""), table=table_of(t))
+        for t in report.tables
+    ]
+    pictures = [
+        Section(path.stem.replace("_", " "), picture=path.name)
+        for path in report.written
+        if path.suffix == ".png"
+    ]
+    warnings = [f"(!) {sentence}" for sentence in report.warnings]
+    command = " ".join(["jaxsky", *sys.argv[1:]])
+    end = f"Written by `{command}` in {seconds:.0f} s,"
+    intro = [report.description, *warnings]
+    write_page(out / PAGE, title or "jaxsky", intro, [*tables, *pictures], end)
+
+
+def _write_example(path: Path, example: Path) -> None:
+    """Write an example of the settings, unless the file exists."""
+    if path.exists():
+        raise ValueError(f"{path}: exists already and is left as it is.")
+    path.write_text(example.read_text())
+    print_written([path])

@@ -1,0 +1,85 @@
+"""`jaxsky separate`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fits.commands.run import (
+    Init,
+    Kind,
+    Options,
+    Overwrite,
+    Report,
+    Resume,
+    Run,
+    SettingsPath,
+    Values,
+    run,
+)
+
+__all__ = ["separate"]
+
+RESULTS = (
+    "result.json",
+    "log.json",
+    "components.fits",
+    "residuals.fits",
+    "parameters.fits",
+    "components.png",
+    "residuals.png",
+    "parameters.png",
+    "spectra.png",
+    "r.png",
+    "posterior.png",
+    "simulations.npz",
+    "chain.h5",
+)
+
+
+def separate(
+    settings_file: SettingsPath = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/separate"),
+    init: Init = False,
+    seed: Annotated[
+        int | None,
+        typer.Option(help="Seed of simulations, chains, and maps of the embedded sky."),
+    ] = None,
+    nside: Annotated[int | None, typer.Option(help="Common nside of the maps.")] = None,
+    domain: Annotated[
+        str | None, typer.Option(help="pixel, or harmonic with a beam for each band.")
+    ] = None,
+    nsims: Annotated[
+        int | None, typer.Option(min=20, help="Number of simulations of the noise.")
+    ] = None,
+    values: Values = None,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Separate CMB and foregrounds by their laws, and measure r from the cleaned B modes."""
+    from fits.separate.settings import EMBEDDED, EXAMPLE, SeparateSettings
+
+    kind = Kind(SeparateSettings, EMBEDDED, EXAMPLE, "separation.toml", RESULTS)
+    overrides = {"seed": seed, "nside": nside, "domain": domain, "nsims": nsims}
+    options = Options(settings_file, out, init, values, resume, overwrite)
+    run(kind, _work, options, {"separation": overrides})
+
+
+def _work(settings, command: Run) -> Report:
+    from fits.results import FitError
+    from fits.separate import report
+    from fits.separate.separate import separate as separate_maps
+    from fits.separate.setup import build
+
+    command.steps.step("reading and preparing maps")
+    setup = build(settings)
+    command.begin()
+    try:
+        found = separate_maps(settings, setup, command.out, command.steps)
+    except FitError as error:
+        raise ValueError(f"The spectral parameters were not found. {error}") from None
+    command.steps.step("drawing")
+    written = report.write_report(command.out, found, settings, command.steps.seconds)
+    return Report(
+        setup.description, report.tables(found), report.warnings(found, settings), written
+    )

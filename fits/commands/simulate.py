@@ -1,0 +1,117 @@
+"""`jaxsky simulate`."""
+
+import statistics
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fits.commands.run import (
+    Init,
+    Kind,
+    Options,
+    Overwrite,
+    Report,
+    Resume,
+    Run,
+    SettingsPath,
+    Values,
+    run,
+)
+from jaxsky.io.folders import ALL
+
+__all__ = ["simulate"]
+
+#: What is simulated with --only: from the names of the foregrounds.
+ONLY: dict[str, Callable[[list[str]], list[str]]] = {
+    "noise": lambda foregrounds: ["noise"],
+    "signal": lambda foregrounds: [*foregrounds, "cmb"],
+    "foregrounds": lambda foregrounds: foregrounds,
+    "cmb": lambda foregrounds: ["cmb"],
+}
+
+
+def simulate(
+    settings_file: SettingsPath = None,
+    out: Annotated[Path, typer.Option(help="Folder for the maps.")] = Path("results/simulate"),
+    init: Init = False,
+    nsims: Annotated[int, typer.Option(min=1, help="Number of realisations.")] = 1,
+    first: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Number of the first one.")] = 0,
+    only: Annotated[
+        str | None, typer.Option(help=f"Simulate one thing only: {', '.join(ONLY)}.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of all realisations.")] = None,
+    nside: Annotated[int | None, typer.Option(help="Resolution of the maps.")] = None,
+    values: Values = None,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Simulate maps of the microwave sky as an experiment observes it."""
+    from jaxsky.experiment import DEFAULT, EXAMPLE, Experiment
+
+    if only is not None and only not in ONLY:
+        raise ValueError(f"--only must be one of {', '.join(ONLY)}, not {only!r}.")
+    indices = range(first, first + nsims)
+
+    def work(settings: Experiment, command: Run) -> Report:
+        if only is not None:
+            main = {"include": ONLY[only](settings.foregrounds())}
+            settings = settings.model_copy(
+                update={"experiment": settings.experiment.model_copy(update=main)}
+            )
+        return _work(settings, command, indices)
+
+    # What is kept and what is replaced is seen to map by map. With --overwrite all realisations
+    # are removed, so nobody else may be making any.
+    kind = Kind(Experiment, DEFAULT, EXAMPLE, "experiment.toml", ())
+    options = Options(settings_file, out, init, values, resume, overwrite)
+    part = ALL if overwrite else indices
+    run(kind, work, options, {"experiment": {"seed": seed, "nside": nside}}, part)
+
+
+def _work(settings, command: Run, indices: range) -> Report:
+    from jaxsky import experiment, montecarlo, plots
+    from jaxsky.io import read_maps
+
+    out, steps, options = command.out, command.steps, command.options
+    steps.step("reading templates")
+    montecarlo.check_folder(out, settings, options.resume, options.overwrite, indices)
+    setup = experiment.build(settings)
+    names = setup.observation.names
+    seconds, notes, count = {}, dict[str, None](), len(indices) * len(names)
+    steps.step("simulating")
+    for done, file in enumerate(
+        montecarlo.run(
+            settings,
+            setup,
+            out,
+            indices,
+            options.overwrite,
+            lambda note: notes.setdefault(note),
+            lambda: command.folder.narrow(indices),
+        )
+    ):
+        steps.advance(done + 1, count)
+        if file.seconds is not None:
+            seconds[file.path] = file.seconds
+    written = [out / "sim_*"]
+    if settings.experiment.sheet:
+        steps.step("drawing")
+        written.append(out / f"sim_{indices.start:05d}.png")
+        plots.contact_sheet(
+            written[-1],
+            montecarlo.paths(out, names, indices.start),
+            lambda path: read_maps(path, fields=["Q", "U"], missing=[]).maps,
+            setup.observation.lmax,
+            settings.experiment.unit,
+            settings.title,
+        )
+    kept = count - len(seconds)
+    rate = f"{statistics.median(seconds.values()):.2g} s a band, " if seconds else ""
+    remark = (
+        f"Written: {len(seconds)} maps in {' and '.join(map(str, written))}"
+        + (f"; {kept} maps were there already" if kept else "")
+        + f" ({rate}{steps.seconds:.1f} s in all)."
+    )
+    return Report(setup.description, (), list(notes), (), remark)

@@ -1,0 +1,5 @@
+"""`python -m jaxsky`: the command line."""
+
+from fits.app import main
+
+main()

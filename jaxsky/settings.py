@@ -359,7 +359,7 @@ def _assigned(assignment: str) -> dict[str, Any]:
         If it is none.
     """
     key, equals, value = assignment.partition("=")
-    for line in (assignment, f"{key} = {json.dumps(value.strip())}"):
+    for line in (assignment, f"{key} = {json.dumps(value.strip())}") if equals else ():
         try:
             return tomllib.loads(line)
         except (tomllib.TOMLDecodeError, RecursionError):

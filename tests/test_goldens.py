@@ -27,6 +27,7 @@ PATH = Path(__file__).with_name("goldens.json")
 #: Relative to the largest number of an entry: sums in another order differ by less.
 TOLERANCE = 1e-9
 NSIDE = 8
+jax.config.update("jax_enable_x64", True)  # before the bands below, where this is a script
 BANDS = {f"{c:g}": Bandpass.top_hat(c, 0.25 * c, samples=5) for c in (30.0, 95.0, 220.0, 353.0)}
 START = {"dust.beta_dust": 1.55, "synchrotron.beta_syn": 3.05}
 #: Steps from there at which likelihoods are taken.
@@ -150,7 +151,6 @@ def test_no_golden_is_left_over(goldens):
 
 
 if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
     entries = {name: [float(f"{x:.12g}") for x in values] for name, values in numbers()}
     lines = [f"{json.dumps(name)}: {json.dumps(values)}" for name, values in entries.items()]
     PATH.write_text("{\n" + ",\n".join(lines) + "\n}\n")

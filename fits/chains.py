@@ -1,6 +1,5 @@
 """The file of a chain of emcee: whole at any moment, and checked before a run goes on with it."""
 
-import copy
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -71,7 +70,10 @@ class ChainFile(emcee.backends.HDFBackend):
         if not self._pending:
             self._written = int(self.iteration)
         # emcee goes on to change the arrays of the state it hands over.
-        self._pending.append((copy.deepcopy(state), accepted.copy()))
+        kept = emcee.State(
+            state.coords.copy(), state.log_prob.copy(), random_state=state.random_state
+        )
+        self._pending.append((kept, accepted.copy()))
         if time.monotonic() > self._due:
             self.flush()
 

@@ -157,6 +157,8 @@ def content(out: Path) -> dict:
                         found[f"{name}{data.name}"] = (key, data.shape, data[()].tobytes())
                     attributes = {k: np.asarray(v).tobytes() for k, v in group.attrs.items()}
                     found[f"{name}{group.name}"] = attributes
+        elif name == "log.txt":
+            continue  # times of steps
         elif path.suffix == ".html":
             found[name] = re.sub(r"in \d+ s", "", path.read_text())
         else:

@@ -21,6 +21,7 @@ from fits.separation.tensor_ratio import fit_tensors
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis
 from jaxsky.io import InputError
+from jaxsky.progress import Progress
 from jaxsky.settings import SettingsError
 
 NSIDE, FWHM = 16, 360.0
@@ -241,11 +242,16 @@ def test_more_parameters_than_can_be_sampled_are_named(monkeypatch):
 def test_simulations_are_kept_and_gone_on_with(tmp_path):
     how, setup, _ = separated()
     counts = []
-    again = separate(how, setup, tmp_path, progress=counts.append)
+
+    class Counted(Progress):
+        def advance(self, done, of):
+            counts.append(done)
+
+    again = separate(how, setup, tmp_path, Counted())
     assert counts == list(range(21))
     counts.clear()
     more = how.model_copy(update={"separation": how.separation.model_copy(update={"nsims": 22})})
-    found = separate(more, setup, tmp_path, progress=counts.append)
+    found = separate(more, setup, tmp_path, Counted())
     assert counts == [20, 21, 22]
     np.testing.assert_array_equal(found.simulated.total[:20], again.simulated.total)
     other = settings(tensors={"A_lens": 0.5}, separation={"sampler": "none"})

@@ -242,7 +242,7 @@ def _show(out: Path, title: str, report: Report, seconds: float) -> None:
         if path.suffix == ".png"
     ]
     warnings = [f"(!) {sentence}" for sentence in report.warnings]
-    command = " ".join(["jaxsky", *sys.argv[1:]])
+    command = " ".join(["jaxsky", *sys.argv[1:2]])
     end = f"Written by `{command}` in {seconds:.0f} s,"
     intro = [report.description, *warnings]
     write_page(out / PAGE, title or "jaxsky", intro, [*tables, *pictures], end)

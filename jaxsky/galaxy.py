@@ -39,6 +39,8 @@ NSIDE_SCALE = 64
 SYNCHROTRON_FRACTION = 0.75
 #: Steps along the line of sight; the maps are then converged to about 1e-3 of their rms.
 STEPS = 96
+#: Pixels that are integrated at once.
+BLOCK = 12 * 32**2
 #: The steps are equal in ln(1 + s / STEP_SCALE), from the Sun to s = FARTHEST [kpc].
 STEP_SCALE, FARTHEST = 0.1, 30.0
 #: Distances of the shells of independent turbulence [kpc].
@@ -171,6 +173,24 @@ def _geometry(nside: int) -> _Geometry:
     return _Geometry(theta, phi, ell, place)
 
 
+def _sine_and_cosine(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Sine and cosine to some roundings, in a tenth of the time of XLA's, which do one at a time.
+
+    The series at an eighth of the angle, doubled three times, with 1 - cos in place of the cosine.
+    """
+    z = (x - 2 * np.pi * jnp.round(x / (2 * np.pi))) / 8
+    square = z**2
+    sine = versine = 1.0
+    for n in (156, 110, 72, 42, 20, 6):
+        sine = 1 - square / n * sine
+    for n in (182, 132, 90, 56, 30, 12):
+        versine = 1 - square / n * versine
+    sine, versine = z * sine, square / 2 * versine
+    for _ in range(3):
+        sine, versine = 2 * sine * (1 - versine), 2 * sine**2
+    return sine, 1 - versine
+
+
 def magnetic_field(
     model: GalaxyModel, x: Float[Array, "..."], y: Float[Array, "..."], z: Float[Array, "..."]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
@@ -191,10 +211,11 @@ def magnetic_field(
     r2 = x**2 + y**2 + 1e-12
     psi = jnp.deg2rad(model.psi0 + model.psi1 * jnp.log(jnp.sqrt(r2) / model.r_sun))
     chi = jnp.deg2rad(model.chi0 * jnp.tanh(z / model.chi_height))
-    horizontal = jnp.cos(chi) * jnp.sqrt(-jnp.expm1(-r2 / CORE**2) / r2)
-    vertical = jnp.cos(chi) * jnp.exp(-r2 / (2 * CORE**2))
-    radial, azimuthal = horizontal * jnp.sin(psi), horizontal * jnp.cos(psi)
-    return radial * x - azimuthal * y, radial * y + azimuthal * x, jnp.sin(chi) + vertical
+    (sin_psi, cos_psi), (sin_chi, cos_chi) = _sine_and_cosine(psi), _sine_and_cosine(chi)
+    horizontal = cos_chi * jnp.sqrt(-jnp.expm1(-r2 / CORE**2) / r2)
+    vertical = cos_chi * jnp.exp(-r2 / (2 * CORE**2))
+    radial, azimuthal = horizontal * sin_psi, horizontal * cos_psi
+    return radial * x - azimuthal * y, radial * y + azimuthal * x, sin_chi + vertical
 
 
 def _density(r, z, r_sun, radius, height):
@@ -247,49 +268,58 @@ def _integrate(
     dtype = jnp.result_type(float)
     theta, phi = (jnp.asarray(angle, dtype) for angle in geometry[:2])
     st, ct, sp, cp = jnp.sin(theta), jnp.cos(theta), jnp.sin(phi), jnp.cos(phi)
-    direction = jnp.stack([st * cp, st * sp, ct])
-    basis = jnp.stack(
-        [jnp.stack([ct * cp, ct * sp, -st]), jnp.stack([-sp, cp, jnp.zeros_like(sp)]), direction]
-    )
+    rows = [ct * cp, ct * sp, -st], [-sp, cp, jnp.zeros_like(sp)], [st * cp, st * sp, ct]
+    basis = jnp.stack(list(map(jnp.stack, rows)))
     turbulence = _turbulence(key, model.slope, geometry, basis)
-
-    @jax.checkpoint
-    def emission(step):
-        x, y, z = direction * step["s"]
-        x = x - model.r_sun
-        Bx, By, Bz = magnetic_field(model, x, y, z)
-        near, far = turbulence[step["near"]], turbulence[step["near"] + 1]
-        rms = model.turbulence / jnp.sqrt(1 + step["s"] / model.coherence)
-        random = rms * (step["cos"] * near + step["sin"] * far)
-        Bt, Bp, Bs = (
-            e[0] * Bx + e[1] * By + e[2] * Bz + part for e, part in zip(basis, random, strict=True)
-        )
-        across = Bt**2 + Bp**2
-        fraction = model.p0 / (across + Bs**2)
-        # Polarized perpendicular to the field: along theta_hat (Q > 0) for one along phi_hat.
-        Q, U = Bp**2 - Bt**2, -2 * Bt * Bp
-        # Kept off zero, where its derivative is not defined.
-        r = jnp.sqrt(x**2 + y**2 + 1e-12)
-        dust = _density(r, z, model.r_sun, model.dust_radius, model.dust_height)
-        electrons = _density(r, z, model.r_sun, model.electron_radius, model.electron_height)
-        dust, electrons = dust * step["ds"], electrons * step["ds"]
-        polarized = SYNCHROTRON_FRACTION * electrons
-        return (
-            dust * (1 + model.p0 * 2 / 3 - fraction * across),
-            dust * fraction * Q,
-            dust * fraction * U,
-            electrons * across,
-            polarized * Q,
-            polarized * U,
-        )
-
-    def add(total, step):
-        return tuple(map(jnp.add, total, emission(step))), None
-
-    # Six maps rather than one array, which XLA would fill with one pass a row.
-    start = (jnp.zeros(theta.size, dtype),) * 6
     path = {name: jnp.asarray(values) for name, values in _path(steps).items()}
-    return jnp.stack(jax.lax.scan(add, start, path)[0]).reshape(2, 3, -1)
+
+    def integral(pixels):
+        """Of a few pixels, which stay in the processor's cache from step to step."""
+        basis, turbulence = pixels
+
+        def add(total, step):
+            return tuple(map(jnp.add, total, _emission(model, basis, turbulence, step))), None
+
+        # Six maps rather than one array, which XLA would fill with one pass a row.
+        start = (jnp.zeros(basis.shape[-1], dtype),) * 6
+        return jnp.stack(jax.lax.scan(add, start, path)[0])
+
+    blocks = theta.size // min(theta.size, BLOCK)
+    apart = [jnp.moveaxis(x.reshape(*x.shape[:2], blocks, -1), 2, 0) for x in (basis, turbulence)]
+    found = jax.lax.map(integral, tuple(apart))
+    return jnp.moveaxis(found, 0, 1).reshape(2, 3, -1)
+
+
+@jax.checkpoint
+def _emission(model, basis, turbulence, step):
+    """I, Q, U of dust and of synchrotron from a step along the line of sight."""
+    x, y, z = basis[2] * step["s"]
+    x = x - model.r_sun
+    Bx, By, Bz = magnetic_field(model, x, y, z)
+    near, far = turbulence[step["near"]], turbulence[step["near"] + 1]
+    rms = model.turbulence / jnp.sqrt(1 + step["s"] / model.coherence)
+    random = rms * (step["cos"] * near + step["sin"] * far)
+    Bt, Bp, Bs = (
+        e[0] * Bx + e[1] * By + e[2] * Bz + part for e, part in zip(basis, random, strict=True)
+    )
+    across = Bt**2 + Bp**2
+    fraction = model.p0 / (across + Bs**2)
+    # Polarized perpendicular to the field: along theta_hat (Q > 0) for one along phi_hat.
+    Q, U = Bp**2 - Bt**2, -2 * Bt * Bp
+    # Kept off zero, where its derivative is not defined.
+    r = jnp.sqrt(x**2 + y**2 + 1e-12)
+    dust = _density(r, z, model.r_sun, model.dust_radius, model.dust_height)
+    electrons = _density(r, z, model.r_sun, model.electron_radius, model.electron_height)
+    dust, electrons = dust * step["ds"], electrons * step["ds"]
+    polarized = SYNCHROTRON_FRACTION * electrons
+    return (
+        dust * (1 + model.p0 * 2 / 3 - fraction * across),
+        dust * fraction * Q,
+        dust * fraction * U,
+        electrons * across,
+        polarized * Q,
+        polarized * U,
+    )
 
 
 def _check(nside: int, seed: int, steps: int) -> None:

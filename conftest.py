@@ -11,10 +11,10 @@ import pytest
 from jaxsky.programs import keep_programs
 
 jax.config.update("jax_enable_x64", True)
-# Of the tests, and of the commands that they start.
-keep_programs(Path(__file__).parent / ".programs")
-if kept := jax.config.jax_compilation_cache_dir:
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = kept
+# What can be had again, of the tests and of the commands that they start.
+CACHE = Path(__file__).parent / ".cache"
+os.environ["JAXSKY_CACHE"] = str(CACHE)
+keep_programs(CACHE / "programs")
 
 DATA = Path(os.environ.get("JAXSKY_DATA", Path(__file__).parents[1] / "shared" / "data"))
 

@@ -1,6 +1,10 @@
 """The CMB: power spectra from CAMB, and realisations of them."""
 
+import contextlib
+import hashlib
 from functools import cache, partial
+from importlib.metadata import version
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -97,8 +101,7 @@ def _scalars(end, **cosmology):
     # The lensing of l = end needs higher multipoles.
     lmax = end + 1000
     accuracy = {"lens_potential_accuracy": max(4.0, (lmax - 1500) / 500)} | cosmology
-    results = _results(**accuracy, lmax=lmax)
-    return results.get_lensed_scalar_cls(end, CMB_unit="muK", raw_cl=True).T
+    return _spectra("get_lensed_scalar_cls", end, **accuracy, lmax=lmax)
 
 
 @cache
@@ -107,7 +110,9 @@ def _tensors(end, **cosmology):
     lmax = end + 500
     # Between too few multipoles, CAMB's interpolation is off by 2 % beyond l = 500.
     accuracy = {"nt": 0.0, "lSampleBoost": 2, "lAccuracyBoost": 2} | cosmology
-    results = _results(
+    return _spectra(
+        "get_tensor_cls",
+        end,
         **accuracy,
         r=1.0,
         WantTensors=True,
@@ -116,18 +121,32 @@ def _tensors(end, **cosmology):
         max_l_tensor=lmax,
         max_eta_k_tensor=3 * lmax,
     )
-    return results.get_tensor_cls(end, CMB_unit="muK", raw_cl=True).T
 
 
-def _results(**arguments):
-    """What CAMB computes for arguments of `camb.set_params`."""
-    import camb  # takes as long to import as a small simulation takes
+def _spectra(which: str, end: int, **arguments: Any) -> Float[np.ndarray, "4 ell"]:
+    """What CAMB computes up to l = end for arguments of `camb.set_params`, once and for all."""
+    from jaxsky.io.files import whole  # the border is slow to import, as CAMB is
+    from jaxsky.io.folders import cache_folder
+
+    mark = repr((version("camb"), which, end, sorted(arguments.items())))
+    path = cache_folder() / "spectra" / f"{hashlib.sha256(mark.encode()).hexdigest()}.npy"
+    with contextlib.suppress(OSError, ValueError, EOFError):
+        found = np.load(path)
+        if found.shape == (4, end + 1):
+            return found
+    import camb
 
     try:
-        return camb.get_results(camb.set_params(**arguments))
+        results = camb.get_results(camb.set_params(**arguments))
     except (camb.CAMBError, camb.CAMBFortranError, TypeError, ValueError) as error:
         said = " ".join(str(error).split())
         raise ValueError(f"CAMB does not take the cosmology: {said}") from None
+    spectra = np.asarray(getattr(results, which)(end, CMB_unit="muK", raw_cl=True).T)
+    with contextlib.suppress(OSError):  # it can be had again
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole(path) as beside, beside.open("wb") as file:
+            np.save(file, spectra)
+    return spectra
 
 
 def realisation(

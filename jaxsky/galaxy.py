@@ -180,7 +180,7 @@ def _sine_and_cosine(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float
     """
     z = (x - 2 * np.pi * jnp.round(x / (2 * np.pi))) / 8
     square = z**2
-    sine = versine = 1.0
+    sine = versine = jnp.ones_like(x)
     for n in (156, 110, 72, 42, 20, 6):
         sine = 1 - square / n * sine
     for n in (182, 132, 90, 56, 30, 12):

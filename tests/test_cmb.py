@@ -123,3 +123,28 @@ def test_refuses_nonsense():
         cmb.tensor_spectra(-2)
     with pytest.raises(ValueError, match="`stokes` must be 'QU' or 'IQU', not 'Q'"):
         cmb.realisation(jax.random.key(0), jnp.ones((4, 5)), "Q")
+
+
+def test_spectra_are_kept_from_one_process_to_the_next(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAXSKY_CACHE", str(tmp_path))
+
+    def fresh(**cosmology):
+        """As in another process."""
+        cmb._scalars.cache_clear()
+        return cmb.camb_spectra(20, **cosmology)
+
+    first = fresh()
+    (kept,) = (tmp_path / "spectra").iterdir()
+    computed, compute = [], camb.get_results
+    monkeypatch.setattr(camb, "get_results", lambda p: (computed.append(p), compute(p))[1])
+    np.testing.assert_array_equal(fresh(), first)
+    assert not computed
+    kept.write_bytes(kept.read_bytes()[:500])  # damaged
+    np.testing.assert_allclose(fresh(), first, rtol=1e-9)
+    assert len(computed) == 1
+    other = fresh(H0=70.0, ombh2=0.022, omch2=0.12, tau=0.05, As=2.1e-9, ns=0.96)
+    assert np.abs(other[:, 2:] / first[:, 2:] - 1).max() > 1e-3
+    assert len(list((tmp_path / "spectra").iterdir())) == 2
+    monkeypatch.setenv("JAXSKY_CACHE", str(kept / "no" / "folder"))
+    np.testing.assert_allclose(fresh(), first, rtol=1e-9)
+    cmb._scalars.cache_clear()

@@ -19,6 +19,13 @@ keep_programs(CACHE / "programs")
 DATA = Path(os.environ.get("JAXSKY_DATA", Path(__file__).parents[1] / "shared" / "data"))
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """All of the folder `validation` is slow."""
+    for item in items:
+        if "validation" in item.path.parts[-2:]:
+            item.add_marker("slow")
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """Folder with the real sky maps and bandpasses; tests that need it are skipped without."""

@@ -50,8 +50,11 @@ UNITS = {"uK_RJ": r"$\mu{\rm K}_{\rm RJ}$", "uK_CMB": r"$\mu{\rm K}_{\rm CMB}$"}
 
 
 def plain(text: str) -> str:
-    """Text that is drawn as it is: between its dollar signs there is no formula."""
-    return text.replace("$", r"\$")
+    """Text that is drawn as it is: between its dollar signs there is no formula.
+
+    Behind a thin space, as labels that begin with an underscore are left out of legends.
+    """
+    return ("\N{THIN SPACE}" if text.startswith("_") else "") + text.replace("$", r"\$")
 
 
 def in_formula(text: str) -> str:

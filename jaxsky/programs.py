@@ -4,6 +4,7 @@ Compilation takes longer than most commands compute. Programs with a transform a
 `jaxsky.harmonics.transforms`.
 """
 
+import contextlib
 import hashlib
 import os
 import platform
@@ -25,8 +26,12 @@ class _Cache(lru_cache.LRUCache):
     def put(self, key: str, value: bytes) -> None:
         final = Path(self._path) / f"{key}-cache"
         part = final.with_name(f".partial-{os.getpid()}-{key}")
-        part.write_bytes(value)
-        part.replace(final)
+        try:
+            part.write_bytes(value)
+            part.replace(final)
+        except OSError:  # a full disk: it is done without
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
 
 
 def _processor() -> str:

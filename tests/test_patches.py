@@ -59,6 +59,7 @@ def simulated(noise, count, cross=False, signal=1.0):
     return A / TRUTH, alpha, A_error / TRUTH, alpha_error, rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("noise", "cross"), [(0.0, False), (1.0, False), (1.0, True)], ids=["clean", "noisy", "cross"]
 )

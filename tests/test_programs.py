@@ -102,6 +102,11 @@ def test_entries_appear_whole(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         cache.put("x", b"1234")
     assert cache.get("x") is None
+    (part,) = tmp_path.iterdir()
+    part.unlink()
+    monkeypatch.setattr(Path, "replace", lambda *_: (_ for _ in ()).throw(OSError("full")))
+    cache.put("x", b"1234")
+    assert not list(tmp_path.iterdir())
     monkeypatch.undo()
     cache.put("x", b"1234")
     assert cache.get("x") == b"1234"

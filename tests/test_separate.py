@@ -62,6 +62,7 @@ def separated(domain: str = "pixel", nsims: int = 20, sampler: str = "none"):
     return how, setup, separate(how, setup)
 
 
+@pytest.mark.slow
 def test_pulls_of_laws_and_r():
     """In pixels outside a mask, where smoothed noise is correlated and E leaks into B."""
     how, setup, found = separated("pixel", 200)

@@ -176,6 +176,7 @@ def simulate(size: float, npix: int, count: int = 200):
     return np.array(pulls), np.array(probabilities)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "npix"), [(30.0, 48), (3.0, 768)])
 def test_errors_are_honest(size, npix):
     """Also where signals are only a few times the noise of a pixel."""

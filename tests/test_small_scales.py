@@ -206,6 +206,7 @@ def test_final_spectra_of_the_real_sky(data_dir, name):
     np.testing.assert_allclose(steps, 1, atol=0.2)
 
 
+@pytest.mark.slow
 def test_final_spectra_of_the_embedded_sky():
     # With fewer steps along the line of sight than usual, for speed; slopes are the same in 0.06.
     maps = smooth(embedded_sky(512, steps=12).synchrotron[1:], 60.0)

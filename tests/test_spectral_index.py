@@ -299,6 +299,7 @@ def pulls():
     return {key: np.array(pull) for key, pull in values.items()}
 
 
+@pytest.mark.slow
 def test_errors_are_honest(pulls):
     for (kind, stokes, name), pull in pulls.items():
         print(f"{kind} {stokes} {name}: mean {pull.mean():+.3f}, std {pull.std(ddof=1):.3f}")

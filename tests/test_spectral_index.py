@@ -309,6 +309,7 @@ def test_errors_are_honest(pulls):
             assert 0.9 < pull.std(ddof=1) < 1.1, key
 
 
+@pytest.mark.slow
 def test_the_diagonal_likelihood_misstates_its_errors(pulls):
     """Why it is only the named option: correlated noise and the CMB are left out of it."""
     worst = max(p.std(ddof=1) for key, p in pulls.items() if key[0] == "diagonal")

@@ -1,9 +1,12 @@
 """Realisations of a Monte Carlo that are kept in a file, so that a stopped run goes on."""
 
+import os
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -51,18 +54,41 @@ def realisations(
     done = [] if path is None else _load(path, mark, names)
     held, saved = len(done), time.monotonic()
     try:
-        for i in range(held, count):
-            report(i, count)
-            key = jax.random.fold_in(jax.random.key(seed), i)
-            done.append([np.asarray(x) for x in make(key)])
+        report(held, count)
+        for result in _made(make, seed, range(held, count)):
+            done.append(result)
+            report(len(done), count)
             if path is not None and time.monotonic() - saved > SAVED_EVERY:
                 _save(path, mark, names, done)
                 held, saved = len(done), time.monotonic()
     finally:
         if path is not None and len(done) > held:
             _save(path, mark, names, done)
-    report(count, count)
     return list(map(np.stack, zip(*done[:count], strict=True)))
+
+
+def _made(
+    make: Callable[[Array], Sequence[Array | np.ndarray]], seed: int, numbers: range
+) -> Iterator[list[np.ndarray]]:
+    """Realisations in order, made by as many threads as there are processors."""
+
+    def one(number: int) -> list[np.ndarray]:
+        key = jax.random.fold_in(jax.random.key(seed), number)
+        return [np.asarray(x) for x in make(key)]
+
+    first, rest = numbers[:1], numbers[1:]
+    yield from map(one, first)  # alone, so that each program is compiled once
+    threads = os.cpu_count() or 1
+    pool = ThreadPoolExecutor(threads)
+    try:
+        pending = deque(pool.submit(one, number) for number in rest[:threads])
+        for number in rest[threads:]:
+            yield pending.popleft().result()
+            pending.append(pool.submit(one, number))
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _save(path: Path, mark: str, names: Sequence[str], done: list[list[np.ndarray]]) -> None:

@@ -168,7 +168,8 @@ def run(
         report = work(settings, Run(options, kind, folder, steps))
         if kind.results:
             _show(out, settings.title, report, steps.seconds)
-    console.print(report.description)
+    if report.description:
+        console.print(report.description)
     print_tables(report.tables)
     for sentence in report.warnings:
         warn(sentence)

@@ -1,9 +1,12 @@
 """All figures and tables of the paper in order, and the page that shows them."""
 
+import gc
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
+
+import jax
 
 from fits.commands.page import Section, Table, write_page
 from fits.paper import (
@@ -159,6 +162,9 @@ def run(
             item = Item(step.label, "not made", "", f"Not made: {reason}")
         store.add(item._replace(seconds=round(time.perf_counter() - start, 1)))
         _show(settings, sources, store, order)
+        # No two figures have programs in common, and what these hold adds up.
+        jax.clear_caches()
+        gc.collect()
     items = _show(settings, sources, store, order)
     write_log(out / LOG, settings, time.perf_counter() - started)
     return items

@@ -67,6 +67,8 @@ def main() -> None:
 
             jax.config.update("jax_enable_x64", True)
             keep_programs(cache_folder() / "programs")
+            if "--version" in sys.argv:  # after any command
+                sys.argv[1:] = ["--version"]
             app()
     except Exception as error:
         print_error(error)

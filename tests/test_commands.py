@@ -2,6 +2,7 @@
 
 import io
 import itertools
+import os
 import re
 import subprocess
 import sys
@@ -150,11 +151,24 @@ def test_page(tmp_path):
 
 @pytest.mark.parametrize(
     "line",
-    [["-m", "jaxsky", "--version"], ["-c", "from fits.app import main; main()", "--version"]],
+    [
+        ["-m", "jaxsky", "--version"],
+        ["-m", "jaxsky", "fit", "--version"],
+        ["-c", "from fits.app import main; main()", "data", "fetch", "--version"],
+    ],
 )
 def test_version(line):
     done = subprocess.run([sys.executable, *line], capture_output=True, text=True, check=True)
     assert re.fullmatch(r"jaxsky \d+\.\d+\.\d+\n", done.stdout)
+
+
+def test_shells_complete_commands():
+    line = {"_JAXSKY_COMPLETE": "complete_bash", "COMP_WORDS": "jaxsky se", "COMP_CWORD": "1"}
+    jaxsky = Path(sys.executable).with_name("jaxsky")
+    done = subprocess.run(
+        [jaxsky], env=os.environ | line, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["separate"]
 
 
 def test_nothing_in_jaxsky_imports_fits_but_main():

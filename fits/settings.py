@@ -18,8 +18,8 @@ from jaxsky.settings import (
     SettingsFile,
     Table,
     check_angles,
-    load,
 )
+from jaxsky.settings_load import load
 from jaxsky.settings_types import (
     BandName,
     ComponentName,

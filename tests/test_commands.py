@@ -15,7 +15,8 @@ from rich.table import Table
 from fits.commands import console as terminal
 from fits.commands.page import Section, key_of, table_of, write_page
 from fits.settings import EMBEDDED, Settings
-from jaxsky.settings import SettingsError, load
+from jaxsky.settings import SettingsError
+from jaxsky.settings_load import load
 
 SETTINGS = """
 [analysis]

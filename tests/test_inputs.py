@@ -25,8 +25,8 @@ from jaxsky.settings import (
     Table,
     TemplateFile,
     check_angles,
-    load,
 )
+from jaxsky.settings_load import load
 from jaxsky.settings_types import Nside
 
 NSIDE = 4

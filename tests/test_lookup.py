@@ -21,7 +21,8 @@ from jaxsky.experiment import build as build_experiment
 from jaxsky.experiment import load_experiment
 from jaxsky.io import InputError, write_maps
 from jaxsky.lookup import find_file, found_files
-from jaxsky.settings import MapFile, SettingsError, SettingsFile, load
+from jaxsky.settings import MapFile, SettingsError, SettingsFile
+from jaxsky.settings_load import load
 
 KNOWN = "LFI_RIMO_R3.31.fits"
 MASK = "wmap_polarization_analysis_mask_r9_9yr_v5.fits"

@@ -7,7 +7,8 @@ from fits.paper.settings import PaperSettings
 from fits.separate.settings import SeparateSettings
 from fits.settings import Settings
 from jaxsky.experiment.settings import Experiment
-from jaxsky.settings import SettingsError, load
+from jaxsky.settings import SettingsError
+from jaxsky.settings_load import load
 
 TEMPLATE = '[templates."{component}"]\nfile = "a.fits"\nlaw = "dust"\nnu_ref = 353\n'
 BAND = '[[bands]]\nname = "{band}"\n'

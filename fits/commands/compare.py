@@ -5,19 +5,8 @@ from typing import Annotated
 
 import typer
 
+from fits.commands import run
 from fits.commands.fit import region_files
-from fits.commands.run import (
-    Init,
-    Kind,
-    Options,
-    Overwrite,
-    Report,
-    Resume,
-    Run,
-    SettingsPath,
-    Values,
-    run,
-)
 from jaxsky.settings_keys import at_key
 
 __all__ = ["compare"]
@@ -35,9 +24,9 @@ RESULTS = (
 
 
 def compare(
-    settings_file: SettingsPath = None,
+    settings_file: run.SettingsPath = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/compare"),
-    init: Init = False,
+    init: run.Init = False,
     seed: Annotated[
         int | None,
         typer.Option(help="Seed of realisations, and of the maps of the embedded sky."),
@@ -49,20 +38,20 @@ def compare(
     nsims: Annotated[
         int | None, typer.Option(min=30, help="Number of realisations of CMB and noise.")
     ] = None,
-    values: Values = None,
-    resume: Resume = False,
-    overwrite: Overwrite = False,
+    values: run.Values = None,
+    resume: run.Resume = False,
+    overwrite: run.Overwrite = False,
 ) -> None:
     """Compare observed maps with the model of foregrounds, CMB and noise."""
     from fits.settings import EMBEDDED_COMPARISON, EXAMPLE, Settings
 
-    kind = Kind(Settings, EMBEDDED_COMPARISON, EXAMPLE, "analysis.toml", RESULTS)
+    kind = run.Kind(Settings, EMBEDDED_COMPARISON, EXAMPLE, "analysis.toml", RESULTS)
     analysis = {"seed": seed, "regions": region_files(region), "nside": nside}
-    options = Options(settings_file, out, init, values, resume, overwrite)
-    run(kind, _work, options, {"analysis": analysis, "compare": {"nsims": nsims}})
+    options = run.Options(settings_file, out, init, values, resume, overwrite)
+    run.run(kind, _work, options, {"analysis": analysis, "compare": {"nsims": nsims}})
 
 
-def _work(settings, command: Run) -> Report:
+def _work(settings, command: run.Run) -> run.Report:
     from fits.comparison import check_comparison, compare, compare_patches, report
     from fits.inputs import inputs_of
     from fits.regions import region_masks
@@ -84,7 +73,7 @@ def _work(settings, command: Run) -> Report:
         patches = compare_patches(settings, inputs)
     steps.step("drawing")
     written = report.write_report(out, inputs, settings, found, steps.seconds, patches)
-    return Report(
+    return run.Report(
         inputs.description,
         [report.comparison_table(found)],
         report.warnings(found, settings),

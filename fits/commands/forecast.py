@@ -5,17 +5,7 @@ from typing import Annotated
 
 import typer
 
-from fits.commands.run import (
-    Init,
-    Kind,
-    Options,
-    Overwrite,
-    Report,
-    Run,
-    SettingsPath,
-    Values,
-    run,
-)
+from fits.commands import run
 
 __all__ = ["forecast"]
 
@@ -23,20 +13,20 @@ RESULTS = ("forecast.json", "log.json", "bb.png", "fisher.png")
 
 
 def forecast(
-    settings_file: SettingsPath = None,
+    settings_file: run.SettingsPath = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/forecast"),
-    init: Init = False,
-    values: Values = None,
-    overwrite: Overwrite = False,
+    init: run.Init = False,
+    values: run.Values = None,
+    overwrite: run.Overwrite = False,
 ) -> None:
     """Forecast B modes: foregrounds against primordial ones, and errors on r and the laws."""
     from fits.forecast.settings import DEFAULT, EXAMPLE, ForecastSettings
 
-    kind = Kind(ForecastSettings, DEFAULT, EXAMPLE, "forecast.toml", RESULTS, resumable=False)
-    run(kind, _work, Options(settings_file, out, init, values, overwrite=overwrite))
+    kind = run.Kind(ForecastSettings, DEFAULT, EXAMPLE, "forecast.toml", RESULTS, resumable=False)
+    run.run(kind, _work, run.Options(settings_file, out, init, values, overwrite=overwrite))
 
 
-def _work(settings, command: Run) -> Report:
+def _work(settings, command: run.Run) -> run.Report:
     from fits.forecast import report
     from fits.forecast.forecast import forecast as forecast_errors
 
@@ -44,4 +34,6 @@ def _work(settings, command: Run) -> Report:
     command.steps.step("drawing")
     command.begin()
     written = report.write_report(command.out, found, settings, command.steps.seconds)
-    return Report(found.setup.description, report.tables(found), report.warnings(found), written)
+    return run.Report(
+        found.setup.description, report.tables(found), report.warnings(found), written
+    )

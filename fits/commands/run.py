@@ -17,8 +17,9 @@ from fits.commands.errors import logged
 from fits.commands.interrupt import interruptible
 from fits.commands.page import Section, table_of, write_page
 from jaxsky.io.folders import ALL, Folder, occupied
-from jaxsky.settings import SettingsFile, load
+from jaxsky.settings import SettingsFile
 from jaxsky.settings_keys import of_file
+from jaxsky.settings_load import load
 
 __all__ = [
     "Init",

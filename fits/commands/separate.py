@@ -5,18 +5,7 @@ from typing import Annotated
 
 import typer
 
-from fits.commands.run import (
-    Init,
-    Kind,
-    Options,
-    Overwrite,
-    Report,
-    Resume,
-    Run,
-    SettingsPath,
-    Values,
-    run,
-)
+from fits.commands import run
 
 __all__ = ["separate"]
 
@@ -38,9 +27,9 @@ RESULTS = (
 
 
 def separate(
-    settings_file: SettingsPath = None,
+    settings_file: run.SettingsPath = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/separate"),
-    init: Init = False,
+    init: run.Init = False,
     seed: Annotated[
         int | None,
         typer.Option(help="Seed of simulations, chains, and maps of the embedded sky."),
@@ -52,20 +41,20 @@ def separate(
     nsims: Annotated[
         int | None, typer.Option(min=20, help="Number of simulations of the noise.")
     ] = None,
-    values: Values = None,
-    resume: Resume = False,
-    overwrite: Overwrite = False,
+    values: run.Values = None,
+    resume: run.Resume = False,
+    overwrite: run.Overwrite = False,
 ) -> None:
     """Separate CMB and foregrounds by their laws, and measure r from the cleaned B modes."""
     from fits.separate.settings import EMBEDDED, EXAMPLE, SeparateSettings
 
-    kind = Kind(SeparateSettings, EMBEDDED, EXAMPLE, "separation.toml", RESULTS)
+    kind = run.Kind(SeparateSettings, EMBEDDED, EXAMPLE, "separation.toml", RESULTS)
     overrides = {"seed": seed, "nside": nside, "domain": domain, "nsims": nsims}
-    options = Options(settings_file, out, init, values, resume, overwrite)
-    run(kind, _work, options, {"separation": overrides})
+    options = run.Options(settings_file, out, init, values, resume, overwrite)
+    run.run(kind, _work, options, {"separation": overrides})
 
 
-def _work(settings, command: Run) -> Report:
+def _work(settings, command: run.Run) -> run.Report:
     from fits.results import FitError
     from fits.separate import report
     from fits.separate.separate import separate as separate_maps
@@ -80,6 +69,6 @@ def _work(settings, command: Run) -> Report:
         raise ValueError(f"The spectral parameters were not found. {error}") from None
     command.steps.step("drawing")
     written = report.write_report(command.out, found, settings, command.steps.seconds)
-    return Report(
+    return run.Report(
         setup.description, report.tables(found), report.warnings(found, settings), written
     )

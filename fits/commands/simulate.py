@@ -7,18 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fits.commands.run import (
-    Init,
-    Kind,
-    Options,
-    Overwrite,
-    Report,
-    Resume,
-    Run,
-    SettingsPath,
-    Values,
-    run,
-)
+from fits.commands import run
 from jaxsky.io.folders import ALL
 
 __all__ = ["simulate"]
@@ -33,9 +22,9 @@ ONLY: dict[str, Callable[[list[str]], list[str]]] = {
 
 
 def simulate(
-    settings_file: SettingsPath = None,
+    settings_file: run.SettingsPath = None,
     out: Annotated[Path, typer.Option(help="Folder for the maps.")] = Path("results/simulate"),
-    init: Init = False,
+    init: run.Init = False,
     nsims: Annotated[int, typer.Option(min=1, help="Number of realisations.")] = 1,
     first: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Number of the first one.")] = 0,
     only: Annotated[
@@ -43,9 +32,9 @@ def simulate(
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of all realisations.")] = None,
     nside: Annotated[int | None, typer.Option(help="Resolution of the maps.")] = None,
-    values: Values = None,
-    resume: Resume = False,
-    overwrite: Overwrite = False,
+    values: run.Values = None,
+    resume: run.Resume = False,
+    overwrite: run.Overwrite = False,
 ) -> None:
     """Simulate maps of the microwave sky as an experiment observes it."""
     from jaxsky.experiment import DEFAULT, EXAMPLE, Experiment
@@ -54,7 +43,7 @@ def simulate(
         raise ValueError(f"--only must be one of {', '.join(ONLY)}, not {only!r}.")
     indices = range(first, first + nsims)
 
-    def work(settings: Experiment, command: Run) -> Report:
+    def work(settings: Experiment, command: run.Run) -> run.Report:
         if only is not None:
             main = {"include": ONLY[only](settings.foregrounds())}
             settings = settings.model_copy(
@@ -64,13 +53,13 @@ def simulate(
 
     # What is kept and what is replaced is seen to map by map. With --overwrite all realisations
     # are removed, so nobody else may be making any.
-    kind = Kind(Experiment, DEFAULT, EXAMPLE, "experiment.toml", ())
-    options = Options(settings_file, out, init, values, resume, overwrite)
+    kind = run.Kind(Experiment, DEFAULT, EXAMPLE, "experiment.toml", ())
+    options = run.Options(settings_file, out, init, values, resume, overwrite)
     part = ALL if overwrite else indices
-    run(kind, work, options, {"experiment": {"seed": seed, "nside": nside}}, part)
+    run.run(kind, work, options, {"experiment": {"seed": seed, "nside": nside}}, part)
 
 
-def _work(settings, command: Run, indices: range) -> Report:
+def _work(settings, command: run.Run, indices: range) -> run.Report:
     from jaxsky import experiment, montecarlo, plots
     from jaxsky.io import read_maps
 
@@ -114,4 +103,4 @@ def _work(settings, command: Run, indices: range) -> Report:
         + (f"; {kept} maps were there already" if kept else "")
         + f" ({rate}{steps.seconds:.1f} s in all)."
     )
-    return Report(setup.description, (), list(notes), (), remark)
+    return run.Report(setup.description, (), list(notes), (), remark)

@@ -5,7 +5,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from jaxsky.settings import FileName, SettingsFile, Table, TemplateFile, check_angles, load
+from jaxsky.settings import FileName, SettingsFile, Table, TemplateFile, check_angles
+from jaxsky.settings_load import load
 from jaxsky.settings_types import (
     BandName,
     ComponentName,
@@ -146,5 +147,5 @@ class ForecastSettings(SettingsFile):
 
 
 def load_forecast(path: Path) -> ForecastSettings:
-    """Settings from a TOML file; see `jaxsky.settings.load`."""
+    """Settings from a TOML file; see `jaxsky.settings_load.load`."""
     return load(path, ForecastSettings)

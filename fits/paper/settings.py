@@ -6,7 +6,8 @@ from pydantic import Field, model_validator
 
 from fits.settings import Settings
 from jaxsky.experiment.settings import SmallScalesTable
-from jaxsky.settings import FileName, MapFile, MaskFile, Table, load
+from jaxsky.settings import FileName, MapFile, MaskFile, Table
+from jaxsky.settings_load import load
 from jaxsky.settings_types import Pair
 from jaxsky.settings_values import check_reference
 from jaxsky.small_scales import DUST, SYNCHROTRON

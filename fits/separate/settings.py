@@ -8,7 +8,8 @@ from pydantic import Field, model_validator
 
 from fits.priors import Gaussian, Prior
 from fits.settings import Band, Parameter, check_free
-from jaxsky.settings import MapFile, MaskFile, SettingsFile, Table, load
+from jaxsky.settings import MapFile, MaskFile, SettingsFile, Table
+from jaxsky.settings_load import load
 from jaxsky.settings_types import (
     Law,
     Nside,
@@ -183,5 +184,5 @@ class SeparateSettings(SettingsFile):
 def load_separate(
     path: Path, overrides: Mapping[str, Mapping[str, Any]] | None = None
 ) -> SeparateSettings:
-    """Settings from a TOML file; see `jaxsky.settings.load`."""
+    """Settings from a TOML file; see `jaxsky.settings_load.load`."""
     return load(path, SeparateSettings, overrides)

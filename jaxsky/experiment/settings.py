@@ -14,8 +14,8 @@ from jaxsky.settings import (
     Table,
     TemplateFile,
     check_angles,
-    load,
 )
+from jaxsky.settings_load import load
 from jaxsky.settings_types import (
     BandName,
     ComponentName,
@@ -191,5 +191,5 @@ class Experiment(SettingsFile):
 def load_experiment(
     path: Path, overrides: Mapping[str, Mapping[str, object]] | None = None
 ) -> Experiment:
-    """Settings from a TOML file; see `jaxsky.settings.load`."""
+    """Settings from a TOML file; see `jaxsky.settings_load.load`."""
     return load(path, Experiment, overrides)

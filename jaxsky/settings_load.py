@@ -1,0 +1,163 @@
+"""Settings from TOML files and the command line, with a sentence for each mistake."""
+
+import json
+import reprlib
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+
+from jaxsky.settings import SettingsError, SettingsFile, expand
+
+__all__ = ["load"]
+
+
+def _key(raw: Any, place: Sequence[str | int], missing: bool) -> str:
+    """The dotted key of a mistake; its place also names types, which are no keys."""
+    keys = []
+    for i, step in enumerate(place):
+        if isinstance(raw, dict) and step in raw:
+            keys.append(str(step))
+            raw = raw[step]
+        elif isinstance(raw, list) and isinstance(step, int):
+            keys.append(str(step))
+            raw = raw[step] if step < len(raw) else None
+        elif missing and i == len(place) - 1:
+            keys.append(str(step))
+    return ".".join(keys)
+
+
+def _sentence(path: Path, raw: Any, error: ValidationError, options: Mapping[str, str]) -> str:
+    wrong: dict[str, list[str]] = {}
+    types: dict[str, str] = {}
+    for item in error.errors():
+        what = item["msg"].removeprefix("Value error, ").rstrip(".")
+        where = _key(raw, item["loc"], item["type"] == "missing")
+        if item["type"] == "extra_forbidden":
+            what = "unknown key"
+        elif item["type"] == "missing":
+            what = "is missing"
+        elif item["type"].endswith(("_type", "literal_error")):
+            wanted = what.removeprefix("Input should be ").partition(" or instance")[0]
+            wanted = wanted.replace("dictionary", "table")
+            known = types.get(where, "input should be ").partition(", not ")[0]
+            joined = known + ("" if known.endswith("be ") else " or ") + wanted
+            types[where] = f"{joined}, not {reprlib.repr(item['input'])}"
+            continue
+        elif item["msg"] == what:
+            value = "" if ", not " in what else f", not {reprlib.repr(item['input'])}"
+            what = f"{what[0].lower()}{what[1:]}{value}"
+        wrong.setdefault(where, []).append(what)
+    # Of a value that may be of several types, those that it is not matter only if it is none.
+    places = [*wrong, *types]
+    for where, what in types.items():
+        if where not in wrong and not any(place.startswith(f"{where}.") for place in places):
+            wrong[where] = [what]
+    sentences = [
+        ": ".join(filter(None, (k, " or ".join(w)))) + options.get(k, "") for k, w in wrong.items()
+    ]
+    return f"{path}: {'; '.join(sentences)}."
+
+
+S = TypeVar("S", bound=SettingsFile)
+
+
+def _assigned(assignment: str) -> dict[str, Any]:
+    """The tables of `key=value`, where the value is TOML, or text as it is.
+
+    Raises
+    ------
+    SettingsError
+        If it is none.
+    """
+    key, equals, value = assignment.partition("=")
+    for line in (assignment, f"{key} = {json.dumps(value.strip())}") if equals else ():
+        try:
+            return tomllib.loads(line)
+        except (tomllib.TOMLDecodeError, RecursionError):
+            continue
+    raise SettingsError(
+        f"--set {assignment}: must be KEY=VALUE, as in a settings file, with the table's name "
+        f"before the key{'' if equals else '; there is no ='}."
+    )
+
+
+def _merge(raw: Any, changes: Mapping[str, Any]) -> Any:
+    """Tables with changes in them; a number is the place in a list."""
+    if isinstance(raw, list):
+        merged = list(raw)
+        for key, value in changes.items():
+            if not key.isdecimal() or int(key) >= len(raw):
+                raise ValueError(f"{key}: is not among the {len(raw)} entries, 0 to {len(raw) - 1}")
+            known = raw[int(key)]
+            merged[int(key)] = _merge(known, value) if isinstance(value, dict) else value
+        return merged
+    if not isinstance(raw, dict):
+        return changes
+    into = [k for k, v in changes.items() if isinstance(v, dict) and k in raw]
+    return {**raw, **changes, **{k: _merge(raw[k], changes[k]) for k in into}}
+
+
+def load(
+    path: Path,
+    model: type[S],
+    overrides: Mapping[str, Mapping[str, Any]] | None = None,
+    assignments: Sequence[str] = (),
+) -> S:
+    """Settings from a TOML file.
+
+    Parameters
+    ----------
+    path : the file; relative paths in it are relative to its `data_dir`, and that to its folder
+    model : what the settings are
+    overrides : by table, values of options with the key's name, which replace those of the file;
+        None is ignored
+    assignments : `key=value` with a dotted key, such as "analysis.nside=32", "bands.0.fwhm=30" or
+        "free.'dust.beta_dust'.start=1.5"; they are merged into the file's tables
+
+    Returns
+    -------
+    The settings, with `data_dir` as an absolute path.
+
+    Raises
+    ------
+    SettingsError
+        If the file is absent, is not TOML, or has a mistake; the message names file and key.
+    """
+    try:
+        raw = tomllib.loads(path.read_text())
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read ({error.strerror}).") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: is not valid TOML ({error}).") from None
+    except RecursionError:
+        raise SettingsError(f"{path}: is nested too deeply.") from None
+    options: dict[str, str] = {}
+    for table, values in (overrides or {}).items():
+        given = {key: value for key, value in values.items() if value is not None}
+        options |= {
+            f"{table}.{key}": f" (given as --{key})"
+            for key, value in given.items()
+            if not isinstance(value, list)
+        }
+        if given and isinstance(raw.get(table, {}), dict):
+            raw[table] = raw.get(table, {}) | given
+    for assignment in assignments:
+        changes = _assigned(assignment)
+        try:
+            raw = _merge(raw, changes)
+        except ValueError as error:
+            raise SettingsError(f"{path}: --set {assignment}: {error}.") from None
+        options[assignment.partition("=")[0].strip()] = " (given with --set)"
+    try:
+        settings = model.model_validate(raw)
+        folder = (path.absolute().parent / expand(settings.data_dir)).resolve()
+        if folder.exists() and not folder.is_dir():
+            raise ValueError(f"{folder} is not a folder")
+    except ValidationError as error:
+        raise SettingsError(_sentence(path, raw, error, options)) from None
+    except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: links in a circle
+        raise SettingsError(f"{path}: data_dir: {error}.") from None
+    return settings.model_copy(update={"data_dir": str(folder)})

@@ -258,6 +258,7 @@ def _integrate(
 
     def integral(pixels):
         """Of a few pixels, which stay in the processor's cache from step to step."""
+
         def add(total, step):
             return tuple(map(jnp.add, total, _emission(model, *pixels, step))), None
 

@@ -97,7 +97,7 @@ def _table(table: Table) -> str:
 
 def _section(section: Section) -> str:
     title = escape(section.title)
-    parts = [f'<section id="{key_of(title)}">', f"<h2>{title}</h2>"]
+    parts = [f'<section id="{escape(key_of(section.title))}">', f"<h2>{title}</h2>"]
     if section.picture is not None:
         picture = escape(section.picture)
         parts.append(
@@ -128,7 +128,7 @@ def write_page(
     end : a last line
     """
     links = "\n".join(
-        f'<li><a href="#{key_of(s.title)}">{escape(s.title)}</a></li>' for s in sections
+        f'<li><a href="#{escape(key_of(s.title))}">{escape(s.title)}</a></li>' for s in sections
     )
     write_text(
         path,

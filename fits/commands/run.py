@@ -235,8 +235,8 @@ def results_folder(
 def _show(out: Path, title: str, report: Report, seconds: float) -> None:
     """Write the page of a command's tables and pictures."""
     tables = [
-        Section(str(t.title or "Results"), str(t.caption or ""), table=table_of(t))
-        for t in report.tables
+        Section(str(t.title or f"Results {i}"), str(t.caption or ""), table=table_of(t))
+        for i, t in enumerate(report.tables, 1)
     ]
     pictures = [
         Section(path.stem.replace("_", " "), picture=path.name)

@@ -16,8 +16,8 @@ from jaxtyping import Array, Float
 from fits.preparation import Preparation
 from jaxsky.cmb import realisation
 from jaxsky.harmonics import adjoint_synthesis, alm_ell, expand, synthesis
-from jaxsky.noise import draw
-from jaxsky.streams import stream
+from jaxsky.keys import stream
+from jaxsky.noise import draw, uniform_alm
 
 __all__ = ["Fluctuations"]
 
@@ -37,6 +37,8 @@ class Fluctuations(eqx.Module):
     cmb_spectra : C_l of EE and BB [uK_CMB^2], shape (2, ell); None without CMB
     cmb_windows : beam and pixel window of the prepared maps of each band, shape (band, ell)
     cmb_factors : uK_RJ per uK_CMB in each band, shape (band,)
+    names : of the bands; the random numbers of each come from its name
+    levels : of the noise of each band [uK_RJ arcmin] where it is uniform, else None
     """
 
     preparations: tuple[Preparation, ...]
@@ -45,6 +47,8 @@ class Fluctuations(eqx.Module):
     cmb_spectra: Float[Array, "stokes ell"] | None
     cmb_windows: Float[Array, "band ell"] | None
     cmb_factors: Float[Array, " band"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    levels: tuple[float | None, ...]
 
     # Not one program: XLA would hold the maps of all rows and bands at once.
     def covariance(
@@ -76,12 +80,18 @@ class Fluctuations(eqx.Module):
     def noise_realisation(self, key: Array) -> Float[Array, "band stokes pix"]:
         """Noise of all bands at the common resolution [uK_RJ]."""
         maps = []
-        for b, (preparation, noise) in enumerate(zip(self.preparations, self.noise, strict=True)):
-            drawn = draw(stream(key, "noise", str(b)), jnp.asarray(noise, float))
-            total = preparation.of_noise(drawn)
+        for b, (name, preparation) in enumerate(zip(self.names, self.preparations, strict=True)):
+            white = stream(key, "noise", name)
+            if (level := self.levels[b]) is not None and preparation.window is not None:
+                # Uniform noise has independent multipoles: no pixels finer than the result's.
+                alm = uniform_alm(white, level, preparation.window.size - 1)
+                total = synthesis(alm * expand(preparation.window), preparation.nside)
+            else:
+                drawn = draw(white, jnp.asarray(self.noise[b], float))
+                total = preparation.of_noise(drawn)
             if (spectrum := self.correlated[b]) is not None:
-                white = jax.random.normal(stream(key, "correlated", str(b)), (2, spectrum.size**2))
-                total = total + synthesis(white * expand(jnp.sqrt(spectrum)), preparation.nside)
+                modes = jax.random.normal(stream(key, "correlated", name), (2, spectrum.size**2))
+                total = total + synthesis(modes * expand(jnp.sqrt(spectrum)), preparation.nside)
             maps.append(total)
         return jnp.stack(maps)
 

@@ -6,7 +6,6 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import healpy
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -15,18 +14,15 @@ from fits.settings import Band as BandSettings
 from fits.settings import Settings
 from fits.template_noise import TemplateNoise, read_template_noise
 from jaxsky import (
-    CMB,
     Bandpass,
-    Sky,
     get_parameters,
-    observe,
     observe_band,
     parameter_names,
     set_parameters,
 )
-from jaxsky.cmb import camb_spectra, realisation
+from jaxsky.cmb import camb_spectra
 from jaxsky.galaxy import EmbeddedSky, embedded_sky
-from jaxsky.harmonics import gaussian_beam, resample, synthesis
+from jaxsky.harmonics import gaussian_beam, resample
 from jaxsky.inputs import (
     Template,
     check_stokes,
@@ -37,16 +33,19 @@ from jaxsky.inputs import (
     set_parameters_of,
     uK_RJ_per,
 )
-from jaxsky.instrument import load_instrument
+from jaxsky.instrument import Instrument, load_instrument
+from jaxsky.keys import realisation_key
 from jaxsky.noise import (
-    draw,
     estimate_variance,
     fit_knee,
     knee_spectrum,
     uniform_covariance,
 )
 from jaxsky.noise_inputs import read_noise
+from jaxsky.observation import Observation, Source
+from jaxsky.preparation import prepare
 from jaxsky.settings_keys import at_key
+from jaxsky.simulate import observe_bands
 
 __all__ = [
     "Band",
@@ -123,29 +122,27 @@ def embedded_inputs(settings: Settings, galaxy: EmbeddedSky | None = None) -> In
             for name, chosen in embedded.channels.items()
             for channel in load_instrument(name).select(chosen)
         ]
-    bandpasses = [channel.band() for channel in channels]
-    lmax = 2 * embedded.nside  # what the pixels resolve without aliasing
+    observed = Instrument("embedded", channels).observed()
+    nside, lmax = embedded.nside, 2 * embedded.nside  # what the pixels resolve without aliasing
     r = settings.cmb.r if settings.cmb.include else None
-    cmb_key, *noise_keys = jax.random.split(jax.random.key(seed), 1 + len(channels))
-    components = dict(sky.components)
-    if r is not None:
-        alm = realisation(cmb_key, camb_spectra(lmax, r))
-        components["cmb"] = CMB(synthesis(alm, embedded.nside))
-    seen = observe(Sky(components), bandpasses)
-
+    observation = Observation(
+        observed, nside, finest=min(float(channel.fwhm) for channel in channels)
+    )
+    key = realisation_key(seed)
+    prepared = prepare(key, {name: Source(sky[name]) for name in sky}, observation)
+    spectra = None if r is None else jnp.asarray(camb_spectra(lmax, r))
     bands = {}
-    used = np.ones(healpy.nside2npix(embedded.nside), bool)
-    for channel, bandpass, maps, key in zip(channels, bandpasses, seen, noise_keys, strict=True):
-        factor = bandpass.conversion(channel.noise_unit, "uK_RJ")
-        noise = uniform_covariance(channel.noise * factor, embedded.nside)
-        beam, fwhm, leakage = gaussian_beam(channel.fwhm, lmax), float(channel.fwhm), None
-        smoothed = resample(maps, beam, embedded.nside) + draw(key, noise)
-        if fraction := embedded.leakage.get(channel.name):
+    used = np.ones(healpy.nside2npix(nside), bool)
+    for name, seen in observe_bands(key, prepared, observation, spectra):
+        channel, maps, leakage = observed[name], seen["total"], None
+        fwhm = float(channel.beam)
+        if fraction := embedded.leakage.get(name):
             whole = set_parameters(galaxy.sky("IQU"), settings.fixed)
-            leaked = leak(fraction * observe_band(whole, bandpass)[0])
-            leakage = Leakage(resample(leaked, beam, embedded.nside), used, fwhm)
-            smoothed = smoothed + leakage.maps
-        bands[channel.name] = Band(smoothed, used, bandpass, fwhm, noise, leakage=leakage)
+            leaked = leak(fraction * observe_band(whole, channel.band)[0])
+            leakage = Leakage(resample(leaked, gaussian_beam(fwhm, lmax), nside), used, fwhm)
+            maps = maps + leakage.maps
+        noise = uniform_covariance(channel.noise, nside)
+        bands[name] = Band(maps, used, channel.band, fwhm, noise, leakage=leakage)
     templates = {name: Template(sky[name], 0.0, used) for name in sky}
     known = parameter_names(sky)
     free = get_parameters(sky, [name for name in settings.free if name in known])

@@ -9,12 +9,11 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import jax
 import numpy as np
 from jaxtyping import Array
 
-from jaxsky.checks import check_seed
 from jaxsky.io import InputError, whole
+from jaxsky.keys import realisation_key, stream
 from jaxsky.progress import QUIET
 
 __all__ = ["realisations"]
@@ -50,7 +49,6 @@ def realisations(
     jaxsky.io.InputError
         If the file is damaged, or holds realisations of other data or settings.
     """
-    check_seed("seed", seed)
     done = [] if path is None else _load(path, mark, names)
     held, saved = len(done), time.monotonic()
     try:
@@ -73,7 +71,7 @@ def _made(
     """Realisations in order, made by as many threads as there are processors."""
 
     def one(number: int) -> list[np.ndarray]:
-        key = jax.random.fold_in(jax.random.key(seed), number)
+        key = stream(realisation_key(seed, number), "realisation")  # unlike what is observed
         return [np.asarray(x) for x in make(key)]
 
     first, rest = numbers[:1], numbers[1:]

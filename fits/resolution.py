@@ -17,6 +17,7 @@ from fits.template_noise import prepared_variance
 from jaxsky import Bandpass, Sky, observe
 from jaxsky.cmb import camb_spectra
 from jaxsky.harmonics import gaussian_beam, pixel_window
+from jaxsky.noise import uniform_level
 from jaxsky.types import Numeric
 
 __all__ = ["Prepared", "prepare"]
@@ -176,7 +177,16 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
         _prepared_spectrum(band.correlated, op, lmax)
         for op, band in zip(preparations, inputs.bands.values(), strict=True)
     )
-    fluctuations = Fluctuations(preparations, noise, correlated, spectra, windows, factors)
+    fluctuations = Fluctuations(
+        preparations,
+        noise,
+        correlated,
+        spectra,
+        windows,
+        factors,
+        tuple(inputs.bands),
+        tuple(map(uniform_level, noise)),
+    )
     sigma = fluctuations.sigma()
     known = np.asarray(jnp.isfinite(sigma).all(axis=(0, 1)))
     return Prepared(

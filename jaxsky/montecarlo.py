@@ -11,21 +11,20 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Array, Float
 
 import jaxsky
-from jaxsky.checks import check_seed
 from jaxsky.experiment import Experiment, Setup
 from jaxsky.io import write_maps, write_text
 from jaxsky.io.files import check_guards
 from jaxsky.io.folders import alone
+from jaxsky.keys import realisation_key
 from jaxsky.lookup import found_files
 from jaxsky.preparation import Prepared, plan, prepare
 from jaxsky.simulate import observe_bands
 
-__all__ = ["LOG", "Written", "check_folder", "paths", "realisation_key", "run"]
+__all__ = ["LOG", "Written", "check_folder", "paths", "run"]
 
 LOG = "simulation.json"
 PACKAGES = ("jaxsky", "jax", "numpy", "healpy", "ducc0", "jaxbind", "camb")
@@ -40,13 +39,6 @@ class Written(NamedTuple):
     band: str
     path: Path
     seconds: float | None
-
-
-def realisation_key(seed: int, index: int) -> Array:
-    """The key of a realisation, from nothing but the seed and its number."""
-    check_seed("seed", seed)
-    check_seed("index", index)
-    return jax.random.fold_in(jax.random.key(seed), index)
 
 
 def paths(out: Path, names: tuple[str, ...], index: int) -> dict[str, Path]:
@@ -312,7 +304,7 @@ def run(
         key = realisation_key(main.seed, index)
         if prepared is None or random:
             terms = plan(setup.sources, observation) if terms is None else terms
-            small = key if random else jax.random.key(main.small_scales_seed or 0)
+            small = key if random else realisation_key(main.small_scales_seed or 0)
             correlated = [n for n, source in setup.sources.items() if source.correlated_with]
             prepared = prepare(small, setup.sources, observation, terms, release=not random)
             for name in correlated:

@@ -27,9 +27,9 @@ from jaxsky.harmonics import (
     synthesis,
 )
 from jaxsky.interpolation import Terms, choose_terms, term, term_weights
+from jaxsky.keys import stream
 from jaxsky.observation import Observation, Source
 from jaxsky.small_scales import continue_templates
-from jaxsky.streams import stream
 
 __all__ = ["Prepared", "plan", "prepare"]
 

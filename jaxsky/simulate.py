@@ -17,10 +17,10 @@ from jaxtyping import Array, Float
 from jaxsky.cmb import realisation
 from jaxsky.harmonics import analysis, beam_ratio, expand, resample, synthesis
 from jaxsky.interpolation import Terms, band_sed
+from jaxsky.keys import stream
 from jaxsky.noise import draw, uniform_alm, uniform_map
 from jaxsky.observation import Observation, ObservedBand, Source
 from jaxsky.preparation import Prepared, prepare
-from jaxsky.streams import stream
 
 __all__ = ["observe_bands", "simulate"]
 

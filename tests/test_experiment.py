@@ -18,6 +18,7 @@ from jaxsky.experiment import DEFAULT, EXAMPLE, build, load_experiment, setup
 from jaxsky.harmonics import alm_ell, expand, gaussian_beam, synthesis
 from jaxsky.io import read_maps, write_maps
 from jaxsky.io.folders import occupied
+from jaxsky.keys import realisation_key
 from jaxsky.simulate import simulate
 
 NSIDE = 8
@@ -126,7 +127,7 @@ def test_files_are_the_simulation(folder, tmp_path, monkeypatch, capsys):
     assert "Written: 2 maps" in " ".join(capsys.readouterr().err.split())
     assert sorted(content(out)) == ["sim_00000/143.fits", "sim_00000/30.fits"]
     setup = build(load_experiment(path))
-    key = montecarlo.realisation_key(3, 0)
+    key = realisation_key(3, 0)
     expected = simulate(key, setup.sources, setup.observation, jnp.asarray(setup.cmb))
     for name, maps in zip(setup.observation.names, expected, strict=True):
         file = out / "sim_00000" / f"{name}.fits"
@@ -393,9 +394,7 @@ def test_double_precision(folder, tmp_path, monkeypatch):
     file = tmp_path / "out" / "sim_00000" / "30.fits"
     assert pyfits.getheader(file, 1)["TFORM1"].endswith("D")
     setup = build(load_experiment(path))
-    expected = simulate(
-        montecarlo.realisation_key(3, 0), setup.sources, setup.observation, setup.cmb
-    )
+    expected = simulate(realisation_key(3, 0), setup.sources, setup.observation, setup.cmb)
     found = read_maps(file, fields=["Q", "U"]).maps
     np.testing.assert_allclose(found, expected[0], rtol=0, atol=1e-12 * np.abs(found).max())
 
@@ -433,7 +432,7 @@ def test_small_scales_can_be_the_same_for_all(folder, tmp_path, monkeypatch):
 def simulated(path):
     settings = load_experiment(path)
     setup = build(settings)
-    key = montecarlo.realisation_key(settings.experiment.seed, 0)
+    key = realisation_key(settings.experiment.seed, 0)
     cmb = None if setup.cmb is None else jnp.asarray(setup.cmb)
     return np.asarray(simulate(key, setup.sources, setup.observation, cmb))
 
@@ -823,7 +822,7 @@ def test_intensity_and_the_sheet(folder, tmp_path, monkeypatch):
     assert picture.name == "sim_00007.png"
     assert picture.read_bytes().startswith(b"\x89PNG")
     setup = build(load_experiment(path))
-    key = montecarlo.realisation_key(3, 7)
+    key = realisation_key(3, 7)
     expected = simulate(key, setup.sources, setup.observation, jnp.asarray(setup.cmb))
     found = read_maps(out / "sim_00007" / "30.fits", fields=["I", "Q", "U"])
     np.testing.assert_allclose(found.maps, expected[0], atol=1e-6 * float(jnp.abs(expected).max()))

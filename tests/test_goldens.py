@@ -66,6 +66,8 @@ def fluctuations():
         spectra,
         jnp.stack([gaussian_beam(900.0, lmax)] * 2),
         jnp.array([0.9, 0.7]),
+        ("44", "70"),
+        (None, None),
     )
 
 

@@ -62,7 +62,14 @@ def fluctuations(cmb: bool = True) -> Fluctuations:
     windows = jnp.stack([gaussian_beam(fwhm, lmax) for fwhm in (1500.0, 1200.0)])
     correlated = (None, jnp.zeros(lmax + 1).at[2:].set(3.0 / jnp.arange(2, lmax + 1) ** 2))
     return Fluctuations(
-        preparations, noise, correlated, spectra if cmb else None, windows, jnp.array([0.95, 0.9])
+        preparations,
+        noise,
+        correlated,
+        spectra if cmb else None,
+        windows,
+        jnp.array([0.95, 0.9]),
+        ("44", "70"),
+        (None, None),
     )
 
 

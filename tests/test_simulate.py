@@ -21,11 +21,11 @@ from jaxsky.harmonics import (
     smooth,
     synthesis,
 )
+from jaxsky.keys import stream
 from jaxsky.observation import Observation, ObservedBand, Source
 from jaxsky.preparation import plan, prepare
 from jaxsky.simulate import observe_bands, simulate
 from jaxsky.small_scales import SmallScales
-from jaxsky.streams import stream
 
 NSIDE = 8
 NPIX, LMAX = 12 * NSIDE**2, 2 * NSIDE

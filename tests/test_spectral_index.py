@@ -70,7 +70,9 @@ def test_variance_of_prepared_noise():
         draws = jnp.stack(
             [preparation(draw(k, covariance)) for k in jax.random.split(jax.random.key(0), 400)]
         )
-        model = Fluctuations((preparation,), (covariance,), (None,), None, None, jnp.ones(1))
+        model = Fluctuations(
+            (preparation,), (covariance,), (None,), None, None, jnp.ones(1), ("44",), (None,)
+        )
         ratio = np.asarray(draws.var(axis=0) / model.sigma()[0] ** 2)
         inside = np.abs(healpy.pix2ang(nside, np.arange(ratio.shape[1]), lonlat=True)[1])
         for low in (0, 30, 60):
@@ -249,7 +251,14 @@ def pulls():
     spectra = jnp.asarray(camb_spectra(256))
     windows = jnp.stack([gaussian_beam(fwhm, lmax)] * 2)
     model = Fluctuations(
-        preparations, noise, (None, None), spectra[1:3, : lmax + 1], windows, factors
+        preparations,
+        noise,
+        (None, None),
+        spectra[1:3, : lmax + 1],
+        windows,
+        factors,
+        ("44", "70"),
+        (None, None),
     )
     latitude = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)[1]
     sigma = jnp.where(np.abs(latitude) <= 20, model.sigma(), jnp.inf)

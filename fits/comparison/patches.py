@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import healpy
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -14,7 +13,7 @@ from fits.patches import PatchFits, PreparedPatches, fit_patches, prepare_patche
 from fits.resolution import Prepared, prepare
 from fits.settings import Settings
 from jaxsky.harmonics import average_pixels, gaussian_beam, pixel_window
-from jaxsky.streams import stream
+from jaxsky.keys import realisation_key, stream
 
 __all__ = ["PatchComparison", "compare_patches", "template_patches"]
 
@@ -134,8 +133,8 @@ def compare_patches(settings: Settings, inputs: Inputs) -> PatchComparison:
     window = np.asarray(_window(band, nside, fwhm, lmax))
     patches = prepare_patches(paper_patches(nside), window)
     noise = _noise(band, prepared, patches)
-    # Realisations of their own: those of the embedded observation come from another key.
-    key = stream(jax.random.key(settings.analysis.seed), "patches")
+    # Realisations of their own, unlike those of what is observed.
+    key = stream(realisation_key(settings.analysis.seed), "patches")
     model = prepared.model()[0]
     fluctuations = prepared.fluctuations
     model = model + fluctuations.noise_realisation(key)[0] + fluctuations.cmb_realisation(key)[0]

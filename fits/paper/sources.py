@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import healpy
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -18,9 +17,9 @@ from jaxsky import AME, Dust, Synchrotron
 from jaxsky.experiment.settings import SmallScalesTable
 from jaxsky.galaxy import EmbeddedSky, embedded_sky
 from jaxsky.inputs import Template, read, read_templates, set_parameters_of, uK_RJ_per
+from jaxsky.keys import realisation_key, stream
 from jaxsky.settings import SettingsError, TemplateFile
 from jaxsky.small_scales import Continued, SmallScales, continue_templates
-from jaxsky.streams import stream
 from jaxsky.templates import dust_index, polarization_template
 
 __all__ = ["NSIDE", "PAPER_FWHM", "Ame", "Layer", "Sources", "listed"]
@@ -100,7 +99,7 @@ class Sources:
     def __init__(self, settings: PaperSettings) -> None:
         self.settings = settings
         self.folder = Path(settings.data_dir)
-        self.key = jax.random.key(settings.analysis.seed)
+        self.key = realisation_key(settings.analysis.seed)
         self._made: dict[str, Any] = {}
 
     def once(self, name: str, make: Callable[[], T]) -> T:

@@ -27,8 +27,8 @@ from fits.separation.maps import (
 from fits.separation.noise import Noise
 from jaxsky import Bandpass, Sky
 from jaxsky.harmonics import analysis, expand, gaussian_beam, lmax_of, synthesis
-from jaxsky.noise import draw
-from jaxsky.streams import stream
+from jaxsky.keys import stream
+from jaxsky.noise import draw, uniform_alm, uniform_level
 
 __all__ = ["Domain", "HarmonicDomain", "PixelDomain"]
 
@@ -131,7 +131,11 @@ class HarmonicDomain(NamedTuple):
         for name, covariance, spectrum in zip(
             self.bands, self.covariance, self.correlated, strict=True
         ):
-            alm = analysis(draw(stream(key, "noise", name), covariance), self.lmax, 0)
+            level = uniform_level(covariance)
+            if level is not None:
+                alm = uniform_alm(stream(key, "noise", name), level, self.lmax)
+            else:
+                alm = analysis(draw(stream(key, "noise", name), covariance), self.lmax, 0)
             white = jax.random.normal(stream(key, "correlated", name), alm.shape)
             bands.append(np.asarray(alm + white * expand(jnp.sqrt(jnp.asarray(spectrum)))))
         return np.stack(bands)

@@ -22,7 +22,7 @@ from fits.separation.likelihood import SpectralLikelihood
 from fits.separation.response import Response
 from jaxsky.cmb import realisation
 from jaxsky.harmonics import analysis, expand, power_spectrum, synthesis
-from jaxsky.streams import stream
+from jaxsky.keys import stream
 
 __all__ = ["Realisation", "Simulated"]
 

@@ -5,11 +5,12 @@ import reprlib
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from pydantic import ValidationError
 
-from jaxsky.settings import SettingsError, SettingsFile, expand
+from jaxsky.settings import SettingsError, expand
+from jaxsky.settings_experiment import Experiment
 
 __all__ = ["load"]
 
@@ -61,9 +62,6 @@ def _sentence(path: Path, raw: Any, error: ValidationError, options: Mapping[str
     return f"{path}: {'; '.join(sentences)}."
 
 
-S = TypeVar("S", bound=SettingsFile)
-
-
 def _assigned(assignment: str) -> dict[str, Any]:
     """The tables of `key=value`, where the value is TOML, or text as it is.
 
@@ -100,21 +98,13 @@ def _merge(raw: Any, changes: Mapping[str, Any]) -> Any:
     return {**raw, **changes, **{k: _merge(raw[k], changes[k]) for k in into}}
 
 
-def load(
-    path: Path,
-    model: type[S],
-    overrides: Mapping[str, Mapping[str, Any]] | None = None,
-    assignments: Sequence[str] = (),
-) -> S:
-    """Settings from a TOML file.
+def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
+    """An experiment from a TOML file.
 
     Parameters
     ----------
     path : the file; relative paths in it are relative to its `data_dir`, and that to its folder
-    model : what the settings are
-    overrides : by table, values of options with the key's name, which replace those of the file;
-        None is ignored
-    assignments : `key=value` with a dotted key, such as "analysis.nside=32", "bands.0.fwhm=30" or
+    assignments : `key=value` with a dotted key, such as "common.nside=32", "bands.0.fwhm=30" or
         "free.'dust.beta_dust'.start=1.5"; they are merged into the file's tables
 
     Returns
@@ -135,15 +125,6 @@ def load(
     except RecursionError:
         raise SettingsError(f"{path}: is nested too deeply.") from None
     options: dict[str, str] = {}
-    for table, values in (overrides or {}).items():
-        given = {key: value for key, value in values.items() if value is not None}
-        options |= {
-            f"{table}.{key}": f" (given as --{key})"
-            for key, value in given.items()
-            if not isinstance(value, list)
-        }
-        if given and isinstance(raw.get(table, {}), dict):
-            raw[table] = raw.get(table, {}) | given
     for assignment in assignments:
         changes = _assigned(assignment)
         try:
@@ -151,11 +132,13 @@ def load(
         except ValueError as error:
             raise SettingsError(f"{path}: --set {assignment}: {error}.") from None
         options[assignment.partition("=")[0].strip()] = " (given with --set)"
+    named = raw.get("data_dir", ".")
     try:
-        settings = model.model_validate(raw)
-        folder = (path.absolute().parent / expand(settings.data_dir)).resolve()
+        name = expand(named) if isinstance(named, str) else "."
+        folder = (path.absolute().parent / name).resolve()
         if folder.exists() and not folder.is_dir():
             raise ValueError(f"{folder} is not a folder")
+        settings = Experiment.model_validate(raw, context={"folder": folder})
     except ValidationError as error:
         raise SettingsError(_sentence(path, raw, error, options)) from None
     except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: links in a circle

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple, TypeVar
 import healpy
 import jax.numpy as jnp
 import numpy as np
+from jaxsky.experiment.settings import SmallScalesTable
 from jaxtyping import Array, Float
 
 from fits.paper.indices import Index, drawn_index, held_index, read_index
 from fits.paper.item import Impossible
 from fits.paper.settings import IndexFile, PaperSettings
 from jaxsky import AME, Dust, Synchrotron
-from jaxsky.experiment.settings import SmallScalesTable
 from jaxsky.galaxy import EmbeddedSky, embedded_sky
 from jaxsky.inputs import Template, read, read_templates, set_parameters_of, uK_RJ_per
 from jaxsky.keys import realisation_key, stream

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Array
 
+from jaxsky.checks import check_seed
 from jaxsky.io import InputError, whole
 from jaxsky.keys import realisation_key, stream
 from jaxsky.progress import QUIET
@@ -49,6 +50,7 @@ def realisations(
     jaxsky.io.InputError
         If the file is damaged, or holds realisations of other data or settings.
     """
+    check_seed("seed", seed)
     done = [] if path is None else _load(path, mark, names)
     held, saved = len(done), time.monotonic()
     try:

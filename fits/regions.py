@@ -14,7 +14,7 @@ from jaxsky.lookup import find_file
 from jaxsky.settings import MaskFile
 from jaxsky.settings_experiment import Experiment, parse_region
 
-__all__ = ["apodize", "region_mask", "region_masks"]
+__all__ = ["apodize", "region_mask", "region_masks", "region_words"]
 
 COMPARISONS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 
@@ -57,6 +57,14 @@ def region_mask(
             found = healpy.ud_grade(found.astype(float), nside) > 0
         inside = inside & (degrade_mask(found, nside) if coarser else mask_at(found, nside, where))
     return np.asarray(inside)
+
+
+def region_words(settings: Experiment, name: str) -> str:
+    """What a region is, as part of a sentence."""
+    region = settings.regions[name]
+    if isinstance(region, MaskFile):
+        return f"the mask {name}"
+    return "the full sky" if parse_region(region) is None else f"{region} deg"
 
 
 def apodize(used: Bool[np.ndarray, " pix"], width: float) -> Float[np.ndarray, " pix"]:

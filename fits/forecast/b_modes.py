@@ -3,11 +3,13 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import healpy
 import numpy as np
 from jaxtyping import Float
 
 from fits.pseudo_cl import MaskedSpectra, band_powers
 from jaxsky import Bandpass, Sky, observe_band
+from jaxsky.harmonics import beam_ratio
 from jaxsky.observation import ObservedBand
 
 __all__ = [

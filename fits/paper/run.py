@@ -18,11 +18,11 @@ from fits.paper import (
     templates,
 )
 from fits.paper.item import NUMBERS, Impossible, Item
-from fits.paper.settings import PaperSettings
 from fits.paper.sources import Sources
 from fits.paper.store import Store
 from fits.record import write_log
 from jaxsky.progress import QUIET, Progress
+from jaxsky.settings_experiment import Experiment
 
 __all__ = ["LOG", "STEPS", "Step", "labels_of", "run"]
 
@@ -45,7 +45,7 @@ class Step(NamedTuple):
     """
 
     label: str
-    make: Callable[[PaperSettings, Sources, Path], Item]
+    make: Callable[[Experiment, Sources, Path], Item]
 
 
 #: In the order of the paper.
@@ -114,7 +114,7 @@ def _numbers(items: Iterable[Item]) -> Item | None:
 
 
 def run(
-    settings: PaperSettings,
+    settings: Experiment,
     out: Path,
     only: Iterable[str] = (),
     *,
@@ -170,7 +170,7 @@ def run(
     return items
 
 
-def _show(settings: PaperSettings, sources: Sources, store: Store, order: list[str]) -> list[Item]:
+def _show(settings: Experiment, sources: Sources, store: Store, order: list[str]) -> list[Item]:
     """Write the page."""
     items = store.ordered(order)
     numbers = _numbers(items)

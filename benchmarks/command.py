@@ -8,9 +8,10 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
+from fits.settings import EXAMPLE
+
 from benchmarks.table import Row, time_text
 from benchmarks.timing import usage
-from fits.settings import EXAMPLE
 
 __all__ = ["fit", "planck"]
 

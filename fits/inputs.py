@@ -34,9 +34,9 @@ from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import Observation, ObservedBand
 from jaxsky.preparation import prepare
 from jaxsky.settings import SettingsError
-from jaxsky.settings_experiment import Experiment
-from jaxsky.settings_keys import at_key
-from jaxsky.settings_tables import BandTable
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import at_key
+from jaxsky.settings.tables import BandTable
 from jaxsky.simulate import observe_bands
 
 __all__ = ["Band", "Inputs", "Leakage", "inputs_of", "read_band"]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsky.settings_experiment import Experiment
+from jaxsky.settings.experiment import Experiment
 from jaxsky.types import Numeric
 
 __all__ = [

@@ -14,9 +14,9 @@ import numpy as np
 
 from jaxsky.io import write_text
 from jaxsky.lookup import found_files
-from jaxsky.planck_names import leak
 from jaxsky.settings import SettingsFile
-from jaxsky.settings_experiment import Experiment
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.planck_names import leak
 
 __all__ = ["fingerprint", "leaks", "probability", "with_error", "write_json", "write_log"]
 

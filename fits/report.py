@@ -13,7 +13,7 @@ from fits.inputs import Inputs
 from fits.record import leaks, write_json, write_log
 from fits.spectral_index import Fit, all_free
 from fits.template_noise import unknown_noise
-from jaxsky.settings_experiment import Experiment
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["known_truth", "result_table", "warnings", "write_report"]
 

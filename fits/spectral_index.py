@@ -25,8 +25,8 @@ from fits.template_noise import Attenuation, attenuation
 from jaxsky import observe_components, parameter_names, set_parameters
 from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import SettingsError
-from jaxsky.settings_experiment import Experiment
-from jaxsky.settings_keys import at_key
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import at_key
 
 __all__ = ["Fit", "all_free", "run"]
 

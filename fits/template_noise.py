@@ -24,7 +24,7 @@ from jaxsky.harmonics import gaussian_beam, pixel_window
 from jaxsky.inputs import Template
 from jaxsky.noise_inputs import read_noise
 from jaxsky.settings import SettingsError
-from jaxsky.settings_tables import ComponentTable
+from jaxsky.settings.tables import ComponentTable
 from jaxsky.units import conversion
 
 __all__ = [

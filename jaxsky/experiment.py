@@ -21,9 +21,9 @@ from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import DTYPES, Observation, ObservedBand, Source
 from jaxsky.parameters import get_parameters, parameter_names
 from jaxsky.settings import SettingsError
-from jaxsky.settings_experiment import Experiment
-from jaxsky.settings_keys import at_key
-from jaxsky.settings_tables import BandTable
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import at_key
+from jaxsky.settings.tables import BandTable
 from jaxsky.sky import Sky, observe_band
 from jaxsky.small_scales import SmallScales
 

@@ -17,9 +17,9 @@ from jaxsky.lookup import find_file
 from jaxsky.parameter_maps import parameter_map
 from jaxsky.parameters import set_parameters
 from jaxsky.settings import BandpassSpec, MapFile, MapKeys, SettingsError
-from jaxsky.settings_experiment import Experiment
-from jaxsky.settings_keys import at_key
-from jaxsky.settings_tables import ComponentTable
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import at_key
+from jaxsky.settings.tables import ComponentTable
 from jaxsky.sky import Sky
 
 __all__ = [

@@ -23,7 +23,7 @@ from jaxsky.io.observations import observed_tables
 from jaxsky.keys import realisation_key
 from jaxsky.lookup import found_files
 from jaxsky.preparation import Prepared, plan, prepare
-from jaxsky.settings_experiment import Experiment
+from jaxsky.settings.experiment import Experiment
 from jaxsky.simulate import observe_bands
 
 __all__ = ["LOG", "Written", "check_folder", "paths", "run"]

@@ -19,7 +19,7 @@ from jaxsky.noise import (
     weights_covariance,
 )
 from jaxsky.settings import Hits, MapFile, MapKeys, NoiseColumns, NoiseTable, SettingsError
-from jaxsky.settings_keys import at_key
+from jaxsky.settings.keys import at_key
 
 __all__ = ["read_noise"]
 

@@ -8,18 +8,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import fits.forecast.settings
+import fits.paper.settings
+import fits.separate.settings
+import fits.settings
+
 import fits.forecast.setup
 import fits.inputs
-import fits.paper.settings
 import fits.regions
 import fits.resolution
-import fits.separate.settings
 import fits.separate.setup
-import fits.settings
 from jaxsky import experiment
 from jaxsky.io import InputError
 from jaxsky.settings import SettingsError
-from jaxsky.settings_keys import at_key, of_file
+from jaxsky.settings.keys import at_key, of_file
 
 VALUES = (-1, 0, 1.5, 1e30, -1e300, 2**40, True, "", "unknown", "[/] $x_$", [], [1], [-1, "a"], {},
           {"unknown": 1})  # fmt: skip

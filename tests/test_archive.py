@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import pytest
+from fits.settings import load_settings
 
 from commands import jaxsky
 from fits import settings as fit_settings
 from fits.paper import settings as paper_settings
 from fits.separate import settings as separate_settings
-from fits.settings import load_settings
 from jaxsky.archive import (
     ProductSet,
     catalogue,

@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.io import fits as pyfits
-
 from fits.forecast.settings import load_forecast
-from fits.inputs import read_inputs
 from fits.paper.settings import load_paper
 from fits.separate.settings import load_separate
 from fits.settings import load_settings
+
+from fits.inputs import read_inputs
 from jaxsky import Bandpass, Dust, Synchrotron
 from jaxsky.experiment import load_experiment
 from jaxsky.io import (

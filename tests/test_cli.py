@@ -8,9 +8,9 @@ import healpy
 import jax
 import numpy as np
 import pytest
+from fits.settings import EXAMPLE, load_settings
 
 from commands import jaxsky, one_sentence
-from fits.settings import EXAMPLE, load_settings
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.harmonics import alm_ell, gaussian_beam, synthesis
 from jaxsky.io import write_maps

@@ -9,14 +9,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from fits.settings import EMBEDDED, Settings
 from rich.console import Console
 from rich.table import Table
 
 from fits.commands import console as terminal
 from fits.commands.page import Section, key_of, table_of, write_page
-from fits.settings import EMBEDDED, Settings
 from jaxsky.settings import SettingsError
-from jaxsky.settings_load import load
+from jaxsky.settings.load import load
 
 SETTINGS = """
 [analysis]

@@ -192,6 +192,7 @@ def test_a_law_has_one_class():
 
 def test_separate_refuses_what_has_no_polarization():
     from fits.separate.settings import SeparateSettings
+
     from fits.separate.setup import build
 
     laws = {"cmb": {"law": "cmb"}, "dust": {"law": "dust"}, "ff": {"law": "free_free"}}

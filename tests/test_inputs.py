@@ -26,8 +26,8 @@ from jaxsky.settings import (
     TemplateFile,
     check_angles,
 )
-from jaxsky.settings_load import load
-from jaxsky.settings_types import Nside
+from jaxsky.settings.load import load
+from jaxsky.settings.types import Nside
 
 NSIDE = 4
 NPIX = 12 * NSIDE**2

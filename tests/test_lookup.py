@@ -5,24 +5,24 @@ import stat
 
 import numpy as np
 import pytest
-
 from fits.forecast.settings import load_forecast
+from fits.paper.settings import load_paper
+from fits.separate.settings import load_separate
+from fits.settings import Settings, load_settings
+
 from fits.forecast.setup import build as build_forecast
 from fits.inputs import read_inputs
-from fits.paper.settings import load_paper
 from fits.paper.sources import Sources
 from fits.record import write_log
 from fits.regions import region_masks
-from fits.separate.settings import load_separate
 from fits.separate.setup import build as build_separation
-from fits.settings import Settings, load_settings
 from jaxsky.archive import cache_folder
 from jaxsky.experiment import build as build_experiment
 from jaxsky.experiment import load_experiment
 from jaxsky.io import InputError, write_maps
 from jaxsky.lookup import find_file, found_files
 from jaxsky.settings import MapFile, SettingsError, SettingsFile
-from jaxsky.settings_load import load
+from jaxsky.settings.load import load
 
 KNOWN = "LFI_RIMO_R3.31.fits"
 MASK = "wmap_polarization_analysis_mask_r9_9yr_v5.fits"

@@ -4,14 +4,14 @@ import healpy
 import numpy as np
 import pytest
 from astropy.io import fits as pyfits
+from fits.paper.settings import PaperSettings
+from fits.separate.settings import SeparateSettings
+from jaxsky.experiment.settings import Experiment
 
 from fits import settings as fit_settings
 from fits.inputs import read_band, read_inputs
-from fits.paper.settings import PaperSettings
 from fits.regions import region_masks
-from fits.separate.settings import SeparateSettings
 from fits.separate.setup import build
-from jaxsky.experiment.settings import Experiment
 from jaxsky.inputs import read, read_templates
 from jaxsky.io import InputError
 from jaxsky.settings import MapFile, SettingsError, TemplateFile

@@ -8,13 +8,13 @@ import healpy
 import jax
 import numpy as np
 import pytest
+from fits.paper.settings import EMBEDDED, EXAMPLE, PaperSettings, load_paper
 
 import commands
 from fits.paper import STEPS, Impossible, Item, Number, Sources, Step, run
 from fits.paper.experiment import _observation, _prepared
 from fits.paper.item import NUMBERS
 from fits.paper.run import labels_of
-from fits.paper.settings import EMBEDDED, EXAMPLE, PaperSettings, load_paper
 from jaxsky.harmonics import gaussian_beam, power_spectrum
 from jaxsky.io import read_maps
 from jaxsky.observation import Source

@@ -3,13 +3,13 @@
 from pathlib import Path
 
 import pytest
+from fits.paper.settings import EMBEDDED, PaperSettings, load_paper
 
 from fits.comparison import compare
 from fits.forecast.forecast import forecast
 from fits.inputs import inputs_of
 from fits.paper import STEPS, run
 from fits.paper.forecasts import _settings
-from fits.paper.settings import EMBEDDED, PaperSettings, load_paper
 from fits.paper.sources import Sources
 from fits.record import with_error
 from fits.regions import region_masks

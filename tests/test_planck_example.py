@@ -7,17 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from fits import settings as fit_settings
-from fits.inputs import Band, Inputs, embedded_inputs, read_band, read_inputs
 from fits.paper.settings import EXAMPLE as PAPER
 from fits.paper.settings import load_paper
-from fits.preparation import Preparation
-from fits.report import result_json, warnings
-from fits.resolution import prepare
 from fits.separate.settings import EXAMPLE as SEPARATE
 from fits.separate.settings import load_separate
 from fits.settings import EXAMPLE, leaks, load_settings
+
+from fits import settings as fit_settings
+from fits.inputs import Band, Inputs, embedded_inputs, read_band, read_inputs
+from fits.preparation import Preparation
+from fits.report import result_json, warnings
+from fits.resolution import prepare
 from fits.spectral_index import run
 from fits.template_noise import TemplateNoise, prepared_variance
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, inputs, observe

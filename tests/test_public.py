@@ -11,12 +11,12 @@ import re
 import numpy as np
 import pytest
 from astropy import units as u
+from fits.settings import Analysis
 from pydantic import BaseModel, ValidationError
 
 import fits
 import jaxsky
 from fits.pseudo_cl import band_powers, masked_spectra
-from fits.settings import Analysis
 from jaxsky import Bandpass, Sky, Synchrotron, observe, set_parameters
 from jaxsky.checks import as_array
 from jaxsky.harmonics import smooth

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fits.separate.settings import EMBEDDED, EXAMPLE, SeparateSettings, load_separate
 
 from fits.pseudo_cl import band_powers
 from fits.separate import report
 from fits.separate import separate as module
 from fits.separate.report import tables, warnings
 from fits.separate.separate import separate
-from fits.separate.settings import EMBEDDED, EXAMPLE, SeparateSettings, load_separate
 from fits.separate.setup import build
 from fits.separation import fit_spectra
 from fits.separation.response import Response, widened

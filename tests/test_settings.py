@@ -1,14 +1,14 @@
 """Settings of all commands: values of their types, within bounds, names that results can bear."""
 
 import pytest
-
 from fits.forecast.settings import ForecastSettings
 from fits.paper.settings import PaperSettings
 from fits.separate.settings import SeparateSettings
 from fits.settings import Settings
 from jaxsky.experiment.settings import Experiment
+
 from jaxsky.settings import SettingsError
-from jaxsky.settings_load import load
+from jaxsky.settings.load import load
 
 TEMPLATE = '[templates."{component}"]\nfile = "a.fits"\nlaw = "dust"\nnu_ref = 353\n'
 BAND = '[[bands]]\nname = "{band}"\n'

@@ -4,7 +4,7 @@ import pytest
 
 from jaxsky.io import InputError
 from jaxsky.settings import SettingsError
-from jaxsky.settings_keys import at_key, of_file
+from jaxsky.settings.keys import at_key, of_file
 from settings_fuzz import KINDS, fault, faults, small
 
 

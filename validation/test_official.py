@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fits.settings import EXAMPLE, load_settings
 
 from fits.inputs import read_inputs
 from fits.optimize import best_fit
 from fits.regions import region_masks
 from fits.resolution import prepare
-from fits.settings import EXAMPLE, load_settings
 
 TRUTH = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1}
 SEEDS = range(1, 51)

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from fits.settings import EMBEDDED, load_settings
 
 from fits.inputs import inputs_of
 from fits.optimize import best_fit
 from fits.resolution import prepare
-from fits.settings import EMBEDDED, load_settings
 from jaxsky.galaxy import embedded_sky
 
 SKIES = 200

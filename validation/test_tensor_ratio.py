@@ -2,10 +2,10 @@
 
 import jax
 import numpy as np
+from fits.separate.settings import SeparateSettings
 
 from fits.pseudo_cl import band_powers
 from fits.separate.separate import separate
-from fits.separate.settings import SeparateSettings
 from fits.separate.setup import build
 from fits.separation import fit_spectra
 from fits.separation.tensor_ratio import fit_tensors

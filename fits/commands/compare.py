@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fits.commands import run
-from jaxsky.settings_keys import at_key
+from jaxsky.settings.keys import at_key
 
 __all__ = ["compare"]
 
@@ -28,12 +28,13 @@ KIND = run.Kind(
 def compare(
     settings_file: run.SettingsPath = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/compare"),
+    maps: run.Maps = None,
     values: run.Values = None,
     resume: run.Resume = False,
     overwrite: run.Overwrite = False,
 ) -> None:
     """Compare observed maps with the model of foregrounds, CMB and noise."""
-    run.run(KIND, _work, run.Options(settings_file, out, values, resume, overwrite))
+    run.run(KIND, _work, run.Options(settings_file, out, values, resume, overwrite, maps))
 
 
 def _work(settings, command: run.Run) -> run.Report:

@@ -3,6 +3,7 @@
 A command is a function from its settings to a `Report`; the rest is here, once.
 """
 
+import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,12 +18,13 @@ from fits.commands.errors import logged
 from fits.commands.interrupt import interruptible
 from fits.commands.page import Section, table_of, write_page
 from jaxsky.io.folders import ALL, Folder, occupied
-from jaxsky.settings_experiment import Experiment
-from jaxsky.settings_keys import of_file
-from jaxsky.settings_load import load
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import of_file
+from jaxsky.settings.load import load
 
 __all__ = [
     "Kind",
+    "Maps",
     "Options",
     "Overwrite",
     "Report",
@@ -46,6 +48,10 @@ SettingsPath = Annotated[
 Values = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Any key of the file; repeatable."),
+]
+Maps = Annotated[
+    Path | None,
+    typer.Option(help="Folder of a realisation of `jaxsky simulate`, for bands without a file."),
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Keep what is in --out, and go on with it.")]
 Overwrite = Annotated[
@@ -76,6 +82,7 @@ class Options(NamedTuple):
     values: Sequence[str] | None = None
     resume: bool = False
     overwrite: bool = False
+    maps: Path | None = None
 
 
 class Report(NamedTuple):
@@ -138,7 +145,10 @@ def run(
         nor replaced, or in which another command works.
     """
     path, out = options.settings_file or DEFAULTS / f"{kind.name}.toml", options.out
-    settings = load(path, options.values or ())
+    values = list(options.values or ())
+    if options.maps is not None:
+        values.append(f"common.maps={json.dumps(str(options.maps.resolve()))}")
+    settings = load(path, values)
     with (
         of_file(path),
         results_folder(

@@ -32,12 +32,13 @@ KIND = run.Kind(
 def separate(
     settings_file: run.SettingsPath = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/separate"),
+    maps: run.Maps = None,
     values: run.Values = None,
     resume: run.Resume = False,
     overwrite: run.Overwrite = False,
 ) -> None:
     """Separate CMB and foregrounds by their laws, and measure r from the cleaned B modes."""
-    run.run(KIND, _work, run.Options(settings_file, out, values, resume, overwrite))
+    run.run(KIND, _work, run.Options(settings_file, out, values, resume, overwrite, maps))
 
 
 def _work(settings, command: run.Run) -> run.Report:

@@ -9,7 +9,7 @@ import typer
 
 from fits.commands import run
 from jaxsky.io.folders import ALL
-from jaxsky.settings_experiment import Experiment
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["simulate"]
 

@@ -16,7 +16,7 @@ from fits.record import fingerprint
 from fits.resolution import Prepared
 from jaxsky.progress import QUIET
 from jaxsky.settings import SettingsError
-from jaxsky.settings_experiment import Experiment
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["Comparison", "check_comparison", "compare"]
 

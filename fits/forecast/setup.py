@@ -15,7 +15,7 @@ from jaxsky.inputs import Template, read_sky
 from jaxsky.io import degrade_mask
 from jaxsky.observation import ObservedBand
 from jaxsky.settings import SettingsError
-from jaxsky.settings_experiment import Experiment
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["Setup", "build"]
 

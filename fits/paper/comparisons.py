@@ -14,7 +14,7 @@ from fits.paper.sources import Sources, listed
 from fits.record import probability, with_error
 from fits.regions import region_masks, region_words
 from fits.resolution import prepare
-from jaxsky.settings_experiment import Experiment
+from jaxsky.settings.experiment import Experiment
 
 __all__ = [
     "figure_leakage",

@@ -11,8 +11,8 @@ from fits.pseudo_cl import sky_fraction
 from fits.regions import region_words
 from jaxsky.instrument import band_tables
 from jaxsky.io import InputError
-from jaxsky.settings_experiment import Experiment
-from jaxsky.settings_tables import BandTable
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.tables import BandTable
 
 __all__ = ["figure_b_modes"]
 

@@ -17,8 +17,8 @@ from jaxsky.galaxy import EmbeddedSky, embedded_sky
 from jaxsky.inputs import Template, embedded_galaxy, read, read_sky, uK_RJ_per
 from jaxsky.keys import realisation_key, stream
 from jaxsky.settings import SettingsError
-from jaxsky.settings_experiment import Experiment, IndexFile
-from jaxsky.settings_tables import ComponentTable, SmallScalesTable
+from jaxsky.settings.experiment import Experiment, IndexFile
+from jaxsky.settings.tables import ComponentTable, SmallScalesTable
 from jaxsky.small_scales import Continued, SmallScales, continue_templates
 from jaxsky.templates import dust_index, polarization_template
 

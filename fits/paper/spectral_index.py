@@ -11,7 +11,7 @@ from fits.report import known_truth, with_errors
 from fits.resolution import prepare
 from fits.spectral_index import run
 from jaxsky.settings import SettingsError
-from jaxsky.settings_experiment import Experiment
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["figure_probability"]
 

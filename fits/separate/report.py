@@ -13,7 +13,7 @@ from fits.separate.separate import SAMPLED, Separation
 from fits.separation.maps import ComponentMaps
 from jaxsky.io import write_maps
 from jaxsky.parameter_maps import parameter_unit
-from jaxsky.settings_experiment import Experiment
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["result_json", "tables", "warnings", "write_report"]
 

@@ -29,8 +29,8 @@ from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import SettingsError
-from jaxsky.settings_experiment import Experiment
-from jaxsky.settings_keys import at_key
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import at_key
 
 __all__ = ["SAMPLED", "Separation", "separate"]
 

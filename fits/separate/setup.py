@@ -22,9 +22,9 @@ from jaxsky.components import component_class
 from jaxsky.inputs import read, read_parameter
 from jaxsky.parameter_maps import one_column
 from jaxsky.settings import MapFile, SettingsError
-from jaxsky.settings_experiment import Experiment
-from jaxsky.settings_keys import at_key
-from jaxsky.settings_tables import Regions
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import at_key
+from jaxsky.settings.tables import Regions
 
 __all__ = ["Setup", "build"]
 

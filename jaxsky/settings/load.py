@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from jaxsky.settings import SettingsError, expand
-from jaxsky.settings_experiment import Experiment
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["load"]
 

@@ -16,8 +16,8 @@ from pydantic import (
     model_validator,
 )
 
-from jaxsky.settings_types import Several, Word
-from jaxsky.settings_values import (
+from jaxsky.settings.types import Several, Word
+from jaxsky.settings.values import (
     file_names,
     hdu_numbers,
     missing_numbers,

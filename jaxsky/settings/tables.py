@@ -6,9 +6,9 @@ from typing import Any, ClassVar, Literal
 from pydantic import ConfigDict, Field, model_validator
 
 from jaxsky.components import AME, component_class
-from jaxsky.planck_names import check_release
 from jaxsky.settings import BandpassSpec, FileName, MapFile, MapKeys, NoiseTable, Table
-from jaxsky.settings_types import (
+from jaxsky.settings.planck_names import check_release
+from jaxsky.settings.types import (
     BandName,
     Law,
     Nside,
@@ -19,7 +19,7 @@ from jaxsky.settings_types import (
     Word,
     check_component_names,
 )
-from jaxsky.settings_values import check_reference, check_signs
+from jaxsky.settings.values import check_reference, check_signs
 
 __all__ = [
     "BandTable",

@@ -9,14 +9,14 @@ from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
 from jaxsky.instrument import band_tables
 from jaxsky.settings import FileName, MapFile, MaskFile, SettingsFile, Table
-from jaxsky.settings_tables import (
+from jaxsky.settings.tables import (
     BandTable,
     CMBTable,
     FreeParameter,
     SkyTable,
     SmallScalesTable,
 )
-from jaxsky.settings_types import (
+from jaxsky.settings.types import (
     Distinct,
     Nside,
     Pair,
@@ -26,7 +26,7 @@ from jaxsky.settings_types import (
     Word,
     check_names,
 )
-from jaxsky.settings_values import check_reference, check_signs
+from jaxsky.settings.values import check_reference, check_signs
 from jaxsky.small_scales import DUST, SYNCHROTRON
 
 __all__ = [

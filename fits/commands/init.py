@@ -1,0 +1,37 @@
+"""`jaxsky init`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fits.commands.console import print_written
+from fits.commands.run import DEFAULTS
+
+__all__ = ["init"]
+
+#: All that an experiment file can say, with comments.
+TEMPLATE = "experiment"
+
+
+def init(
+    name: Annotated[
+        str,
+        typer.Argument(
+            help=f"{TEMPLATE}: all keys, commented; planck-44-70: Planck's maps of 2018; or a "
+            "command, for what it does without a file."
+        ),
+    ] = TEMPLATE,
+    out: Annotated[
+        Path | None, typer.Option(help="File to write.", show_default="NAME.toml")
+    ] = None,
+) -> None:
+    """Write an experiment file to start from."""
+    known = sorted(path.stem for path in DEFAULTS.glob("*.toml"))
+    if name not in known:
+        raise ValueError(f"There is no experiment {name!r}; there are {', '.join(known)}.")
+    path = out or Path(f"{name}.toml")
+    if path.exists():
+        raise ValueError(f"{path}: exists already and is left as it is.")
+    path.write_text((DEFAULTS / f"{name}.toml").read_text())
+    print_written([path])

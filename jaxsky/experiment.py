@@ -65,7 +65,7 @@ class Setup(NamedTuple):
     def observed(self, name: str) -> Observed:
         """How a band is observed, as its maps are."""
         channel = self.observation.channels[name]
-        smoothed, per_pixel = channel.target is not None, bool(jnp.ndim(channel.noise))
+        smoothed, per_pixel = channel.target is not None, bool(np.ndim(channel.noise))
         beam = channel.target if smoothed else channel.beam
         level = spectrum = covariance = None
         if channel.noise is not None and not smoothed:

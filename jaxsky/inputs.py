@@ -138,7 +138,7 @@ def read_sky(
     # Those with the angles of others come after these.
     others = [angles for name in wanted if (angles := tables[name].angles)]
     order = list(dict.fromkeys((*others, *wanted)))
-    description = settings.title or ("Templates from files." if wanted else "No foregrounds.")
+    description = (settings.title or "Templates from files.") if wanted else "No foregrounds."
     known: dict[str, Template] = {}
     if own := [name for name in order if tables[name].file is None]:
         galaxy = galaxy or embedded_galaxy(settings)

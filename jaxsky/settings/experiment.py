@@ -26,7 +26,7 @@ from jaxsky.settings.types import (
     Word,
     check_names,
 )
-from jaxsky.settings.values import check_reference, check_signs
+from jaxsky.settings.values import MistakeAt, check_reference, check_signs
 from jaxsky.small_scales import DUST, SYNCHROTRON
 
 __all__ = [
@@ -249,13 +249,13 @@ class Paper(Table):
     @model_validator(mode="after")
     def _plausible(self) -> "Paper":
         if self.ame is not None and self.ame.nu_ref is None:
-            raise ValueError("ame.nu_ref: is missing")
+            raise MistakeAt("ame.nu_ref", "is missing")
         steeper = {"steepening", "spectrum"}
         others = {"ame": steeper, "beta_dust": {"nu_ref", *steeper}, "beta_syn": {"nu_ref"}}
         for key, keys in others.items():
             one: IndexFile | None = getattr(self, key)
             if one is not None and (wrong := one.model_fields_set & keys):
-                raise ValueError(f"{key}.{min(wrong)}: unknown key")
+                raise MistakeAt(f"{key}.{min(wrong)}", "unknown key")
         if self.ame is not None:
             check_reference("ame", self.ame.nu_ref, {})
         return self
@@ -299,6 +299,7 @@ class Experiment(SettingsFile):
         self.regions = REGIONS | self.regions
         names = [str(band.name) for band in self.bands]
         check_names("bands", names)
+        check_names("regions", self.regions)
         if both := set(self.free) & set(self.fixed):
             raise ValueError(f"{', '.join(sorted(both))} cannot be both free and fixed")
         check_signs("fixed", self.fixed)
@@ -306,9 +307,9 @@ class Experiment(SettingsFile):
         check_signs("free", {name: one.numbers() for name, one in self.free.items()})
         for name, one in self.sky.given.items():
             if one.nu_ref is not None and f"{name}.nu_ref" in self.fixed:
-                raise ValueError(
-                    f"fixed.{name}.nu_ref: nu_ref is given twice, here and in sky.{name}"
-                )
+                raise MistakeAt(f"fixed.{name}.nu_ref", f"is given twice, here and in sky.{name}")
+        if not self.forecast.free and not self.free_in("forecast"):
+            raise MistakeAt("forecast.free", "is empty, and so is the table free")
         components = list(self.sky.components)
         simulated = [*components, "cmb", "noise"]
         known: list[tuple[str, Iterable[str], Collection[str]]] = [
@@ -325,7 +326,7 @@ class Experiment(SettingsFile):
             for value in values:
                 if value not in allowed:
                     there = ", ".join(allowed) or "none is there"
-                    raise ValueError(f"{key}: {value!r} is none of {there}")
+                    raise MistakeAt(key, f"{value!r} is none of {there}")
         return self
 
     def modelled(self) -> list[str]:
@@ -376,7 +377,7 @@ def _bands(entry: BandTable, index: int, folder: Path) -> list[BandTable]:
     try:
         return entry.merged(band_tables(entry.instrument, wanted, folder))
     except KeyError as error:
-        raise ValueError(f"bands.{index}.instrument: {error.args[0]}") from None
+        raise MistakeAt(f"bands.{index}.instrument", error.args[0]) from None
 
 
 Experiment.model_rebuild()

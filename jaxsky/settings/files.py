@@ -111,7 +111,8 @@ class MapKeys(_Columns):
 
     @model_validator(mode="after")
     def _of_a_file(self) -> "MapKeys":
-        of_file = [key for key in MapKeys.model_fields if key in self.model_fields_set]
+        # Those that are as by default may be from a log.
+        of_file = [k for k, one in MapKeys.model_fields.items() if getattr(self, k) != one.default]
         if self.file is None and of_file:
             raise ValueError(f"{', '.join(of_file)}: of a file, but file is missing")
         return self

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from jaxsky.settings import SettingsError, expand
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.values import MistakeAt
 
 __all__ = ["load"]
 
@@ -36,7 +37,11 @@ def _sentence(path: Path, raw: Any, error: ValidationError, options: Mapping[str
     for item in error.errors():
         what = item["msg"].removeprefix("Value error, ").rstrip(".")
         where = _key(raw, item["loc"], item["type"] == "missing")
-        if item["type"] == "extra_forbidden":
+        mistake = item.get("ctx", {}).get("error")
+        if isinstance(mistake, MistakeAt):
+            where = f"{where}.{mistake.key}" if where else mistake.key
+            what = mistake.words.rstrip(".")
+        elif item["type"] == "extra_forbidden":
             what = "unknown key"
         elif item["type"] == "missing":
             what = "is missing"

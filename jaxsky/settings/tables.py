@@ -19,7 +19,7 @@ from jaxsky.settings.types import (
     Word,
     check_component_names,
 )
-from jaxsky.settings.values import check_reference, check_signs
+from jaxsky.settings.values import MistakeAt, check_reference, check_signs
 
 __all__ = [
     "BandTable",
@@ -76,7 +76,7 @@ class ComponentTable(MapKeys):
     @model_validator(mode="after")
     def _plausible(self) -> "ComponentTable":
         if self.noise is not None and self.noise.estimate_above is not None:
-            raise ValueError("noise.estimate_above: is of bands")
+            raise MistakeAt("noise.estimate_above", "is of bands")
         check_signs("parameters", self.parameters)
         if self.file is None:
             if self.angles or self.fwhm:
@@ -90,7 +90,7 @@ class ComponentTable(MapKeys):
     def check(self, law: str) -> None:
         """Raise ValueError for keys that do not go with a law."""
         if law == "cmb":
-            raise ValueError("law: the CMB is described in the table cmb")
+            raise MistakeAt("law", "the CMB is described in the table cmb")
         if self.angles and component_class(law) is not AME:
             raise ValueError("angles are for the law 'ame' only")
         check_reference(law, self.nu_ref, self.parameters)
@@ -137,13 +137,13 @@ class SkyTable(Table):
                 if own and (one.law != own or one.nu_ref is not None):
                     raise ValueError("law and nu_ref are those of the embedded map; give a file")
             except ValueError as error:
-                raise ValueError(f"{name}: {error}") from None
+                raise MistakeAt(name, error) from None
             if one.angles is None:
                 continue
             if one.angles not in self.templates:
-                raise ValueError(f"{name}.angles: there is no map of {one.angles}")
+                raise MistakeAt(f"{name}.angles", f"there is no map of {one.angles}")
             if self.components[one.angles].angles:
-                raise ValueError(f"{name}.angles: {one.angles} has none of its own")
+                raise MistakeAt(f"{name}.angles", f"{one.angles} has none of its own")
         return self
 
 
@@ -205,16 +205,16 @@ class BandTable(MapKeys):
         if self.channels is not None and (self.instrument is None or self.name is not None):
             raise ValueError("channels choose from an instrument, in place of a name")
         if self.file is not None and self.name is None:
-            raise ValueError("file: is of one band; give its name")
+            raise MistakeAt("file", "is of one band; give its name")
         if self.fwhm is not None and self.beam is not None:
             raise ValueError("give the beam either as fwhm or as the file of a window, beam")
         if self.noise is not None and 0 in (self.noise.level, self.noise.rms):
-            raise ValueError("noise: must be greater than 0")
+            raise MistakeAt("noise", "must be greater than 0")
         if self.file is None:
             if self.leakage is not None:
-                raise ValueError("leakage: is subtracted from a map, but file is missing")
+                raise MistakeAt("leakage", "is subtracted from a map, but file is missing")
             if self.noise is not None and self.noise.estimate_above is not None:
-                raise ValueError("noise.estimate_above: is of a map, but file is missing")
+                raise MistakeAt("noise.estimate_above", "is of a map, but file is missing")
         if self.leakage is not None:
             check_release(self.files, self.leakage.files, self.label, self.leakage.label)
         return self

@@ -7,6 +7,7 @@ from typing import Annotated, TypeVar
 from pydantic import AfterValidator, Field, Strict
 
 from jaxsky.components import component_class
+from jaxsky.settings.values import MistakeAt
 
 __all__ = [
     "BandName",
@@ -93,11 +94,11 @@ def check_names(kind: str, names: Iterable[str]) -> None:
 
 
 def check_component_names(names: Iterable[str]) -> None:
-    """Raise ValueError, beginning with the name, if a component cannot be called so."""
+    """Raise MistakeAt its name if a component cannot be called so."""
     names = list(names)
     check_names("components", names)
     for name in names:
         try:
             _name(name, "", RESERVED)
         except ValueError as error:
-            raise ValueError(f"{name}: {error}") from None
+            raise MistakeAt(name, error) from None

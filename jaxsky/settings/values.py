@@ -6,6 +6,7 @@ from typing import Any
 from jaxsky.components import component_class, declared
 
 __all__ = [
+    "MistakeAt",
     "check_reference",
     "check_sign",
     "check_signs",
@@ -14,6 +15,16 @@ __all__ = [
     "missing_numbers",
     "stokes_words",
 ]
+
+
+class MistakeAt(ValueError):
+    """A mistake at a key inside of the table that is checked."""
+
+    def __init__(self, key: str, mistake: str | ValueError) -> None:
+        inside = isinstance(mistake, MistakeAt)
+        self.key = f"{key}.{mistake.key}" if inside else key
+        self.words = mistake.words if inside else str(mistake)
+        super().__init__(f"{self.key}: {self.words}")
 
 
 def check_reference(law: str, nu_ref: float | None, parameters: Mapping[str, Any]) -> None:
@@ -39,9 +50,10 @@ def check_sign(name: str, *values: float) -> None:
     """Raise ValueError for an index beta_syn in the sign of T ~ nu^beta, by its dotted name."""
     negative = [value for value in values if value <= 0]
     if name.split(".")[-1] == "beta_syn" and negative:
-        raise ValueError(
-            f"{name}: beta_syn is the index in T ~ nu^-beta_syn, positive and about 3, not "
-            f"{negative[0]:g}; that of T ~ nu^beta has the other sign"
+        raise MistakeAt(
+            name,
+            "beta_syn is the index in T ~ nu^-beta_syn, positive and about 3, not "
+            f"{negative[0]:g}; that of T ~ nu^beta has the other sign",
         )
 
 
@@ -52,7 +64,7 @@ def check_signs(table: str, values: Mapping[str, Any]) -> None:
         try:
             check_sign(name, *(x for x in numbers if isinstance(x, int | float)))
         except ValueError as error:
-            raise ValueError(f"{table}.{error}") from None
+            raise MistakeAt(table, error) from None
 
 
 def file_names(value: Any) -> Any:

@@ -191,6 +191,5 @@ def to_unbounded(params: Mapping[str, Numeric], priors: Mapping[str, Prior]) -> 
                     f"Start value {value[outside].flat[0]:g} of {name!r} is not inside its uniform "
                     f"prior {p.low:g} ... {p.high:g}."
                 )
-            unit = 2 * (jnp.asarray(result[name]) - p.low) / (p.high - p.low) - 1
-            result[name] = jnp.arcsin(unit)
+            result[name] = np.arcsin(2 * (value - p.low) / (p.high - p.low) - 1)
     return result

@@ -109,9 +109,9 @@ def prepared_variance(
         window = gaussian_beam(own_fwhm, lmax) * pixel_window(preparation.nside, lmax)
     else:
         window = gaussian_beam(fwhm, preparation.window.size - 1)
-    ell = jnp.arange(2, window.size)
-    power = (noise.level * np.radians(1 / 60)) ** 2 * window[2:] ** 2
-    return jnp.full((2, npix), jnp.sum((2 * ell + 1) * power) / (4 * jnp.pi))
+    ell = np.arange(2, window.size)
+    power = (noise.level * np.radians(1 / 60)) ** 2 * np.asarray(window)[2:] ** 2
+    return jnp.asarray(np.full((2, npix), np.sum((2 * ell + 1) * power) / (4 * np.pi)))
 
 
 def attenuation(

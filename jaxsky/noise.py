@@ -36,6 +36,7 @@ _PIECE = 1 << 20
 _COLUMNS = {3: ("QQ", "QU", "UU"), 6: ("II", "IQ", "IU", "QQ", "QU", "UU")}
 
 
+@partial(jax.jit, static_argnames=("nside", "stokes"))
 def uniform_covariance(
     noise: Numeric, nside: int, stokes: int = 2
 ) -> Float[Array, "stokes stokes pix"]:

@@ -41,7 +41,7 @@ def fit(quick: bool) -> list[Row]:
 
 def planck(quick: bool) -> list[Row]:
     """The fit that `jaxsky init planck-44-70` writes, on files in the structure of Planck's."""
-    nside = 64 if quick else 1024
+    nside = 128 if quick else 1024
     work = f"`jaxsky fit examples/planck_44_70.toml`, nside {nside}, cold process"
     if not MAKER.is_file():
         return [Row(work, "", remarks=f"left out: {MAKER} is not there")]

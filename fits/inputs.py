@@ -141,6 +141,7 @@ def embedded_inputs(settings: Settings, galaxy: EmbeddedSky | None = None) -> In
             leaked = leak(fraction * observe_band(whole, channel.band)[0])
             leakage = Leakage(resample(leaked, gaussian_beam(fwhm, lmax), nside), used, fwhm)
             maps = maps + leakage.maps
+        assert channel.noise is not None  # channels of an instrument have some
         noise = uniform_covariance(channel.noise, nside)
         bands[name] = Band(maps, used, channel.band, fwhm, noise, leakage=leakage)
     templates = {name: Template(sky[name], 0.0, used) for name in sky}

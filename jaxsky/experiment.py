@@ -165,6 +165,8 @@ def map_nside(settings: Experiment, templates: Mapping[str, Template]) -> int:
     """
     if settings.simulate.nside is not None:
         return settings.simulate.nside
+    if not templates and settings.sky.templates:  # nothing of the sky is simulated
+        templates, _ = read_sky(settings, names=settings.sky.templates)
     if not templates:
         raise SettingsError("simulate.nside: is missing; there is no map of the sky that has one.")
     return min(healpy.npix2nside(template.used.size) for template in templates.values())

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fits import settings as fit_settings
 from fits.comparison.patches import _noise, compare_patches, template_patches
 from fits.comparison.plots import plot_patches, plot_template_patches
 from fits.discs import paper_patches
@@ -17,15 +16,17 @@ from fits.patches import fit_patches, prepare_patches
 from fits.pseudo_cl import band_powers
 from fits.resolution import prepare
 from jaxsky.harmonics import gaussian_beam
+from jaxsky.settings.experiment import Experiment
 
 NSIDE = 64
 
 
 @pytest.fixture(scope="module")
 def settings():
-    return fit_settings.Settings.model_validate(
+    return Experiment.model_validate(
         {
-            "embedded": {"channels": {"planck": ["353"]}, "nside": NSIDE},
+            "sky": {"embedded": {"nside": NSIDE}},
+            "bands": [{"instrument": "planck", "channels": ["353"]}],
             "compare": {"patches": "353", "patches_nside": NSIDE},
         }
     )

@@ -252,9 +252,11 @@ class Paper(Table):
             raise MistakeAt("ame.nu_ref", "is missing")
         steeper = {"steepening", "spectrum"}
         others = {"ame": steeper, "beta_dust": {"nu_ref", *steeper}, "beta_syn": {"nu_ref"}}
+        fields = IndexFile.model_fields  # what is as by default may be from a log
         for key, keys in others.items():
             one: IndexFile | None = getattr(self, key)
-            if one is not None and (wrong := one.model_fields_set & keys):
+            wrong = [k for k in keys if one and getattr(one, k) != fields[k].default]
+            if wrong:
                 raise MistakeAt(f"{key}.{min(wrong)}", "unknown key")
         if self.ame is not None:
             check_reference("ame", self.ame.nu_ref, {})

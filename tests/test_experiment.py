@@ -23,6 +23,7 @@ from jaxsky.keys import realisation_key
 from jaxsky.settings.load import load
 from jaxsky.simulate import simulate
 
+TEMPLATE = DEFAULTS / "experiment.toml"
 NSIDE = 8
 NPIX = 12 * NSIDE**2
 SETTINGS = """
@@ -499,9 +500,7 @@ def test_diagonal_noise(folder):
     only = ("nside = 8", 'nside = 8\ninclude = ["noise"]')
     own = ("fwhm = 1200.0", 'fwhm = "own"')
     one = simulated(write(folder, noise, only, own))
-    other = simulated(
-        write(folder, noise, only, own, ("sheet = false", "diagonal_noise = true"))
-    )
+    other = simulated(write(folder, noise, only, own, ("sheet = false", "diagonal_noise = true")))
     np.testing.assert_array_equal(one[0, 0], other[0, 0])
     assert not np.allclose(one[0, 1], other[0, 1])
 
@@ -570,32 +569,22 @@ RMS = '{ rms = 1.0, unit = "uK_RJ" }'
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        (
-            [("nside = 8", "nside = 4")],
-            "pixels of 879 arcmin (nside 4) are too wide for the beam of 1200 arcmin of band '30'; "
-            "that takes nside 8, or a common simulate.fwhm of at least 1.32e+03 arcmin",
-        ),
+        ([("nside = 8", "nside = 4")],
+         "pixels of 879 arcmin (nside 4) are too wide for the beam of 1200 arcmin of band '30'; "
+         "that takes nside 8, or a common simulate.fwhm of at least 1.32e+03 arcmin"),
         ([("nside = 8", "nside = 9")], "simulate.nside: nside must be a power of two, not 9"),
-        (
-            [("fwhm = 1200.0", "fwhm = 700.0")],
-            "simulate.fwhm: 700 arcmin is finer than the beam of band '30', 800 arcmin",
-        ),
-        ([("fwhm = 1200.0", "fwhm = 0")], "fwhm must be positive, or 'own', not 0"),
-        (
-            [("fwhm = 1200.0", "fwhm = 850.0")],
-            "sky.dust: its resolution, 900 arcmin, is coarser than the 850 arcmin of band '30'; add "
-            "small scales, [sky.dust.small_scales], or bring the maps to a common simulate.fwhm of "
-            "at least 900 arcmin",
-        ),
-        (
-            [("nside = 8", 'nside = 8\ninclude = ["dst"]')],
-            "simulate.include: 'dst' is none of dust, synchrotron, cmb, noise",
-        ),
+        ([("fwhm = 1200.0", "fwhm = 700.0")],
+         "simulate.fwhm: 700 arcmin is finer than the beam of band '30', 800 arcmin"),
+        ([("fwhm = 1200.0", "fwhm = 0")], "simulate.fwhm: input should be greater than 0, not 0"),
+        ([("fwhm = 1200.0", "fwhm = 850.0")],
+         "sky.dust: its resolution, 900 arcmin, is coarser than the 850 arcmin of band '30'; "
+         "add small scales, [sky.dust.small_scales], or bring the maps to a common "
+         "simulate.fwhm of at least 900 arcmin"),
+        ([("nside = 8", 'nside = 8\ninclude = ["dst"]')],
+         "simulate.include: 'dst' is none of dust, synchrotron, cmb, noise"),
         ([("nside = 8", "nside = 8\ninclude = []")], "simulate.include: list should have"),
-        (
-            [("nside = 8", 'nside = 8\ninclude = ["noise"]'), (f"noise = {RMS}", "")],
-            "Nothing is left to be observed in band '143': no component, no CMB, no noise",
-        ),
+        ([("nside = 8", 'nside = 8\ninclude = ["noise"]'), (f"noise = {RMS}", "")],
+         "Nothing is left to be observed in band '143': no component, no CMB, no noise"),
         ([('name = "30"', 'name = "30"\nchannels = ["30"]')],
          "bands.0: channels choose from an instrument, in place of a name"),
         ([('name = "30"', 'instrument = "core"\nchannels = ["45", "a"]')],
@@ -617,8 +606,7 @@ RMS = '{ rms = 1.0, unit = "uK_RJ" }'
          "fixed: there is no component 'ame'; components are dust, synchrotron"),
         # Small scales.
         ([(CMB, SMALL + CMB), *IQU], "'dust' has small scales, which are added to Q and U only"),
-        ([(CMB, SMALL.replace("dust", "ame") + CMB)],
-         "sky.ame: law is missing"),
+        ([(CMB, SMALL.replace("dust", "ame") + CMB)], "sky.ame: law is missing"),
         ([(CMB, SMALL + CMB), ("EE = [4, 10]", "EE = [4, 30]")],
          "Small scales of dust: A power law cannot be fitted from l = 4 to 30 to a spectrum that "
          "ends at 16"),
@@ -651,7 +639,7 @@ RMS = '{ rms = 1.0, unit = "uK_RJ" }'
         ([("width = 6.0", "width = 70.0")], "bands.30.bandpass: Argument `nu` must be positive"),
         ([("level = 300.0", "level = 300.0, rms = 1.0")],
          "bands.0.noise: give the noise as exactly one of level, rms, map, covariance, hits"),
-        ([("level = 300.0", "level = 0.0")], "bands.0.noise.level: input should be greater than 0"),
+        ([("level = 300.0", "level = 0.0")], "bands.0.noise: must be greater than 0"),
         ([("level = 300.0", 'level = 300.0, unit = "MJy/sr"')],
          "bands.0.noise.unit: must be a temperature such as uK_RJ or mK_CMB, not 'MJy/sr'"),
         ([(RMS, '{ map = { file = "coarse.fits" } }')],
@@ -756,53 +744,64 @@ def test_a_file_in_place_of_the_folder_is_left_alone(folder, tmp_path, monkeypat
 # Examples, titles and pictures.
 
 
-def test_init_writes_an_example_that_is_valid(tmp_path, monkeypatch, capsys):
+def test_init_writes_an_experiment_that_is_valid(tmp_path, monkeypatch, capsys):
     path = tmp_path / "mine.toml"
-    assert command(monkeypatch, path, "--init") == 0
-    assert path.read_text() == EXAMPLE.read_text()
+    assert jaxsky(monkeypatch, "init", "--out", path) == 0
+    assert path.read_text() == TEMPLATE.read_text()
     settings = load(path)
     assert settings.included() == ["dust", "synchrotron", "cmb", "noise"]
-    channels = setup._channels(settings)
-    assert list(channels) == ["45", "105", "315"]
+    assert [band.name for band in settings.bands] == ["40", "68", "100", "140", "195", "280", "402"]
     path.write_text("mine")
     capsys.readouterr()
-    assert command(monkeypatch, path, "--init") == 2
+    assert jaxsky(monkeypatch, "init", "--out", path) == 2
     assert "exists already" in one_sentence(capsys)
     assert path.read_text() == "mine"
 
 
-def test_what_is_commented_out_in_the_example_is_valid(tmp_path):
-    text, path = EXAMPLE.read_text(), tmp_path / "example.toml"
-    lines = re.findall(r"^# (\w+ = .*)$", text.split("# ... or maps")[0], re.MULTILINE)
-    tail = text.split("[fixed]")[1].split("# Bands of one's own")[0]
-    lines += re.findall(r"^# (\w+ = .*)$", tail, re.MULTILINE)
-    assert len(lines) > 14
-    for line in lines:
-        changed = text.replace(f"# {line}", line, 1)
-        if line.startswith("spectra"):
-            changed = changed.replace("r = 0.01", "")
-        path.write_text(changed)
-        load(path)
-    # Tables: maps and bands of one's own.
-    own = text.split("# ... or maps of one's own")[1].split("[fixed]")[0].split("\n", 2)[2]
-    bands = text.split("instead of an instrument:\n")[1]
-    # Several ways to give the noise: the first one.
-    bands = re.sub(r"^# noise = \{ (rms|covariance|hits).*\n", "", bands, flags=re.MULTILINE)
-    tables = re.sub(r"^# ?", "", own + bands, flags=re.MULTILINE)
-    path.write_text(
-        "[experiment]\nnside = 512\n[small_scales.dust]\nEE=[60,300]\nBB=[60,300]\n" + tables
-    )
-    settings = load(path)
-    assert list(settings.templates) == ["dust", "ame"]
-    assert [band.name for band in settings.bands] == ["44"]
+TABLES = re.split(r"^(?=(?:# )?\[)", TEMPLATE.read_text(), flags=re.MULTILINE)
+#: What is commented out in the template and is not the default.
+ALTERNATIVES = {
+    "[cmb]": "cosmology spectra",
+    "[common]": "mask components maps",
+    "[regions]": "clean",
+    "[free]": "calibration.44 dust.beta_dust",
+    "[fixed]": "dust.beta_dust",
+    "[truth]": "synchrotron.curvature",
+    "[simulate]": "nside include small_scales_seed leakage",
+    "[compare]": "patches",
+    "[separate]": "nsteps lmax",
+    "[forecast]": "bands priors",
+    "[paper]": "ame beta_dust beta_syn",
+}
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda table: table.partition("\n")[0][:30])
+def test_what_is_commented_out_in_the_template_is_valid(tmp_path, table):
+    """Each line by itself, with the first ones of all keys if the table is commented out."""
+    path, plain = tmp_path / "mine.toml", load(TEMPLATE).model_dump(exclude={"data_dir"})
+    title = "" if table == TABLES[0] else table.partition("\n")[0]
+    found = re.findall(r'^(# )?(([\w."-]+) = .*)$', table, re.MULTILINE)
+    own, changed = title.startswith("# "), set()
+    used = {key: line for mark, line, key in reversed(found) if own or not mark}
+    # No parameter is both free and fixed.
+    others = [t for t in TABLES if t != table and (title, t[:6]) != ("[fixed]", "[free]")]
+    for mark, line, key in found:
+        if title == "[free]" and key == "regions":
+            line, key = f'"dust.beta_dust".{line}', '"dust.beta_dust"'
+        mine = "\n".join([title.removeprefix("# "), *(used | {key: line}).values(), ""])
+        path.write_text("".join([*others, mine] if title else [mine, *others]))
+        if mark and load(path).model_dump(exclude={"data_dir"}) != plain:
+            changed.add(key.strip('"'))
+    assert own or changed == set(ALTERNATIVES.get(title, "").split())
 
 
 def test_the_default_is_valid():
-    settings = load(DEFAULT)
-    channels = setup._channels(settings)
+    settings = load(DEFAULTS / "simulate.toml")
+    assert settings.sky.embedded.nside == 256
+    channels = {b.name: experiment.read_channel(settings, b, 256) for b in settings.bands}
     assert len(channels) == 15
     assert all(c.noise > 0 and c.target == 60.0 for c in channels.values())
-    setup._check_pixels(settings.experiment.nside, dict.fromkeys(channels, 60.0))
+    experiment._check_pixels(256, dict.fromkeys(channels, 60.0))
 
 
 def test_titles_of_all_kinds(folder, tmp_path, monkeypatch, capsys):

@@ -14,7 +14,7 @@ SKIES = 200
 
 @pytest.fixture(scope="module")
 def pulls():
-    """(best fit - truth) / sigma of both indices, and chi2, of each sky."""
+    """(best fit - truth) / sigma of both indices in each sky."""
     settings = load_settings(EMBEDDED, {"nside": 16, "fwhm": 300.0})
     embedded = settings.embedded.model_copy(update={"nside": 32})
     settings, galaxy = settings.model_copy(update={"embedded": embedded}), embedded_sky(32)

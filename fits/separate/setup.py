@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fits import settings as analysis_settings
+from fits.covariance import uniform_level
 from fits.forecast.setup import apodize
 from fits.inputs import Band, Inputs, embedded_inputs, read_band
 from fits.preparation import Preparation
@@ -295,6 +296,7 @@ def _multipoles(settings, sky, inputs, foregrounds):
         np.array([band.fwhm for band in inputs.bands.values()]),
         np.stack(spectra),
         covariance,
+        tuple(map(uniform_level, covariance)),
         correlated,
         lmax,
         main.nside,

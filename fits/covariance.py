@@ -21,7 +21,7 @@ from jaxsky.harmonics import adjoint_synthesis, alm_ell, expand, synthesis
 from jaxsky.keys import stream
 from jaxsky.noise import draw, uniform_alm
 
-__all__ = ["Fluctuations"]
+__all__ = ["Fluctuations", "uniform_level"]
 
 #: Pixels whose products are added up at once; few enough to stay in cache.
 CHUNK = 1 << 16
@@ -134,6 +134,20 @@ class Fluctuations(eqx.Module):
             variances.append(variance)
         total = np.stack(variances)
         return jnp.asarray(np.sqrt(np.where(total > 0, total, np.nan)))
+
+
+def uniform_level(covariance: Float[Array, "stokes stokes pix"]) -> float | None:
+    """The level [u arcmin] of which `jaxsky.noise.uniform_covariance` makes this, if there is one.
+
+    None for noise that varies, is correlated, or differs between Stokes parameters.
+    """
+    values = np.asarray(covariance)
+    variance = values[0, 0, 0]
+    for s, t in np.ndindex(values.shape[:2]):
+        if not np.all(values[s, t] == (variance if s == t else 0.0)):
+            return None
+    nside = healpy.npix2nside(values.shape[-1])
+    return float(np.sqrt(variance) * healpy.nside2resol(nside, arcmin=True))
 
 
 def _products(

@@ -21,8 +21,9 @@ __all__ = ["realisations"]
 
 #: They are written to their file after so many seconds, and when they are stopped.
 SAVED_EVERY = 10.0
-#: What a damaged archive raises besides.
-ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
+#: What a damaged archive raises besides: RuntimeError for one that seems encrypted or packed in
+#: a way that is not known.
+ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, RuntimeError)
 
 
 def realisations(

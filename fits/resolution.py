@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fits.covariance import Fluctuations
+from fits.covariance import Fluctuations, uniform_level
 from fits.inputs import Inputs
 from fits.likelihood import CovarianceOf, Likelihood, likelihood
 from fits.preparation import Preparation, prepare_component
@@ -16,7 +16,6 @@ from fits.record import fingerprint
 from fits.template_noise import prepared_variance
 from jaxsky import Bandpass, Sky, observe
 from jaxsky.harmonics import beam_ratio, gaussian_beam, pixel_window
-from jaxsky.noise import uniform_level
 from jaxsky.types import Numeric
 
 __all__ = ["Prepared", "prepare"]

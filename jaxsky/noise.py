@@ -52,17 +52,6 @@ def uniform_covariance(
     return jnp.eye(stokes)[..., None] * jnp.full(healpy.nside2npix(nside), sigma**2)
 
 
-def uniform_level(covariance: Float[Array, "stokes stokes pix"]) -> float | None:
-    """The level [u arcmin] of which `uniform_covariance` makes this, or None if there is none."""
-    values = np.asarray(covariance)
-    variance = values[0, 0, 0]
-    for s, t in np.ndindex(values.shape[:2]):
-        if not np.all(values[s, t] == (variance if s == t else 0.0)):
-            return None
-    nside = healpy.npix2nside(values.shape[-1])
-    return float(np.sqrt(variance) * healpy.nside2resol(nside, arcmin=True))
-
-
 def uniform_map(
     key: Array, noise: ArrayLike, nside: int, stokes: int = 2
 ) -> Float[Array, "stokes pix"]:

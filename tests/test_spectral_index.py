@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fits.commands.run import DEFAULTS
-from fits.covariance import Fluctuations
+from fits.covariance import Fluctuations, uniform_level
 from fits.inputs import Band, Inputs, inputs_of
 from fits.likelihood import likelihood
 from fits.optimize import best_fit
@@ -18,7 +18,14 @@ from fits.spectral_index import run
 from jaxsky import Bandpass, Dust, Sky, observe
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.galaxy import embedded_sky
-from jaxsky.harmonics import alm_ell, gaussian_beam, resample, synthesis
+from jaxsky.harmonics import (
+    alm_ell,
+    analysis,
+    gaussian_beam,
+    power_spectrum,
+    resample,
+    synthesis,
+)
 from jaxsky.inputs import Template
 from jaxsky.instrument import load_instrument
 from jaxsky.noise import draw, fit_knee, knee_spectrum, uniform_covariance
@@ -80,6 +87,53 @@ def test_variance_of_prepared_noise():
             band = (inside >= low) & (inside < low + 30)
             # Some 100 independent smoothed pixels x 400 draws: below 1 % of sampling error.
             assert ratio[:, band].mean() == pytest.approx(1.0, abs=0.02)
+
+
+def test_uniform_noise_is_drawn_by_multipoles():
+    """As smoothed white noise in pixels: the same variance and the same spectrum."""
+    nside_in, nside, lmax = 32, 16, 47
+    covariance = uniform_covariance(1000.0, nside_in)
+    assert uniform_level(covariance) == pytest.approx(1000.0, rel=1e-12)
+    preparation = Preparation.smoothing(nside_in, 60.0, nside, 400.0, lmax)
+    parts = (preparation,), (covariance,), (None,), None, None, jnp.ones(1), ("44",)
+    model, pixels = Fluctuations(*parts, (1000.0,)), Fluctuations(*parts, (None,))
+    keys = jax.random.split(jax.random.key(0), 200)
+    maps = [np.stack([m.noise_realisation(k)[0] for k in keys]) for m in (model, pixels)]
+    # Some 1600 modes x 200 draws: 0.3 % of sampling error.
+    for drawn in maps:
+        assert np.mean(drawn**2 / model.sigma()[0] ** 2) == pytest.approx(1.0, abs=0.015)
+    powers = [
+        np.mean([power_spectrum(analysis(jnp.asarray(m), 24)) for m in drawn], axis=0)[:, 2:]
+        for drawn in maps
+    ]
+    np.testing.assert_allclose(powers[0].mean(), powers[1].mean(), rtol=0.02)
+    np.testing.assert_allclose(powers[0][0].mean(), powers[0][1].mean(), rtol=0.03)
+
+
+def test_noise_that_is_not_uniform_has_no_level():
+    covariance = np.array(uniform_covariance(3.0, 4))
+    for at, value in [((0, 0, 5), 2.0), ((0, 1, 5), 1e-3), ((1, 1), 2.0), ((0, 0, 0), np.nan)]:
+        changed = covariance.copy()
+        changed[at] = value
+        assert uniform_level(changed) is None
+    assert uniform_level(covariance.astype(np.float32)) == pytest.approx(3.0, rel=1e-6)
+    assert uniform_level(0 * covariance) == 0.0
+
+
+def test_noise_of_a_band_is_that_of_its_name():
+    covariance = uniform_covariance(1000.0, 16)
+    how = Preparation.smoothing(16, 60.0, 8, 900.0, 16)
+
+    def drawn(names, level):
+        count = len(names)
+        parts = (how,) * count, (covariance,) * count, (None,) * count, None, None
+        model = Fluctuations(*parts, jnp.ones(count), names, (level,) * count)
+        return dict(zip(names, np.asarray(model.noise_realisation(jax.random.key(5))), strict=True))
+
+    for level in (1000.0, None):
+        both, other = drawn(("44", "70"), level), drawn(("30", "70"), level)
+        np.testing.assert_array_equal(both["70"], other["70"])
+        assert abs(np.corrcoef(both["44"].ravel(), both["70"].ravel())[0, 1]) < 0.5
 
 
 def test_component_maps_are_prepared_with_their_templates():
@@ -203,6 +257,16 @@ def test_embedded_run_recovers_the_truth(quick_settings, tmp_path):
                 assert abs(r.best_fit[name] - truth) < 4 * sigma
                 assert abs(r.best_fit[name] - results["gradient"].best_fit[name]) < 0.1 * sigma
                 assert r.sigma(name) == pytest.approx(sigma, rel=0.05)
+
+
+def test_what_a_band_shows_does_not_depend_on_the_others(quick_settings):
+    whole = inputs_of(quick_settings).bands
+    band = quick_settings.bands[0].model_copy(update={"channels": ["70", "353"]})
+    other = inputs_of(quick_settings.model_copy(update={"bands": [band]})).bands
+    assert list(other) == ["70", "353"]
+    # Finer beams take more steps of an analysis, which changes the sky by less than 1e-7.
+    maps = np.asarray(whole["70"].maps)
+    np.testing.assert_allclose(other["70"].maps, maps, rtol=0, atol=1e-6 * maps.std())
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ SKIES = 200
 
 @pytest.fixture(scope="module")
 def pulls():
-    """(best fit - truth) / sigma of both indices, and chi2, of each sky."""
+    """(best fit - truth) / sigma of both indices in each sky."""
     values = ["common.nside=16", "common.fwhm=300.0", "sky.embedded.nside=32"]
     settings, galaxy = load(DEFAULTS / "fit.toml", values), embedded_sky(32)
     start, rows = settings.start("fit"), []

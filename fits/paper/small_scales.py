@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
@@ -21,6 +20,7 @@ from jaxsky.harmonics import (
     power_spectrum,
     synthesis,
 )
+from jaxsky.keys import stream
 from jaxsky.plots import COLORS, STYLE, draw_spectra, save
 from jaxsky.settings.experiment import Experiment
 from jaxsky.small_scales import DUST, SYNCHROTRON, SmallScales, continue_templates
@@ -147,7 +147,7 @@ def figure_randomised(settings: Experiment, sources: Sources, out: Path) -> Item
         small.amplitude,
         small.modulation_fwhm,
     )
-    other = jax.random.fold_in(sources.small_scales_key("synchrotron"), 1)
+    other = stream(sources.key, "other small scales", "synchrotron")
     wide = polarization_template(layer.maps, layer.fwhm, layer.fwhm, nside)
     first = sources.continued("synchrotron").alms[0]
     alms = {

@@ -28,7 +28,7 @@ from fits.separation.noise import Noise
 from jaxsky import Bandpass, Sky
 from jaxsky.harmonics import analysis, expand, gaussian_beam, lmax_of, synthesis
 from jaxsky.keys import stream
-from jaxsky.noise import draw, uniform_alm, uniform_level
+from jaxsky.noise import draw, uniform_alm
 
 __all__ = ["Domain", "HarmonicDomain", "PixelDomain"]
 
@@ -102,6 +102,7 @@ class HarmonicDomain(NamedTuple):
     fwhms : of the bands [arcmin]
     noise : N_l of the maps as observed [unit^2 sr]
     covariance : of Q and U in each pixel of the bands [unit^2], each at its own nside
+    levels : of the noise of the bands [unit arcmin] where it is uniform, else None
     correlated : N_l of noise that is correlated between pixels, part of `noise`; zero where none
     lmax : largest multipole
     nside, fwhm : of the maps that are made [arcmin]
@@ -114,6 +115,7 @@ class HarmonicDomain(NamedTuple):
     fwhms: Float[np.ndarray, " band"]
     noise: Float[np.ndarray, "band stokes ell"]
     covariance: tuple[Float[Array, "stokes stokes pix"], ...]
+    levels: tuple[float | None, ...]
     correlated: Float[np.ndarray, "band ell"]
     lmax: int
     nside: int
@@ -128,14 +130,14 @@ class HarmonicDomain(NamedTuple):
     def noise_realisation(self, key: Array) -> Float[np.ndarray, "band stokes alm"]:
         """Noise like that of the data."""
         bands = []
-        for name, covariance, spectrum in zip(
-            self.bands, self.covariance, self.correlated, strict=True
+        for name, covariance, level, spectrum in zip(
+            self.bands, self.covariance, self.levels, self.correlated, strict=True
         ):
-            level = uniform_level(covariance)
+            own = stream(key, "noise", name)
             if level is not None:
-                alm = uniform_alm(stream(key, "noise", name), level, self.lmax)
+                alm = uniform_alm(own, level, self.lmax)
             else:
-                alm = analysis(draw(stream(key, "noise", name), covariance), self.lmax, 0)
+                alm = analysis(draw(own, covariance), self.lmax, 0)
             white = jax.random.normal(stream(key, "correlated", name), alm.shape)
             bands.append(np.asarray(alm + white * expand(jnp.sqrt(jnp.asarray(spectrum)))))
         return np.stack(bands)

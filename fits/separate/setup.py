@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from fits.covariance import uniform_level
 from fits.inputs import Band, Inputs, inputs_of
 from fits.preparation import Preparation
 from fits.regions import apodize, region_mask
@@ -258,6 +259,7 @@ def _multipoles(settings, sky, inputs, foregrounds):
         _fwhms(inputs),
         np.stack(spectra),
         covariance,
+        tuple(map(uniform_level, covariance)),
         correlated,
         lmax,
         common.nside,

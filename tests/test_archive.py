@@ -74,9 +74,26 @@ def test_sets_are_files_of_the_catalogue():
     assert total_size(find(["planck-ancillary"])) == "more than 19 MB"
 
 
-@pytest.mark.parametrize("path", [EXAMPLES / "planck_44_70.toml", DEFAULTS / "planck-44-70.toml"])
-def test_sets_are_the_files_of_examples(path):
-    assert set(named_files(load(path))) == {product.name for product in find(["planck-44-70"])}
+@pytest.mark.parametrize(
+    ("wanted", "path"),
+    [
+        ("planck-44-70", EXAMPLES / "planck_44_70.toml"),
+        ("planck-44-70", DEFAULTS / "planck-44-70.toml"),
+        ("separate", DEFAULTS / "planck-separate.toml"),
+    ],
+)
+def test_sets_are_the_files_of_examples(wanted, path):
+    assert set(named_files(load(path))) == {product.name for product in find([wanted])}
+
+
+def test_the_set_of_the_paper_is_what_is_commented_out_in_an_example(tmp_path):
+    text = (DEFAULTS / "planck-44-70.toml").read_text()
+    for line in ("[paper]", "ame = ", "beta_dust = {"):
+        assert f"\n# {line}" in text
+        text = text.replace(f"\n# {line}", f"\n{line}")
+    path = tmp_path / "x.toml"
+    path.write_text(text)
+    assert set(named_files(load(path))) == {product.name for product in find(["paper"])}
 
 
 def test_products_are_found_by_group_name_and_part():

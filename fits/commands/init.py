@@ -18,7 +18,7 @@ def init(
     name: Annotated[
         str,
         typer.Argument(
-            help=f"{TEMPLATE}: all keys, commented; planck-44-70: Planck's maps of 2018; or a "
+            help=f"{TEMPLATE}: all keys, commented; planck-44-70, planck-separate: Planck's maps of 2018; or a "
             "command, for what it does without a file."
         ),
     ] = TEMPLATE,

@@ -32,7 +32,6 @@ from jaxsky.noise import draw, fit_knee, knee_spectrum, uniform_covariance
 from jaxsky.settings import SettingsError
 from jaxsky.settings.load import load
 
-
 QUICK = ["common.nside=16", "common.fwhm=300.0", "seed=3", "sky.embedded.nside=32"]
 
 

@@ -116,7 +116,7 @@ def _claim(out: Path, settings: Experiment, overwrite: bool) -> None:
     out.mkdir(parents=True, exist_ok=True)
     with alone(out):
         if overwrite:
-            for path in (*_maps(out), *out.glob("sim_*.png")):
+            for path in (*_maps(out), *out.glob("sim_*.png"), *out.glob("log*.txt")):
                 path.unlink()
         elif (out / LOG).exists():
             # Another process may have left it since the folder was checked.

@@ -127,7 +127,7 @@ COMPONENTS = ("sheet = false", 'sheet = false\noutputs = ["total", "components"]
 def test_files_are_the_simulation(folder, tmp_path, monkeypatch, capsys):
     path, out = write(folder), tmp_path / "out"
     assert command(monkeypatch, path, "--out", out) == 0
-    assert "Written: 2 maps" in " ".join(capsys.readouterr().err.split())
+    assert " 2 maps in " in " ".join(capsys.readouterr().err.split())
     assert sorted(content(out)) == ["sim_00000/143.fits", "sim_00000/30.fits"]
     setup = build(load(path))
     key = realisation_key(3, 0)
@@ -290,7 +290,7 @@ def test_a_realisation_does_not_depend_on_the_order(three, tmp_path, monkeypatch
     lost.unlink()
     capsys.readouterr()
     assert command(monkeypatch, path, "--out", out, "--nsims", 3, "--resume") == 0
-    assert "Written: 1 maps" in (said := " ".join(capsys.readouterr().err.split()))
+    assert " 1 maps in " in (said := " ".join(capsys.readouterr().err.split()))
     assert "5 maps were there already" in said
     assert content(out) == expected
     assert [p for p, t in times.items() if p.stat().st_mtime_ns != t] == [lost]

@@ -34,11 +34,13 @@ def paper(
             only or (),
             resume=options.resume,
             overwrite=options.overwrite,
+            begin=command.begin,
             progress=command.steps,
         )
         missing = [f"{i.label}: {i.differs}" for i in items if not (i.picture or i.table)]
         count = f"{len(items)} figures and tables ({command.steps.seconds:.1f} s)"
-        return run.Report("", (), missing, (), f"Written: {command.out / 'index.html'}, {count}.")
+        page = command.out / run.PAGE
+        return run.Report("", (), missing, [page], f"{count}.", page=False)
 
     # What is kept and what is replaced is seen to figure by figure.
     run.run(run.Kind("paper", ()), work, run.Options(settings_file, out, values, resume, overwrite))

@@ -38,6 +38,8 @@ __all__ = [
 
 #: Steps and their times, and the page that shows the results, in every folder.
 LOG, PAGE = "log.txt", "index.html"
+#: Steps of a process that makes a part of the results, from its first one.
+PART_LOG = "log_{:05d}.txt"
 #: Experiments that commands have without a file.
 DEFAULTS = Path(__file__).parents[1] / "defaults"
 
@@ -94,6 +96,7 @@ class Report(NamedTuple):
     tables, warnings : results, and what a user should know before using them
     written : files, but for log and page
     remark : what else is said at the end
+    page : whether a page of tables and pictures is made of it
     """
 
     description: str
@@ -101,6 +104,7 @@ class Report(NamedTuple):
     warnings: Sequence[str] = ()
     written: Sequence[Path] = ()
     remark: str = ""
+    page: bool = True
 
 
 class Run(NamedTuple):
@@ -110,6 +114,7 @@ class Run(NamedTuple):
     kind: Kind
     folder: Folder
     steps: Steps
+    part: range = ALL
 
     @property
     def out(self) -> Path:
@@ -120,7 +125,13 @@ class Run(NamedTuple):
         """Nothing is wrong with the input: what is to be replaced goes, and the log begins."""
         if self.options.overwrite:
             self.folder.remove(self.kind.results)
-        self.steps.keep(self.out / LOG)
+        self.steps.keep(self.log)
+
+    @property
+    def log(self) -> Path:
+        """File of the steps."""
+        whole = self.part.start == 0
+        return self.out / (LOG if whole else PART_LOG.format(self.part.start))
 
 
 def run(
@@ -163,17 +174,17 @@ def run(
         import matplotlib as mpl
 
         mpl.use("Agg")  # pictures go to files
-        report = work(settings, Run(options, kind, folder, steps))
-        if kind.results:
+        command = Run(options, kind, folder, steps, part)
+        report = work(settings, command)
+        if report.page:
             _show(out, settings.title, report, steps.seconds)
     if report.description:
         console.print(report.description)
     print_tables(report.tables)
     for sentence in report.warnings:
         warn(sentence)
-    if report.written:
-        pages = [out / PAGE] if kind.results else []
-        print_written([*pages, *report.written, out / LOG])
+    pages = [out / PAGE] if report.page else []
+    print_written([*pages, *report.written, command.log])
     if report.remark:
         console.print(report.remark, soft_wrap=True)
 

@@ -72,18 +72,16 @@ def _work(settings, command: run.Run, indices: range) -> run.Report:
             indices,
             options.overwrite,
             lambda note: notes.setdefault(note),
-            lambda: command.folder.narrow(indices),
+            lambda: _begin(command, indices),
         )
     ):
         steps.advance(done + 1, count)
         if file.seconds is not None:
             seconds[file.path] = file.seconds
-    written = [out / "sim_*"]
     if settings.simulate.sheet:
         steps.step("drawing")
-        written.append(out / f"sim_{indices.start:05d}.png")
         plots.contact_sheet(
-            written[-1],
+            out / f"sim_{indices.start:05d}.png",
             montecarlo.paths(out, names, indices.start),
             lambda path: read_maps(path, fields=["Q", "U"], missing=[]).maps,
             setup.observation.lmax,
@@ -93,8 +91,14 @@ def _work(settings, command: run.Run, indices: range) -> run.Report:
     kept = count - len(seconds)
     rate = f"{statistics.median(seconds.values()):.2g} s a band, " if seconds else ""
     remark = (
-        f"Written: {len(seconds)} maps in {' and '.join(map(str, written))}"
+        f"{len(seconds)} maps in {out / 'sim_*'}"
         + (f"; {kept} maps were there already" if kept else "")
         + f" ({rate}{steps.seconds:.1f} s in all)."
     )
-    return run.Report(setup.description, (), list(notes), (), remark)
+    return run.Report(setup.description, (), list(notes), sorted(out.glob("sim_*.png")), remark)
+
+
+def _begin(command: run.Run, indices: range) -> None:
+    """The folder is this simulation's: others may make other realisations in it."""
+    command.folder.narrow(indices)
+    command.begin()

@@ -120,6 +120,7 @@ def run(
     *,
     resume: bool = False,
     overwrite: bool = False,
+    begin: Callable[[], None] = lambda: None,
     progress: Progress = QUIET,
     steps: Iterable[Step] | None = None,
 ) -> list[Item]:
@@ -133,6 +134,7 @@ def run(
     resume : keep what is in the folder and make what is missing
     overwrite : make again what is wanted; what else is in the folder is kept if it is of these
         settings
+    begin : called when nothing is wrong with what is wanted, before anything is written
     progress : told of each item
     steps : instead of `STEPS`
 
@@ -151,6 +153,7 @@ def run(
     steps = list(STEPS if steps is None else steps)
     order, wanted = [step.label for step in steps], labels_of(only, steps)
     store, sources = Store(out, settings, resume, overwrite), Sources(settings)
+    begin()
     todo = [s for s in steps if s.label in wanted and (overwrite or not store.has(s.label))]
     for done, step in enumerate(todo):
         progress.step(step.label)

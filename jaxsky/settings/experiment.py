@@ -378,8 +378,9 @@ def _bands(entry: BandTable, index: int, folder: Path) -> list[BandTable]:
     wanted = entry.channels if entry.name is None else [entry.name]
     try:
         return entry.merged(band_tables(entry.instrument, wanted, folder))
-    except KeyError as error:
-        raise MistakeAt(f"bands.{index}.instrument", error.args[0]) from None
+    except (KeyError, ValueError, OSError) as error:
+        what = error.args[0] if isinstance(error, KeyError) else str(error)
+        raise MistakeAt(f"bands.{index}.instrument", what) from None
 
 
 Experiment.model_rebuild()

@@ -243,7 +243,7 @@ def band_tables(
                 raise ValueError(", ".join(names) or "there are none")
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise ValueError(
-                f"{path}: is no TOML file with a list of bands, each with a name of its own ({error})"
+                f"{path}: is no TOML file with a list of bands that have different names ({error})"
             ) from None
     else:
         known = ", ".join(_presets())

@@ -220,12 +220,20 @@ class BandTable(MapKeys):
         return self
 
     def merged(self, channels: Sequence[Mapping[str, Any]]) -> list["BandTable"]:
-        """The bands that this stands for: channels of an instrument, with what is given here."""
+        """The bands that this stands for: channels of an instrument, with what is given here.
+
+        Levels of noise of an instrument are in uK_CMB, whatever the unit of a map that is given
+        here.
+        """
         own = self.model_dump(exclude_unset=True, exclude={"instrument", "channels", "name"})
         beam = {"fwhm", "beam"} if {"fwhm", "beam"} & set(own) else set()
         bands = []
         for channel in channels:
-            raw = {k: v for k, v in channel.items() if k not in beam} | own
+            raw = {k: v for k, v in channel.items() if k not in beam}
+            noise = raw.get("noise")
+            if "file" not in raw and isinstance(noise, dict) and {"level", "rms"} & set(noise):
+                raw["noise"] = {"unit": "uK_CMB"} | noise
+            raw |= own
             try:
                 if "instrument" in channel:
                     raise MistakeAt("instrument", "a band of an instrument has none")

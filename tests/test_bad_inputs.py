@@ -656,6 +656,30 @@ STRICT += [
     file_of_settings("nothing", "", "bands", read=and_then(inputs_of)),
 ]
 
+
+def instrument(given: str, bands: list[dict[str, Any]], *refused: str) -> Row:
+    """A file with the bands of an instrument."""
+
+    def make(folder: Path) -> Callable[[], Any]:
+        (folder / "own.toml").write_text(f"bands = {toml(bands)}\n")
+        return partial(load, write_settings(folder, {"bands": [{"instrument": "own.toml"}]}))
+
+    words = ("given.toml", "bands.0.instrument", "own.toml", *refused) if refused else ()
+    return Row(f"an instrument {given}", make, words)
+
+
+OWN = {"name": "a", "bandpass": {"center": 44.0}, "fwhm": 27.0, "noise": {"level": 240.0}}
+STRICT += [
+    instrument("of one's own", [OWN]),
+    instrument("without bands", [], "none"),
+    instrument("with a band without a name", [{"fwhm": 27.0}], "name"),
+    instrument("with a band twice", [OWN, OWN], "a, a"),
+    instrument("with a beam in quotes", [OWN | {"fwhm": "27"}], "band a: fwhm", "'27'"),
+    instrument("with negative noise", [OWN | {"noise": {"level": -1.0}}], "noise.level", "-1.0"),
+    instrument("with another key", [OWN | {"colour": 1}], "band a: colour"),
+    instrument("with a band of another", [OWN | {"instrument": "planck"}], "band a: instrument"),
+]
+
 # What settings and files say together
 
 
@@ -682,6 +706,9 @@ def of_pixels(values: Any, unit: str | None = "1", name: str = "MAP") -> dict[st
 BETA = {"sky/dust/parameters": {"beta_dust": {"file": "beta.fits"}}}
 LEVELS = 1.5 + 0.1 * RNG.random(NPIX)
 RMS = {"bands/0/noise": {"map": {"file": "rms.fits"}}}
+PIXEL = healpy.nside2resol(NSIDE, arcmin=True)
+BAND_44 = Bandpass.top_hat(44.1, 10.72)
+rms_of = lambda found: np.sqrt(found.bands["44"].noise[0, 0])  # noqa: E731
 TOGETHER = [
     sky("files that are right", {}),
     sky("a map of beta_dust", BETA, beta=of_pixels(LEVELS)),
@@ -714,6 +741,12 @@ TOGETHER = [
     sky("a map of rms in the wrong unit", RMS, "44", "K_CMB", rms=of_pixels(1e3 * LEVELS, "K_CMB")),
     sky("a map of rms of 48 pixels", RMS, "rms.fits", "48", rms=of_pixels(LEVELS[:48], "K_CMB")),
     sky("a map of rms with zeros", RMS, "rms.fits", "missing", rms=of_pixels(0 * LEVELS, "K_CMB")),
+    sky(
+        "the noise of an instrument in uK_CMB, and a map in uK_RJ",
+        {"bands/0": {"name": "44", "instrument": "planck", "file": "44.fits"}},
+        right=equal(240.0 / PIXEL / BAND_44.conversion("uK_RJ", "uK_CMB"), rms_of),
+        **{"44": {n: column(n, "D", v, unit="uK_RJ") for n, v in QU.items()}},
+    ),
     sky("a map of U alone", {"bands/0/fields": ["U_STOKES"]}, "44"),
     sky("U before Q", {"bands/0/fields": ["U_STOKES", "Q_STOKES"]}, "44", "U_STOKES"),
     sky(
@@ -743,7 +776,6 @@ def python(given: str, call: Callable[[], Any], *refused: str) -> Row:
     return Row(given, lambda folder: call, refused)
 
 
-BAND_44 = Bandpass.top_hat(44.0, 8.0)
 MAPS_QU = np.array([Q, U])
 PYTHON = [
     python("a shift in MHz", lambda: BAND_44.shifted(1 * u.MHz), "delta"),

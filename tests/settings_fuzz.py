@@ -75,27 +75,33 @@ def paths(table: Any, at: tuple = ()) -> Iterator[tuple]:
 
 
 def changed(raw: dict[str, Any], at: tuple, value: Any) -> dict[str, Any]:
-    """Settings with another value at a place."""
+    """Settings with another value at a place, in a table that need not be there."""
     raw = deepcopy(raw)
     table: Any = raw
     for key in at[:-1]:
-        table = table[key]
+        table = table.setdefault(key, {}) if isinstance(table, dict) else table[key]
     table[at[-1]] = value
     return raw
 
 
 def toml(value: Any) -> str:
-    """A value as TOML."""
+    """A value as TOML has it, on one line."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{json.dumps(k)} = {toml(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ", ".join(map(toml, value)) + "]"
-    return json.dumps(value)
+    return json.dumps(value).replace("Infinity", "inf").replace("NaN", "nan")
+
+
+def written(path: Path, raw: dict[str, Any]) -> Path:
+    """The path, to which settings are written."""
+    path.write_text("".join(f"{json.dumps(key)} = {toml(v)}\n" for key, v in raw.items()))
+    return path
 
 
 def fault(kind: str, raw: dict[str, Any], at: tuple, path: Path, build: bool = True) -> str | None:
     """What is wrong with the answer to settings; None if they work or are refused well."""
-    path.write_text("".join(f"{json.dumps(key)} = {toml(v)}\n" for key, v in raw.items()))
+    written(path, raw)
     known = [str(key) for key in at if not isinstance(key, int)]
     known += [f"{other[0]}.{other[1]}" for other in paths(raw) if len(other) > 1]
     try:

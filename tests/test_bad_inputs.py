@@ -6,7 +6,6 @@ in any other exception, and the file stays as it was.
 """
 
 import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -25,6 +24,7 @@ from jaxsky import Bandpass, Dust, Synchrotron
 from jaxsky.io import read_bandpass, read_beam, read_maps, read_mask, read_spectra, unit_factor
 from jaxsky.settings.keys import of_file
 from jaxsky.settings.load import load
+from settings_fuzz import changed, written
 
 NSIDE = 4
 NPIX = 12 * NSIDE**2
@@ -453,15 +453,6 @@ BANDPASSES = [
 # Settings
 
 
-def toml(value: Any) -> str:
-    """A value as TOML has it, on one line."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(k)} = {toml(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(toml, value)) + "]"
-    return json.dumps(value).replace("Infinity", "inf").replace("NaN", "nan")
-
-
 FREE = {"dust.beta_dust": {"start": 1.6, "uniform": [0.5, 2.5]}}
 TEMPLATES = {
     "dust": {"law": "dust", "file": "dust.fits", "nu_ref": 353.0},
@@ -515,23 +506,9 @@ BASES: dict[str, tuple[dict[str, Any], Callable[[Path], Any]]] = {
 }
 
 
-def changed(base: Any, key: str, value: Any) -> Any:
-    """A copy with one entry changed, named as in messages ("bands.0.noise")."""
-    first, inner, rest = key.partition("/")
-    entries = list(base) if isinstance(base, list) else dict(base)
-    at: Any = int(first) if isinstance(base, list) else first
-    if inner:
-        inside = entries[at] if isinstance(base, list) else entries.get(at, {})
-        entries[at] = changed(inside, rest, value)
-    else:
-        entries[at] = value
-    return entries
-
-
-def write_settings(folder: Path, settings: dict[str, Any]) -> Path:
-    path = folder / "given.toml"
-    path.write_text("".join(f"{k} = {toml(v)}\n" for k, v in settings.items()))
-    return path
+def changed_at(base: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """A copy with one entry changed, "/" between the parts of its key ("bands/0/noise")."""
+    return changed(base, tuple(int(k) if k.isdecimal() else k for k in key.split("/")), value)
 
 
 def settings(command: str, key: str, value: Any, *refused: str) -> Row:
@@ -539,7 +516,9 @@ def settings(command: str, key: str, value: Any, *refused: str) -> Row:
     base, load = BASES[command]
 
     def make(folder: Path) -> Callable[[], Any]:
-        return partial(load, write_settings(folder, changed(base, key, value) if key else value))
+        return partial(
+            load, written(folder / "given.toml", changed_at(base, key, value) if key else value)
+        )
 
     words = ("given.toml", *refused) if refused else ()
     return Row(f"{command}: {key} = {value!r}", make, words)
@@ -661,8 +640,10 @@ def instrument(given: str, bands: list[dict[str, Any]], *refused: str) -> Row:
     """A file with the bands of an instrument."""
 
     def make(folder: Path) -> Callable[[], Any]:
-        (folder / "own.toml").write_text(f"bands = {toml(bands)}\n")
-        return partial(load, write_settings(folder, {"bands": [{"instrument": "own.toml"}]}))
+        written(folder / "own.toml", {"bands": bands})
+        return partial(
+            load, written(folder / "given.toml", {"bands": [{"instrument": "own.toml"}]})
+        )
 
     words = ("given.toml", "bands.0.instrument", "own.toml", *refused) if refused else ()
     return Row(f"an instrument {given}", make, words)
@@ -692,8 +673,8 @@ def sky(given: str, changes: dict[str, Any], *refused: str, right: Any = None, *
             save(folder, columns, {}).rename(folder / f"{name}.fits")
         settings = base
         for key, value in changes.items():
-            settings = changed(settings, key, value)
-        path = write_settings(folder, settings)
+            settings = changed_at(settings, key, value)
+        path = written(folder / "given.toml", settings)
         return lambda: inputs_of(load(path))
 
     return Row(given, make, refused, right)

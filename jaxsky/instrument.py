@@ -238,10 +238,12 @@ def band_tables(
     elif path.is_file():
         try:
             bands = tomllib.loads(path.read_text())["bands"]
-            [band["name"] for band in bands]
+            names = [str(band["name"]) for band in bands]
+            if not names or len(set(names)) < len(names):
+                raise ValueError(", ".join(names) or "there are none")
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise ValueError(
-                f"{path}: is no TOML file with a list of bands that have names ({error})"
+                f"{path}: is no TOML file with a list of bands that have different names ({error})"
             ) from None
     else:
         presets = ", ".join(_presets())

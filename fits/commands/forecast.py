@@ -31,5 +31,8 @@ def _work(settings, command: run.Run) -> run.Report:
     command.begin()
     written = report.write_report(command.out, found, settings, command.steps.seconds)
     return run.Report(
-        found.setup.description, report.tables(found), report.warnings(found), written
+        found.setup.description,
+        report.tables(found),
+        [*report.warnings(found), *settings.left_out("forecast")],
+        written,
     )

@@ -85,10 +85,11 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
     spectra = masked_spectra(setup.mask, edges, window=window)
     bands = {name: setup.bands[name].band for name in setup.shown}
     powers = b_modes.foreground_powers(setup.sky, bands, spectra)
-    laws = {
-        name: b_modes.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
-        for name, D in powers.items()
-    }
+    with at_key("forecast.fit"):
+        laws = {
+            name: b_modes.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
+            for name, D in powers.items()
+        }
     highest = max(spectra.lmax, spec.fisher_lmax, b_modes.PIVOT)
     with at_key("cmb.cosmology"):
         tensors = tensor_spectra(highest, **settings.cmb.cosmology)

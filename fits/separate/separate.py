@@ -118,7 +118,8 @@ def separate(
     check_double("A separation")
     spec, domain, priors = settings.separate, setup.domain, priors_of(settings, "separate")
     progress.step("spectral parameters")
-    like = domain.likelihood(setup.data)
+    with at_key("free"):
+        like = domain.likelihood(setup.data)
     fit = fit_spectra(like, priors=priors, throw=False)
     # What no law describes is separated nevertheless, and said.
     fit.checked(throw=fit.message != misfit(fit.chi2, fit.dof))

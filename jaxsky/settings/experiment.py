@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
 from jaxsky.instrument import band_tables
-from jaxsky.settings import FileName, MapFile, MaskFile, SettingsFile, Table
+from jaxsky.settings import FileName, MapFile, MaskFile, SettingsError, SettingsFile, Table
 from jaxsky.settings.tables import (
     BandTable,
     CMBTable,
@@ -352,23 +352,31 @@ class Experiment(SettingsFile):
         }
 
     def left_out(self, command: str) -> list[str]:
-        """A warning about free parameters that a command does not have."""
-        if not (names := [name for name in self.free if name not in self.free_in(command)]):
-            return []
-        return [f"Not free here, as jaxsky {command} does not have them: {', '.join(names)}."]
+        """Warnings about what is said of free parameters that a command does not have."""
+        here = self.free_in(command)
+        regions = [n for n, one in here.items() if one.regions and command != "separate"]
+        uniform = [n for n, one in here.items() if one.uniform and command == "forecast"]
+        parts = {
+            "Not free here, as jaxsky {} does not have them": [
+                n for n in self.free if n not in here
+            ],
+            "One value for all, as jaxsky {} does not have regions of parameters": regions,
+            "Without a prior, as jaxsky {} does not have uniform ones": uniform,
+        }
+        return [f"{w.format(command)}: {', '.join(names)}." for w, names in parts.items() if names]
 
     def start(self, command: str) -> dict[str, float]:
         """Start values of the free parameters of a command.
 
         Raises
         ------
-        ValueError
+        SettingsError
             For one without a start and a prior.
         """
         values = {}
         for name, one in self.free_in(command).items():
             if (value := one.first()) is None:
-                raise ValueError(f"free.{name}: start is missing")
+                raise SettingsError(f"free.{name}: start is missing.")
             values[name] = value
         return values
 
@@ -380,8 +388,9 @@ def _bands(entry: BandTable, index: int, folder: Path) -> list[BandTable]:
     wanted = entry.channels if entry.name is None else [entry.name]
     try:
         return entry.merged(band_tables(entry.instrument, wanted, folder))
-    except KeyError as error:
-        raise MistakeAt(f"bands.{index}.instrument", error.args[0]) from None
+    except (KeyError, ValueError, OSError) as error:
+        what = error.args[0] if isinstance(error, KeyError) else str(error)
+        raise MistakeAt(f"bands.{index}.instrument", what) from None
 
 
 Experiment.model_rebuild()

@@ -1,7 +1,6 @@
 """Settings from TOML files and the command line, with a sentence for each mistake."""
 
 import json
-import reprlib
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,60 +10,9 @@ from pydantic import ValidationError
 
 from jaxsky.settings import SettingsError, expand
 from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.values import MistakeAt
+from jaxsky.settings.values import mistakes
 
 __all__ = ["load"]
-
-
-def _key(raw: Any, place: Sequence[str | int], missing: bool) -> str:
-    """The dotted key of a mistake; its place also names types, which are no keys."""
-    keys = []
-    for i, step in enumerate(place):
-        if isinstance(raw, dict) and step in raw:
-            keys.append(str(step))
-            raw = raw[step]
-        elif isinstance(raw, list) and isinstance(step, int):
-            keys.append(str(step))
-            raw = raw[step] if step < len(raw) else None
-        elif missing and i == len(place) - 1:
-            keys.append(str(step))
-    return ".".join(keys)
-
-
-def _sentence(path: Path, raw: Any, error: ValidationError, options: Mapping[str, str]) -> str:
-    wrong: dict[str, list[str]] = {}
-    types: dict[str, str] = {}
-    for item in error.errors():
-        what = item["msg"].removeprefix("Value error, ").rstrip(".")
-        where = _key(raw, item["loc"], item["type"] == "missing")
-        mistake = item.get("ctx", {}).get("error")
-        if isinstance(mistake, MistakeAt):
-            where = f"{where}.{mistake.key}" if where else mistake.key
-            what = mistake.words.rstrip(".")
-        elif item["type"] == "extra_forbidden":
-            what = "unknown key"
-        elif item["type"] == "missing":
-            what = "is missing"
-        elif item["type"].endswith(("_type", "literal_error")):
-            wanted = what.removeprefix("Input should be ").partition(" or instance")[0]
-            wanted = wanted.replace("dictionary", "table")
-            known = types.get(where, "input should be ").partition(", not ")[0]
-            joined = known + ("" if known.endswith("be ") else " or ") + wanted
-            types[where] = f"{joined}, not {reprlib.repr(item['input'])}"
-            continue
-        elif item["msg"] == what:
-            value = "" if ", not " in what else f", not {reprlib.repr(item['input'])}"
-            what = f"{what[0].lower()}{what[1:]}{value}"
-        wrong.setdefault(where, []).append(what)
-    # Of a value that may be of several types, those that it is not matter only if it is none.
-    places = [*wrong, *types]
-    for where, what in types.items():
-        if where not in wrong and not any(place.startswith(f"{where}.") for place in places):
-            wrong[where] = [what]
-    sentences = [
-        ": ".join(filter(None, (k, " or ".join(w)))) + options.get(k, "") for k, w in wrong.items()
-    ]
-    return f"{path}: {'; '.join(sentences)}."
 
 
 def _assigned(assignment: str) -> dict[str, Any]:
@@ -145,7 +93,7 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
             raise ValueError(f"{folder} is not a folder")
         settings = Experiment.model_validate(raw, context={"folder": folder})
     except ValidationError as error:
-        raise SettingsError(_sentence(path, raw, error, options)) from None
+        raise SettingsError(f"{path}: {mistakes(raw, error, options)}.") from None
     except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: links in a circle
         raise SettingsError(f"{path}: data_dir: {error}.") from None
     return settings.model_copy(update={"data_dir": str(folder)})

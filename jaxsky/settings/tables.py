@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from jaxsky.components import AME, component_class
 from jaxsky.settings import BandpassSpec, FileName, MapFile, MapKeys, NoiseTable, Table
@@ -19,7 +19,7 @@ from jaxsky.settings.types import (
     Word,
     check_component_names,
 )
-from jaxsky.settings.values import MistakeAt, check_reference, check_signs
+from jaxsky.settings.values import MistakeAt, check_reference, check_signs, mistakes
 
 __all__ = [
     "BandTable",
@@ -215,7 +215,7 @@ class BandTable(MapKeys):
         ):
             raise MistakeAt("samples", "is of a top-hat, but the bandpass has no width")
         if self.noise is not None and 0 in (self.noise.level, self.noise.rms):
-            raise MistakeAt("noise", "must be greater than 0")
+            raise MistakeAt("noise", "must be greater than 0, not 0")
         if self.file is None:
             if self.leakage is not None:
                 raise MistakeAt("leakage", "is subtracted from a map, but file is missing")
@@ -226,13 +226,28 @@ class BandTable(MapKeys):
         return self
 
     def merged(self, channels: Sequence[Mapping[str, Any]]) -> list["BandTable"]:
-        """The bands that this stands for: channels of an instrument, with what is given here."""
+        """The bands that this stands for: channels of an instrument, with what is given here.
+
+        Levels of noise of an instrument are in uK_CMB, whatever the unit of a map that is given
+        here.
+        """
         own = self.model_dump(exclude_unset=True, exclude={"instrument", "channels", "name"})
         beam = {"fwhm", "beam"} if {"fwhm", "beam"} & set(own) else set()
-        return [
-            BandTable.model_validate({k: v for k, v in c.items() if k not in beam} | own)
-            for c in channels
-        ]
+        bands = []
+        for channel in channels:
+            raw = {k: v for k, v in channel.items() if k not in beam}
+            noise = raw.get("noise")
+            if "file" not in raw and isinstance(noise, dict) and {"level", "rms"} & set(noise):
+                raw["noise"] = {"unit": "uK_CMB"} | noise
+            raw |= own
+            try:
+                if "instrument" in channel:
+                    raise MistakeAt("instrument", "a band of an instrument has none")
+                bands.append(BandTable.model_validate(raw))
+            except ValueError as error:
+                what = mistakes(raw, error) if isinstance(error, ValidationError) else str(error)
+                raise ValueError(f"{self.instrument}, band {channel['name']}: {what}") from None
+        return bands
 
 
 class Regions(Table):

@@ -1,7 +1,11 @@
 """Checks of values in settings; ValueError with the words that follow the key."""
 
-from collections.abc import Mapping
+import reprlib
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
+
+from pydantic import ValidationError
 
 from jaxsky.components import component_class, declared
 
@@ -13,6 +17,7 @@ __all__ = [
     "file_names",
     "hdu_numbers",
     "missing_numbers",
+    "mistakes",
     "stokes_words",
 ]
 
@@ -25,6 +30,60 @@ class MistakeAt(ValueError):
         if isinstance(mistake, MistakeAt):
             self.key, self.words = f"{key}.{mistake.key}", mistake.words
         super().__init__(f"{self.key}: {self.words}")
+
+
+def _key(raw: Any, place: Sequence[str | int], missing: bool) -> str:
+    """The dotted key of a mistake; its place also names types, which are no keys."""
+    keys = []
+    for i, step in enumerate(place):
+        if isinstance(raw, dict) and step in raw:
+            keys.append(str(step))
+            raw = raw[step]
+        elif isinstance(raw, list) and isinstance(step, int):
+            keys.append(str(step))
+            raw = raw[step] if step < len(raw) else None
+        elif missing and i == len(place) - 1:
+            keys.append(str(step))
+    return ".".join(keys)
+
+
+def mistakes(
+    raw: Any, error: ValidationError, options: Mapping[str, str] = MappingProxyType({})
+) -> str:
+    """A sentence about what is wrong with tables, with the keys; options add to those of a key."""
+    wrong: dict[str, list[str]] = {}
+    types: dict[str, str] = {}
+    for item in error.errors():
+        what = item["msg"].removeprefix("Value error, ").rstrip(".")
+        where = _key(raw, item["loc"], item["type"] == "missing")
+        mistake = item.get("ctx", {}).get("error")
+        if isinstance(mistake, MistakeAt):
+            where = f"{where}.{mistake.key}" if where else mistake.key
+            what = mistake.words.rstrip(".")
+        elif item["type"] == "extra_forbidden":
+            what = "unknown key"
+        elif item["type"] == "missing":
+            what = "is missing"
+        elif item["type"].endswith(("_type", "literal_error")):
+            wanted = what.removeprefix("Input should be ").partition(" or instance")[0]
+            wanted = wanted.replace("dictionary", "table")
+            known = types.get(where, "input should be ").partition(", not ")[0]
+            joined = known + ("" if known.endswith("be ") else " or ") + wanted
+            types[where] = f"{joined}, not {reprlib.repr(item['input'])}"
+            continue
+        elif item["msg"] == what:
+            value = "" if ", not " in what else f", not {reprlib.repr(item['input'])}"
+            what = f"{what[0].lower()}{what[1:]}{value}"
+        wrong.setdefault(where, []).append(what)
+    # Of a value that may be of several types, those that it is not matter only if it is none.
+    places = [*wrong, *types]
+    for where, what in types.items():
+        if where not in wrong and not any(place.startswith(f"{where}.") for place in places):
+            wrong[where] = [what]
+    sentences = [
+        ": ".join(filter(None, (k, " or ".join(w)))) + options.get(k, "") for k, w in wrong.items()
+    ]
+    return "; ".join(sentences)
 
 
 def check_reference(law: str, nu_ref: float | None, parameters: Mapping[str, Any]) -> None:

@@ -65,7 +65,7 @@ class Fluctuations(eqx.Module):
                 modes = np.asarray(_modes(rows[b], np.stack([spectrum] * 2)))
                 block = block + modes @ modes.T
             total[b, :, b, :] += block
-        total = total.reshape(bands * count, bands * count)
+        square = total.reshape(bands * count, bands * count)
         if self.cmb_spectra is not None and self.cmb_windows is not None:
             modes = np.concatenate(
                 [
@@ -76,8 +76,8 @@ class Fluctuations(eqx.Module):
                     )
                 ]
             )
-            total = total + modes @ modes.T
-        return total
+            square = square + modes @ modes.T
+        return square
 
     # Not one program: in that XLA draws the normals anew for each row.
     def noise_realisation(self, key: Array) -> Float[Array, "band stokes pix"]:

@@ -162,10 +162,12 @@ def _simulated(
     used = np.ones(healpy.nside2npix(observation.nside), bool)
     bands = {}
     for name, maps in observe_bands(key, sky, observation, setup.cmb):
-        observed, total = setup.observed(name), maps["total"]
-        if observed.leakage is not None:
-            total = total + observed.leakage
-        bands[name] = _band(observed, total, used, f"bands.{name}")
+        observed, total, where = setup.observed(name), maps["total"], f"bands.{name}"
+        noise, correlated = _noise_of(observed, used.size, where)
+        if (leakage := _leakage_of(observed, used, where)) is not None:
+            total = total + leakage.maps
+        band, beam = observed.bandpass, observed.beam
+        bands[name] = Band(total, used, band, beam, noise, correlated, leakage)
     if not foregrounds or not sky:
         return bands, None
     quiet = {n: ObservedBand(c.band, c.beam, c.target) for n, c in observation.channels.items()}
@@ -173,30 +175,36 @@ def _simulated(
     return bands, {name: maps["total"] for name, maps in observe_bands(key, sky, alone)}
 
 
-def _band(
-    observed: Observed,
-    maps: Float[Array, "stokes pix"],
-    used: Bool[np.ndarray, " pix"],
-    where: str,
-) -> Band:
-    """A band with the noise and the leakage of a simulation."""
-    nside, correlated = healpy.npix2nside(used.size), None
+def _noise_of(
+    observed: Observed, npix: int, where: str
+) -> tuple[Float[Array, "stokes stokes pix"], Float[Array, " ell"] | None]:
+    """Covariance of each pixel and spectrum beyond it of the noise of a simulation."""
+    nside = healpy.npix2nside(npix)
     if observed.covariance is not None:
-        noise = jnp.asarray(observed.covariance)
-    elif observed.level is not None:
-        noise = uniform_covariance(observed.level, nside)
-    elif observed.spectrum is not None:
-        noise = uniform_covariance(0.0, nside)
-        beyond = max(0, 4 * nside + 1 - observed.spectrum.size)
-        correlated = jnp.asarray(np.pad(observed.spectrum, (0, beyond)))
-    else:
+        _check_size("NOISE", observed.covariance, npix, where)
+        return jnp.asarray(observed.covariance), None
+    if observed.level is not None:
+        return uniform_covariance(observed.level, nside), None
+    if observed.spectrum is None:
         raise SettingsError(
             f"{where}.noise: is missing, or is of pixels that were smoothed with the map."
         )
-    leakage = None
-    if observed.leakage is not None:
-        leakage = Leakage(jnp.asarray(observed.leakage), used, observed.beam)
-    return Band(maps, used, observed.bandpass, observed.beam, noise, correlated, leakage)
+    beyond = max(0, 4 * nside + 1 - observed.spectrum.size)
+    return uniform_covariance(0.0, nside), jnp.asarray(np.pad(observed.spectrum, (0, beyond)))
+
+
+def _leakage_of(observed: Observed | None, used: Bool[np.ndarray, " pix"], where: str):
+    if observed is None or observed.leakage is None:
+        return None
+    _check_size("LEAKAGE", observed.leakage, used.size, where)
+    return Leakage(jnp.asarray(observed.leakage), used, observed.beam)
+
+
+def _check_size(table: str, values: np.ndarray, npix: int, where: str) -> None:
+    if values.shape[-1] != npix:
+        raise SettingsError(
+            f"{where}.file: its table {table} has {values.shape[-1]} pixels, its map {npix}."
+        )
 
 
 def _from_file(settings: Experiment, spec: BandTable) -> tuple[Band, Mapping[str, float] | None]:
@@ -251,13 +259,15 @@ def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -
         with at_key(f"{where}.beam"):
             beam = jnp.asarray(read_beam(find_file(folder, spec.beam), 2 * nside))
     elif spec.fwhm is None and observed is not None:
-        beam = observed.beam if np.ndim(observed.beam) == 0 else jnp.asarray(observed.beam)
-    leakage = _read_leakage(folder, spec, bandpass) if spec.leakage else None
+        beam = observed.beam
+    leakage = _leakage_of(observed, used, where)
+    if spec.leakage is not None:
+        leakage = _read_leakage(folder, spec, bandpass)
     if spec.noise is None:
         if observed is None:
             raise SettingsError(f"{where}.noise: is missing.")
-        band = _band(observed, maps, used, where)
-        return band._replace(bandpass=bandpass, beam=beam, leakage=leakage or band.leakage)
+        noise, correlated = _noise_of(observed, used.size, where)
+        return Band(maps, used, bandpass, beam, noise, correlated, leakage)
     if spec.noise.estimate_above is not None:
         with at_key(f"{where}.noise.estimate_above"):
             noise, correlated = _estimated_noise(spec.noise, maps, used)

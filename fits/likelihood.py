@@ -39,7 +39,7 @@ __all__ = ["Likelihood", "PixelLikelihood", "TemplateLikelihood", "chi2", "likel
 
 #: Covariance of the inner products <rows, data>: (band, row, stokes, pix) -> square matrix over
 #: (band, row) flattened. `fits.covariance.Fluctuations.covariance` is one.
-CovarianceOf = Callable[[Float[Array, "band row stokes pix"]], Float[Array, "row row"]]
+CovarianceOf = Callable[[Float[Array, "band row stokes pix"]], Float[np.ndarray, "row row"]]
 
 
 class Bands(eqx.Module):
@@ -202,11 +202,11 @@ def _check_maps(sky: Sky, bands: Mapping[str, Any], data: Array, sigma: Array) -
             f"Argument `sigma` must broadcast to (band, stokes, pix) = {shape}, "
             f"but has shape {sigma.shape}."
         )
-    data, sigma = np.asarray(data), np.asarray(sigma)
-    if bad := int(np.sum(~(sigma > 0))):
-        raise ValueError(f"Argument `sigma` has {bad} of {sigma.size} values that are not > 0.")
-    used = np.isfinite(np.broadcast_to(sigma, shape))
-    if bad := int(np.sum(used & (~np.isfinite(data) | (data < UNSEEN)))):
+    values, errors = np.asarray(data), np.asarray(sigma)
+    if bad := int(np.sum(~(errors > 0))):
+        raise ValueError(f"Argument `sigma` has {bad} of {errors.size} values that are not > 0.")
+    used = np.isfinite(np.broadcast_to(errors, shape))
+    if bad := int(np.sum(used & (~np.isfinite(values) | (values < UNSEEN)))):
         raise ValueError(
             f"Argument `data` has {bad} values that are not finite (or UNSEEN) in pixels that are "
             "used; mask them with an infinite `sigma`."

@@ -60,7 +60,7 @@ def region_mask(
 
 
 def region_words(settings: Experiment, name: str) -> str:
-    """What a region is, as part of a sentence."""
+    """What a region is, after the word "in" of a sentence."""
     region = settings.regions[name]
     if isinstance(region, MaskFile):
         return f"the mask {name}"

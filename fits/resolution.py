@@ -1,7 +1,7 @@
 """Templates and maps at a common resolution, where they can be compared."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import healpy
 import jax.numpy as jnp
@@ -102,7 +102,9 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
     ValueError
         If a map is coarser than the common resolution.
     """
-    maps = {f"template {name!r}": (t.used, t.fwhm) for name, t in inputs.templates.items()}
+    maps: dict[str, tuple[Bool[np.ndarray, " pix"], Any]] = {
+        f"template {name!r}": (t.used, t.fwhm) for name, t in inputs.templates.items()
+    }
     maps |= {f"band {name!r}": (b.used, b.beam) for name, b in inputs.bands.items()}
     maps |= {
         f"leakage of band {name!r}": (b.leakage.used, b.leakage.beam)
@@ -208,9 +210,9 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
 
 def _remembered(covariance_of: CovarianceOf) -> CovarianceOf:
     """A covariance that is made once for rows that come again, as for each choice of Stokes."""
-    last: dict[str, Float[Array, "row row"]] = {}
+    last: dict[str, Float[np.ndarray, "row row"]] = {}
 
-    def remembered(rows: Float[Array, "band row stokes pix"]) -> Float[Array, "row row"]:
+    def remembered(rows: Float[Array, "band row stokes pix"]) -> Float[np.ndarray, "row row"]:
         mark = fingerprint(rows)
         if mark not in last:
             last.clear()

@@ -65,24 +65,25 @@ class Setup(NamedTuple):
     def observed(self, name: str) -> Observed:
         """How a band is observed, as its maps are."""
         channel = self.observation.channels[name]
-        smoothed, per_pixel = channel.target is not None, bool(np.ndim(channel.noise))
-        beam = channel.target if smoothed else channel.beam
+        beam = channel.beam if channel.target is None else channel.target
         level = spectrum = covariance = None
-        if channel.noise is not None and not smoothed:
-            covariance = np.asarray(channel.noise) if per_pixel else None
-            level = None if per_pixel else float(channel.noise)
-        elif channel.noise is not None and not per_pixel:
+        smoothed, noise = channel.target is not None, channel.noise
+        if noise is not None and jnp.ndim(noise):
+            covariance = None if smoothed else np.asarray(noise)
+        elif noise is not None and not smoothed:
+            level = float(noise)
+        elif noise is not None:
             lmax = self.observation.lmax
             window = np.asarray(beam_ratio(beam, channel.beam, lmax, f"band {name!r}"))
-            spectrum = (float(channel.noise) * np.radians(1 / 60) * window) ** 2
+            spectrum = (float(noise) * np.radians(1 / 60) * window) ** 2
             spectrum[:2] = 0.0
         return Observed(
             channel.band,
-            np.asarray(beam) if jnp.ndim(beam) else float(beam),
+            jnp.asarray(beam) if jnp.ndim(beam) else float(beam),
             level,
             spectrum,
             covariance,
-            self.leakage.get(name),
+            None if name not in self.leakage else np.asarray(self.leakage[name]),
             self.truth,
         )
 

@@ -238,14 +238,14 @@ def band_tables(
     elif path.is_file():
         try:
             bands = tomllib.loads(path.read_text())["bands"]
-            known = {str(band["name"]): band for band in bands}
+            [band["name"] for band in bands]
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise ValueError(
                 f"{path}: is no TOML file with a list of bands that have names ({error})"
             ) from None
     else:
-        known = ", ".join(_presets())
-        raise KeyError(f"Unknown instrument {name!r}; known are {known}, or a file.")
+        presets = ", ".join(_presets())
+        raise KeyError(f"Unknown instrument {name!r}; known are {presets}, or a file.")
     known = {str(band["name"]): band for band in bands}
     for channel in channels or ():
         if channel not in known:

@@ -11,7 +11,6 @@ import re
 import numpy as np
 import pytest
 from astropy import units as u
-from fits.settings import Analysis
 from pydantic import BaseModel, ValidationError
 
 import fits
@@ -23,6 +22,7 @@ from jaxsky.harmonics import smooth
 from jaxsky.io import Maps, unit_factor
 from jaxsky.keys import realisation_key
 from jaxsky.noise import estimate_variance
+from jaxsky.settings.experiment import Common
 
 #: Annotations of arguments that may be numbers, or hold some.
 NUMERIC = re.compile(
@@ -161,7 +161,7 @@ def test_what_is_refused_inside_of_other_things():
     with pytest.raises(TypeError, match="Argument `tolerance` carries the unit GHz"):
         observe(sky, [Bandpass.delta(44.0)], tolerance=QUANTITY)
     with pytest.raises(ValidationError, match="fwhm\\n  Input should be a valid number"):
-        Analysis(fwhm=60 * u.arcmin)
+        Common(fwhm=60 * u.arcmin)
 
 
 def test_arrays_of_other_packages_are_refused():

@@ -18,8 +18,8 @@ def init(
     name: Annotated[
         str,
         typer.Argument(
-            help=f"{TEMPLATE}: all keys, commented; planck-44-70: Planck's maps of 2018; or a "
-            "command, for what it does without a file."
+            help=f"{TEMPLATE}: all keys, commented; planck-44-70, planck-separate: Planck's maps "
+            "of 2018; or a command, for what it does without a file."
         ),
     ] = TEMPLATE,
     out: Annotated[

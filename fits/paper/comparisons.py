@@ -104,7 +104,7 @@ def figure_scatter(settings: Experiment, sources: Sources, out: Path) -> Item:
     return Item(
         "Figure 5",
         "observed and modelled pixels",
-        f"Pixels of nside {settings.common.nside}, {region_words(settings, region)}, "
+        f"Pixels of nside {settings.common.nside} in {region_words(settings, region)}, "
         f"{_beam(settings)}: Q in the upper row of each pair, U in the lower. "
         "Slopes have the errors of noise and CMB; PTE is the probability that these alone "
         "leave larger differences.",

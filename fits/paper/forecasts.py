@@ -48,16 +48,15 @@ def figure_b_modes(settings: Experiment, sources: Sources, out: Path) -> Item:
     picture = picture_of("Figure 12")
     plot_b_modes(out / picture, found, chosen)
     fraction = 100 * sky_fraction(found.setup.mask)
-    where = region_words(settings, settings.forecast.region)
     sky = sources.sky_differs
     if sources.embedded:
         sky = f"The sky is the embedded model of the Galaxy at nside {NSIDE}."
     return Item(
         "Figure 12",
         "primordial B modes and foregrounds",
-        "BB of the foregrounds in three bands of COrE (thick) and their noise (thin), where "
-        f"{where}, {fraction:.0f} % of the sky, with the mixing of the mask undone, against "
-        "primordial BB for several r, and lensing.",
+        "BB of the foregrounds in three bands of COrE (thick) and their noise (thin) in "
+        f"{region_words(settings, settings.forecast.region)}, {fraction:.0f} % of the sky, "
+        "with the mixing of the mask undone, against primordial BB for several r, and lensing.",
         f"{sky} The edge of what is used is smooth, and the paper's is WMAP's polarization mask, "
         "which leaves 63 %. Noise and lensing are added.",
         picture,

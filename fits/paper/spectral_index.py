@@ -60,7 +60,7 @@ def figure_probability(settings: Experiment, sources: Sources, out: Path) -> Ite
         "Figure 11",
         "probability of the spectral indices",
         f"Probability of the free parameters from the bands {names}: Q, U and both together, "
-        f"pixels at {region_words(settings, 'strip')} (above) and the full sky (below); contours "
+        f"in {region_words(settings, 'strip')} (above) and the full sky (below); contours "
         "hold 68 and 95 per cent.",
         "Noise after smoothing is correlated between pixels and the CMB between bands: the "
         "likelihood has both, where the paper's sum over pixels has neither. "

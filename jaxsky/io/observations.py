@@ -1,12 +1,13 @@
 """How a simulated map was observed, kept in its file: bandpass, beam, noise, leakage, truth."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from astropy.io import fits as pyfits
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.io.errors import InputError
@@ -34,7 +35,7 @@ class Observed(NamedTuple):
     """
 
     bandpass: Bandpass
-    beam: float | Float[np.ndarray, " ell"]
+    beam: float | Float[Array, " ell"]
     level: float | None = None
     spectrum: Float[np.ndarray, " ell"] | None = None
     covariance: Float[np.ndarray, "2 2 pix"] | None = None
@@ -54,8 +55,8 @@ def observed_tables(observed: Observed) -> list[pyfits.BinTableHDU]:
         columns["NOISE_SPECTRUM"] = {"N_L": np.asarray(observed.spectrum)}
     if observed.covariance is not None:
         matrix = np.asarray(observed.covariance)[-2:, -2:]
-        rows = matrix[0, 0], matrix[0, 1], matrix[1, 1]
-        columns["NOISE"] = dict(zip(NOISE, rows, strict=True))
+        parts = matrix[0, 0], matrix[0, 1], matrix[1, 1]
+        columns["NOISE"] = dict(zip(NOISE, parts, strict=True))
     if observed.leakage is not None:
         columns["LEAKAGE"] = dict(zip("QU", np.asarray(observed.leakage), strict=True))
     if observed.truth:
@@ -90,32 +91,40 @@ def read_observed(path: Path) -> Observed | None:
         tables = {hdu.name: hdu for hdu in hdus[1:]}
         if "BANDPASS" not in tables or tables["BANDPASS"].header.get("CREATOR") != CREATOR:
             return None
-        band = tables["BANDPASS"]
-        header = band.header
+        header = tables["BANDPASS"].header
 
         def column(table: str, name: str) -> np.ndarray:
-            return np.array(tables[table].data[name], float)
+            values = np.array(tables[table].data[name], float)
+            if not np.isfinite(values).all():
+                raise InputError(f"{path}: the column {name} of its table {table} is not finite.")
+            return values
 
-        if "FWHM" not in header and "BEAM" not in tables:
+        def number(key: str) -> float | None:
+            if (value := header.get(key)) is not None and not 0 <= float(value) < np.inf:
+                raise InputError(f"{path}: {key} of its table BANDPASS is {value}.")
+            return None if value is None else float(value)
+
+        def columns(table: str, names: Sequence[str]) -> list[np.ndarray] | None:
+            return [column(table, name) for name in names] if table in tables else None
+
+        beam: float | Array | None = number("FWHM")
+        if beam is None and "BEAM" in tables:
+            beam = jnp.asarray(column("BEAM", "BEAM"))
+        if beam is None:
             raise InputError(f"{path}: the table of its beam is missing.")
-        fwhm = header.get("FWHM")
-        covariance = None
-        if "NOISE" in tables:
-            QQ, QU, UU = (column("NOISE", name) for name in NOISE)
-            covariance = np.array([[QQ, QU], [QU, UU]])
+        spectrum = columns("NOISE_SPECTRUM", ["N_L"])
+        noise = columns("NOISE", NOISE)
+        leakage = columns("LEAKAGE", "QU")
         truth: dict[str, float] = {}
         if "TRUTH" in tables:
             names = [str(name) for name in tables["TRUTH"].data["NAME"]]
             truth = dict(zip(names, column("TRUTH", "VALUE").tolist(), strict=True))
-        leakage = None
-        if "LEAKAGE" in tables:
-            leakage = np.array([column("LEAKAGE", name) for name in "QU"])
         return Observed(
             Bandpass(column("BANDPASS", "NU"), column("BANDPASS", "WEIGHT"), header["CONVENT"]),
-            column("BEAM", "BEAM") if fwhm is None else float(fwhm),
-            header.get("NOISE"),
-            column("NOISE_SPECTRUM", "N_L") if "NOISE_SPECTRUM" in tables else None,
-            covariance,
-            leakage,
+            beam,
+            number("NOISE"),
+            spectrum[0] if spectrum else None,
+            np.array([noise[:2], noise[1:]]) if noise else None,
+            np.array(leakage) if leakage else None,
             truth,
         )

@@ -45,7 +45,7 @@ Positive = Annotated[float, Field(gt=0)]
 Multipole = Annotated[int, Field(ge=2)]
 
 #: Regions that need not be named.
-REGIONS = {"strip": "|b| <= 20", "outside": "|b| > 20", "full": "full"}
+REGIONS: dict[str, str | MaskFile] = {"strip": "|b| <= 20", "outside": "|b| > 20", "full": "full"}
 #: First parts of free parameters that are no components, and the commands that have them.
 WORDS = {
     "calibration": "fit", "offset": "fit",
@@ -312,6 +312,8 @@ class Experiment(SettingsFile):
                 raise MistakeAt(f"fixed.{name}.nu_ref", f"is given twice, here and in sky.{name}")
         if not self.forecast.free and not self.free_in("forecast"):
             raise MistakeAt("forecast.free", "is empty, and so is the table free")
+        if "cmb" in (self.simulate.include or ()) and not self.cmb.include:
+            raise MistakeAt("simulate.include", "has 'cmb', but cmb.include is false")
         components = list(self.sky.components)
         simulated = [*components, "cmb", "noise"]
         known: list[tuple[str, Iterable[str], Collection[str]]] = [

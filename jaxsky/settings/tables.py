@@ -208,6 +208,12 @@ class BandTable(MapKeys):
             raise MistakeAt("file", "is of one band; give its name")
         if self.fwhm is not None and self.beam is not None:
             raise ValueError("give the beam either as fwhm or as the file of a window, beam")
+        if (
+            self.samples != type(self).model_fields["samples"].default
+            and self.bandpass
+            and not self.bandpass.width
+        ):
+            raise MistakeAt("samples", "is of a top-hat, but the bandpass has no width")
         if self.noise is not None and 0 in (self.noise.level, self.noise.rms):
             raise MistakeAt("noise", "must be greater than 0")
         if self.file is None:

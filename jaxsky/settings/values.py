@@ -21,9 +21,9 @@ class MistakeAt(ValueError):
     """A mistake at a key inside of the table that is checked."""
 
     def __init__(self, key: str, mistake: str | ValueError) -> None:
-        inside = isinstance(mistake, MistakeAt)
-        self.key = f"{key}.{mistake.key}" if inside else key
-        self.words = mistake.words if inside else str(mistake)
+        self.key, self.words = key, str(mistake)
+        if isinstance(mistake, MistakeAt):
+            self.key, self.words = f"{key}.{mistake.key}", mistake.words
         super().__init__(f"{self.key}: {self.words}")
 
 

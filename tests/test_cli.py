@@ -299,11 +299,7 @@ def test_seeds_out_of_bounds(command, seed, tmp_path, monkeypatch, capsys):
         ("start = 1.5", "start = 9.0", "start 9 is not inside the uniform prior"),
         ("uniform = [0.5, 2.5]", "uniform = [2.5, 0.5]", "free.dust.beta_dust"),
         ('"dust.beta_dust" =', '"dust.beta" =', "Unknown parameter 'dust.beta'"),
-        (
-            "[sky.dust]",
-            '[fixed]\\n"dust.T" = 3\\n[sky.dust]',
-            "Unknown parameter 'dust.T'",
-        ),
+        ("[sky.dust]", '[fixed]\\n"dust.T" = 3\\n[sky.dust]', "Unknown parameter 'dust.T'"),
         (
             "[sky.dust]",
             '[fixed]\\n"dust.beta_dust" = 1.5\\n[sky.dust]',
@@ -317,11 +313,7 @@ def test_seeds_out_of_bounds(command, seed, tmp_path, monkeypatch, capsys):
         ("width = 14.0", "width = 14.0, file = '44.txt'", "either as file or as center and width"),
         ('"44.txt"', '"nothing.txt"', "nothing.txt"),
         ('name = "70"', 'name = "44"', "names of the bands must differ"),
-        (
-            "nu_ref = 353.0",
-            "nu_ref = -1.0",
-            "sky.dust.nu_ref: input should be greater than 0",
-        ),
+        ("nu_ref = 353.0", "nu_ref = -1.0", "sky.dust.nu_ref: input should be greater than 0"),
         ("nsteps = 2200", "nwalkers = 2", "fit.nwalkers"),
     ],
 )

@@ -162,13 +162,18 @@ def test_version(line):
     assert re.fullmatch(r"jaxsky \d+\.\d+\.\d+\n", done.stdout)
 
 
-def test_shells_complete_commands():
-    line = {"_JAXSKY_COMPLETE": "complete_bash", "COMP_WORDS": "jaxsky se", "COMP_CWORD": "1"}
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [("se", ["separate"]), ("init pl", ["planck-44-70", "planck-separate"])],
+)
+def test_shells_complete_commands_and_experiments(words, completed):
+    line = {"_JAXSKY_COMPLETE": "complete_bash", "COMP_WORDS": f"jaxsky {words}"}
+    line["COMP_CWORD"] = str(len(words.split()))
     jaxsky = Path(sys.executable).with_name("jaxsky")
     done = subprocess.run(
         [jaxsky], env=os.environ | line, capture_output=True, text=True, check=True
     )
-    assert done.stdout.split() == ["separate"]
+    assert done.stdout.split() == completed
 
 
 def test_nothing_in_jaxsky_imports_fits_but_main():

@@ -14,12 +14,18 @@ __all__ = ["init"]
 TEMPLATE = "experiment"
 
 
+def _names(incomplete: str = "") -> list[str]:
+    """The experiments that begin so."""
+    return sorted(p.stem for p in DEFAULTS.glob("*.toml") if p.stem.startswith(incomplete))
+
+
 def init(
     name: Annotated[
         str,
         typer.Argument(
             help=f"{TEMPLATE}: all keys, commented; planck-44-70, planck-separate: Planck's maps "
-            "of 2018; or a command, for what it does without a file."
+            "of 2018; or a command, for what it does without a file.",
+            autocompletion=_names,
         ),
     ] = TEMPLATE,
     out: Annotated[
@@ -27,9 +33,8 @@ def init(
     ] = None,
 ) -> None:
     """Write an experiment file to start from."""
-    known = sorted(path.stem for path in DEFAULTS.glob("*.toml"))
-    if name not in known:
-        raise ValueError(f"There is no experiment {name!r}; there are {', '.join(known)}.")
+    if name not in _names():
+        raise ValueError(f"There is no experiment {name!r}; there are {', '.join(_names())}.")
     path = out or Path(f"{name}.toml")
     if path.exists():
         raise ValueError(f"{path}: exists already and is left as it is.")

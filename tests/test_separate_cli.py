@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from commands import jaxsky, one_sentence
+from commands import jaxsky, one_sentence, said
 from fits.commands.separate import KIND
 from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.harmonics import alm_ell, gaussian_beam, resample, synthesis
@@ -125,7 +125,7 @@ def test_maps_of_ones_own(folder, tmp_path, monkeypatch, capsys):
     again = json.loads((out / "result.json").read_text())
     assert again == json.loads(before)
     assert jaxsky(monkeypatch, "separate", path, "--out", out, "--resume", "--set", "seed=8") == 2
-    assert "holds realisations of other data or settings" in one_sentence(capsys)
+    assert "holds realisations of other data or settings" in said(capsys)
 
 
 def test_multipoles_of_files(folder, tmp_path, monkeypatch):

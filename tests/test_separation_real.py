@@ -8,9 +8,9 @@ import healpy
 import numpy as np
 import pytest
 
-from fits.forecast.setup import apodize
 from fits.priors import Gaussian
 from fits.pseudo_cl import band_powers, bin_edges, masked_spectra
+from fits.regions import apodize
 from fits.separation import (
     as_noise,
     component_maps,

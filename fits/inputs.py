@@ -25,7 +25,7 @@ from jaxsky.inputs import (
     read_sky,
     uK_RJ_per,
 )
-from jaxsky.io import read_beam
+from jaxsky.io import MissingFileError, read_beam
 from jaxsky.io.observations import Observed, read_observed
 from jaxsky.keys import realisation_key
 from jaxsky.lookup import find_file
@@ -219,8 +219,10 @@ def _from_file(settings: Experiment, spec: BandTable) -> tuple[Band, Mapping[str
             )
         return read_band(folder, spec, observed), None if observed is None else observed.truth
     name = f"{settings.common.maps}/{spec.name}.fits"
-    with at_key("common.maps"):
+    try:
         observed = read_observed(find_file(folder, name))
+    except MissingFileError as error:
+        raise SettingsError(f"common.maps: {error}") from None
     if observed is None:
         raise SettingsError(f"common.maps: {name} was not written by jaxsky simulate.")
     # What the file says is true of its map: it may have another beam than the band.

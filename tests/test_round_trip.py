@@ -218,9 +218,8 @@ def test_maps_of_others_are_refused(files, tmp_path):
     write_maps(tmp_path / "maps/44.fits", maps, names=["Q", "U"], unit="uK_RJ")
     with pytest.raises(SettingsError, match=r"common.maps: .*44.fits was not written by"):
         inputs_of(load(files, ['common.maps = "maps"']))
-    with pytest.raises(
-        SettingsError, match=r"common.maps: .*none/44.fits: no such file, nor folder"
-    ):
+    missing = r"common.maps: .*none/44.fits: no such file, nor folder"
+    with pytest.raises(SettingsError, match=missing):
         inputs_of(load(files, ['common.maps = "none"']))
 
 

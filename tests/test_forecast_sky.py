@@ -300,6 +300,8 @@ def test_settings_that_come_along():
         ('fwhm = 60.0\nnoise = { level = 20.0 }',
          'fwhm = 60.0\nfile = "dust.fits"\nnoise = { estimate_above = 30.0 }',
          "bands.40.noise.estimate_above: is of a map"),
+        ("level = 20.0", 'map = { file = "dust.fits" }, unit = "K_CMB"',
+         "argument `unit` is K_CMB, but column Q_STOKES is in uK_RJ"),
         ("level = 20.0", "level = 0.0", "bands.0.noise: must be greater than 0"),
         ('file = "dust.fits"\n', "", "fwhm and angles are of a map, but file is missing"),
         ('file = "dust.fits"\nnu_ref = 353.0\nfwhm = 60.0', "", "sky.dust: file is missing"),

@@ -292,12 +292,20 @@ def read_channel(
         raise SettingsError(f"{where}: give the beam either as fwhm or as a window, beam.")
     noise: Array | float | None = None
     if spec.noise is not None and noisy:
-        unit = spec.noise.unit or "uK_CMB"
+        unit = _noise_unit(spec, f"{where}.noise")
         if spec.noise.level is not None:
-            noise = spec.noise.level * band.conversion(unit, "uK_RJ")
+            with at_key(f"{where}.noise"):
+                noise = spec.noise.level * band.conversion(unit, "uK_RJ")
         else:
             noise, known = read_noise(
-                folder, spec.noise, band, nside, stokes, where=f"{where}.noise", unit=unit
+                folder,
+                spec.noise,
+                band,
+                nside,
+                stokes,
+                where=f"{where}.noise",
+                unit=unit,
+                own=None if spec.file is None else spec,
             )
             if missing := int(np.sum(~known)):
                 raise SettingsError(
@@ -306,6 +314,19 @@ def read_channel(
                 )
     target = None if settings.simulate.fwhm == "own" else settings.simulate.fwhm
     return ObservedBand(band, beam, target, noise, settings.simulate.diagonal_noise)
+
+
+def _noise_unit(spec: BandTable, where: str) -> str:
+    """Unit of the noise of a band whose map, if it has one, is not read."""
+    noise = spec.noise
+    assert noise is not None  # as called
+    if noise.estimate_above is not None:
+        raise SettingsError(f"{where}.estimate_above: is of a map, but here none is read.")
+    observations = noise.hits or noise.weights
+    own = noise.map or noise.covariance or (observations and observations.sigma0_unit)
+    if unit := noise.unit or spec.unit or ("uK_CMB" if own or spec.file is None else None):
+        return unit
+    raise SettingsError(f"{where}.unit: is missing; it is that of the map, which is not read here.")
 
 
 def cmb_spectra(settings: Experiment, lmax: int, r: float | None = None) -> np.ndarray:

@@ -99,6 +99,9 @@ def _covariance(folder, noise, at, nside, stokes, where, unit, own):
     kinds = ("map", "covariance", "hits", "weights")
     kind = next(k for k in kinds if getattr(noise, k) is not None)
     spec, where = getattr(noise, kind), f"{where}.{kind}"
+    if noise.unit and spec.unit is None and kind in ("map", "covariance"):
+        squared = "^2" if kind == "covariance" else ""
+        spec = spec.model_copy(update={"unit": noise.unit + squared})
     found = _read_columns(folder, _file(spec, own, where), kind, where)
     if found.nside != nside:
         raise SettingsError(f"{where}: nside is {found.nside}, but that of the map is {nside}.")

@@ -13,6 +13,8 @@ from fits.forecast.b_modes import BandLaw, noise_level, noise_spectrum
 from fits.forecast.fisher import Model, covariance, fiducial, fisher_errors, foreground_names
 from jaxsky import AME, Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.instrument import Channel, Instrument, load_instrument
+from jaxsky.noise import uniform_covariance
+from jaxsky.observation import ObservedBand
 from jaxsky.parameters import set_parameters
 from systems import spread
 
@@ -206,6 +208,8 @@ def test_noise_is_the_same_in_all_units():
     for unit in ("uK_CMB", "mK_CMB", "uK_RJ"):
         channel = Channel(*numbers, 3.0 * float(band.conversion("uK_CMB", unit)), unit)
         levels.append(noise_level(Instrument("one", [channel]).observed()["a"]))
+    per_pixel = uniform_covariance(3.0 * float(band.conversion("uK_CMB", "uK_RJ")), 4)
+    levels.append(noise_level(ObservedBand(band, 30.0, noise=per_pixel)))
     np.testing.assert_allclose(levels, 3.0 * np.pi / 180 / 60, rtol=1e-12)
     observed = load_instrument("planck").observed()["143"]
     sigma = np.radians(7.30 / 60) / np.sqrt(8 * np.log(2))

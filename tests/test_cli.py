@@ -128,6 +128,7 @@ def write_settings(
     return path
 
 
+@pytest.mark.slow
 def test_fit_on_files_in_plancks_format(folder, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     assert jaxsky(monkeypatch, "fit", write_settings(folder, "full"), "--out", out) == 0

@@ -85,6 +85,7 @@ def realised(prepared):
     return [fluctuations.noise_realisation(k) + fluctuations.cmb_realisation(k) for k in keys]
 
 
+@pytest.mark.slow
 def test_realisations_have_the_covariance(prepared, realised):
     """Of any inner products; that of three bands is 3 x 3, with the CMB in all of them."""
     rng = np.random.default_rng(1)
@@ -111,6 +112,7 @@ def test_noise_is_prepared_as_maps_are(prepared):
     np.testing.assert_allclose(fast.sum(axis=-1), exact.sum(axis=-1), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_slopes_are_those_of_the_maps_and_their_errors_are_honest(
     prepared, model, regions, simulated, realised
 ):
@@ -341,6 +343,7 @@ def test_a_model_that_is_wrong_is_pointed_out(settings, prepared, regions):
     assert found.pte_text == "<0.03"
 
 
+@pytest.mark.slow
 def test_wmap_on_the_real_sky(data_dir, monkeypatch):
     """V and W against the real templates: slopes of 1 within errors, at low latitude and above."""
     monkeypatch.setenv("JAXSKY_DATA", str(data_dir))

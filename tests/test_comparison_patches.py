@@ -42,6 +42,7 @@ def found(settings, inputs):
     return compare_patches(settings, inputs)
 
 
+@pytest.mark.slow
 def test_noise_is_that_of_each_patch(inputs):
     """Twice as much on one half of the sky."""
     band = inputs.bands["353"]
@@ -83,6 +84,7 @@ def test_map_and_model_agree(found):
         assert abs(difference) < 4 * error
 
 
+@pytest.mark.slow
 def test_a_template_alone(inputs, tmp_path):
     maps = inputs.templates["dust"].component.amplitude
     fit = template_patches(maps, 0.0)

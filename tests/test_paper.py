@@ -149,6 +149,7 @@ def test_embedded_sky(small, made):
     assert numbers["mean of β_syn"].note == "by construction"
 
 
+@pytest.mark.slow
 def test_real_sky(real, data_dir):
     settings, out, items = real
     check_items(out, items)

@@ -43,6 +43,7 @@ def numbers(items):
     return {number.what: number for item in items.values() for number in item.numbers}
 
 
+@pytest.mark.slow
 def test_figures(made):
     out, items = made
     assert set(LABELS) <= set(items)
@@ -85,6 +86,7 @@ def test_b_modes_are_those_of_the_forecast(small, made):
         assert shown[f"r with as much BB at l = 80, {band} GHz"].ours == f"{equal['l = 80']:.3g}"
 
 
+@pytest.mark.slow
 def test_without_bands_of_the_paper(data_dir, monkeypatch, tmp_path):
     """The real maps are WMAP's: no Planck spectra, no leakage, and patches of the template."""
     monkeypatch.setenv("JAXSKY_DATA", str(data_dir))

@@ -214,6 +214,7 @@ def inputs_of(sky: Sky, seen: dict[str, tuple[float, float]], noise=(), template
     return Inputs(given, bands, None, None, "", dict(noise))
 
 
+@pytest.mark.slow
 def test_a_band_without_weight_is_named_and_not_counted():
     inside = {"all": np.ones(NPIX, bool)}
     bands = {"30": (30.0, 10.0), "353": (353.0, 10.0)}
@@ -230,6 +231,7 @@ def test_a_band_without_weight_is_named_and_not_counted():
     assert found["warnings"] == warnings(made, settings, [fit])
 
 
+@pytest.mark.slow
 def test_noise_of_templates_moves_a_fit_as_computed():
     """The mean over many noisy templates, against the first order from one of them."""
     sky, settings, inside = sky_of(3), settings_of(), {"all": np.ones(NPIX, bool)}

@@ -22,6 +22,7 @@ def wmap(data_dir, monkeypatch):
     return load(EXAMPLE)
 
 
+@pytest.mark.slow
 def test_wmap_from_the_command_line(wmap, tmp_path, monkeypatch):
     assert jaxsky(monkeypatch, "fit", EXAMPLE, "--out", tmp_path) == 0
     results = json.loads((tmp_path / "result.json").read_text())["results"]
@@ -48,6 +49,7 @@ def test_published_noise_is_recovered_from_the_maps(wmap):
         assert float(row[0]) / factor == pytest.approx(expected, rel=0.06)
 
 
+@pytest.mark.slow
 def test_a_map_of_the_dust_index_shifts_as_a_whole(wmap):
     """The per-pixel path on real index maps: a fitted offset to a map of beta_dust."""
     raw = wmap.model_dump()

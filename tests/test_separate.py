@@ -97,7 +97,7 @@ def test_pulls_of_laws_and_r():
     assert min(found.sigma[n] / found.fit.sigma[n] for n in found.fit.free) > 1.5
 
 
-@pytest.mark.parametrize("domain", ["pixel", "harmonic"])
+@pytest.mark.parametrize("domain", ["pixel", pytest.param("harmonic", marks=pytest.mark.slow)])
 def test_both_domains_find_the_sky(domain):
     _, setup, found = separated(domain)
     for name in found.fit.free:
@@ -140,6 +140,7 @@ def test_noise_of_multipoles_has_its_spectrum():
         )
 
 
+@pytest.mark.slow
 def test_a_law_that_is_wrong_shows_in_r():
     """Synchrotron with a curvature that the fit does not know."""
     how = settings(
@@ -155,6 +156,7 @@ def test_a_law_that_is_wrong_shows_in_r():
     assert "the laws do not describe the maps" in said
 
 
+@pytest.mark.slow
 def test_regions_have_values_of_their_own():
     regions = {"dust.beta_dust": {"latitudes": [40.0]}, "synchrotron.beta_syn": {"clusters": 3}}
     free = {name: value | {"regions": regions.get(name)} for name, value in FREE.items()}
@@ -197,6 +199,7 @@ def test_the_response_is_that_of_a_new_fit():
     assert np.sqrt(scatter[at, at]) == pytest.approx(expected, rel=0.15)
 
 
+@pytest.mark.slow
 def test_widened_samples_have_the_errors_of_simulations():
     _, _, found = separated("pixel", 20, "nuts")
     chain = found.chain

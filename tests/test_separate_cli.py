@@ -128,6 +128,7 @@ def test_maps_of_ones_own(folder, tmp_path, monkeypatch, capsys):
     assert "holds realisations of other data or settings" in said(capsys)
 
 
+@pytest.mark.slow
 def test_multipoles_of_files(folder, tmp_path, monkeypatch):
     path = settings(folder, "harmonic", regions="REGIONS", **{", regions = REGIONS": ""})
     out = tmp_path / "out"
@@ -200,6 +201,7 @@ def test_mistakes_are_one_sentence(folder, tmp_path, monkeypatch, capsys, change
     assert not (out / "result.json").exists()
 
 
+@pytest.mark.slow
 def test_noise_that_varies(folder, tmp_path, monkeypatch):
     """Weights of pixels of their own; the likelihood goes through all of them."""
     variance = SIGMA**2 * np.linspace(0.5, 2.0, 12 * NSIDE**2)

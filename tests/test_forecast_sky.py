@@ -305,6 +305,8 @@ def test_settings_that_come_along():
         ("level = 20.0", "level = 0.0", "bands.0.noise: must be greater than 0"),
         ('file = "dust.fits"\n', "", "fwhm and angles are of a map, but file is missing"),
         ('file = "dust.fits"\nnu_ref = 353.0\nfwhm = 60.0', "", "sky.dust: file is missing"),
+        ("[fixed]", "[cmb]\ninclude = false\n[fixed]", "cmb.include: is false, but a forecast has"),
+        ("[fixed]", '[cmb]\nspectra = "cl.txt"\n[fixed]', "cmb.spectra: a forecast has r"),
         ('"half"', '"third"', "masks.npz: no mask 'third'"),
         ('"half"', '"odd"', "a mask has values 0 and 1, but 1536 of 3072 pixels have others"),
         ('"half"', '"few"', "The mask leaves too few pixels"),

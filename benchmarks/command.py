@@ -10,7 +10,7 @@ from statistics import median
 
 from benchmarks.table import Row, time_text
 from benchmarks.timing import usage
-from fits.settings import EXAMPLE
+from fits.commands.run import DEFAULTS
 
 __all__ = ["fit", "planck"]
 
@@ -40,8 +40,8 @@ def fit(quick: bool) -> list[Row]:
 
 
 def planck(quick: bool) -> list[Row]:
-    """The analysis that `jaxsky fit --init` writes, on files in the structure of Planck's."""
-    nside = 64 if quick else 1024
+    """The fit that `jaxsky init planck-44-70` writes, on files in the structure of Planck's."""
+    nside = 128 if quick else 1024
     work = f"`jaxsky fit examples/planck_44_70.toml`, nside {nside}, cold process"
     if not MAKER.is_file():
         return [Row(work, "", remarks=f"left out: {MAKER} is not there")]
@@ -52,7 +52,7 @@ def planck(quick: bool) -> list[Row]:
         subprocess.run(line, check=True, capture_output=True)
         (folder / "LFI_RIMO_R3.31.fits").symlink_to(DATA / "bandpass" / "LFI_RIMO_R3.31.fits")
         settings, out = folder / "planck.toml", folder / "results"
-        settings.write_text(EXAMPLE.read_text())
+        settings.write_text((DEFAULTS / "planck-44-70.toml").read_text())
         run = usage([jaxsky, "fit", str(settings), "--out", str(out)])
         found = json.loads((out / "result.json").read_text())["results"]
     pulls = {

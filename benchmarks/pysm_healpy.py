@@ -26,7 +26,7 @@ SAMPLES, FWHM, ITERATIONS = 10, 60.0, 3
 
 
 class Channel(NamedTuple):
-    """A row of `instruments.toml`: [GHz], [GHz], [arcmin], [uK_RJ arcmin]."""
+    """A band of `instruments.toml`: [GHz], [GHz], [arcmin], [uK_RJ arcmin]."""
 
     name: str
     center: float
@@ -42,7 +42,11 @@ class Channel(NamedTuple):
 
 
 def _channels() -> list[Channel]:
-    return [Channel(*row) for row in tomllib.loads(INSTRUMENTS.read_text())["core"]["channels"]]
+    bands = tomllib.loads(INSTRUMENTS.read_text())["core"]["bands"]
+    return [
+        Channel(b["name"], **b["bandpass"], fwhm=b["fwhm"], noise=b["noise"]["level"])
+        for b in bands
+    ]
 
 
 def _read(path: Path, fields: int | tuple[int, ...]) -> np.ndarray:

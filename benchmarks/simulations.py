@@ -74,17 +74,19 @@ def _write_inputs(folder: Path, nside: int) -> None:
 def _component(name: str, law: str, nu_ref: float, **parameters: str) -> str:
     lines = "\n".join(f"{key} = {value}" for key, value in parameters.items())
     return f"""
-[templates.{name}]
+[sky.{name}]
 law = "{law}"
 file = "{name}.fits"
 fields = ["Q", "U"]
 nu_ref = {nu_ref}
-[templates.{name}.parameters]
+[sky.{name}.parameters]
 {lines}
 """
 
 
-def _write_settings(folder: Path, experiment: str, varying: bool = False) -> Path:
+def _write_settings(
+    folder: Path, nside: int, fwhm: float, channels: str = "", varying: bool = False
+) -> Path:
     """Settings of the command for these files."""
 
     def index(name, number):
@@ -94,8 +96,8 @@ def _write_settings(folder: Path, experiment: str, varying: bool = False) -> Pat
     beta_syn = index("beta_syn", peer.BETA_SYN)
     path = folder / "experiment.toml"
     path.write_text(
-        '[experiment]\ninstrument = "core"\nsheet = false\n'
-        f"samples = {peer.SAMPLES}\n{experiment}\n"
+        f"[simulate]\nsheet = false\nnside = {nside}\nfwhm = {fwhm}\n"
+        f'[[bands]]\ninstrument = "core"\nsamples = {peer.SAMPLES}\n{channels}'
         + _component("dust", "dust", peer.NU_DUST, T_dust=peer.T_DUST, beta_dust=beta_dust)
         + _component("synchrotron", "synchrotron", peer.NU_SYNCHROTRON, beta_syn=beta_syn)
         + '[cmb]\nspectra = "cmb.fits"\n'
@@ -110,7 +112,7 @@ class _Beside:
         folder.mkdir()
         _write_inputs(folder, nside)
         self.folder, self.names = folder, load_instrument("core").names
-        self.settings = _write_settings(folder, f"nside = {nside}\nfwhm = {peer.FWHM}", varying)
+        self.settings = _write_settings(folder, nside, peer.FWHM, varying=varying)
         self.options = [] if varying else ["--constant"]
         self.runs = 0
 
@@ -125,10 +127,7 @@ class _Beside:
 
     def ours_double(self) -> Usage:
         """A run of the command in double precision."""
-        path = self.folder / "double.toml"
-        text = self.settings.read_text()
-        path.write_text(text.replace("[experiment]", '[experiment]\nprecision = "double"'))
-        return _command(path, self._out())
+        return _command(self.settings, self._out(), "--set", "simulate.precision=double")
 
     def theirs(self, *options: str) -> tuple[Usage, Path]:
         """A run of the peer, and where its maps are."""
@@ -231,9 +230,7 @@ def monte_carlo(quick: bool) -> list[Row]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _write_inputs(folder, nside)
-        settings = _write_settings(
-            folder, f'channels = ["105", "225"]\nnside = {nside}\nfwhm = 120.0'
-        )
+        settings = _write_settings(folder, nside, 120.0, 'channels = ["105", "225"]\n')
         run = _command(settings, folder / "out", "--nsims", str(nsims))
         pace = _pace(folder / "out")
     return [
@@ -252,20 +249,18 @@ def nside_2048(quick: bool) -> list[Row]:
     nside, template, finest = (128, 64, 60.0) if quick else (2048, 512, 3.0)
     small = (20, 60) if quick else (100, 600)
     bands = "".join(
-        f'[[bands]]\nname = "{c.name}"\nfwhm = {max(float(c.fwhm), finest)}\n'
-        f"bandpass = {{ center = {c.center}, width = {c.width} }}\n"
-        f'noise = {{ level = {c.noise}, unit = "{c.noise_unit}" }}\n'
+        f'[[bands]]\nname = "{c.name}"\ninstrument = "core"\nfwhm = {max(float(c.fwhm), finest)}\n'
         for c in load_instrument("core")
     )
     scales = "".join(
-        f"[small_scales.{name}]\nEE = {list(small)}\nBB = {list(small)}\n"
+        f"[sky.{name}.small_scales]\nEE = {list(small)}\nBB = {list(small)}\n"
         for name in ("dust", "synchrotron")
     )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         settings = folder / "experiment.toml"
         settings.write_text(
-            f"[experiment]\nnside = {nside}\n[embedded]\nnside = {template}\n{scales}{bands}"
+            f"[simulate]\nnside = {nside}\n[sky.embedded]\nnside = {template}\n{scales}{bands}"
         )
         run = _command(settings, folder / "out")
         pace = _pace(folder / "out")

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 import jaxsky
-from fits.commands import compare, data, fit, forecast, paper, separate, simulate
+from fits.commands import compare, data, fit, forecast, init, paper, separate, simulate
 from fits.commands.console import replace_unprintable
 from fits.commands.errors import print_error
 from fits.commands.interrupt import prompt
@@ -38,7 +38,7 @@ def options(version: Version = False) -> None:
     """A JAX-differentiable model of the polarized microwave sky, with the tools to fit it."""
 
 
-for _command in (simulate, fit, compare, separate, forecast, paper):
+for _command in (init, simulate, fit, compare, separate, forecast, paper):
     _name = _command.__name__.rpartition(".")[2]
     app.command(_name)(getattr(_command, _name))
 app.add_typer(data.data, name="data")

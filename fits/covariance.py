@@ -6,6 +6,8 @@ rows with the data therefore have a covariance that follows exactly from a few t
 transforms of the rows; no simulation, no matrix over pixels.
 """
 
+from typing import Any
+
 import equinox as eqx
 import healpy
 import jax
@@ -53,28 +55,29 @@ class Fluctuations(eqx.Module):
     # Not one program: XLA would hold the maps of all rows and bands at once.
     def covariance(
         self, rows: Float[Array, "band row stokes pix"]
-    ) -> Float[Array, "bandrow bandrow"]:
+    ) -> Float[np.ndarray, "bandrow bandrow"]:
         """Covariance of the inner products of rows with the fluctuations of each band."""
         bands, count = rows.shape[:2]
-        total = jnp.zeros((bands, count, bands, count))
+        total = np.zeros((bands, count, bands, count))
         for b, (preparation, noise) in enumerate(zip(self.preparations, self.noise, strict=True)):
             block = _products(preparation, noise, rows[b])
             if (spectrum := self.correlated[b]) is not None:
-                modes = _modes(rows[b], jnp.stack([spectrum, spectrum]))
+                modes = np.asarray(_modes(rows[b], np.stack([spectrum] * 2)))
                 block = block + modes @ modes.T
-            total = total.at[b, :, b, :].add(block)
-        total = total.reshape(bands * count, bands * count)
+            total[b, :, b, :] += block
+        square = total.reshape(bands * count, bands * count)
         if self.cmb_spectra is not None and self.cmb_windows is not None:
-            modes = jnp.concatenate(
+            modes = np.concatenate(
                 [
-                    factor * _modes(band, self.cmb_spectra * window**2)
+                    np.asarray(factor)
+                    * _modes(band, np.asarray(self.cmb_spectra) * np.asarray(window) ** 2)
                     for factor, window, band in zip(
                         self.cmb_factors, self.cmb_windows, rows, strict=True
                     )
                 ]
             )
-            total = total + modes @ modes.T
-        return total
+            square = square + modes @ modes.T
+        return square
 
     # Not one program: in that XLA draws the normals anew for each row.
     def noise_realisation(self, key: Array) -> Float[Array, "band stokes pix"]:
@@ -120,17 +123,17 @@ class Fluctuations(eqx.Module):
         NaN where it cannot be had: next to steps of the noise by more than a factor of some
         hundred, where the smoothed map of variances rings below zero.
         """
-        variances = []
+        variances: list[Any] = []
         for preparation, noise, spectrum in zip(
             self.preparations, self.noise, self.correlated, strict=True
         ):
             variance = preparation.variance([noise[s, s] for s in range(len(noise))])
             if spectrum is not None:
-                modes = 2 * jnp.arange(spectrum.size) + 1
-                variance = variance + jnp.sum(modes * spectrum) / (4 * jnp.pi)
+                modes = 2 * np.arange(spectrum.size) + 1
+                variance = np.asarray(variance) + np.sum(modes * np.asarray(spectrum)) / (4 * np.pi)
             variances.append(variance)
-        total = jnp.stack(variances)
-        return jnp.sqrt(jnp.where(total > 0, total, jnp.nan))
+        total = np.stack(variances)
+        return jnp.asarray(np.sqrt(np.where(total > 0, total, np.nan)))
 
 
 def uniform_level(covariance: Float[Array, "stokes stokes pix"]) -> float | None:

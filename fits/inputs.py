@@ -1,6 +1,7 @@
-"""What an analysis starts from: templates and observed maps, from files or embedded."""
+"""What an analysis starts from: templates and observed maps, from files or simulated."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -10,53 +11,35 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fits.settings import Band as BandSettings
-from fits.settings import Settings
 from fits.template_noise import TemplateNoise, read_template_noise
-from jaxsky import (
-    Bandpass,
-    get_parameters,
-    observe_band,
-    parameter_names,
-    set_parameters,
-)
-from jaxsky.cmb import camb_spectra
-from jaxsky.galaxy import EmbeddedSky, embedded_sky
-from jaxsky.harmonics import gaussian_beam, resample
+from jaxsky import Bandpass
+from jaxsky.experiment import Setup, build, cmb_spectra
+from jaxsky.galaxy import EmbeddedSky
 from jaxsky.inputs import (
     Template,
     check_stokes,
+    embedded_galaxy,
     narrow,
     read,
     read_bandpass_spec,
-    read_templates,
-    set_parameters_of,
+    read_sky,
     uK_RJ_per,
 )
-from jaxsky.instrument import Instrument, load_instrument
+from jaxsky.io import MissingFileError, read_beam
+from jaxsky.io.observations import Observed, read_observed
 from jaxsky.keys import realisation_key
-from jaxsky.noise import (
-    estimate_variance,
-    fit_knee,
-    knee_spectrum,
-    uniform_covariance,
-)
+from jaxsky.lookup import find_file
+from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum, uniform_covariance
 from jaxsky.noise_inputs import read_noise
-from jaxsky.observation import Observation, Source
+from jaxsky.observation import Observation, ObservedBand
 from jaxsky.preparation import prepare
-from jaxsky.settings_keys import at_key
+from jaxsky.settings import SettingsError
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import at_key
+from jaxsky.settings.tables import BandTable
 from jaxsky.simulate import observe_bands
 
-__all__ = [
-    "Band",
-    "Inputs",
-    "Leakage",
-    "embedded_inputs",
-    "inputs_of",
-    "leak",
-    "read_band",
-    "read_inputs",
-]
+__all__ = ["Band", "Inputs", "Leakage", "inputs_of", "read_band"]
 
 
 class Leakage(NamedTuple):
@@ -64,21 +47,21 @@ class Leakage(NamedTuple):
 
     maps: Float[Array, "stokes pix"]
     used: Bool[np.ndarray, " pix"]
-    fwhm: float
+    beam: float | Float[Array, " ell"]
 
 
 class Band(NamedTuple):
     """Observed Q and U [uK_RJ] of a band at the resolution of the map.
 
-    `noise` is the covariance of Q and U in each pixel, `correlated` the spectrum of noise
-    beyond that, if there is any [uK_RJ^2]. `leakage` is in the maps, and subtracted where they
-    are brought to a common resolution.
+    `beam` is the FWHM of a Gaussian [arcmin] or a table b_l. `noise` is the covariance of Q and U
+    in each pixel, `correlated` the spectrum of noise beyond that, if there is any [uK_RJ^2].
+    `leakage` is in the maps, and subtracted where they are brought to a common resolution.
     """
 
     maps: Float[Array, "stokes pix"]
     used: Bool[np.ndarray, " pix"]
     bandpass: Bandpass
-    fwhm: float
+    beam: float | Float[Array, " ell"]
     noise: Float[Array, "stokes stokes pix"]
     correlated: Float[Array, " ell"] | None = None
     leakage: Leakage | None = None
@@ -87,144 +70,226 @@ class Band(NamedTuple):
 class Inputs(NamedTuple):
     """Templates and bands by name, and what is known about them.
 
-    `r` is the tensor-to-scalar ratio of the CMB, None where there is no CMB, `truth` holds the
-    parameters of a simulation, and `description` says what the maps are. Templates whose noise is
-    not known are missing in `template_noise`.
+    `cmb` gives spectra TT, EE, BB, TE of the CMB up to a multipole, None where there is no CMB.
+    `truth` holds the parameters of a simulated sky that are numbers, "r" among them; None where
+    maps are not simulated. `description` says what the maps are. Templates whose noise is not
+    known are missing in `template_noise`. `foregrounds` are those alone in simulated bands.
     """
 
     templates: dict[str, Template]
     bands: dict[str, Band]
-    r: float | None
+    cmb: Callable[[int], np.ndarray] | None
     truth: dict[str, float] | None
     description: str
     template_noise: Mapping[str, TemplateNoise] = MappingProxyType({})
+    foregrounds: dict[str, Float[Array, "stokes pix"]] | None = None
 
 
-def inputs_of(settings: Settings, galaxy: EmbeddedSky | None = None) -> Inputs:
-    """The embedded sky where the settings have it, else what they name; see there."""
-    return embedded_inputs(settings, galaxy) if settings.embedded else read_inputs(settings)
+def inputs_of(
+    settings: Experiment,
+    *,
+    templates: bool = True,
+    foregrounds: bool = False,
+    galaxy: EmbeddedSky | None = None,
+) -> Inputs:
+    """Templates and maps: from files, or simulated where the settings name none.
 
-
-def embedded_inputs(settings: Settings, galaxy: EmbeddedSky | None = None) -> Inputs:
-    """The embedded model of the Galaxy, observed with channels of instruments.
-
-    The sky is the paper's baseline with the fixed parameters of the settings; CMB and noise are
-    drawn from the seed. `galaxy` is the model at the settings' nside, if it is made already.
-    """
-    embedded, seed = settings.embedded, settings.analysis.seed
-    assert embedded is not None
-    galaxy = galaxy or embedded_sky(embedded.nside)
-    with at_key("fixed"):
-        sky = set_parameters(galaxy.sky("QU"), settings.fixed)
-    with at_key("embedded.channels"):
-        channels = [
-            channel
-            for name, chosen in embedded.channels.items()
-            for channel in load_instrument(name).select(chosen)
-        ]
-    observed = Instrument("embedded", channels).observed()
-    nside, lmax = embedded.nside, 2 * embedded.nside  # what the pixels resolve without aliasing
-    r = settings.cmb.r if settings.cmb.include else None
-    observation = Observation(
-        observed, nside, finest=min(float(channel.fwhm) for channel in channels)
-    )
-    key = realisation_key(seed)
-    prepared = prepare(key, {name: Source(sky[name]) for name in sky}, observation)
-    spectra = None if r is None else jnp.asarray(camb_spectra(lmax, r))
-    bands = {}
-    used = np.ones(healpy.nside2npix(nside), bool)
-    for name, seen in observe_bands(key, prepared, observation, spectra):
-        channel, maps, leakage = observed[name], seen["total"], None
-        fwhm = float(channel.beam)
-        if fraction := embedded.leakage.get(name):
-            whole = set_parameters(galaxy.sky("IQU"), settings.fixed)
-            leaked = leak(fraction * observe_band(whole, channel.band)[0])
-            leakage = Leakage(resample(leaked, gaussian_beam(fwhm, lmax), nside), used, fwhm)
-            maps = maps + leakage.maps
-        assert channel.noise is not None  # channels of an instrument have some
-        noise = uniform_covariance(channel.noise, nside)
-        bands[name] = Band(maps, used, channel.band, fwhm, noise, leakage=leakage)
-    templates = {name: Template(sky[name], 0.0, used) for name in sky}
-    known = parameter_names(sky)
-    free = get_parameters(sky, [name for name in settings.free if name in known])
-    truth = {name: float(value) for name, value in free.items()}
-    exact = dict.fromkeys(templates, TemplateNoise())
-    return Inputs(templates, bands, r, truth, galaxy.description, exact)
-
-
-def leak(intensity: Float[Array, " pix"]) -> Float[Array, "2 pix"]:
-    """Q and U of an intensity that is polarized along the meridians of the ecliptic.
-
-    As detectors with different bandpasses see it that turn about the Sun's direction once a
-    minute and always have the same angle to the direction in which they move.
-    """
-    nside = healpy.npix2nside(intensity.size)
-    theta, phi = healpy.pix2ang(nside, np.arange(intensity.size))
-    pole = healpy.Rotator(coord=["E", "G"])(np.array([0.0, 0.0, 1.0]))
-    south = [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)]
-    east = [-np.sin(phi), np.cos(phi), np.zeros_like(phi)]
-    angle = 2 * np.arctan2(np.einsum("i,ip", pole, east), np.einsum("i,ip", pole, south))
-    return intensity * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-
-
-def read_inputs(settings: Settings) -> Inputs:
-    """Templates and maps from the files that the settings name.
+    Parameters
+    ----------
+    settings : of the experiment
+    templates : read those of the components that are modelled
+    foregrounds : give the foregrounds alone as well, where all bands are simulated
+    galaxy : the embedded model, if it is made already
 
     Raises
     ------
     jaxsky.io.InputError, SettingsError
-        For files that cannot be read as what they should be.
+        For files that cannot be read as what they should be, and bands that say too little.
     """
     folder = Path(settings.data_dir)
-    templates = read_templates(folder, settings.templates)
-    with at_key("fixed"):
-        sky = set_parameters_of(templates, settings.fixed)
-    bands = {spec.name: read_band(folder, spec) for spec in settings.bands}
-    noise = {
-        name: read_template_noise(folder, name, spec, sky[name])
-        for name, spec in settings.templates.items()
-        if spec.noise is not None
-    }
-    r = settings.cmb.r if settings.cmb.include else None
-    return Inputs(sky, bands, r, None, settings.title, noise)
+    if not settings.bands:
+        raise SettingsError("bands: there are none.")
+    if galaxy is None and settings.sky.embedded is not None:
+        galaxy = embedded_galaxy(settings)
+    sky: dict[str, Template] = {}
+    description = settings.title
+    if templates:
+        sky, description = read_sky(settings, names=settings.modelled(), galaxy=galaxy)
+    bands: dict[str, Band] = {}
+    truths: list[Mapping[str, float] | None] = []
+    for spec in settings.bands:
+        if spec.file is not None or settings.common.maps is not None:
+            bands[str(spec.name)], truth = _from_file(settings, spec)
+            truths.append(truth)
+    alone = None
+    missing = [str(spec.name) for spec in settings.bands if str(spec.name) not in bands]
+    if missing:
+        setup = build(settings, missing, written=False, galaxy=galaxy)
+        made, alone = _simulated(settings, setup, foregrounds and not bands)
+        bands = {str(s.name): (bands | made)[str(s.name)] for s in settings.bands}
+        truths.append(setup.truth)
+        description = setup.description
+    return Inputs(
+        sky,
+        bands,
+        partial(cmb_spectra, settings) if settings.cmb.include else None,
+        dict(truths[0]) if truths[0] and all(t == truths[0] for t in truths) else None,
+        description,
+        _template_noise(folder, settings, sky),
+        alone,
+    )
 
 
-def read_band(folder: Path, spec: BandSettings) -> Band:
+def _template_noise(
+    folder: Path, settings: Experiment, sky: Mapping[str, Template]
+) -> dict[str, TemplateNoise]:
+    noise = {}
+    for name, template in sky.items():
+        spec = settings.sky.components[name]
+        if spec.noise is not None:
+            noise[name] = read_template_noise(folder, name, spec, template)
+        elif spec.file is None:
+            noise[name] = TemplateNoise()  # the embedded maps are exact
+    return noise
+
+
+def _simulated(
+    settings: Experiment, setup: Setup, foregrounds: bool
+) -> tuple[dict[str, Band], dict[str, Array] | None]:
+    """Bands as the first realisation of `jaxsky simulate` has them, and their foregrounds."""
+    observation, key = setup.observation, realisation_key(settings.seed)
+    sky = prepare(setup.small_scales_key(key), setup.sources, observation)
+    used = np.ones(healpy.nside2npix(observation.nside), bool)
+    bands = {}
+    for name, maps in observe_bands(key, sky, observation, setup.cmb):
+        observed, total, where = setup.observed(name), maps["total"], f"bands.{name}"
+        noise, correlated = _noise_of(observed, used.size, where)
+        if (leakage := _leakage_of(observed, used, where)) is not None:
+            total = total + leakage.maps
+        band, beam = observed.bandpass, observed.beam
+        bands[name] = Band(total, used, band, beam, noise, correlated, leakage)
+    if not foregrounds or not sky:
+        return bands, None
+    quiet = {n: ObservedBand(c.band, c.beam, c.target) for n, c in observation.channels.items()}
+    alone = Observation(quiet, observation.nside, lmax=observation.lmax)
+    return bands, {name: maps["total"] for name, maps in observe_bands(key, sky, alone)}
+
+
+def _noise_of(
+    observed: Observed, npix: int, where: str
+) -> tuple[Float[Array, "stokes stokes pix"], Float[Array, " ell"] | None]:
+    """Covariance of each pixel and spectrum beyond it of the noise of a simulation."""
+    nside = healpy.npix2nside(npix)
+    if observed.covariance is not None:
+        _check_size("NOISE", observed.covariance, npix, where)
+        return jnp.asarray(observed.covariance), None
+    if observed.level is not None:
+        return uniform_covariance(observed.level, nside), None
+    if observed.spectrum is None:
+        raise SettingsError(
+            f"{where}.noise: is missing, or is of pixels that were smoothed with the map."
+        )
+    beyond = max(0, 4 * nside + 1 - observed.spectrum.size)
+    return uniform_covariance(0.0, nside), jnp.asarray(np.pad(observed.spectrum, (0, beyond)))
+
+
+def _leakage_of(observed: Observed | None, used: Bool[np.ndarray, " pix"], where: str):
+    if observed is None or observed.leakage is None:
+        return None
+    _check_size("LEAKAGE", observed.leakage, used.size, where)
+    return Leakage(jnp.asarray(observed.leakage), used, observed.beam)
+
+
+def _check_size(table: str, values: np.ndarray, npix: int, where: str) -> None:
+    if values.shape[-1] != npix:
+        raise SettingsError(
+            f"{where}.file: its table {table} has {values.shape[-1]} pixels, its map {npix}."
+        )
+
+
+def _from_file(settings: Experiment, spec: BandTable) -> tuple[Band, Mapping[str, float] | None]:
+    """A band from its file, or from the folder of simulated maps, and the truth about its sky."""
+    folder, where = Path(settings.data_dir), f"bands.{spec.name}"
+    if spec.file is not None:
+        observed = read_observed(find_file(folder, spec.files[0]))
+        if observed is not None and spec.fwhm not in (None, observed.beam):
+            raise SettingsError(
+                f"{where}.fwhm: {spec.fwhm:g} arcmin, but the map {spec.label} says that its beam "
+                f"is {'a table' if np.ndim(observed.beam) else f'{observed.beam:g} arcmin'}."
+            )
+        return read_band(folder, spec, observed), None if observed is None else observed.truth
+    name = f"{settings.common.maps}/{spec.name}.fits"
+    try:
+        observed = read_observed(find_file(folder, name))
+    except MissingFileError as error:
+        raise SettingsError(f"common.maps: {error}") from None
+    if observed is None:
+        raise SettingsError(f"common.maps: {name} was not written by jaxsky simulate.")
+    # What the file says is true of its map: it may have another beam than the band.
+    plain = BandTable(name=spec.name, file=name, fields=["Q", "U"])
+    return read_band(folder, plain, observed), observed.truth
+
+
+def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -> Band:
     """Map, bandpass and noise of a band from the files that its settings name.
+
+    Parameters
+    ----------
+    folder : of the files
+    spec : what the settings say
+    observed : how a simulated map was observed, for what they do not say
 
     Raises
     ------
     jaxsky.io.InputError, SettingsError
         For files that cannot be read as what they should be.
     """
-    found = read(folder, spec)
-    check_stokes(f"bands.{spec.name}", found, "QU")
-    with at_key(f"bands.{spec.name}.bandpass"):
-        bandpass = read_bandpass_spec(folder, spec.bandpass)
-    maps = narrow(found.maps[-2:] * uK_RJ_per(found.unit, bandpass, f"bands.{spec.name}"))
-    used, unit = np.asarray(found.mask), found.unit
+    where, found = f"bands.{spec.name}", read(folder, spec)
+    check_stokes(where, found, "QU")
+    if spec.bandpass is not None:
+        with at_key(f"{where}.bandpass"):
+            bandpass = read_bandpass_spec(folder, spec.bandpass, spec.samples)
+    elif observed is not None:
+        bandpass = observed.bandpass
+    else:
+        raise SettingsError(f"{where}.bandpass: is missing.")
+    maps = narrow(found.maps[-2:] * uK_RJ_per(found.unit, bandpass, where))
+    used, unit, nside = np.asarray(found.mask), found.unit, found.nside
     del found  # as large as all else
-    leakage = _read_leakage(folder, spec, bandpass) if spec.leakage else None
+    beam: float | Array = spec.fwhm or 0.0
+    if spec.beam is not None:
+        with at_key(f"{where}.beam"):
+            beam = jnp.asarray(read_beam(find_file(folder, spec.beam), 2 * nside))
+    elif spec.fwhm is None and observed is not None:
+        beam = observed.beam
+    leakage = _leakage_of(observed, used, where)
+    if spec.leakage is not None:
+        leakage = _read_leakage(folder, spec, bandpass)
+    if spec.noise is None:
+        if observed is None:
+            raise SettingsError(f"{where}.noise: is missing.")
+        noise, correlated = _noise_of(observed, used.size, where)
+        return Band(maps, used, bandpass, beam, noise, correlated, leakage)
     if spec.noise.estimate_above is not None:
-        with at_key(f"bands.{spec.name}.noise.estimate_above"):
+        with at_key(f"{where}.noise.estimate_above"):
             noise, correlated = _estimated_noise(spec.noise, maps, used)
-        return Band(maps, used, bandpass, spec.fwhm, noise, correlated, leakage)
+        return Band(maps, used, bandpass, beam, noise, correlated, leakage)
     noise, known = read_noise(
         folder,
         spec.noise,
         bandpass,
-        healpy.npix2nside(used.size),
-        where=f"bands.{spec.name}.noise",
+        nside,
+        where=f"{where}.noise",
         unit=unit,
         own=spec,
         maps=maps,
         used=used,
     )
     maps = maps if known.all() else jnp.where(known, maps, 0)
-    return Band(maps, used & known, bandpass, spec.fwhm, noise, leakage=leakage)
+    return Band(maps, used & known, bandpass, beam, noise, leakage=leakage)
 
 
-def _read_leakage(folder: Path, spec: BandSettings, bandpass: Bandpass) -> Leakage:
+def _read_leakage(folder: Path, spec: BandTable, bandpass: Bandpass) -> Leakage:
     assert spec.leakage is not None  # as called
     found = read(folder, spec.leakage, zeros_are_data=True)
     check_stokes(f"bands.{spec.name}.leakage", found, "QU")

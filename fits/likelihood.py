@@ -39,7 +39,7 @@ __all__ = ["Likelihood", "PixelLikelihood", "TemplateLikelihood", "chi2", "likel
 
 #: Covariance of the inner products <rows, data>: (band, row, stokes, pix) -> square matrix over
 #: (band, row) flattened. `fits.covariance.Fluctuations.covariance` is one.
-CovarianceOf = Callable[[Float[Array, "band row stokes pix"]], Float[Array, "row row"]]
+CovarianceOf = Callable[[Float[Array, "band row stokes pix"]], Float[np.ndarray, "row row"]]
 
 
 class Bands(eqx.Module):
@@ -202,10 +202,11 @@ def _check_maps(sky: Sky, bands: Mapping[str, Any], data: Array, sigma: Array) -
             f"Argument `sigma` must broadcast to (band, stokes, pix) = {shape}, "
             f"but has shape {sigma.shape}."
         )
-    if bad := int(jnp.sum(~(sigma > 0))):
-        raise ValueError(f"Argument `sigma` has {bad} of {sigma.size} values that are not > 0.")
-    used = jnp.isfinite(jnp.broadcast_to(sigma, shape))
-    if bad := int(jnp.sum(used & (~jnp.isfinite(data) | (data < UNSEEN)))):
+    values, errors = np.asarray(data), np.asarray(sigma)
+    if bad := int(np.sum(~(errors > 0))):
+        raise ValueError(f"Argument `sigma` has {bad} of {errors.size} values that are not > 0.")
+    used = np.isfinite(np.broadcast_to(errors, shape))
+    if bad := int(np.sum(used & (~np.isfinite(values) | (values < UNSEEN)))):
         raise ValueError(
             f"Argument `data` has {bad} values that are not finite (or UNSEEN) in pixels that are "
             "used; mask them with an infinite `sigma`."
@@ -264,7 +265,7 @@ def likelihood(
     stokes = labels if stokes is None else stokes
     if not stokes or set(stokes) - set(labels):
         raise ValueError(f"Argument `stokes` must be among {labels!r}, not {stokes!r}.")
-    keep = jnp.array([labels.index(s) for s in stokes])
+    keep = np.array([labels.index(s) for s in stokes])
     own = Bands(tuple(bands.values()), tuple(bands), labels)
     params = Likelihood(sky, own).check(start)
     offsets = [name for name in params if name.startswith("offset.")]
@@ -274,7 +275,7 @@ def likelihood(
     sky_params = own.sky_parameters(params)
     shifts = {name: value for name, value in sky_params.items() if name.endswith(OFFSET)}
     sky = set_parameters(sky, {n: v for n, v in sky_params.items() if n not in shifts})
-    weights = jnp.broadcast_to(1 / sigma**2, data.shape)
+    weights = _weights(data, sigma)
     if not is_uniform(sky) or pixelwise:
         at_start = set_parameters(sky, shifts)
         return _pixel_likelihood(
@@ -282,11 +283,12 @@ def likelihood(
         )
 
     templates = jnp.stack([c.amplitude for c in sky.components.values()])
-    products = gram(data, templates, weights)[:, keep]
+    products = np.asarray(gram(data, templates, weights))[:, keep]
+    values = jnp.asarray(np.sum(np.asarray(weights)[:, keep] > 0))
     if covariance_of is None:
         root = square_root(products)
         matrix = _matrix(None, root, keep, len(labels))
-        return TemplateLikelihood(_unit_sky(sky), own, matrix, jnp.sum(weights[:, keep] > 0))
+        return TemplateLikelihood(_unit_sky(sky), own, matrix, values)
     used = slice(1, None if offsets else -1)  # a constant row tells offsets from templates
     if offsets:
         templates = jnp.concatenate([templates, jnp.ones_like(templates[:1])])
@@ -294,6 +296,12 @@ def likelihood(
     whitening = _whitening(_covariance(covariance_of, rows, keep))
     matrix = _matrix(whitening, products[:, :, used], keep, len(labels))
     return TemplateLikelihood(_unit_sky(sky), own, matrix, jnp.array(len(whitening)))
+
+
+@jax.jit
+def _weights(data, sigma):
+    """1/sigma^2 of all data."""
+    return jnp.broadcast_to(1 / sigma**2, data.shape)
 
 
 @jax.jit
@@ -323,20 +331,20 @@ def _one_stokes_each(rows: Array) -> Float[Array, "band row stokes pix"]:
 
 
 def _covariance(
-    covariance_of: CovarianceOf, rows: Float[Array, "band template stokes pix"], keep: Array
-) -> Float[Array, "row row"]:
+    covariance_of: CovarianceOf, rows: Float[Array, "band template stokes pix"], keep: np.ndarray
+) -> Float[np.ndarray, "row row"]:
     """Covariance of the products of rows with the data, one for each of the Stokes parameters kept.
 
     Cut out of that of all Stokes parameters, which is the same whatever is kept.
     """
     bands, templates, stokes, _ = rows.shape
-    total = covariance_of(_one_stokes_each(rows))
+    total = np.asarray(covariance_of(_one_stokes_each(rows)))
     total = total.reshape(2 * (bands, stokes, templates))
     size = bands * len(keep) * templates
     return total[:, keep][:, :, :, :, keep].reshape(size, size)
 
 
-def _whitening(covariance: Float[Array, "row row"]) -> Float[Array, "row row"]:
+def _whitening(covariance: Float[np.ndarray, "row row"]) -> Float[Array, "row row"]:
     """W with W^T W the inverse of a covariance.
 
     Raises
@@ -344,11 +352,10 @@ def _whitening(covariance: Float[Array, "row row"]) -> Float[Array, "row row"]:
     ValueError
         If the covariance is not positive definite: two templates are the same up to a factor.
     """
-    values = np.asarray(covariance)
-    scale = np.sqrt(np.diagonal(values))
+    scale = np.sqrt(np.diagonal(covariance))
     usable = np.all(scale > 0)
     if usable:
-        correlation = values / scale[:, None] / scale[None, :]
+        correlation = covariance / scale[:, None] / scale[None, :]
         usable = np.linalg.eigvalsh(correlation)[0] > 1e-12
     if not usable:
         raise ValueError(
@@ -373,7 +380,7 @@ def _pixel_likelihood(at_start, sky, bands, data, weights, keep, covariance_of, 
         maps = [*seen.values(), *([jnp.ones_like(data)] if constant else [])]
         whole = every[:, None] * jnp.stack(maps, axis=1)
         whitening = _whitening(_covariance(covariance_of, whole, keep))
-        kept = (keep[:, None] * len(maps) + jnp.arange(len(maps))).ravel()
+        kept = (keep[:, None] * len(maps) + np.arange(len(maps))).ravel()
         rows = _one_stokes_each(whole)[:, kept]
         values = jnp.array(len(whitening))
     return PixelLikelihood(sky, bands, data, jnp.sqrt(weights), nodes, rows, whitening, values)

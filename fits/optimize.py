@@ -149,7 +149,7 @@ def best_fit(
         (like, priors),
         params,
         priors=priors,
-        scale={name: jnp.maximum(jnp.abs(value), 1e-3) for name, value in sizes.items()},
+        scale={name: np.maximum(np.abs(value), 1e-3) for name, value in sizes.items()},
         solver=solver,
     )
     values = {name: float(found[name]) for name in free}

@@ -44,9 +44,17 @@ class Preparation(eqx.Module):
 
     @classmethod
     def smoothing(
-        cls, nside_in: int, own_fwhm: float, nside: int, fwhm: float, lmax: int, what: str = "map"
+        cls,
+        nside_in: int,
+        own: float | Array,
+        nside: int,
+        fwhm: float,
+        lmax: int,
+        what: str = "map",
     ) -> "Preparation":
-        """Smooth from a beam of own_fwhm to one of fwhm [arcmin], by sqrt(fwhm^2 - own_fwhm^2).
+        """Smooth from an own beam to one of fwhm [arcmin], by sqrt(fwhm^2 - own^2).
+
+        `own` is the FWHM of a Gaussian [arcmin], or a table b_l.
 
         Raises
         ------
@@ -54,7 +62,7 @@ class Preparation(eqx.Module):
             If the target is finer than `what` is, in beam or pixels.
         """
         _check_nside(nside_in, nside, what)
-        return cls(beam_ratio(fwhm, own_fwhm, lmax, what), nside_in, nside)
+        return cls(beam_ratio(fwhm, own, lmax, what), nside_in, nside)
 
     @classmethod
     def averaging(cls, nside_in: int, nside: int, what: str = "map") -> "Preparation":

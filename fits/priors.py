@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxsky.settings.experiment import Experiment
 from jaxsky.types import Numeric
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "from_unbounded",
     "log_prior",
     "prior_residuals",
+    "priors_of",
     "to_unbounded",
 ]
 
@@ -91,6 +93,17 @@ class Gaussian(Prior):
 def log_prior(params: Mapping[str, Numeric], priors: Mapping[str, Prior]) -> Float[Array, ""]:
     """Sum of the log-densities of the parameters that have a prior."""
     return sum((p.log_density(params[name]) for name, p in priors.items()), jnp.zeros(()))
+
+
+def priors_of(settings: Experiment, command: str) -> dict[str, Prior]:
+    """Priors of the free parameters of a command that have one."""
+    priors: dict[str, Prior] = {}
+    for name, one in settings.free_in(command).items():
+        if one.uniform:
+            priors[name] = Uniform(*one.uniform)
+        elif one.gaussian:
+            priors[name] = Gaussian(*one.gaussian)
+    return priors
 
 
 def check_priors(priors: Mapping[str, Prior] | None, free: Iterable[str]) -> dict[str, Prior]:
@@ -178,6 +191,5 @@ def to_unbounded(params: Mapping[str, Numeric], priors: Mapping[str, Prior]) -> 
                     f"Start value {value[outside].flat[0]:g} of {name!r} is not inside its uniform "
                     f"prior {p.low:g} ... {p.high:g}."
                 )
-            unit = 2 * (jnp.asarray(result[name]) - p.low) / (p.high - p.low) - 1
-            result[name] = jnp.arcsin(unit)
+            result[name] = np.arcsin(2 * (value - p.low) / (p.high - p.low) - 1)
     return result

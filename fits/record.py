@@ -15,8 +15,10 @@ import numpy as np
 from jaxsky.io import write_text
 from jaxsky.lookup import found_files
 from jaxsky.settings import SettingsFile
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.planck_names import leak
 
-__all__ = ["fingerprint", "probability", "with_error", "write_json", "write_log"]
+__all__ = ["fingerprint", "leaks", "probability", "with_error", "write_json", "write_log"]
 
 PACKAGES = (
     "jaxsky",
@@ -30,6 +32,12 @@ PACKAGES = (
     "camb",
     "ducc0",
 )
+
+
+def leaks(settings: Experiment) -> list[str]:
+    """Warnings about maps that are known to hold leakage which is not subtracted."""
+    bands = [band for band in settings.bands if band.leakage is None]
+    return list(filter(None, (leak(str(band.name), band.files) for band in bands)))
 
 
 def fingerprint(tree: Any) -> str:

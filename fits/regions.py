@@ -1,84 +1,85 @@
-"""Parts of the sky by name: latitudes, or masks in files."""
+"""Parts of the sky by name: latitudes, or masks in files; and masks with smooth edges."""
 
-from collections.abc import Iterable
+import operator
+from collections.abc import Sequence
 from pathlib import Path
 
 import healpy
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
-from fits.settings import Settings
 from jaxsky.inputs import mask_at
-from jaxsky.io import InputError, read_mask
+from jaxsky.io import degrade_mask, read_mask
 from jaxsky.lookup import find_file
-from jaxsky.settings import SettingsError
+from jaxsky.settings import MaskFile
+from jaxsky.settings.experiment import Experiment, parse_region
 
-__all__ = ["known_regions", "region_masks"]
+__all__ = ["apodize", "region_mask", "region_masks", "region_words"]
 
-
-#: Names of masks become parts of file names.
-LONGEST = 200
-
-
-def known_regions() -> Iterable[str]:
-    """Names of regions that are not files."""
-    return ("strip", "outside", "full")
+COMPARISONS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 
 
-def region_masks(settings: Settings) -> dict[str, Bool[np.ndarray, " pix"]]:
-    """Pixels of each region at the common nside.
+def region_masks(settings: Experiment, names: Sequence[str]) -> dict[str, Bool[np.ndarray, " pix"]]:
+    """Pixels of some regions at the common nside; see `region_mask`."""
+    return {name: region_mask(settings, name, settings.common.nside) for name in names}
+
+
+def region_mask(
+    settings: Experiment, name: str, nside: int, *, coarser: bool = False
+) -> Bool[np.ndarray, " pix"]:
+    """Pixels of a region that the common mask leaves.
+
+    Parameters
+    ----------
+    settings : of the experiment, with its regions
+    name : of one of them
+    nside : resolution
+    coarser : take a coarser mask for all pixels inside of its own, instead of refusing it
 
     Raises
     ------
     SettingsError, jaxsky.io.InputError
-        For a region that is neither known nor a readable mask.
+        For a mask that cannot be read, or is coarser.
     """
-    analysis, folder = settings.analysis, Path(settings.data_dir)
-    npix = healpy.nside2npix(analysis.nside)
-    latitude = healpy.pix2ang(analysis.nside, np.arange(npix), lonlat=True)[1]
-    common = np.ones(npix, bool)
-    if analysis.mask is not None:
-        mask = analysis.mask
-        path = find_file(folder, mask.file)
+    region, inside = settings.regions[name], np.ones(healpy.nside2npix(nside), bool)
+    masks = {"common.mask": settings.common.mask}
+    if isinstance(region, MaskFile):
+        masks[f"regions.{name}"] = region
+    elif (said := parse_region(region)) is not None:
+        latitude = healpy.pix2ang(nside, np.arange(inside.size), lonlat=True)[1]
+        inside = COMPARISONS[said[0]](np.abs(latitude), said[1])
+    for where, mask in masks.items():
+        if mask is None:
+            continue
+        path = find_file(Path(settings.data_dir), mask.file)
         found = read_mask(path, key=mask.key, ordering=mask.ordering)
-        common = mask_at(found, analysis.nside, "analysis.mask")
-    regions = {}
-    for name in analysis.regions:
-        label = name if name in known_regions() else _label(name)
-        if name == "strip":
-            region = np.abs(latitude) <= analysis.latitude
-        elif name == "outside":
-            region = np.abs(latitude) > analysis.latitude
-        elif name == "full":
-            region = np.ones(npix, bool)
-        else:
-            found = read_mask(_mask_file(folder, name))
-            region = mask_at(found, analysis.nside, f"analysis.regions: {name}")
-        if label in regions:
-            raise SettingsError(f"analysis.regions: two regions are called {label!r}.")
-        regions[label] = np.asarray(region & common)
-    return regions
+        if coarser and found.size < inside.size:
+            found = healpy.ud_grade(found.astype(float), nside) > 0
+        inside = inside & (degrade_mask(found, nside) if coarser else mask_at(found, nside, where))
+    return np.asarray(inside)
 
 
-def _label(file: str) -> str:
-    """The name of a region in results, and in the names of their files: that of its mask."""
-    label = Path(file).stem
-    if label in known_regions():
-        raise SettingsError(
-            f"analysis.regions: the file {file} is called as a region of latitudes; rename it."
-        )
-    if (length := len(label.encode())) > LONGEST:
-        raise SettingsError(
-            f"analysis.regions: a mask's name has at most {LONGEST} bytes, not {length}: {file}."
-        )
-    return label
+def region_words(settings: Experiment, name: str) -> str:
+    """What a region is, after the word "in" of a sentence."""
+    region = settings.regions[name]
+    if isinstance(region, MaskFile):
+        return f"the mask {name}"
+    return "the full sky" if parse_region(region) is None else f"{region} deg"
 
 
-def _mask_file(folder: Path, name: str) -> Path:
-    try:
-        return find_file(folder, name)
-    except InputError as error:
-        raise SettingsError(
-            f"analysis.regions: {name!r} is neither {', '.join(known_regions())} nor a file that "
-            f"can be read: {error}"
-        ) from None
+def apodize(used: Bool[np.ndarray, " pix"], width: float) -> Float[np.ndarray, " pix"]:
+    """A mask that rises from 0 at its edge to 1 with two continuous derivatives.
+
+    With x^2 = (1 - cos d) / (1 - cos w) of the distance d to the edge and the width w, the weight
+    is x - sin(2 pi x) / 2 pi, the C2 of Grain, Tristram & Stompor (2009).
+
+    Parameters
+    ----------
+    used : True in used pixels, RING
+    width : over which the mask rises [deg]; 0 leaves it as it is
+    """
+    if not width or used.all():
+        return used.astype(float)
+    distance = healpy.dist2holes(~used)  # 0 where not used
+    x = np.minimum(np.sin(distance / 2) / np.sin(np.radians(width) / 2), 1.0)
+    return np.where(distance > np.radians(width), 1.0, x - np.sin(2 * np.pi * x) / (2 * np.pi))

@@ -10,12 +10,12 @@ from rich.table import Table
 
 from fits import plots
 from fits.inputs import Inputs
-from fits.record import write_json, write_log
-from fits.settings import Settings, leaks
+from fits.record import leaks, write_json, write_log
 from fits.spectral_index import Fit, all_free
 from fits.template_noise import unknown_noise
+from jaxsky.settings.experiment import Experiment
 
-__all__ = ["result_table", "warnings", "write_report"]
+__all__ = ["known_truth", "result_table", "warnings", "write_report"]
 
 #: A fit with a smaller probability to exceed its chi^2 is pointed out.
 UNLIKELY = 0.01
@@ -49,7 +49,14 @@ def _result(fit: Fit, method: str) -> dict[str, Any]:
     return numbers
 
 
-def result_json(inputs: Inputs, settings: Settings, fits: Sequence[Fit]) -> dict[str, Any]:
+def known_truth(inputs: Inputs, fits: Sequence[Fit]) -> dict[str, float] | None:
+    """The truth about the free parameters, if there is one."""
+    if inputs.truth is None:
+        return None
+    return {name: inputs.truth[name] for name in all_free(fits) if name in inputs.truth}
+
+
+def result_json(inputs: Inputs, settings: Experiment, fits: Sequence[Fit]) -> dict[str, Any]:
     """All numbers: `results` by region, then Stokes parameters, then method."""
     results: dict[str, Any] = {}
     for fit in fits:
@@ -57,8 +64,8 @@ def result_json(inputs: Inputs, settings: Settings, fits: Sequence[Fit]) -> dict
         results.setdefault(fit.region, {})[fit.stokes] = methods
     return {
         "description": inputs.description,
-        "likelihood": settings.analysis.likelihood,
-        "truth": inputs.truth,
+        "likelihood": settings.fit.likelihood,
+        "truth": known_truth(inputs, fits),
         "warnings": warnings(inputs, settings, fits),
         "results": results,
     }
@@ -107,9 +114,9 @@ def result_table(fits: Sequence[Fit], truth: Mapping[str, float] | None = None) 
     return table
 
 
-def warnings(inputs: Inputs, settings: Settings, fits: Sequence[Fit]) -> list[str]:
+def warnings(inputs: Inputs, settings: Experiment, fits: Sequence[Fit]) -> list[str]:
     """What a user should know before using the numbers, a sentence each, the gravest first."""
-    sentences = leaks(settings.bands)
+    sentences = [*leaks(settings), *settings.left_out("fit")]
     if unknown := [name for name in inputs.templates if name not in inputs.template_noise]:
         sentences.append(unknown_noise(unknown))
     for band in dict.fromkeys(name for fit in fits for name in fit.weightless):
@@ -118,7 +125,7 @@ def warnings(inputs: Inputs, settings: Settings, fits: Sequence[Fit]) -> list[st
             f"Band {band} carries no weight ({where}): its noise is too large, so the fit is one "
             "of the other bands alone. It is not counted in degrees of freedom."
         )
-    if "grid" in settings.analysis.methods and not any("grid" in fit.results for fit in fits):
+    if "grid" in settings.fit.methods and not any("grid" in fit.results for fit in fits):
         sentences.append(
             "The grid was left out: it takes one or two free parameters with uniform priors."
         )
@@ -157,7 +164,7 @@ def _attenuated(fit: Fit) -> str | None:
 
 
 def write_report(
-    out: Path, inputs: Inputs, settings: Settings, fits: Sequence[Fit], seconds: float
+    out: Path, inputs: Inputs, settings: Experiment, fits: Sequence[Fit], seconds: float
 ) -> list[Path]:
     """Write result.json, the pictures and log.json to a folder; returns what was written.
 
@@ -170,7 +177,7 @@ def write_report(
         "marginals.png": plots.plot_marginals,
         "posterior.png": plots.plot_posterior,
     }.items():
-        if plot(out / name, fits, inputs.truth, settings.title):
+        if plot(out / name, fits, known_truth(inputs, fits), settings.title):
             written.append(out / name)
     write_log(written[1], settings, seconds)
     return written

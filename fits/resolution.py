@@ -1,7 +1,7 @@
 """Templates and maps at a common resolution, where they can be compared."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import healpy
 import jax.numpy as jnp
@@ -15,8 +15,7 @@ from fits.preparation import Preparation, prepare_component
 from fits.record import fingerprint
 from fits.template_noise import prepared_variance
 from jaxsky import Bandpass, Sky, observe
-from jaxsky.cmb import camb_spectra
-from jaxsky.harmonics import gaussian_beam, pixel_window
+from jaxsky.harmonics import beam_ratio, gaussian_beam, pixel_window
 from jaxsky.types import Numeric
 
 __all__ = ["Prepared", "prepare"]
@@ -103,10 +102,12 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
     ValueError
         If a map is coarser than the common resolution.
     """
-    maps = {f"template {name!r}": (t.used, t.fwhm) for name, t in inputs.templates.items()}
-    maps |= {f"band {name!r}": (b.used, b.fwhm) for name, b in inputs.bands.items()}
+    maps: dict[str, tuple[Bool[np.ndarray, " pix"], Any]] = {
+        f"template {name!r}": (t.used, t.fwhm) for name, t in inputs.templates.items()
+    }
+    maps |= {f"band {name!r}": (b.used, b.beam) for name, b in inputs.bands.items()}
     maps |= {
-        f"leakage of band {name!r}": (b.leakage.used, b.leakage.fwhm)
+        f"leakage of band {name!r}": (b.leakage.used, b.leakage.beam)
         for name, b in inputs.bands.items()
         if b.leakage is not None
     }
@@ -162,12 +163,12 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
     spectra = windows = None
     if not fwhm:  # averaged pixels hold multipoles beyond those they resolve
         lmax = 4 * nside
-    if inputs.r is not None:
-        beams = [fwhm or band.fwhm for band in inputs.bands.values()]
-        windows = jnp.stack([gaussian_beam(beam, lmax) for beam in beams])
+    if inputs.cmb is not None:
+        beams = [fwhm or band.beam for band in inputs.bands.values()]
+        windows = jnp.stack([beam_ratio(beam, 0.0, lmax) for beam in beams])
         if not fwhm:
             windows = windows * pixel_window(nside, lmax)
-        spectra = jnp.asarray(camb_spectra(lmax, inputs.r)[1:3])
+        spectra = jnp.asarray(inputs.cmb(lmax)[1:3])
     noise = tuple(
         band.noise if kept is None else band.noise * kept
         for band, kept in zip(inputs.bands.values(), whole, strict=True)
@@ -209,9 +210,9 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
 
 def _remembered(covariance_of: CovarianceOf) -> CovarianceOf:
     """A covariance that is made once for rows that come again, as for each choice of Stokes."""
-    last: dict[str, Float[Array, "row row"]] = {}
+    last: dict[str, Float[np.ndarray, "row row"]] = {}
 
-    def remembered(rows: Float[Array, "band row stokes pix"]) -> Float[Array, "row row"]:
+    def remembered(rows: Float[Array, "band row stokes pix"]) -> Float[np.ndarray, "row row"]:
         mark = fingerprint(rows)
         if mark not in last:
             last.clear()

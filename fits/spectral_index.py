@@ -16,16 +16,17 @@ from fits.chains import kept_chain
 from fits.grid import grid_fit, grid_is_possible
 from fits.likelihood import chi2
 from fits.optimize import best_fit
+from fits.priors import priors_of
 from fits.record import fingerprint
 from fits.resolution import Prepared
 from fits.results import FitResult
 from fits.sample import sample
-from fits.settings import Settings
 from fits.template_noise import Attenuation, attenuation
 from jaxsky import observe_components, parameter_names, set_parameters
 from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import SettingsError
-from jaxsky.settings_keys import at_key
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import at_key
 
 __all__ = ["Fit", "all_free", "run"]
 
@@ -64,7 +65,7 @@ def all_free(fits: Sequence[Fit]) -> tuple[str, ...]:
 
 
 def fit_pixels(
-    settings: Settings,
+    settings: Experiment,
     prepared: Prepared,
     used: Bool[np.ndarray, " pix"],
     region: str,
@@ -77,48 +78,48 @@ def fit_pixels(
     other = tuple(s for s in "QU" if s not in stokes)
     start = {
         name: value
-        for name, value in settings.start().items()
+        for name, value in settings.start("fit").items()
         if not (name.startswith("offset.") and name.endswith(other))
     }
-    priors = {name: prior for name, prior in settings.priors().items() if name in start}
+    priors = {name: prior for name, prior in priors_of(settings, "fit").items() if name in start}
     progress.step(f"{region}, {stokes}: inner products")
     with at_key("free"):
         diagonal = prepared.likelihood(start, stokes=stokes, region=used, kind="diagonal")
     like, dof_amplitudes = diagonal, None
     nothing = weightless(prepared, start, used, stokes)
     weighty = 1 - len(nothing) / len(prepared.bands)
-    if settings.analysis.likelihood == "exact":
+    if settings.fit.likelihood == "exact":
         like = prepared.likelihood(start, stokes=stokes, region=used)
         dof_amplitudes = round(like.residuals(start).size * weighty) - len(start)
     results: dict[str, FitResult] = {}
-    for method in settings.analysis.methods:
+    for method in settings.fit.methods:
         progress.step(f"{region}, {stokes}: {method}")
         if method == "grid" and not grid_is_possible(start, priors):
             continue
         if method == "grid":
-            results[method] = grid_fit(like, start, priors=priors, points=settings.grid.points)
+            results[method] = grid_fit(like, start, priors=priors, points=settings.fit.points)
         elif method == "gradient":
             results[method] = best_fit(like, start, priors=priors, throw=False)
         else:
             chain = None
             if chains is not None:
-                mark = f"{fingerprint(like)} {settings.free} {settings.analysis.seed}"
-                size = (settings.mcmc.nwalkers, len(start))
+                mark = f"{fingerprint(like)} {settings.free} {settings.seed}"
+                size = (settings.fit.nwalkers, len(start))
                 chain = kept_chain(chains, f"{region}_{stokes}", size, mark)
             results[method] = sample(
                 like,
                 start,
                 priors=priors,
-                nwalkers=settings.mcmc.nwalkers,
-                nsteps=settings.mcmc.nsteps,
-                seed=settings.analysis.seed,
+                nwalkers=settings.fit.nwalkers,
+                nsteps=settings.fit.nsteps,
+                seed=settings.seed,
                 backend=chain,
                 progress=progress.advance,
                 throw=False,
             )
     if not results:
         raise SettingsError(
-            "analysis.methods: a grid alone takes one or two free parameters with uniform priors."
+            "fit.methods: a grid alone takes one or two free parameters with uniform priors."
         )
     values = {method: float(chi2(diagonal, r.best_fit)) for method, r in results.items()}
     number = len(prepared.bands) - len(nothing)
@@ -158,7 +159,7 @@ def weightless(
 
 
 def run(
-    settings: Settings,
+    settings: Experiment,
     prepared: Prepared,
     regions: dict[str, Bool[np.ndarray, " pix"]],
     chains: Path | None = None,
@@ -179,14 +180,14 @@ def run(
     KeyError, ValueError
         For parameters that do not exist, regions without pixels, or what a method cannot do.
     """
-    if not settings.free:
+    if not settings.free_in("fit"):
         raise SettingsError("free: name at least one parameter to fit.")
     used = {region: inside & prepared.used for region, inside in regions.items()}
     for region, pixels in used.items():
         if not pixels.any():
-            raise SettingsError(f"analysis.regions: region {region!r} leaves no pixel.")
+            raise SettingsError(f"fit.regions: region {region!r} leaves no pixel.")
     return [
         fit_pixels(settings, prepared, pixels, region, stokes, chains, progress)
         for region, pixels in used.items()
-        for stokes in settings.analysis.stokes
+        for stokes in settings.fit.stokes
     ]

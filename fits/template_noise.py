@@ -19,12 +19,12 @@ from fits.compress import gram
 from fits.likelihood import Likelihood, TemplateLikelihood
 from fits.preparation import Preparation
 from fits.results import FitResult
-from fits.settings import TemplateFile
 from jaxsky import Sky
 from jaxsky.harmonics import gaussian_beam, pixel_window
 from jaxsky.inputs import Template
 from jaxsky.noise_inputs import read_noise
 from jaxsky.settings import SettingsError
+from jaxsky.settings.tables import ComponentTable
 from jaxsky.units import conversion
 
 __all__ = [
@@ -60,7 +60,7 @@ class Attenuation(NamedTuple):
 
 
 def read_template_noise(
-    folder: Path, name: str, spec: TemplateFile, template: Template
+    folder: Path, name: str, spec: ComponentTable, template: Template
 ) -> TemplateNoise:
     """The noise that the settings state of a template.
 
@@ -69,7 +69,7 @@ def read_template_noise(
     jaxsky.io.InputError, SettingsError
         For files that cannot be read as what they should be, and noise that cannot be right.
     """
-    noise, where = spec.noise, f"templates.{name}.noise"
+    noise, where = spec.noise, f"sky.{name}.noise"
     assert noise is not None  # as called
     if noise.rms == 0 or noise.level == 0:
         return TemplateNoise()
@@ -78,13 +78,15 @@ def read_template_noise(
             f"{where}: is not known for a template with the angles of another; write "
             "{ rms = 0.0 } to take it as exact."
         )
+    nu_ref = float(template.component.nu_ref)  # type: ignore[attr-defined]
     if noise.level is not None:
-        return TemplateNoise(noise.level * float(conversion(template.unit, "uK_RJ", spec.nu_ref)))
+        unit = noise.unit or template.unit
+        return TemplateNoise(noise.level * float(conversion(unit, "uK_RJ", nu_ref)))
     maps = template.component.amplitude
     covariance, _ = read_noise(
         folder,
         noise,
-        spec.nu_ref,
+        nu_ref,
         healpy.npix2nside(template.used.size),
         where=where,
         unit=template.unit,
@@ -107,9 +109,9 @@ def prepared_variance(
         window = gaussian_beam(own_fwhm, lmax) * pixel_window(preparation.nside, lmax)
     else:
         window = gaussian_beam(fwhm, preparation.window.size - 1)
-    ell = jnp.arange(2, window.size)
-    power = (noise.level * np.radians(1 / 60)) ** 2 * window[2:] ** 2
-    return jnp.full((2, npix), jnp.sum((2 * ell + 1) * power) / (4 * jnp.pi))
+    ell = np.arange(2, window.size)
+    power = (noise.level * np.radians(1 / 60)) ** 2 * np.asarray(window)[2:] ** 2
+    return jnp.asarray(np.full((2, npix), np.sum((2 * ell + 1) * power) / (4 * np.pi)))
 
 
 def attenuation(

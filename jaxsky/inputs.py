@@ -1,37 +1,37 @@
 """What settings name, read: maps, templates with their laws, bandpasses, noise."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import healpy
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import AME, Component, component_class
+from jaxsky.galaxy import EmbeddedSky, GalaxyModel, embedded_sky
 from jaxsky.io import Maps, degrade_mask, read_bandpass, read_maps, unit_factor
 from jaxsky.lookup import find_file
 from jaxsky.parameter_maps import parameter_map
 from jaxsky.parameters import set_parameters
-from jaxsky.settings import (
-    BandpassSpec,
-    MapFile,
-    SettingsError,
-    TemplateFile,
-)
-from jaxsky.settings_keys import at_key
+from jaxsky.settings import BandpassSpec, MapFile, MapKeys, SettingsError
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import at_key
+from jaxsky.settings.tables import ComponentTable
 from jaxsky.sky import Sky
 
 __all__ = [
     "Template",
     "check_stokes",
+    "embedded_galaxy",
     "mask_at",
     "narrow",
     "read",
     "read_bandpass_spec",
     "read_parameter",
-    "read_templates",
+    "read_sky",
     "set_parameters_of",
     "uK_RJ_per",
 ]
@@ -51,7 +51,7 @@ class Template(NamedTuple):
 
 def read(
     folder: Path,
-    spec: MapFile,
+    spec: MapKeys,
     *,
     stokes: str | Sequence[str] | None = None,
     zeros_are_data: bool = False,
@@ -106,56 +106,121 @@ def narrow(values: ArrayLike) -> Array:
     return jnp.asarray(values, jnp.float32 if large else float)
 
 
-def read_templates(
-    folder: Path,
-    specs: Mapping[str, TemplateFile],
+def read_sky(
+    settings: Experiment,
     stokes: str = "QU",
     dtype: type[np.floating] = np.float64,
-) -> dict[str, Template]:
-    """Templates with their laws [uK_RJ], by name; those with angles of others come last.
+    *,
+    names: Collection[str] | None = None,
+    galaxy: EmbeddedSky | None = None,
+) -> tuple[dict[str, Template], str]:
+    """Components of the sky that have maps [uK_RJ], in order, and what they are in a sentence.
 
     Parameters
     ----------
-    folder : of the files
-    specs : by name; their angles are those of each other (`jaxsky.settings.check_angles`)
+    settings : whose fixed parameters are set
     stokes : "QU" for the last two columns of each file, "IQU" for the last three
-    dtype : of the templates; parameters that are maps are always in double precision
+    dtype : of the templates from files; parameters that are maps are always in double precision
+    names : of components, by default all
+    galaxy : the embedded model, if it is made already
 
     Raises
     ------
     jaxsky.io.InputError, SettingsError
-        For files that cannot be read as what they should be.
+        For files that cannot be read as what they should be, a component without a map, and
+        parameters that do not exist.
     """
-    templates: dict[str, Template] = {}
-    for name, spec in sorted(specs.items(), key=lambda item: item[1].angles is not None):
-        templates[name] = _read_template(folder, name, spec, templates, stokes, dtype)
-    return templates
+    tables, folder = settings.sky.components, Path(settings.data_dir)
+    wanted = [name for name in tables if names is None or name in names]
+    for name in wanted:
+        if name not in settings.sky.templates:
+            raise SettingsError(f"sky.{name}: file is missing; here a component has a map.")
+    # Those with the angles of others come after these.
+    others = [angles for name in wanted if (angles := tables[name].angles)]
+    order = list(dict.fromkeys((*others, *wanted)))
+    description = (settings.title or "Templates from files.") if wanted else "No foregrounds."
+    known: dict[str, Template] = {}
+    if own := [name for name in order if tables[name].file is None]:
+        galaxy = galaxy or embedded_galaxy(settings)
+        description, maps = galaxy.description, galaxy.sky(stokes)
+        known = {name: _embedded(folder, name, tables[name], maps[name]) for name in own}
+    for name in order:
+        spec = tables[name]
+        if spec.file is not None:
+            known[name] = _read_template(folder, name, spec, known, stokes, dtype)
+    parts = {name: name.split(".")[0] for name in settings.fixed}
+    left_out = set(tables) - set(wanted)
+    fixed = {n: v for n, v in settings.fixed.items() if parts[n] not in left_out}
+    with at_key("fixed"):
+        return set_parameters_of({name: known[name] for name in wanted}, fixed), description
+
+
+def embedded_galaxy(settings: Experiment) -> EmbeddedSky:
+    """The embedded model of the Galaxy that the settings describe.
+
+    Raises
+    ------
+    SettingsError
+        For a number of the model that does not exist, or cannot be.
+    """
+    embedded = settings.sky.embedded
+    assert embedded is not None  # as called
+    known = GalaxyModel.__dataclass_fields__
+    for name in embedded.model:
+        if name not in known:
+            raise SettingsError(f"sky.embedded.model: {name!r} is none of {', '.join(known)}.")
+    numbers: dict[str, Any] = embedded.model
+    with at_key("sky.embedded.model"):
+        return embedded_sky(embedded.nside, embedded.seed, GalaxyModel(**numbers))
+
+
+def _embedded(folder: Path, name: str, spec: ComponentTable, component: Component) -> Template:
+    """A component of the embedded model, with parameters of the settings."""
+    used = np.ones(component.template.shape[-1], bool)
+    if spec.parameters:
+        parameters, known = _parameters(folder, name, spec, healpy.npix2nside(used.size))
+        with at_key(f"sky.{name}"):
+            own = {"nu_ref": component.nu_ref}  # type: ignore[attr-defined]
+            component = type(component)(component.amplitude, **own | parameters)
+        used &= known
+    return Template(component, 0.0, used)
+
+
+def _parameters(
+    folder: Path, name: str, spec: ComponentTable, nside: int
+) -> tuple[dict[str, Any], Bool[np.ndarray, " pix"]]:
+    """Parameters of a law, maps among them, and where these are known."""
+    parameters: dict[str, Any] = {}
+    used = np.ones(healpy.nside2npix(nside), bool)
+    for key, value in spec.parameters.items():
+        if isinstance(value, MapFile):
+            place = f"sky.{name}.parameters.{key}"
+            column, known = read_parameter(folder, value, key, nside, place)
+            parameters[key], used = jnp.asarray(column), used & known
+        else:
+            parameters[key] = tuple(value) if isinstance(value, list) else value
+    return parameters, used
 
 
 def _read_template(
     folder: Path,
     name: str,
-    spec: TemplateFile,
+    spec: ComponentTable,
     others: dict[str, Template],
     stokes: str,
     dtype: type[np.floating],
 ) -> Template:
+    assert spec.law is not None  # as the settings see to
     found = read(folder, spec)
     law = component_class(spec.law)
     padded = not law.polarized and stokes == "IQU"
-    check_stokes(f"templates.{name}", found, "I" if spec.angles or padded else stokes)
-    factor = uK_RJ_per(found.unit, spec.nu_ref, f"templates.{name}")
+    check_stokes(f"sky.{name}", found, "I" if spec.angles or padded else stokes)
+    parameters, known = _parameters(folder, name, spec, found.nside)
+    parameters.setdefault("nu_ref", spec.nu_ref)
+    factor = uK_RJ_per(found.unit, parameters["nu_ref"], f"sky.{name}")
     maps = jnp.asarray((found.maps * factor).astype(dtype))
-    used = np.asarray(found.mask)
-    parameters: dict[str, Any] = {"nu_ref": spec.nu_ref}
-    for key, value in spec.parameters.items():
-        if isinstance(value, MapFile):
-            place = f"templates.{name}.parameters.{key}"
-            column, known = read_parameter(folder, value, key, found.nside, place)
-            parameters[key], used = jnp.asarray(column), used & known
-        else:
-            parameters[key] = tuple(value) if isinstance(value, list) else value
-    with at_key(f"templates.{name}"):
+    used = np.asarray(found.mask) & known
+    with at_key(f"sky.{name}"):
         if spec.angles:
             if len(maps) != 1:
                 raise ValueError(f"fields must name one intensity map, not {len(maps)} maps")
@@ -176,7 +241,7 @@ def set_parameters_of(
 
     Raises
     ------
-    SettingsError, KeyError
+    KeyError, ValueError
         For a template or a parameter that does not exist.
     """
     by_template: dict[str, dict[str, float]] = {}
@@ -185,8 +250,8 @@ def set_parameters_of(
     changed = dict(templates)
     for name, values in by_template.items():
         if name not in templates:
-            raise SettingsError(
-                f"fixed: there is no template {name!r}; templates are {', '.join(templates)}."
+            raise ValueError(
+                f"there is no component {name!r}; components are {', '.join(templates)}"
             )
         component = set_parameters(Sky({name: templates[name].component}), values)[name]
         changed[name] = templates[name]._replace(component=component)
@@ -227,8 +292,8 @@ def check_stokes(where: str, found: Maps, wanted: str) -> None:
         raise SettingsError(f"{where}.fields: {names} are not {listed} by their names.")
 
 
-def read_bandpass_spec(folder: Path, spec: BandpassSpec) -> Bandpass:
-    """The bandpass of a file, or a top-hat."""
+def read_bandpass_spec(folder: Path, spec: BandpassSpec, samples: int = 51) -> Bandpass:
+    """The bandpass of a file, or a top-hat of so many samples."""
     if spec.file is not None:
         return read_bandpass(
             find_file(folder, spec.file),
@@ -241,4 +306,4 @@ def read_bandpass_spec(folder: Path, spec: BandpassSpec) -> Bandpass:
     assert spec.center is not None  # one of file and center is given
     if not spec.width:
         return Bandpass.delta(spec.center)
-    return Bandpass.top_hat(spec.center, spec.width, spec.convention or "RJ")
+    return Bandpass.top_hat(spec.center, spec.width, spec.convention or "RJ", samples)

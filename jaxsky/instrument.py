@@ -4,6 +4,7 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +16,7 @@ from jaxsky.checks import as_array, check_positive, is_concrete
 from jaxsky.observation import ObservedBand
 from jaxsky.units import parse_unit
 
-__all__ = ["Channel", "Instrument", "instrument_names", "load_instrument"]
+__all__ = ["Channel", "Instrument", "band_tables", "instrument_names", "load_instrument"]
 
 
 class Channel(eqx.Module):
@@ -198,6 +199,57 @@ def load_instrument(name: str) -> Instrument:
     presets = _presets()
     if name not in presets:
         raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(presets)}.")
-    preset = presets[name]
-    unit = preset["noise_unit"]
-    return Instrument(preset["title"], [Channel(*[*row, unit]) for row in preset["channels"]])
+    return Instrument(
+        presets[name]["title"],
+        [
+            Channel(
+                band["name"],
+                band["bandpass"]["center"],
+                band["bandpass"]["width"],
+                band["fwhm"],
+                band["noise"]["level"],
+                band["noise"].get("unit", "uK_CMB"),
+            )
+            for band in presets[name]["bands"]
+        ],
+    )
+
+
+def band_tables(
+    name: str, channels: Sequence[str] | None = None, folder: Path = Path()
+) -> list[dict[str, Any]]:
+    """Bands of an instrument, as tables of an experiment file.
+
+    Parameters
+    ----------
+    name : one of `instrument_names()`, or a file with a list `bands`, relative to `folder`
+    channels : names of the bands wanted, by default all
+
+    Raises
+    ------
+    KeyError
+        For an unknown instrument or channel; lists the known ones.
+    ValueError
+        For a file that is no instrument.
+    """
+    path = folder / name
+    if name in _presets():
+        bands = _presets()[name]["bands"]
+    elif path.is_file():
+        try:
+            bands = tomllib.loads(path.read_text())["bands"]
+            names = [str(band["name"]) for band in bands]
+            if not names or len(set(names)) < len(names):
+                raise ValueError(", ".join(names) or "there are none")
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+            raise ValueError(
+                f"{path}: is no TOML file with a list of bands that have different names ({error})"
+            ) from None
+    else:
+        presets = ", ".join(_presets())
+        raise KeyError(f"Unknown instrument {name!r}; known are {presets}, or a file.")
+    known = {str(band["name"]): band for band in bands}
+    for channel in channels or ():
+        if channel not in known:
+            raise KeyError(f"{name} has no channel {channel!r}; it has {', '.join(known)}.")
+    return [known[channel] for channel in channels or known]

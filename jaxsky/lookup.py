@@ -72,7 +72,7 @@ def found_files(settings: SettingsFile) -> dict[str, str]:
         try:
             found[str(name)] = str(find_file(Path(settings.data_dir), name))
         except InputError:
-            continue  # not needed, or the name of a region
+            continue  # not needed, or a folder of maps
     return found
 
 

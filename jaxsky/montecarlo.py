@@ -3,7 +3,7 @@
 import json
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
@@ -15,13 +15,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxsky
-from jaxsky.experiment import Experiment, Setup
+from jaxsky.experiment import Setup
 from jaxsky.io import write_maps, write_text
 from jaxsky.io.files import check_guards
 from jaxsky.io.folders import alone
+from jaxsky.io.observations import observed_tables
 from jaxsky.keys import realisation_key
 from jaxsky.lookup import found_files
 from jaxsky.preparation import Prepared, plan, prepare
+from jaxsky.settings.experiment import Experiment
 from jaxsky.simulate import observe_bands
 
 __all__ = ["LOG", "Written", "check_folder", "paths", "run"]
@@ -29,7 +31,9 @@ __all__ = ["LOG", "Written", "check_folder", "paths", "run"]
 LOG = "simulation.json"
 PACKAGES = ("jaxsky", "jax", "numpy", "healpy", "ducc0", "jaxbind", "camb")
 #: Settings that do not change what a realisation is.
-LAYOUT: Any = {"title": True, "data_dir": True, "experiment": {"sheet"}}
+LAYOUT: Any = {"simulate": {"sheet"}}
+#: Tables of settings that simulations depend on.
+CONTENT = {"seed", "sky", "bands", "cmb", "fixed", "truth", "simulate"}
 
 
 class Written(NamedTuple):
@@ -47,7 +51,7 @@ def paths(out: Path, names: tuple[str, ...], index: int) -> dict[str, Path]:
 
 
 def _content(settings: Experiment) -> dict[str, Any]:
-    return settings.model_dump(mode="json", exclude_none=True, exclude=LAYOUT)
+    return settings.model_dump(mode="json", exclude_none=True, include=CONTENT, exclude=LAYOUT)
 
 
 def check_folder(
@@ -112,7 +116,7 @@ def _claim(out: Path, settings: Experiment, overwrite: bool) -> None:
     out.mkdir(parents=True, exist_ok=True)
     with alone(out):
         if overwrite:
-            for path in (*_maps(out), *out.glob("sim_*.png")):
+            for path in (*_maps(out), *out.glob("sim_*.png"), *out.glob("log*.txt")):
                 path.unlink()
         elif (out / LOG).exists():
             # Another process may have left it since the folder was checked.
@@ -135,25 +139,24 @@ def _write_log(out: Path, settings: Experiment) -> None:
 
 def _header(settings: Experiment, setup: Setup, name: str, index: int) -> dict[str, Any]:
     channel = setup.observation.channels[name]
-    main = settings.experiment
     nu = np.asarray(channel.band.nu)
     header: dict[str, Any] = {
         "CREATOR": (f"jaxsky {jaxsky.__version__}", "software"),
-        "INSTRUME": (main.instrument or _ascii(settings.title) or "own bands", "instrument"),
+        "INSTRUME": (_ascii(settings.title) or "own bands", "experiment"),
         "BAND": (name, "name of the band"),
         "FREQ": (float(channel.band.center), "[GHz] mean frequency of the band"),
         "FREQMIN": (float(nu.min()), "[GHz] lower end of the band"),
         "FREQMAX": (float(nu.max()), "[GHz] upper end of the band"),
         "LMAX": (setup.observation.lmax, "largest multipole of the sky"),
-        "SEED": (main.seed, "seed of all realisations"),
+        "SEED": (settings.seed, "seed of all realisations"),
         "SIM": (index, "number of the realisation"),
         "CONTENT": (", ".join(settings.included()), "what the total is made of"),
     }
     beam = channel.beam if channel.target is None else channel.target
-    if np.ndim(beam):
-        header["BEAM"] = ("table", "beam, as in the settings")
-    else:
+    if not np.ndim(beam):
         header["FWHM"] = (float(beam), "[arcmin] beam of the maps")
+    else:
+        header["BEAM"] = ("table", "beam, in the table BEAM")
     noise = channel.noise
     if noise is not None and not np.ndim(noise):
         header["NOISE"] = (float(noise), "[uK_RJ arcmin] noise before smoothing")
@@ -187,6 +190,7 @@ def _write(
     columns: Float[np.ndarray, "column pix"],
     settings: Experiment,
     header: Mapping[str, Any],
+    tables: Sequence[Any],
 ) -> None:
     check_guards()
     log = path.parents[1] / LOG
@@ -199,10 +203,11 @@ def _write(
         path,
         columns,
         names=names,
-        unit=settings.experiment.unit,
+        unit=settings.simulate.unit,
         overwrite=True,
         extra_header=header,
-        single=settings.experiment.precision == "single",
+        single=settings.simulate.precision == "single",
+        tables=tables,
     )
 
 
@@ -239,13 +244,16 @@ def _jobs(
     claim: Callable[[], None],
 ) -> Iterator[tuple[str, Callable[[], None]]]:
     """What writes each band of a realisation; `claim` is called when a map is ready."""
-    main = settings.experiment
+    spec = settings.simulate
     for name, maps in seen:
         band = setup.observation.channels[name].band
-        columns = _columns(maps, main.stokes, float(band.conversion("uK_RJ", main.unit)))
+        if (leaked := setup.leakage.get(name)) is not None:
+            maps = {**maps, "total": maps["total"].at[-2:].add(leaked)}
+        columns = _columns(maps, spec.stokes, float(band.conversion("uK_RJ", spec.unit)))
         claim()
         header = _header(settings, setup, name, index)
-        job = partial(_write, files[name], *columns, settings, header)
+        tables = observed_tables(setup.observed(name))
+        job = partial(_write, files[name], *columns, settings, header, tables)
         del maps, columns  # or they would still be there when those of the next band are made
         yield name, job
         del job
@@ -278,11 +286,11 @@ def run(
     -------
     The files, as they are written.
     """
-    main, observation = settings.experiment, setup.observation
+    spec, observation = settings.simulate, setup.observation
     terms = None
     prepared: dict[str, Prepared] | None = None
     # Templates without random small scales, or with the same for all, are prepared once.
-    random = main.small_scales_seed is None and any(
+    random = setup.small_scales_seed is None and any(
         source.small_scales is not None for source in setup.sources.values()
     )
     claimed = False
@@ -301,10 +309,10 @@ def run(
         yield from (Written(index, n, files[n], None) for n in files if n not in missing)
         if not missing:
             continue
-        key = realisation_key(main.seed, index)
+        key = realisation_key(settings.seed, index)
         if prepared is None or random:
             terms = plan(setup.sources, observation) if terms is None else terms
-            small = key if random else realisation_key(main.small_scales_seed or 0)
+            small = key if random else setup.small_scales_key(key)
             correlated = [n for n, source in setup.sources.items() if source.correlated_with]
             prepared = prepare(small, setup.sources, observation, terms, release=not random)
             for name in correlated:
@@ -313,7 +321,7 @@ def run(
                         f"{name}: its extrapolated cross-spectra exceed what the auto-spectra "
                         f"allow at {repaired} multipoles; correlations were reduced there."
                     )
-        components = "components" in main.outputs
+        components = "components" in spec.outputs
         seen = observe_bands(
             key, prepared, observation, setup.cmb, components=components, names=missing
         )

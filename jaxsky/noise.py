@@ -36,6 +36,7 @@ _PIECE = 1 << 20
 _COLUMNS = {3: ("QQ", "QU", "UU"), 6: ("II", "IQ", "IU", "QQ", "QU", "UU")}
 
 
+@partial(jax.jit, static_argnames=("nside", "stokes"))
 def uniform_covariance(
     noise: Numeric, nside: int, stokes: int = 2
 ) -> Float[Array, "stokes stokes pix"]:
@@ -47,8 +48,8 @@ def uniform_covariance(
     nside : resolution
     stokes : number of Stokes parameters, all with this noise
     """
-    sigma = noise / (healpy.nside2resol(nside, arcmin=True))
-    return jnp.eye(stokes)[..., None] * jnp.full(healpy.nside2npix(nside), sigma**2)
+    npix, pixel = healpy.nside2npix(nside), healpy.nside2resol(nside, arcmin=True)
+    return jnp.eye(stokes)[..., None] * jnp.full(npix, (noise / pixel) ** 2)
 
 
 def uniform_map(
@@ -193,8 +194,7 @@ def weights_covariance(
         )
     QQ, QU, UU = weights
     inverse = jnp.stack([jnp.stack([UU, -QU]), jnp.stack([-QU, QQ])]) / (QQ * UU - QU**2)
-    scale = jnp.broadcast_to(sigma0, (2,))
-    return scale[:, None, None] * scale[:, None] * inverse
+    return jnp.outer(scale := jnp.broadcast_to(sigma0, (2,)), scale)[..., None] * inverse
 
 
 def covariance_from_columns(

@@ -15,10 +15,11 @@ from jaxsky.noise import (
     covariance_from_columns,
     hits_covariance,
     rms_covariance,
+    uniform_covariance,
     weights_covariance,
 )
-from jaxsky.settings import Hits, MapFile, NoiseColumns, NoiseFile, SettingsError
-from jaxsky.settings_keys import at_key
+from jaxsky.settings import Hits, MapFile, MapKeys, NoiseColumns, NoiseTable, SettingsError
+from jaxsky.settings.keys import at_key
 
 __all__ = ["read_noise"]
 
@@ -28,14 +29,14 @@ PLAUSIBLE = (1e-6, 10.0)
 
 def read_noise(
     folder: Path,
-    noise: NoiseFile,
+    noise: NoiseTable,
     at: Bandpass | float,
     nside: int,
     stokes: str = "QU",
     *,
     where: str,
     unit: str,
-    own: MapFile | None = None,
+    own: MapKeys | None = None,
     maps: Float[Array, "stokes pix"] | None = None,
     used: Bool[np.ndarray, " pix"] | None = None,
 ) -> tuple[Float[Array, "stokes stokes pix"], Bool[np.ndarray, " pix"]]:
@@ -49,7 +50,7 @@ def read_noise(
     nside : resolution of the map
     stokes : "QU" or "IQU"
     where : key of the noise in the settings, for the messages
-    unit : unit of the map, and so of rms and sigma0
+    unit : unit of the map, and so of level, rms and sigma0 unless the noise has its own
     own : the map that has the noise, if its columns are in the same file
     maps, used : the map that has the noise [uK_RJ] and its pixels, against whose rms it is checked
 
@@ -59,6 +60,7 @@ def read_noise(
         For files that cannot be read as what they should be, another nside, noise that is not
         positive definite, and noise far from the rms of the map.
     """
+    unit = noise.unit or unit
     with at_key(where):
         covariance, known = _covariance(folder, noise, at, nside, stokes, where, unit, own)
         check_covariance("noise", covariance if known.all() else covariance[..., known])
@@ -88,12 +90,18 @@ def _check_plausible(where, covariance, maps, inside, factor, unit):
 def _covariance(folder, noise, at, nside, stokes, where, unit, own):
     """See `read_noise`; with any values where the covariance is not known."""
     n, npix = len(stokes), 12 * nside**2
+    if noise.level is not None:
+        level = noise.level * unit_factor(unit, "uK_RJ", at)
+        return uniform_covariance(level, nside, n), np.ones(npix, bool)
     if noise.rms is not None:
         rms = noise.rms * unit_factor(unit, "uK_RJ", at)
         return rms_covariance(narrow(np.full((n, npix), rms))), np.ones(npix, bool)
     kinds = ("map", "covariance", "hits", "weights")
     kind = next(k for k in kinds if getattr(noise, k) is not None)
     spec, where = getattr(noise, kind), f"{where}.{kind}"
+    if noise.unit and spec.unit is None and kind in ("map", "covariance"):
+        squared = "^2" if kind == "covariance" else ""
+        spec = spec.model_copy(update={"unit": noise.unit + squared})
     found = _read_columns(folder, _file(spec, own, where), kind, where)
     if found.nside != nside:
         raise SettingsError(f"{where}: nside is {found.nside}, but that of the map is {nside}.")
@@ -148,7 +156,7 @@ def _read_columns(folder: Path, spec: MapFile, kind: str, where: str) -> Maps:
     return read(folder, spec, stokes=wanted or "")
 
 
-def _file(spec: MapFile | NoiseColumns, own: MapFile | None, where: str) -> MapFile:
+def _file(spec: MapFile | NoiseColumns, own: MapKeys | None, where: str) -> MapFile:
     """The columns to read; those without a file are in that of the map."""
     said = spec.model_dump(include=set(MapFile.model_fields), exclude_none=True)
     if isinstance(spec, Hits):

@@ -16,70 +16,74 @@ COMMANDS = ("fit", "simulate", "compare", "separate", "paper")
 #: Small settings of each command, on the embedded sky: most of a run is to start and compile.
 SETTINGS = {
     "fit": """
-[embedded]
-channels = { planck = ["44", "70"] }
-nside = 16
-[analysis]
+[sky]
+embedded = { nside = 16 }
+[[bands]]
+instrument = "planck"
+channels = ["44", "70"]
+[common]
 nside = 8
 fwhm = 600.0
+[free]
+"dust.beta_dust" = { start = 1.6, uniform = [0.5, 2.5] }
+[fit]
 regions = ["full"]
 stokes = ["Q", "U"]
 methods = ["mcmc"]
 likelihood = "diagonal"
-[free]
-"dust.beta_dust" = { start = 1.6, uniform = [0.5, 2.5] }
-[mcmc]
 nwalkers = 8
 nsteps = 500
 """,
     "simulate": """
-[experiment]
+[sky]
+embedded = { nside = 16 }
+[[bands]]
 instrument = "core"
 channels = ["45", "105"]
+[simulate]
 nside = 16
 fwhm = 600.0
 sheet = false
-[embedded]
-nside = 16
 """,
     "compare": """
-[embedded]
-channels = { planck = ["70"] }
-nside = 16
-[analysis]
+[sky]
+embedded = { nside = 16 }
+[[bands]]
+instrument = "planck"
+channels = ["70"]
+[common]
 nside = 8
 fwhm = 600.0
-regions = ["full"]
 [compare]
+regions = ["full"]
 nsims = 30
 lmax = 12
 width = 4
 """,
     "separate": """
-[embedded]
+[sky]
+embedded = { nside = 16 }
+[[bands]]
 instrument = "litebird"
 channels = ["40", "100", "140", "280"]
-nside = 16
-[separation]
+[common]
 nside = 8
 fwhm = 600.0
+[free]
+"dust.beta_dust" = { start = 1.6, uniform = [0.5, 2.5] }
+[separate]
 nsims = 20
 sampler = "emcee"
 nsteps = 100
-[tensors]
 width = 3
-[components]
-cmb = { law = "cmb" }
-dust = { law = "dust", nu_ref = 353.0 }
-synchrotron = { law = "synchrotron", nu_ref = 30.0 }
-[free]
-"dust.beta_dust" = { start = 1.6, uniform = [0.5, 2.5] }
 """,
     "paper": """
-[embedded]
-channels = { planck = ["44", "70"] }
-nside = 64
-[analysis]
+[sky]
+embedded = { nside = 64 }
+[[bands]]
+instrument = "planck"
+channels = ["44", "70"]
+[common]
 nside = 16
 fwhm = 300.0
 [free]

@@ -1,74 +1,67 @@
-"""Mutations of settings: each key of each format with values that it cannot have."""
+"""Mutations of settings: each key, for each command, with values that it cannot have."""
 
 import json
 import tomllib
 from collections.abc import Callable, Iterator
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import fits.forecast.settings
 import fits.forecast.setup
-import fits.inputs
-import fits.paper.settings
-import fits.regions
-import fits.resolution
-import fits.separate.settings
 import fits.separate.setup
-import fits.settings
+from fits.commands.run import DEFAULTS
+from fits.inputs import inputs_of
+from fits.regions import region_masks
+from fits.resolution import prepare
 from jaxsky import experiment
 from jaxsky.io import InputError
 from jaxsky.settings import SettingsError
-from jaxsky.settings_keys import at_key, of_file
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import at_key, of_file
+from jaxsky.settings.load import load
 
 VALUES = (-1, 0, 1.5, 1e30, -1e300, 2**40, True, "", "unknown", "[/] $x_$", [], [1], [-1, "a"], {},
           {"unknown": 1})  # fmt: skip
 
 
 class Kind(NamedTuple):
-    """A format of settings: the base of its mutations, what loads and what builds it."""
+    """What a command starts from: the base of mutations, and what builds it."""
 
     base: Path
-    load: Callable[[Path], Any]
-    build: Callable[[Any], Any]
+    build: Callable[[Experiment], Any]
 
 
-def _fit(settings) -> None:
-    fits.regions.region_masks(settings)
-    inputs = fits.inputs.inputs_of(settings)
-    with at_key("analysis"):
-        fits.resolution.prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
+def _prepared(settings: Experiment, regions: str) -> None:
+    region_masks(settings, getattr(settings, regions).regions)
+    inputs = inputs_of(settings)
+    with at_key("common"):
+        prepare(inputs, settings.common.nside, settings.common.fwhm)
 
 
 KINDS = {
-    "experiment": Kind(experiment.DEFAULT, experiment.load_experiment, experiment.build),
-    "fit": Kind(fits.settings.EMBEDDED, fits.settings.load_settings, _fit),
-    "compare": Kind(fits.settings.EMBEDDED_COMPARISON, fits.settings.load_settings, _fit),
-    "separate": Kind(
-        fits.separate.settings.EMBEDDED,
-        fits.separate.settings.load_separate,
-        fits.separate.setup.build,
-    ),
-    "forecast": Kind(
-        fits.forecast.settings.DEFAULT,
-        fits.forecast.settings.load_forecast,
-        fits.forecast.setup.build,
-    ),
-    "paper": Kind(fits.paper.settings.EMBEDDED, fits.paper.settings.load_paper, _fit),
+    "experiment": Kind(DEFAULTS / "experiment.toml", experiment.build),
+    "simulate": Kind(DEFAULTS / "simulate.toml", experiment.build),
+    "fit": Kind(DEFAULTS / "fit.toml", partial(_prepared, regions="fit")),
+    "compare": Kind(DEFAULTS / "compare.toml", partial(_prepared, regions="compare")),
+    "separate": Kind(DEFAULTS / "separate.toml", fits.separate.setup.build),
+    "forecast": Kind(DEFAULTS / "forecast.toml", fits.forecast.setup.build),
+    "paper": Kind(DEFAULTS / "paper.toml", partial(_prepared, regions="compare")),
 }
 
 
 def small(kind: str) -> dict[str, Any]:
-    """The embedded settings of a format at a low resolution."""
+    """The settings of a command at a low resolution; those of "experiment" with all defaults."""
     raw = tomllib.loads(KINDS[kind].base.read_text())
-    for table in raw.values():
+    if kind == "experiment":
+        bands = {"bands": raw["bands"]}
+        raw = json.loads(load(KINDS[kind].base).model_dump_json(exclude_none=True)) | bands
+    for table in (raw["sky"]["embedded"], *raw.values()):
         if isinstance(table, dict):
             table |= {"nside": 8} if "nside" in table else {}
             table |= {"fwhm": 1200.0} if "fwhm" in table else {}
-    if kind == "forecast":
-        raw["spectra"]["lmax"] = 15
-    if kind == "separate":
-        raw["separation"]["nsims"] = 20
+    if "forecast" in raw:
+        raw["forecast"] |= {"lmax": 15}
     return raw
 
 
@@ -82,32 +75,38 @@ def paths(table: Any, at: tuple = ()) -> Iterator[tuple]:
 
 
 def changed(raw: dict[str, Any], at: tuple, value: Any) -> dict[str, Any]:
-    """Settings with another value at a place."""
+    """Settings with another value at a place, in a table that need not be there."""
     raw = deepcopy(raw)
     table: Any = raw
     for key in at[:-1]:
-        table = table[key]
+        table = table.setdefault(key, {}) if isinstance(table, dict) else table[key]
     table[at[-1]] = value
     return raw
 
 
 def toml(value: Any) -> str:
-    """A value as TOML."""
+    """A value as TOML has it, on one line."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{json.dumps(k)} = {toml(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ", ".join(map(toml, value)) + "]"
-    return json.dumps(value)
+    return json.dumps(value).replace("Infinity", "inf").replace("NaN", "nan")
+
+
+def written(path: Path, raw: dict[str, Any]) -> Path:
+    """The path, to which settings are written."""
+    path.write_text("".join(f"{json.dumps(key)} = {toml(v)}\n" for key, v in raw.items()))
+    return path
 
 
 def fault(kind: str, raw: dict[str, Any], at: tuple, path: Path, build: bool = True) -> str | None:
     """What is wrong with the answer to settings; None if they work or are refused well."""
-    path.write_text("".join(f"{json.dumps(key)} = {toml(v)}\n" for key, v in raw.items()))
+    written(path, raw)
     known = [str(key) for key in at if not isinstance(key, int)]
     known += [f"{other[0]}.{other[1]}" for other in paths(raw) if len(other) > 1]
     try:
         with of_file(path):
-            settings = KINDS[kind].load(path)
+            settings = load(path)
             if build:
                 KINDS[kind].build(settings)
     except (SettingsError, InputError) as error:
@@ -122,7 +121,7 @@ def fault(kind: str, raw: dict[str, Any], at: tuple, path: Path, build: bool = T
 
 
 def faults(kind: str, path: Path, every: int = 1, build: bool = True) -> list[str]:
-    """What is wrong with the answers to one of so many mutations of a format's settings."""
+    """What is wrong with the answers to one of so many mutations of a command's settings."""
     raw = small(kind)
     mutations = [(at, value) for at in paths(raw) for value in VALUES]
     found = []

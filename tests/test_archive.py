@@ -5,10 +5,7 @@ from pathlib import Path
 import pytest
 
 from commands import jaxsky
-from fits import settings as fit_settings
-from fits.paper import settings as paper_settings
-from fits.separate import settings as separate_settings
-from fits.settings import load_settings
+from fits.commands.run import DEFAULTS
 from jaxsky.archive import (
     ProductSet,
     catalogue,
@@ -20,6 +17,7 @@ from jaxsky.archive import (
 )
 from jaxsky.io import InputError
 from jaxsky.lookup import named_files
+from jaxsky.settings.load import load
 from jaxsky.units import parse_unit
 from misbehaving import CONTENT, NAME, SHA, Handler, fits_bytes, product, serving
 
@@ -77,17 +75,25 @@ def test_sets_are_files_of_the_catalogue():
 
 
 @pytest.mark.parametrize(
-    ("name", "path", "load"),
+    ("wanted", "path"),
     [
-        ("planck-44-70", EXAMPLES / "planck_44_70.toml", load_settings),
-        ("planck-44-70", fit_settings.EXAMPLE, load_settings),
-        ("paper", paper_settings.EXAMPLE, paper_settings.load_paper),
-        ("separate", separate_settings.EXAMPLE, separate_settings.load_separate),
+        ("planck-44-70", EXAMPLES / "planck_44_70.toml"),
+        ("planck-44-70", DEFAULTS / "planck-44-70.toml"),
+        ("separate", DEFAULTS / "planck-separate.toml"),
     ],
 )
-def test_sets_are_the_files_of_examples(name, path, load):
-    files = {file for file in named_files(load(path)) if "." in file}  # others are regions
-    assert files == {product.name for product in find([name])}
+def test_sets_are_the_files_of_examples(wanted, path):
+    assert set(named_files(load(path))) == {product.name for product in find([wanted])}
+
+
+def test_the_set_of_the_paper_is_what_is_commented_out_in_an_example(tmp_path):
+    text = (DEFAULTS / "planck-44-70.toml").read_text()
+    for line in ("[paper]", "ame = ", "beta_dust = {"):
+        assert f"\n# {line}" in text
+        text = text.replace(f"\n# {line}", f"\n{line}")
+    path = tmp_path / "x.toml"
+    path.write_text(text)
+    assert set(named_files(load(path))) == {product.name for product in find(["paper"])}
 
 
 def test_products_are_found_by_group_name_and_part():

@@ -6,7 +6,6 @@ in any other exception, and the file stays as it was.
 """
 
 import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -19,21 +18,13 @@ import pytest
 from astropy import units as u
 from astropy.io import fits as pyfits
 
-from fits.forecast.settings import load_forecast
-from fits.inputs import read_inputs
-from fits.paper.settings import load_paper
-from fits.separate.settings import load_separate
-from fits.settings import load_settings
+from fits.inputs import inputs_of
+from fits.separate.setup import build as build_separation
 from jaxsky import Bandpass, Dust, Synchrotron
-from jaxsky.experiment import load_experiment
-from jaxsky.io import (
-    read_bandpass,
-    read_beam,
-    read_maps,
-    read_mask,
-    read_spectra,
-    unit_factor,
-)
+from jaxsky.io import read_bandpass, read_beam, read_maps, read_mask, read_spectra, unit_factor
+from jaxsky.settings.keys import of_file
+from jaxsky.settings.load import load
+from settings_fuzz import changed, written
 
 NSIDE = 4
 NPIX = 12 * NSIDE**2
@@ -462,15 +453,6 @@ BANDPASSES = [
 # Settings
 
 
-def toml(value: Any) -> str:
-    """A value as TOML has it, on one line."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(k)} = {toml(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(toml, value)) + "]"
-    return json.dumps(value).replace("Infinity", "inf").replace("NaN", "nan")
-
-
 FREE = {"dust.beta_dust": {"start": 1.6, "uniform": [0.5, 2.5]}}
 TEMPLATES = {
     "dust": {"law": "dust", "file": "dust.fits", "nu_ref": 353.0},
@@ -482,58 +464,51 @@ BAND = {
     "bandpass": {"center": 44.0, "width": 8.0},
     "noise": {"rms": 1.0},
 }
+
+
+def and_then(build: Callable[[Any], Any]) -> Callable[[Path], Any]:
+    """What reads settings and builds what they name, as a command does."""
+
+    def read(path: Path) -> Any:
+        with of_file(path):
+            return build(load(path))
+
+    return read
+
+
+EMBEDDED: dict[str, Any] = {"sky": {"embedded": {}}, "bands": [{"instrument": "planck"}]}
 #: A complete file of settings of each command, and what reads it.
 BASES: dict[str, tuple[dict[str, Any], Callable[[Path], Any]]] = {
     "fit": (
         {
-            "analysis": {"nside": NSIDE, "fwhm": 0},
+            "common": {"nside": NSIDE, "fwhm": 0},
             "free": FREE,
-            "templates": TEMPLATES,
+            "sky": TEMPLATES,
             "bands": [BAND, BAND | {"name": "70", "bandpass": {"center": 70.0, "width": 14.0}}],
         },
-        load_settings,
+        load,
     ),
-    "simulate": (
-        {"experiment": {"instrument": "planck", "nside": 16, "fwhm": 300.0}, "embedded": {}},
-        load_experiment,
-    ),
+    "simulate": (EMBEDDED | {"simulate": {"nside": 16, "fwhm": 300.0}}, load),
     "separate": (
         {
-            "separation": {"nside": 16},
-            "embedded": {"nside": 16},
-            "components": {"cmb": {"law": "cmb"}, "dust": {"law": "dust", "nu_ref": 353.0}},
+            "common": {"nside": 16, "fwhm": 300.0, "components": ["dust"]},
+            "sky": {"embedded": {"nside": 16}, "dust": {"law": "dust"}},
+            "bands": [{"instrument": "litebird", "channels": ["40", "140", "402"]}],
             "free": FREE,
         },
-        load_separate,
+        and_then(build_separation),
     ),
     "forecast": (
-        {"experiment": {"instrument": "planck"}, "embedded": {}, "mask": {"latitude": 20.0}},
-        load_forecast,
+        EMBEDDED | {"regions": {"clean": "|b| > 20"}, "forecast": {"region": "clean"}},
+        load,
     ),
-    "paper": ({"embedded": {}, "free": FREE}, load_paper),
+    "paper": (EMBEDDED | {"free": FREE}, load),
 }
-REMOVED = type("Removed", (), {"__repr__": lambda self: "nothing"})()
 
 
-def changed(base: Any, key: str, value: Any) -> Any:
-    """A copy with one entry changed, named as in messages ("bands.0.noise")."""
-    first, _, rest = key.partition("/")
-    entries = list(base) if isinstance(base, list) else dict(base)
-    at: Any = int(first) if isinstance(base, list) else first
-    if rest:
-        inside = entries[at] if isinstance(base, list) else entries.get(at, {})
-        entries[at] = changed(inside, rest, value)
-    elif value is REMOVED:
-        del entries[at]
-    else:
-        entries[at] = value
-    return entries
-
-
-def write_settings(folder: Path, settings: dict[str, Any]) -> Path:
-    path = folder / "given.toml"
-    path.write_text("".join(f"{k} = {toml(v)}\n" for k, v in settings.items()))
-    return path
+def changed_at(base: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """A copy with one entry changed, "/" between the parts of its key ("bands/0/noise")."""
+    return changed(base, tuple(int(k) if k.isdecimal() else k for k in key.split("/")), value)
 
 
 def settings(command: str, key: str, value: Any, *refused: str) -> Row:
@@ -541,7 +516,9 @@ def settings(command: str, key: str, value: Any, *refused: str) -> Row:
     base, load = BASES[command]
 
     def make(folder: Path) -> Callable[[], Any]:
-        return partial(load, write_settings(folder, changed(base, key, value) if key else value))
+        return partial(
+            load, written(folder / "given.toml", changed_at(base, key, value) if key else value)
+        )
 
     words = ("given.toml", *refused) if refused else ()
     return Row(f"{command}: {key} = {value!r}", make, words)
@@ -550,102 +527,102 @@ def settings(command: str, key: str, value: Any, *refused: str) -> Row:
 STRICT = [
     *(settings(command, "", base[0]) for command, base in BASES.items()),
     *(
-        settings("fit", "analysis/nside", value, "analysis.nside")
+        settings("fit", "common/nside", value, "common.nside")
         for value in (True, "16", 16.5, 12, 0, -4, 2**40, [16], float("nan"))
     ),
+    *(settings("fit", "seed", value, "seed") for value in (-1, 2**32, 2**53, 1.5, True, "1")),
+    settings("fit", "seed", 2**32 - 1),
     *(
-        settings("fit", "analysis/seed", value, "analysis.seed")
-        for value in (-1, 2**32, 2**53, 1.5, True, "1")
-    ),
-    settings("fit", "analysis/seed", 2**32 - 1),
-    *(
-        settings("fit", "analysis/fwhm", value, "analysis.fwhm")
+        settings("fit", "common/fwhm", value, "common.fwhm")
         for value in (True, "60", -1, float("inf"), float("nan"))
     ),
-    settings("fit", "analysis/fwhm", 60),
-    settings("fit", "analysis/regions", [], "analysis.regions"),
-    settings("fit", "analysis/regions", "strip", "analysis.regions"),
-    settings("fit", "analysis/regions", ["strip", "strip"], "analysis.regions"),
-    settings("fit", "analysis/methods", ["guess"], "analysis.methods"),
-    settings("fit", "analysis/stokes", ["V"], "analysis.stokes"),
-    settings("fit", "analysis/latitude", 95.0, "analysis.latitude"),
-    settings("fit", "analysis/colour", 1, "analysis.colour"),
-    settings("fit", "mcmc/nsteps", 0, "mcmc.nsteps"),
-    settings("fit", "mcmc/nwalkers", "32", "mcmc.nwalkers"),
-    settings("fit", "grid/points", 1e3, "grid.points"),
+    settings("fit", "common/fwhm", 60),
+    settings("fit", "fit/regions", [], "fit.regions"),
+    settings("fit", "fit/regions", "strip", "fit.regions"),
+    settings("fit", "fit/regions", ["strip", "strip"], "fit.regions"),
+    settings("fit", "fit/methods", ["guess"], "fit.methods"),
+    settings("fit", "fit/stokes", ["V"], "fit.stokes"),
+    settings("fit", "regions/strip", "|b| <= 95", "regions.strip"),
+    settings("fit", "fit/colour", 1, "fit.colour"),
+    settings("fit", "fit/nsteps", 0, "fit.nsteps"),
+    settings("fit", "fit/nwalkers", "32", "fit.nwalkers"),
+    settings("fit", "fit/points", 1e3, "fit.points"),
     settings("fit", "cmb/include", "yes", "cmb.include"),
     settings("fit", "cmb/include", 1, "cmb.include"),
     settings("fit", "cmb/r", -0.1, "cmb.r"),
     settings("fit", "title", 5, "title"),
-    settings("fit", "bands/0/noise", {}, "noise"),
-    settings("fit", "bands/0/noise/rms", "1.0", "noise"),
-    settings("fit", "bands/0/noise/rms", -1.0, "noise"),
-    settings("fit", "bands/0/name", "", "name"),
-    settings("fit", "bands/0/name", 44, "name"),
-    settings("fit", "bands/0/name", "70", "70"),
-    settings("fit", "bands/0/bandpass/width", -8.0, "width"),
-    settings("fit", "bands/0/bandpass", {"center": 44.0, "file": "a.txt"}, "bandpass"),
-    settings("fit", "free/dust.beta_dust/uniform", [2.5, 0.5], "dust.beta_dust"),
-    settings("fit", "free/dust.beta_dust/start", 5.0, "dust.beta_dust"),
-    settings("fit", "free/dust.beta_dust/start", "1.6", "dust.beta_dust"),
+    settings("fit", "bands/0/noise", {}, "bands.0.noise"),
+    settings("fit", "bands/0/noise/rms", "1.0", "bands.0.noise.rms"),
+    settings("fit", "bands/0/noise/rms", -1.0, "bands.0.noise.rms"),
+    settings("fit", "bands/0/noise/rms", 0.0, "bands.0.noise", "not 0"),
+    settings("fit", "bands/0/name", "", "bands.0.name"),
+    settings("fit", "bands/0/name", 44, "bands.0.name"),
+    settings("fit", "bands/0/name", "70", "names of the bands", "70, 70"),
+    settings("fit", "bands/0/bandpass/width", -8.0, "bands.0.bandpass.width"),
+    settings("fit", "bands/0/bandpass", {"center": 44.0, "file": "a.txt"}, "bands.0.bandpass"),
+    settings("fit", "free/dust.beta_dust/uniform", [2.5, 0.5], "free.dust.beta_dust", "2.5, 0.5"),
+    settings("fit", "free/dust.beta_dust/start", 5.0, "free.dust.beta_dust", "start 5"),
+    settings("fit", "free/dust.beta_dust/start", "1.6", "free.dust.beta_dust.start"),
     settings("fit", "free/synchrotron.beta_syn", {"start": -3.1}, "synchrotron.beta_syn", "3.1"),
     settings("fit", "fixed", {"synchrotron.beta_syn": -3.1}, "synchrotron.beta_syn", "3.1"),
     settings("fit", "fixed", {"dust.beta_dust": 1.5}, "dust.beta_dust"),
-    settings("fit", "templates/dust/nu_ref", -353.0, "nu_ref"),
-    settings("fit", "templates/dust/nu_ref", 353e9, "nu_ref"),
-    settings("fit", "templates/dust/parameters", {"nu_ref": 353.0}, "nu_ref"),
-    settings("fit", "templates/dust/law", "ash", "law"),
-    settings("fit", "templates/dust/hdu", "1.5", "hdu"),
-    settings("fit", "templates/dust/stokes", "QX", "stokes"),
+    settings("fit", "sky/dust/nu_ref", -353.0, "sky.dust.nu_ref"),
+    settings("fit", "sky/dust/nu_ref", 353e9, "sky.dust: nu_ref", "3.53e+11"),
+    settings("fit", "sky/dust/parameters", {"nu_ref": 353.0}, "sky.dust: nu_ref", "353"),
+    settings("fit", "sky/dust/law", "ash", "sky.dust.law"),
+    settings("fit", "sky/dust/hdu", "1.5", "sky.dust.hdu"),
+    settings("fit", "sky/dust/stokes", "QX", "sky.dust.stokes"),
     *(
-        settings("fit", f"templates/{name}", TEMPLATES["dust"], name)
+        settings("fit", f"sky/{name}", TEMPLATES["dust"], f"sky.{name}:")
         for name in ("cmb", "noise", "total", "", "a.b", "x" * 81)
     ),
     *(
-        settings("simulate", "experiment/outputs", value, "outputs")
+        settings("simulate", "simulate/outputs", value, "simulate.outputs")
         for value in ([], ["all"], "total")
     ),
-    settings("simulate", "experiment/outputs", ["total", "total"], "outputs"),
-    settings("simulate", "experiment/sheet", "true", "sheet"),
-    settings("simulate", "experiment/sheet", 1, "sheet"),
-    settings("simulate", "experiment/nside", 2**40, "nside"),
-    settings("simulate", "experiment/nside", True, "nside"),
-    settings("simulate", "experiment/seed", 2**32, "seed"),
-    settings("simulate", "experiment/small_scales_seed", 2**53, "small_scales_seed"),
-    settings("simulate", "experiment/fwhm", "big", "fwhm"),
-    settings("simulate", "experiment/fwhm", True, "fwhm"),
-    settings("simulate", "embedded/seed", -1, "seed"),
-    settings("simulate", "embedded/nside", "16", "nside"),
-    settings("simulate", "experiment/channels", [], "channels"),
-    settings("simulate", "experiment/include", ["fog"], "fog"),
-    settings("separate", "separation/nside", True, "nside"),
-    settings("separate", "separation/seed", 2**32, "seed"),
-    settings("separate", "separation/nsims", "100", "nsims"),
-    settings("separate", "components/cmb", REMOVED, "components"),
-    settings("separate", "components/dust/nu_ref", "353", "nu_ref"),
-    settings("separate", "components/noise", {"law": "synchrotron", "nu_ref": 30.0}, "noise"),
-    settings("separate", "components/total", {"law": "synchrotron", "nu_ref": 30.0}, "total"),
-    settings("separate", "embedded/r", -1, "r"),
-    settings("separate", "embedded/truth", {"dust.beta_dust": "1.5"}, "truth"),
-    settings("separate", "free/dust.beta_dust/regions", {}, "regions"),
-    settings("separate", "tensors/lmin", 1, "lmin"),
-    settings("forecast", "mask/latitude", "20", "latitude"),
-    settings("forecast", "mask", {}, "mask"),
-    settings("forecast", "fisher/free", [], "free"),
-    settings("forecast", "fisher/free", ["r", "r"], "free"),
-    settings("forecast", "spectra/lmax", 10.5, "lmax"),
-    settings("forecast", "embedded/seed", 2**32, "seed"),
-    settings("paper", "paper/fwhm", "5", "fwhm"),
-    settings("paper", "paper/center", [180.0], "center"),
-    settings("paper", "embedded/channels", {"planck": ["999", "999"]}, "channels"),
+    settings("simulate", "simulate/outputs", ["total", "total"], "simulate.outputs"),
+    settings("simulate", "simulate/sheet", "true", "simulate.sheet"),
+    settings("simulate", "simulate/sheet", 1, "simulate.sheet"),
+    settings("simulate", "simulate/nside", 2**40, "simulate.nside"),
+    settings("simulate", "simulate/nside", True, "simulate.nside"),
+    settings("simulate", "seed", 2**32, "seed"),
+    settings("simulate", "simulate/small_scales_seed", 2**53, "simulate.small_scales_seed"),
+    settings("simulate", "simulate/fwhm", "big", "simulate.fwhm"),
+    settings("simulate", "simulate/fwhm", True, "simulate.fwhm"),
+    settings("simulate", "sky/embedded/seed", -1, "sky.embedded.seed"),
+    settings("simulate", "sky/embedded/nside", "16", "sky.embedded.nside"),
+    settings("simulate", "bands/0/channels", [], "bands.0.channels"),
+    settings("simulate", "simulate/include", ["fog"], "simulate.include", "fog"),
+    settings("separate", "common/nside", True, "common.nside"),
+    settings("separate", "seed", 2**32, "seed"),
+    settings("separate", "separate/nsims", "100", "separate.nsims"),
+    settings("separate", "cmb/include", False, "cmb.include"),
+    settings("separate", "sky/dust/nu_ref", "353", "sky.dust.nu_ref"),
+    settings("separate", "sky/noise", {"law": "synchrotron", "nu_ref": 30.0}, "sky.noise"),
+    settings("separate", "sky/total", {"law": "synchrotron", "nu_ref": 30.0}, "sky.total"),
+    settings("separate", "cmb/r", -1, "cmb.r"),
+    settings("separate", "truth", {"dust.beta_dust": "1.5"}, "truth.dust.beta_dust", "1.5"),
+    settings("separate", "free/dust.beta_dust/regions", {}, "free.dust.beta_dust.regions"),
+    settings("separate", "separate/lmin", 1, "separate.lmin"),
+    settings("forecast", "regions/clean", "20", "regions.clean"),
+    settings("forecast", "regions/clean", {}, "regions.clean"),
+    settings("forecast", "forecast/free", [], "forecast.free"),
+    settings("forecast", "forecast/free", ["r", "r"], "forecast.free"),
+    settings("forecast", "forecast/lmax", 10.5, "forecast.lmax"),
+    settings("forecast", "sky/embedded/seed", 2**32, "sky.embedded.seed"),
+    settings("paper", "paper/fwhm", "5", "paper.fwhm"),
+    settings("paper", "paper/center", [180.0], "paper.center"),
+    settings("paper", "bands/0/channels", ["999", "999"], "bands.0.channels"),
 ]
 
 
-def file_of_settings(given: str, content: str | bytes, *refused: str) -> Row:
+def file_of_settings(
+    given: str, content: str | bytes, *refused: str, read: Callable[[Path], Any] = load
+) -> Row:
     def make(folder: Path) -> Callable[[], Any]:
         path = folder / "given.toml"
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return partial(load_settings, path)
+        return partial(read, path)
 
     return Row(given, make, ("given.toml", *refused))
 
@@ -655,13 +632,39 @@ STRICT += [
     file_of_settings("a key twice", "title = 'a'\ntitle = 'b'\n", "TOML"),
     file_of_settings("bytes", b"\xff\xfe\x00", "TOML"),
     file_of_settings("deeper than Python counts", "a = " + "[" * 20000 + "]" * 20000, "nested"),
-    file_of_settings("nothing", "", "templates"),
+    file_of_settings("nothing", "", "bands", read=and_then(inputs_of)),
+]
+
+
+def instrument(given: str, bands: list[dict[str, Any]], *refused: str) -> Row:
+    """A file with the bands of an instrument."""
+
+    def make(folder: Path) -> Callable[[], Any]:
+        written(folder / "own.toml", {"bands": bands})
+        return partial(
+            load, written(folder / "given.toml", {"bands": [{"instrument": "own.toml"}]})
+        )
+
+    words = ("given.toml", "bands.0.instrument", "own.toml", *refused) if refused else ()
+    return Row(f"an instrument {given}", make, words)
+
+
+OWN = {"name": "a", "bandpass": {"center": 44.0}, "fwhm": 27.0, "noise": {"level": 240.0}}
+STRICT += [
+    instrument("of one's own", [OWN]),
+    instrument("without bands", [], "none"),
+    instrument("with a band without a name", [{"fwhm": 27.0}], "name"),
+    instrument("with a band twice", [OWN, OWN], "a, a"),
+    instrument("with a beam in quotes", [OWN | {"fwhm": "27"}], "band a: fwhm", "'27'"),
+    instrument("with negative noise", [OWN | {"noise": {"level": -1.0}}], "noise.level", "-1.0"),
+    instrument("with another key", [OWN | {"colour": 1}], "band a: colour"),
+    instrument("with a band of another", [OWN | {"instrument": "planck"}], "band a: instrument"),
 ]
 
 # What settings and files say together
 
 
-def sky(given: str, changes: dict[str, Any], *refused: str, **files: Any) -> Row:
+def sky(given: str, changes: dict[str, Any], *refused: str, right: Any = None, **files: Any) -> Row:
     """A fit of files at nside 4, with entries changed and files replaced."""
     base, load = BASES["fit"]
 
@@ -670,20 +673,23 @@ def sky(given: str, changes: dict[str, Any], *refused: str, **files: Any) -> Row
             save(folder, columns, {}).rename(folder / f"{name}.fits")
         settings = base
         for key, value in changes.items():
-            settings = changed(settings, key, value)
-        path = write_settings(folder, settings)
-        return lambda: read_inputs(load(path))
+            settings = changed_at(settings, key, value)
+        path = written(folder / "given.toml", settings)
+        return lambda: inputs_of(load(path))
 
-    return Row(given, make, refused)
+    return Row(given, make, refused, right)
 
 
 def of_pixels(values: Any, unit: str | None = "1", name: str = "MAP") -> dict[str, Any]:
     return {name: column(name, "D", values, unit=unit)}
 
 
-BETA = {"templates/dust/parameters": {"beta_dust": {"file": "beta.fits"}}}
+BETA = {"sky/dust/parameters": {"beta_dust": {"file": "beta.fits"}}}
 LEVELS = 1.5 + 0.1 * RNG.random(NPIX)
 RMS = {"bands/0/noise": {"map": {"file": "rms.fits"}}}
+PIXEL = healpy.nside2resol(NSIDE, arcmin=True)
+BAND_44 = Bandpass.top_hat(44.1, 10.72)
+rms_of = lambda found: np.sqrt(found.bands["44"].noise[0, 0])  # noqa: E731
 TOGETHER = [
     sky("files that are right", {}),
     sky("a map of beta_dust", BETA, beta=of_pixels(LEVELS)),
@@ -691,34 +697,24 @@ TOGETHER = [
     sky("beta_dust in uK_CMB", BETA, "beta_dust", "uK_CMB", beta=of_pixels(LEVELS, "uK_CMB")),
     sky(
         "two columns of beta_dust",
-        {"templates/dust/parameters": {"beta_dust": {"file": "beta.fits", "fields": [0, 1]}}},
+        {"sky/dust/parameters": {"beta_dust": {"file": "beta.fits", "fields": [0, 1]}}},
         "beta_dust",
         beta=of_pixels(LEVELS) | of_pixels(LEVELS, name="RMS"),
     ),
     sky(
         "T_dust without unit K",
-        {"templates/dust/parameters": {"T_dust": {"file": "T.fits"}}},
+        {"sky/dust/parameters": {"T_dust": {"file": "T.fits"}}},
         "T_dust",
         T=of_pixels(20 * LEVELS, "mK_CMB"),
     ),
     sky(
         "beta_syn of the other sign",
-        {"templates/synchrotron/parameters": {"beta_syn": {"file": "beta.fits"}}},
+        {"sky/synchrotron/parameters": {"beta_syn": {"file": "beta.fits"}}},
         "beta_syn",
         beta=of_pixels(-2 * LEVELS),
     ),
-    sky(
-        "beta_syn = -3.1",
-        {"templates/synchrotron/parameters": {"beta_syn": -3.1}},
-        "beta_syn",
-        "3.1",
-    ),
-    sky(
-        "a parameter that is not there",
-        {"templates/dust/parameters": {"beta": 1.5}},
-        "dust",
-        "beta",
-    ),
+    sky("beta_syn = -3.1", {"sky/synchrotron/parameters": {"beta_syn": -3.1}}, "beta_syn", "3.1"),
+    sky("a parameter that is not there", {"sky/dust/parameters": {"beta": 1.5}}, "dust", "beta"),
     sky("no such file", {"bands/0/file": "none.fits"}, "none.fits"),
     sky("a rms of 160 K", {"bands/0/noise/rms": 160.0}, "44", "160", "K_CMB"),
     sky("a rms of 1e-9 K", {"bands/0/noise/rms": 1e-9}, "44", "1e-09", "K_CMB"),
@@ -726,6 +722,12 @@ TOGETHER = [
     sky("a map of rms in the wrong unit", RMS, "44", "K_CMB", rms=of_pixels(1e3 * LEVELS, "K_CMB")),
     sky("a map of rms of 48 pixels", RMS, "rms.fits", "48", rms=of_pixels(LEVELS[:48], "K_CMB")),
     sky("a map of rms with zeros", RMS, "rms.fits", "missing", rms=of_pixels(0 * LEVELS, "K_CMB")),
+    sky(
+        "the noise of an instrument in uK_CMB, and a map in uK_RJ",
+        {"bands/0": {"name": "44", "instrument": "planck", "file": "44.fits"}},
+        right=equal(240.0 / PIXEL / BAND_44.conversion("uK_RJ", "uK_CMB"), rms_of),
+        **{"44": {n: column(n, "D", v, unit="uK_RJ") for n, v in QU.items()}},
+    ),
     sky("a map of U alone", {"bands/0/fields": ["U_STOKES"]}, "44"),
     sky("U before Q", {"bands/0/fields": ["U_STOKES", "Q_STOKES"]}, "44", "U_STOKES"),
     sky(
@@ -755,7 +757,6 @@ def python(given: str, call: Callable[[], Any], *refused: str) -> Row:
     return Row(given, lambda folder: call, refused)
 
 
-BAND_44 = Bandpass.top_hat(44.0, 8.0)
 MAPS_QU = np.array([Q, U])
 PYTHON = [
     python("a shift in MHz", lambda: BAND_44.shifted(1 * u.MHz), "delta"),

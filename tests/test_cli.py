@@ -1,7 +1,6 @@
 """The command line: the fit on files, what it leaves behind, and one sentence for a mistake."""
 
 import json
-import tomllib
 
 import h5py
 import healpy
@@ -9,30 +8,30 @@ import jax
 import numpy as np
 import pytest
 
-from commands import jaxsky, one_sentence
-from fits.settings import EXAMPLE, load_settings
+from commands import jaxsky, one_sentence, said
+from fits.commands.run import DEFAULTS
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.harmonics import alm_ell, gaussian_beam, synthesis
 from jaxsky.io import write_maps
 from jaxsky.noise import draw, uniform_covariance
+from jaxsky.settings.load import load
 
 NSIDE = 16
 TRUTH = {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}
 SETTINGS = """
 title = "A small sky"
-[analysis]
+[common]
 nside = 8
 fwhm = 600.0
-regions = ["full"]
 [free]
 "dust.beta_dust" = {{ start = 1.5, uniform = [0.5, 2.5] }}
 "synchrotron.beta_syn" = {{ start = 3.1, uniform = [2.0, 4.5] }}
-[templates.dust]
+[sky.dust]
 law = "dust"
 file = "dust.fits"
 nu_ref = 353.0
 fwhm = 120.0
-[templates.synchrotron]
+[sky.synchrotron]
 law = "synchrotron"
 file = "synchrotron.fits"
 nu_ref = 30.0
@@ -50,7 +49,8 @@ fields = ["Q_STOKES", "U_STOKES"]
 fwhm = 150.0
 bandpass = {{ center = 70.0, width = 14.0 }}
 noise = {noise}
-[mcmc]
+[fit]
+regions = ["full"]
 nsteps = 2200
 """
 
@@ -128,6 +128,7 @@ def write_settings(
     return path
 
 
+@pytest.mark.slow
 def test_fit_on_files_in_plancks_format(folder, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     assert jaxsky(monkeypatch, "fit", write_settings(folder, "full"), "--out", out) == 0
@@ -154,12 +155,14 @@ def test_fit_on_files_in_plancks_format(folder, tmp_path, monkeypatch, capsys):
                 assert abs(numbers["best_fit"][name] - TRUTH[name]) < 4 * sigma
     log = json.loads((out / "log.json").read_text())
     assert {"jax", "jaxsky", "healpy"} <= set(log["versions"])
-    assert log["settings"]["analysis"]["nside"] == 8
+    assert log["settings"]["common"]["nside"] == 8
 
 
 def test_options_replace_settings_and_results_are_kept(folder, tmp_path, monkeypatch, capsys):
     path, out = write_settings(folder, "options"), tmp_path / "out"
-    options = ["--stokes", "QU", "--region", "strip", "--seed", "5", "--nside", "4", "--out", out]
+    options = ["--out", out]
+    for value in ('fit.stokes=["QU"]', 'fit.regions=["strip"]', "seed=5", "common.nside=4"):
+        options += ["--set", value]
     assert jaxsky(monkeypatch, "fit", path, *options) == 0
     before = (out / "result.json").read_bytes()
     assert set(json.loads(before)["results"]) == {"strip"}
@@ -169,7 +172,7 @@ def test_options_replace_settings_and_results_are_kept(folder, tmp_path, monkeyp
     assert "holds results already; go on with --resume" in one_sentence(capsys)
     assert (out / "result.json").read_bytes() == before
     # Another seed is another chain: it is not gone on with.
-    other = [*options[:4], "--seed", "6", *options[6:]]
+    other = [*options, "--set", "seed=6"]
     assert jaxsky(monkeypatch, "fit", path, *other, "--resume") == 2
     assert "holds a chain of other data or settings" in one_sentence(capsys)
     assert jaxsky(monkeypatch, "fit", path, *options, "--resume") == 0
@@ -180,7 +183,7 @@ def test_options_replace_settings_and_results_are_kept(folder, tmp_path, monkeyp
 
 def test_resume_goes_on_with_a_cut_chain(folder, tmp_path, monkeypatch):
     path, out = write_settings(folder, "resume"), tmp_path / "out"
-    options = ["--stokes", "QU", "--out", out]
+    options = ["--out", out, "--set", 'fit.stokes=["QU"]']
     assert jaxsky(monkeypatch, "fit", path, *options) == 0
     whole = json.loads((out / "result.json").read_text())
     short = write_settings(folder, "short", **{"nsteps = 2200": "nsteps = 700"})
@@ -200,10 +203,9 @@ def test_resume_goes_on_with_a_cut_chain(folder, tmp_path, monkeypatch):
     ],
 )
 def test_noise_can_be_given_in_other_ways(folder, tmp_path, monkeypatch, noise, capsys):
-    path = write_settings(
-        folder, "noise", noise, **{'regions = ["full"]': 'methods = ["gradient"]'}
-    )
-    code = jaxsky(monkeypatch, "fit", path, "--out", tmp_path / "o", "--stokes", "QU")
+    few = 'methods = ["gradient"]\nstokes = ["QU"]'
+    path = write_settings(folder, "noise", noise, **{'regions = ["full"]': few})
+    code = jaxsky(monkeypatch, "fit", path, "--out", tmp_path / "o")
     if "map" in noise:  # a covariance is no rms
         assert code == 2
         assert "K_CMB^2" in one_sentence(capsys)
@@ -220,88 +222,100 @@ def test_paths_with_variables(folder, tmp_path, monkeypatch):
     path = write_settings(
         tmp_path, "elsewhere", **{'title = "A small sky"': 'data_dir = "${SKY_MAPS:-/nowhere}"'}
     )
-    assert load_settings(path).data_dir == "/nowhere"
+    assert load(path).data_dir == "/nowhere"
     monkeypatch.setenv("SKY_MAPS", str(folder))
-    assert load_settings(path).data_dir == str(folder.resolve())
+    assert load(path).data_dir == str(folder.resolve())
     plain = path.read_text().replace("${SKY_MAPS:-/nowhere}", "$SKY_NOTHING")
     path.write_text(plain)
     with pytest.raises(ValueError, match=r"data_dir: the environment variable SKY_NOTHING is not"):
-        load_settings(path)
+        load(path)
 
 
-def test_init_writes_an_example_that_is_valid(tmp_path, monkeypatch, capsys):
-    path = tmp_path / "mine.toml"
-    assert jaxsky(monkeypatch, "fit", path, "--init") == 0
-    settings = load_settings(path)
-    assert [band.name for band in settings.bands] == ["44", "70"]
-    # What is commented out is valid, too.
-    assert tomllib.loads(EXAMPLE.read_text())
-    path.write_text("mine")
-    capsys.readouterr()
-    assert jaxsky(monkeypatch, "fit", path, "--init") == 2
-    assert "exists already" in one_sentence(capsys)
-    assert path.read_text() == "mine"
+@pytest.mark.parametrize("name", [path.stem for path in DEFAULTS.glob("*.toml")])
+def test_init_writes_an_experiment_that_is_valid(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert jaxsky(monkeypatch, "init", name) == 0
+    assert f"{name}.toml" in said(capsys)
+    settings = load(tmp_path / f"{name}.toml")
+    given = load(DEFAULTS / f"{name}.toml").model_copy(update={"data_dir": str(tmp_path)})
+    assert settings == given
+
+
+def test_init_leaves_files_alone(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    mine = tmp_path / "mine.toml"
+    assert jaxsky(monkeypatch, "init", "planck-44-70", "--out", mine) == 0
+    assert [band.name for band in load(mine).bands] == ["44", "70"]
+    assert jaxsky(monkeypatch, "init") == 0  # the template
+    assert load(tmp_path / "experiment.toml").title == "LiteBIRD"
+    for path, arguments in ((mine, ["--out", mine]), (tmp_path / "experiment.toml", [])):
+        path.write_text("mine")
+        capsys.readouterr()
+        assert jaxsky(monkeypatch, "init", *arguments) == 2
+        assert f"{path.name}: exists already" in one_sentence(capsys)
+        assert path.read_text() == "mine"
+    assert jaxsky(monkeypatch, "init", "planck", "--out", tmp_path / "other.toml") == 2
+    printed = one_sentence(capsys)
+    assert "no experiment 'planck'; there are" in printed
+    assert all(path.stem in printed for path in DEFAULTS.glob("*.toml"))
+    for out, words in (("none/x.toml", "No such file or directory"), (".", "exists already")):
+        assert jaxsky(monkeypatch, "init", "--out", out) == 2
+        assert f"{out}: {words}" in one_sentence(capsys)
+    assert {path.name for path in tmp_path.iterdir()} == {"mine.toml", "experiment.toml"}
 
 
 @pytest.mark.parametrize("command", ["fit", "compare", "separate", "simulate"])
 @pytest.mark.parametrize("seed", [-1, 2**32, 2**53, 1.5, "x"])
 def test_seeds_out_of_bounds(command, seed, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
-    assert jaxsky(monkeypatch, command, "--seed", seed, "--out", out) == 2
-    said = capsys.readouterr().err
-    assert "--seed" in said
-    assert not isinstance(seed, int) or str(seed) in said
+    assert jaxsky(monkeypatch, command, "--set", f"seed={seed}", "--out", out) == 2
+    printed = one_sentence(capsys)
+    assert f"{command}.toml: seed: " in printed
+    assert "(given with --set)" in printed
+    assert str(seed) in printed
     assert not out.exists()
 
 
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("nside = 8", "nside = 9", "analysis.nside: nside must be a power of two, not 9"),
-        ("nside = 8", "nside = 'x'", "analysis.nside: input should be a valid integer"),
-        ("nside = 8", "nsid = 8", "analysis.nsid: unknown key"),
+        ("nside = 8", "nside = 9", "common.nside: nside must be a power of two, not 9"),
+        ("nside = 8", "nside = 'x'", "common.nside: input should be a valid integer"),
+        ("nside = 8", "nsid = 8", "common.nsid: unknown key"),
         ("nside = 8", "nside = ", "is not valid TOML"),
         ("nside = 8", "nside = 32", "nside 32 is larger than that of"),
         ("fwhm = 600.0", "fwhm = 60.0", "finer than that of template 'dust', 120 arcmin"),
-        ("[templates.dust]", "[template.dust]", "template: unknown key"),
+        ("[sky.dust]", "[skies.dust]", "skies: unknown key"),
         (
             'law = "dust"',
             'law = "dst"',
-            "templates.dust.law: there is no law 'dst'; laws are ame, cmb, dust",
+            "sky.dust.law: there is no law 'dst'; laws are ame, cmb, dust",
         ),
         ('"dust.fits"', '"none.fits"', "none.fits"),
         ('"dust.fits"', '"44.txt"', "44.txt"),
         ('["Q_STOKES", "U_STOKES"]', '["Q_STOKES", "V_STOKES"]', "V_STOKES"),
         ('["Q_STOKES", "U_STOKES"]', '["Q_STOKES"]', "bands.44: fields must name Q and U"),
-        ('["full"]', '["fool"]', "'fool' is neither strip, outside, full nor a file"),
-        ('["full"]', '["full"]\\nstokes = ["I"]', "analysis.stokes.0: input should be 'Q'"),
+        ('["full"]', '["fool"]', "fit.regions: 'fool' is none of strip, outside, full"),
+        ('["full"]', '["full"]\\nstokes = ["I"]', "fit.stokes.0: input should be 'Q'"),
         ("start = 1.5", "start = 9.0", "start 9 is not inside the uniform prior"),
         ("uniform = [0.5, 2.5]", "uniform = [2.5, 0.5]", "free.dust.beta_dust"),
         ('"dust.beta_dust" =', '"dust.beta" =', "Unknown parameter 'dust.beta'"),
+        ("[sky.dust]", '[fixed]\\n"dust.T" = 3\\n[sky.dust]', "Unknown parameter 'dust.T'"),
         (
-            "[templates.dust]",
-            '[fixed]\\n"dust.T" = 3\\n[templates.dust]',
-            "Unknown parameter 'dust.T'",
-        ),
-        (
-            "[templates.dust]",
-            '[fixed]\\n"dust.beta_dust" = 1.5\\n[templates.dust]',
+            "[sky.dust]",
+            '[fixed]\\n"dust.beta_dust" = 1.5\\n[sky.dust]',
             "dust.beta_dust cannot be both free and fixed",
         ),
         (
-            "[templates.dust]",
-            '[fixed]\\n"ame.m60" = 1.5\\n[templates.dust]',
-            "there is no template 'ame'",
+            "[sky.dust]",
+            '[fixed]\\n"ame.m60" = 1.5\\n[sky.dust]',
+            "fixed: there is no component 'ame'",
         ),
         ("width = 14.0", "width = 14.0, file = '44.txt'", "either as file or as center and width"),
         ('"44.txt"', '"nothing.txt"', "nothing.txt"),
         ('name = "70"', 'name = "44"', "names of the bands must differ"),
-        (
-            "nu_ref = 353.0",
-            "nu_ref = -1.0",
-            "templates.dust.nu_ref: input should be greater than 0",
-        ),
-        ("nsteps = 2200", "nwalkers = 2", "mcmc.nwalkers"),
+        ("nu_ref = 353.0", "nu_ref = -1.0", "sky.dust.nu_ref: input should be greater than 0"),
+        ("nsteps = 2200", "nwalkers = 2", "fit.nwalkers"),
     ],
 )
 def test_mistakes_in_settings_are_one_sentence(
@@ -324,7 +338,8 @@ def test_mistakes_in_settings_are_one_sentence(
     [
         ("{ }", "noise as exactly one of"),
         ("{ rms = 1.0, estimate_above = 30 }", "noise as exactly one of"),
-        ("{ rms = -1.0 }", "bands.0.noise.rms: input should be greater than 0, not -1.0"),
+        ("{ rms = -1.0 }", "bands.0.noise.rms: input should be greater than or equal to 0, not -1"),
+        ("{ rms = 0.0 }", "bands.0.noise: must be greater than 0"),
         ("{ covariance = ['QQ_COV', 'XX', 'UU_COV'] }", "XX"),
         ("{ covariance = ['QU_COV', 'QQ_COV', 'UU_COV'] }", "are not QQ, QU, UU by their names"),
         ("{ rms = 1e-6, correlated = true }", "correlated goes with estimate_above only"),
@@ -365,7 +380,7 @@ def test_a_file_in_place_of_the_folder_is_left_alone(folder, tmp_path, monkeypat
 
 def test_a_damaged_chain_is_named_and_kept(folder, tmp_path, monkeypatch, capsys):
     (tmp_path / "chain.h5").write_text("no HDF5")
-    options = ["--out", tmp_path, "--stokes", "QU", "--resume"]
+    options = ["--out", tmp_path, "--resume", "--set", 'fit.stokes=["QU"]']
     assert jaxsky(monkeypatch, "fit", write_settings(folder, "damaged"), *options) == 2
     assert "chain.h5: is damaged; start again with --overwrite" in one_sentence(capsys)
     assert (tmp_path / "chain.h5").read_text() == "no HDF5"

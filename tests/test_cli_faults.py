@@ -154,7 +154,16 @@ cli.main()
 """
 
 
-@pytest.mark.parametrize("how", ["swallowed", "other_error", "caught", "computing"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        "computing",
+        *(
+            pytest.param(how, marks=pytest.mark.slow)
+            for how in ("swallowed", "other_error", "caught")
+        ),
+    ],
+)
 def test_ctrl_c_ends_a_command(tmp_path, how):
     began = time.monotonic()
     run = subprocess.run(

@@ -14,16 +14,16 @@ from rich.table import Table
 
 from fits.commands import console as terminal
 from fits.commands.page import Section, key_of, table_of, write_page
-from fits.settings import EMBEDDED, Settings
+from fits.commands.run import DEFAULTS
 from jaxsky.settings import SettingsError
-from jaxsky.settings_load import load
+from jaxsky.settings.load import load
 
 SETTINGS = """
-[analysis]
+[common]
 nside = 16
 [free]
 "dust.beta_dust" = { start = 1.5, uniform = [0.5, 2.5] }
-[templates.dust]
+[sky.dust]
 law = "dust"
 file = "dust.fits"
 nu_ref = 353.0
@@ -49,11 +49,10 @@ def path(tmp_path):
 def test_any_key_can_be_set(path):
     given = load(
         path,
-        Settings,
-        {"analysis": {"seed": 3}},
         [
-            "analysis.nside=32",
-            "analysis.regions = ['full']",
+            "seed=3",
+            "common.nside=32",
+            "fit.regions = ['full']",
             "title=two words",
             "free.'dust.beta_dust'.start=1.6",
             'free."dust.T_dust"={start = 20.0, gaussian = [20.0, 1.0]}',
@@ -62,12 +61,12 @@ def test_any_key_can_be_set(path):
             "cmb.include=false",
         ],
     )
-    assert (given.analysis.nside, given.analysis.seed, given.analysis.regions) == (32, 3, ["full"])
+    assert (given.common.nside, given.seed, given.fit.regions) == (32, 3, ["full"])
     assert given.title == "two words"
     assert given.free["dust.beta_dust"].start == 1.6
     assert given.free["dust.beta_dust"].uniform == (0.5, 2.5)
     assert given.free["dust.T_dust"].gaussian == (20.0, 1.0)
-    assert [band.fwhm for band in given.bands] == [0.0, 13.2]
+    assert [band.fwhm for band in given.bands] == [None, 13.2]
     assert [band.noise.rms for band in given.bands] == [2.0, 1.0]
     assert given.cmb.include is False
 
@@ -75,19 +74,19 @@ def test_any_key_can_be_set(path):
 @pytest.mark.parametrize(
     ("assignment", "words"),
     [
-        ("analysis.nside", "--set analysis.nside: must be KEY=VALUE"),
+        ("common.nside", "--set common.nside: must be KEY=VALUE"),
         ("=3", "--set =3: must be KEY=VALUE"),
-        ("analysis.nsides=32", "analysis.nsides: unknown key"),
-        ("analysis.nside=33", "analysis.nside: nside must be a power of two, not 33 (given with"),
-        ("analysis.nside=big", "analysis.nside: input should be a valid integer, not 'big' (given"),
+        ("common.nsides=32", "common.nsides: unknown key"),
+        ("common.nside=33", "common.nside: nside must be a power of two, not 33 (given with"),
+        ("common.nside=big", "common.nside: input should be a valid integer, not 'big' (given"),
         ("bands.2.fwhm=3", "--set bands.2.fwhm=3: 2: is not among the 2 entries, 0 to 1"),
         ("bands.44.fwhm=3", "44: is not among the 2 entries"),
-        ("analysis=3", "analysis: input should be a valid table"),
+        ("common=3", "common: input should be a valid table"),
     ],
 )
 def test_what_cannot_be_set_is_one_sentence(path, assignment, words):
     with pytest.raises(SettingsError, match=re.escape(words)):
-        load(path, Settings, assignments=[assignment])
+        load(path, [assignment])
 
 
 def steps(is_terminal: bool, monkeypatch, tmp_path) -> tuple[str, str]:
@@ -163,13 +162,18 @@ def test_version(line):
     assert re.fullmatch(r"jaxsky \d+\.\d+\.\d+\n", done.stdout)
 
 
-def test_shells_complete_commands():
-    line = {"_JAXSKY_COMPLETE": "complete_bash", "COMP_WORDS": "jaxsky se", "COMP_CWORD": "1"}
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [("se", ["separate"]), ("init pl", ["planck-44-70", "planck-separate"])],
+)
+def test_shells_complete_commands_and_experiments(words, completed):
+    line = {"_JAXSKY_COMPLETE": "complete_bash", "COMP_WORDS": f"jaxsky {words}"}
+    line["COMP_CWORD"] = str(len(words.split()))
     jaxsky = Path(sys.executable).with_name("jaxsky")
     done = subprocess.run(
         [jaxsky], env=os.environ | line, capture_output=True, text=True, check=True
     )
-    assert done.stdout.split() == ["separate"]
+    assert done.stdout.split() == completed
 
 
 def test_nothing_in_jaxsky_imports_fits_but_main():
@@ -182,4 +186,4 @@ def test_nothing_in_jaxsky_imports_fits_but_main():
         if re.search(r"^\s*(from|import) fits\b", path.read_text(), re.MULTILINE)
     ]
     assert importing == ["__main__.py"]
-    assert EMBEDDED.is_file()
+    assert list(DEFAULTS.glob("*.toml"))

@@ -11,7 +11,6 @@ import pytest
 import scipy.stats
 
 from commands import jaxsky
-from fits import settings as fit_settings
 from fits.comparison import compare
 from fits.comparison.pixels import compare_pixels
 from fits.comparison.report import warnings
@@ -22,20 +21,28 @@ from fits.regions import region_masks
 from fits.resolution import prepare
 from jaxsky.io import InputError
 from jaxsky.settings import SettingsError
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.load import load
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "wmap7_vw.toml"
 SETTINGS = """
 title = "small"
-[embedded]
-channels = { planck = ["44", "70"], wmap = ["K"] }
-nside = 32
-leakage = { "70" = 0.2 }
-[analysis]
+seed = 3
+[sky]
+embedded = { nside = 32 }
+[[bands]]
+instrument = "planck"
+channels = ["44", "70"]
+[[bands]]
+instrument = "wmap"
+channels = ["K"]
+[common]
 nside = 16
 fwhm = 300.0
-regions = ["strip", "outside"]
-seed = 3
+[simulate]
+leakage = { "70" = 0.2 }
 [compare]
+regions = ["strip", "outside"]
 nsims = 30
 lmax = 25
 width = 8
@@ -47,12 +54,12 @@ panel_nside = 8
 def settings(tmp_path_factory):
     path = tmp_path_factory.mktemp("compare") / "compare.toml"
     path.write_text(SETTINGS)
-    return fit_settings.load_settings(path)
+    return load(path)
 
 
 @pytest.fixture(scope="module")
 def prepared(settings):
-    return prepare(inputs_of(settings), settings.analysis.nside, settings.analysis.fwhm)
+    return prepare(inputs_of(settings), settings.common.nside, settings.common.fwhm)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +69,7 @@ def model(prepared):
 
 @pytest.fixture(scope="module")
 def regions(settings):
-    return region_masks(settings)
+    return region_masks(settings, settings.compare.regions)
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +85,7 @@ def realised(prepared):
     return [fluctuations.noise_realisation(k) + fluctuations.cmb_realisation(k) for k in keys]
 
 
+@pytest.mark.slow
 def test_realisations_have_the_covariance(prepared, realised):
     """Of any inner products; that of three bands is 3 x 3, with the CMB in all of them."""
     rng = np.random.default_rng(1)
@@ -104,6 +112,7 @@ def test_noise_is_prepared_as_maps_are(prepared):
     np.testing.assert_allclose(fast.sum(axis=-1), exact.sum(axis=-1), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_slopes_are_those_of_the_maps_and_their_errors_are_honest(
     prepared, model, regions, simulated, realised
 ):
@@ -222,7 +231,7 @@ def test_spectra_are_healpys(prepared, model, simulated):
 
 
 def test_spectra_do_not_depend_on_the_common_nside(settings, prepared):
-    fine = prepare(inputs_of(settings), 32, settings.analysis.fwhm)
+    fine = prepare(inputs_of(settings), 32, settings.common.fwhm)
     found, finer = full_sky_spectra(prepared.data, 25), full_sky_spectra(fine.data, 25)
     np.testing.assert_allclose(found[..., 2:], finer[..., 2:], rtol=1e-2)
 
@@ -286,14 +295,16 @@ def test_what_cannot_be_compared_is_refused(settings, prepared, regions):
     how = how.model_copy(update={"patches_nside": 32})
     with pytest.raises(SettingsError, match=r"patches_nside: 32 resolves l = 64, .* take 100"):
         compare(settings.model_copy(update={"compare": how}), prepared, regions)
-    with pytest.raises(ValueError, match=r"there is no band '353' among 44, 70, K"):
-        fit_settings.Settings.model_validate(
-            settings.model_dump() | {"compare": {"patches": "353"}}
-        )
-    with pytest.raises(ValueError, match=r"leakage: there is no channel 30"):
-        fit_settings.Embedded(leakage={"30": 0.1})
-    with pytest.raises(ValueError, match=r"channels.wmap\n  List should have at least 1 item"):
-        fit_settings.Embedded(channels={"planck": ["30"], "wmap": []} | {"core": ["30"]})
+    for change, words in (
+        ({"compare": {"patches": "353"}}, r"compare.patches: '353' is none of 44, 70, K"),
+        ({"simulate": {"leakage": {"30": 0.1}}}, r"simulate.leakage: '30' is none of 44, 70, K"),
+        (
+            {"bands": [{"instrument": "wmap", "channels": []}]},
+            r"bands.0.channels\n  List should have at least 1 item",
+        ),
+    ):
+        with pytest.raises(ValueError, match=words):
+            Experiment.model_validate(settings.model_dump() | change)
 
 
 def test_command_line(tmp_path, monkeypatch, capsys):
@@ -310,8 +321,8 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     assert jaxsky(monkeypatch, "compare", tmp_path / "a.toml", "--out", out) == 2
     assert "holds results already" in capsys.readouterr().err
     again = ["compare", tmp_path / "a.toml", "--out", out, "--resume"]
-    assert jaxsky(monkeypatch, *again, "--nsims", 31) == 0
-    assert jaxsky(monkeypatch, *again, "--seed", 9) == 2
+    assert jaxsky(monkeypatch, *again, "--set", "compare.nsims=31") == 0
+    assert jaxsky(monkeypatch, *again, "--set", "seed=9") == 2
     assert "holds realisations of other data" in capsys.readouterr().err
     # What cannot work removes nothing; what works leaves nothing of the old.
     (tmp_path / "bad.toml").write_text(SETTINGS.replace("lmax = 25", "lmax = 33"))
@@ -332,12 +343,13 @@ def test_a_model_that_is_wrong_is_pointed_out(settings, prepared, regions):
     assert found.pte_text == "<0.03"
 
 
+@pytest.mark.slow
 def test_wmap_on_the_real_sky(data_dir, monkeypatch):
     """V and W against the real templates: slopes of 1 within errors, at low latitude and above."""
     monkeypatch.setenv("JAXSKY_DATA", str(data_dir))
-    analysis = {"regions": ["strip", "outside"]}
-    settings = fit_settings.load_settings(EXAMPLE, analysis, {"nsims": 30})
-    found = compare(settings, prepare(inputs_of(settings), 32, 0.0), region_masks(settings))
+    settings = load(EXAMPLE, ["compare.nsims=30"])
+    regions = region_masks(settings, ["strip", "outside"])
+    found = compare(settings, prepare(inputs_of(settings), 32, 0.0), regions)
     for scatter in found.scatters:
         assert abs(scatter.slope - 1) < 3 * scatter.error
         assert scatter.rms == pytest.approx(scatter.expected, rel=0.15)

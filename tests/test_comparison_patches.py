@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fits import settings as fit_settings
 from fits.comparison.patches import _noise, compare_patches, template_patches
 from fits.comparison.plots import plot_patches, plot_template_patches
 from fits.discs import paper_patches
@@ -17,15 +16,17 @@ from fits.patches import fit_patches, prepare_patches
 from fits.pseudo_cl import band_powers
 from fits.resolution import prepare
 from jaxsky.harmonics import gaussian_beam
+from jaxsky.settings.experiment import Experiment
 
 NSIDE = 64
 
 
 @pytest.fixture(scope="module")
 def settings():
-    return fit_settings.Settings.model_validate(
+    return Experiment.model_validate(
         {
-            "embedded": {"channels": {"planck": ["353"]}, "nside": NSIDE},
+            "sky": {"embedded": {"nside": NSIDE}},
+            "bands": [{"instrument": "planck", "channels": ["353"]}],
             "compare": {"patches": "353", "patches_nside": NSIDE},
         }
     )
@@ -41,6 +42,7 @@ def found(settings, inputs):
     return compare_patches(settings, inputs)
 
 
+@pytest.mark.slow
 def test_noise_is_that_of_each_patch(inputs):
     """Twice as much on one half of the sky."""
     band = inputs.bands["353"]
@@ -82,6 +84,7 @@ def test_map_and_model_agree(found):
         assert abs(difference) < 4 * error
 
 
+@pytest.mark.slow
 def test_a_template_alone(inputs, tmp_path):
     maps = inputs.templates["dust"].component.amplitude
     fit = template_patches(maps, 0.0)

@@ -63,13 +63,14 @@ def ends(*cases: str) -> list[int]:
     return [int(line.split()[1]) for line in run.stdout.splitlines()]
 
 
-@pytest.mark.parametrize("gradient", [False, True])
+@pytest.mark.parametrize("gradient", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_script_may_end_in_any_transform(gradient):
     names = ["synthesis", "analysis", "smooth", "rotate"] + ["healpy"] * (not gradient)
     cases = [f"call({name!r}, {gradient})" for name in names]
     assert ends(*cases) == [0] * len(cases)
 
 
+@pytest.mark.slow
 def test_a_script_may_end_in_any_way():
     cases = {
         "jax.block_until_ready(call('smooth'))": 0,

@@ -13,30 +13,33 @@ from astropy.io import fits as pyfits
 
 import systems
 from commands import jaxsky, one_sentence
-from jaxsky import montecarlo
-from jaxsky.experiment import DEFAULT, EXAMPLE, build, load_experiment, setup
+from fits.commands.run import DEFAULTS
+from jaxsky import experiment, inputs, montecarlo
+from jaxsky.experiment import build
 from jaxsky.harmonics import alm_ell, expand, gaussian_beam, synthesis
 from jaxsky.io import read_maps, write_maps
 from jaxsky.io.folders import occupied
 from jaxsky.keys import realisation_key
+from jaxsky.settings.load import load
 from jaxsky.simulate import simulate
 
+TEMPLATE = DEFAULTS / "experiment.toml"
 NSIDE = 8
 NPIX = 12 * NSIDE**2
 SETTINGS = """
 title = "A small sky"
-[experiment]
+seed = 3
+[simulate]
 nside = 8
 fwhm = 1200.0
 sheet = false
-seed = 3
-[templates.dust]
+[sky.dust]
 law = "dust"
 file = "dust.fits"
 nu_ref = 353.0
 fwhm = 900.0
 parameters = { beta_dust = { file = "beta.fits", unit = "" } }
-[templates.synchrotron]
+[sky.synchrotron]
 law = "synchrotron"
 file = "synchrotron.fits"
 nu_ref = 30.0
@@ -55,7 +58,7 @@ bandpass = { center = 143.0, width = 30.0 }
 beam = "beam.txt"
 noise = { rms = 1.0, unit = "uK_RJ" }
 """
-SMALL = "\n[small_scales.dust]\nEE = [4, 10]\nBB = [3, 8]\nmodulation_fwhm = 1500.0\n"
+SMALL = "\n[sky.dust.small_scales]\nEE = [4, 10]\nBB = [3, 8]\nmodulation_fwhm = 1500.0\n"
 BOTH = SMALL + SMALL.replace("dust", "synchrotron")
 
 
@@ -124,9 +127,9 @@ COMPONENTS = ("sheet = false", 'sheet = false\noutputs = ["total", "components"]
 def test_files_are_the_simulation(folder, tmp_path, monkeypatch, capsys):
     path, out = write(folder), tmp_path / "out"
     assert command(monkeypatch, path, "--out", out) == 0
-    assert "Written: 2 maps" in " ".join(capsys.readouterr().err.split())
+    assert " 2 maps in " in " ".join(capsys.readouterr().err.split())
     assert sorted(content(out)) == ["sim_00000/143.fits", "sim_00000/30.fits"]
-    setup = build(load_experiment(path))
+    setup = build(load(path))
     key = realisation_key(3, 0)
     expected = simulate(key, setup.sources, setup.observation, jnp.asarray(setup.cmb))
     for name, maps in zip(setup.observation.names, expected, strict=True):
@@ -168,7 +171,7 @@ def test_files_are_the_simulation(folder, tmp_path, monkeypatch, capsys):
             assert header["NOISE"] == pytest.approx(level)
     log = json.loads((out / montecarlo.LOG).read_text())
     assert {"jaxsky", "jax", "healpy", "ducc0"} <= set(log["versions"])
-    assert log["settings"]["experiment"]["seed"] == 3
+    assert log["settings"]["seed"] == 3
     assert log["settings"]["bands"][0]["noise"]["level"] == 300.0
 
 
@@ -230,9 +233,9 @@ def test_beams_and_noise_of_all_kinds(folder):
         ("fwhm = 900.0", "fwhm = 700.0"),
         (level, '{ covariance = { file = "covariance.fits", '
          'fields = ["QQ_COV", "QU_COV", "UU_COV"] } }'),
-        ("seed = 3", "diagonal_noise = true"),
+        ("sheet = false", "diagonal_noise = true"),
     )  # fmt: skip
-    channels = build(load_experiment(path)).observation.channels
+    channels = build(load(path)).observation.channels
     fields = ["QQ_COV", "QU_COV", "UU_COV"]
     columns = read_maps(folder / "covariance.fits", fields=fields).maps
     np.testing.assert_allclose(channels["30"].noise[[0, 0, 1], [0, 1, 1]], columns)
@@ -242,7 +245,7 @@ def test_beams_and_noise_of_all_kinds(folder):
     np.testing.assert_allclose(channels["143"].beam, gaussian_beam(800.0, 16), rtol=1e-6)
     assert channels["30"].beam == 800.0
     none = write(folder, (f"noise = {rms}", ""))
-    assert build(load_experiment(none)).observation.channels["143"].noise is None
+    assert build(load(none)).observation.channels["143"].noise is None
 
 
 def test_multipoles_that_no_map_shows_are_left_out(folder):
@@ -252,11 +255,11 @@ def test_multipoles_that_no_map_shows_are_left_out(folder):
         ('beam = "beam.txt"', "fwhm = 500.0"),
         ('{ rms = 1.0, unit = "uK_RJ" }', "{ level = 1.0 }"),
     )
-    lmax = build(load_experiment(rough)).observation.lmax
+    lmax = build(load(rough)).observation.lmax
     window = np.asarray(gaussian_beam(1200.0, 2 * lmax))
     assert lmax < 128
     assert window[lmax - 1] > 1e-8 > window[lmax + 1]
-    assert build(load_experiment(write(folder))).observation.lmax == 16
+    assert build(load(write(folder))).observation.lmax == 16
 
 
 # Realisations.
@@ -287,7 +290,7 @@ def test_a_realisation_does_not_depend_on_the_order(three, tmp_path, monkeypatch
     lost.unlink()
     capsys.readouterr()
     assert command(monkeypatch, path, "--out", out, "--nsims", 3, "--resume") == 0
-    assert "Written: 1 maps" in (said := " ".join(capsys.readouterr().err.split()))
+    assert " 1 maps in " in (said := " ".join(capsys.readouterr().err.split()))
     assert "5 maps were there already" in said
     assert content(out) == expected
     assert [p for p, t in times.items() if p.stat().st_mtime_ns != t] == [lost]
@@ -303,7 +306,7 @@ def test_a_monte_carlo_is_split_over_processes(three, tmp_path, monkeypatch, cap
             assert "is being written to by another command (process" in one_sentence(capsys)
         assert command(monkeypatch, path, "--out", out, "--first", 2) == 0
         capsys.readouterr()
-        assert command(monkeypatch, path, "--out", out, "--first", 1, "--seed", 4) == 2
+        assert command(monkeypatch, path, "--out", out, "--first", 1, "--set", "seed=4") == 2
         assert "holds a simulation with other settings" in one_sentence(capsys)
         assert command(monkeypatch, path, "--out", out, "--first", 1) == 0
     capsys.readouterr()
@@ -321,7 +324,7 @@ def test_processes_with_other_settings_do_not_meet(three, tmp_path, monkeypatch,
 
     def meanwhile(*arguments, **options):
         monkeypatch.setattr(montecarlo, "observe_bands", observe)
-        montecarlo._claim(out, load_experiment(path, {"experiment": {"seed": 4}}), False)
+        montecarlo._claim(out, load(path, ["seed=4"]), False)
         return observe(*arguments, **options)
 
     monkeypatch.setattr(montecarlo, "observe_bands", meanwhile)
@@ -389,11 +392,11 @@ def test_what_cannot_be_written_stops_the_run(three, tmp_path, monkeypatch, caps
 
 
 def test_double_precision(folder, tmp_path, monkeypatch):
-    path = write(folder, ("seed = 3", 'seed = 3\nprecision = "double"'), name="double")
+    path = write(folder, ("sheet = false", 'sheet = false\nprecision = "double"'), name="double")
     assert command(monkeypatch, path, "--out", tmp_path / "out") == 0
     file = tmp_path / "out" / "sim_00000" / "30.fits"
     assert pyfits.getheader(file, 1)["TFORM1"].endswith("D")
-    setup = build(load_experiment(path))
+    setup = build(load(path))
     expected = simulate(realisation_key(3, 0), setup.sources, setup.observation, setup.cmb)
     found = read_maps(file, fields=["Q", "U"]).maps
     np.testing.assert_allclose(found, expected[0], rtol=0, atol=1e-12 * np.abs(found).max())
@@ -403,7 +406,7 @@ def test_another_seed_is_another_sky(three, tmp_path, monkeypatch):
     path, expected = three
     for seed in (3, 4):
         out = tmp_path / str(seed)
-        assert command(monkeypatch, path, "--out", out, "--seed", seed) == 0
+        assert command(monkeypatch, path, "--out", out, "--set", f"seed={seed}") == 0
         for name, data in content(out).items():
             assert (data == expected[name]) == (seed == 3)
 
@@ -430,16 +433,16 @@ def test_small_scales_can_be_the_same_for_all(folder, tmp_path, monkeypatch):
 
 
 def simulated(path):
-    settings = load_experiment(path)
+    settings = load(path)
     setup = build(settings)
-    key = realisation_key(settings.experiment.seed, 0)
+    key = realisation_key(settings.seed, 0)
     cmb = None if setup.cmb is None else jnp.asarray(setup.cmb)
     return np.asarray(simulate(key, setup.sources, setup.observation, cmb))
 
 
 def small(line, table="dust"):
     """A key more in the table of small scales."""
-    at = f"[small_scales.{table}]\n"
+    at = f"[sky.{table}.small_scales]\n"
     return (at, f"{at}{line}\n")
 
 
@@ -497,21 +500,20 @@ def test_diagonal_noise(folder):
     only = ("nside = 8", 'nside = 8\ninclude = ["noise"]')
     own = ("fwhm = 1200.0", 'fwhm = "own"')
     one = simulated(write(folder, noise, only, own))
-    other = simulated(
-        write(folder, noise, only, own, ("seed = 3", "seed = 3\ndiagonal_noise=true"))
-    )
+    other = simulated(write(folder, noise, only, own, ("sheet = false", "diagonal_noise = true")))
     np.testing.assert_array_equal(one[0, 0], other[0, 0])
     assert not np.allclose(one[0, 1], other[0, 1])
 
 
 INSTRUMENT = """
-[experiment]
+[[bands]]
 instrument = "core"
 channels = ["45", "105"]
+[simulate]
 nside = 8
 fwhm = 1200.0
-[embedded]
-nside = 8
+[sky]
+embedded = { nside = 8 }
 """
 
 
@@ -524,21 +526,21 @@ def test_keys_of_instruments_and_of_the_embedded_sky(folder, monkeypatch):
         asked.append(arguments)
         return galaxy
 
-    monkeypatch.setattr(setup, "embedded_sky", recorded)
-    monkeypatch.setattr(setup, "camb_spectra", lambda lmax, r: np.zeros((4, lmax + 1)))
+    monkeypatch.setattr(inputs, "embedded_sky", recorded)
+    monkeypatch.setattr(experiment, "camb_spectra", lambda lmax, r: np.zeros((4, lmax + 1)))
 
     def made(*changes):
         wide = ("fwhm = 1200.0", "fwhm = 1400.0")
         path = write(folder, wide, *changes, text=INSTRUMENT, name="core")
-        return build(load_experiment(path)).observation
+        return build(load(path)).observation
 
     plain = made()
     assert plain.names == ("45", "105")
     assert plain.bands[0].nu.size == 51
-    assert made(("nside = 8", "nside = 8\nsamples = 7")).bands[0].nu.size == 7
+    assert made(('"core"', '"core"\nsamples = 7')).bands[0].nu.size == 7
     assert made(("nside = 8", "nside = 8\nstokes = 'IQU'")).stokes == "IQU"
     assert len(made(('channels = ["45", "105"]', "")).names) == 15
-    made(("[embedded]\nnside = 8", "[embedded]\nnside = 16\nseed = 2\nmodel = { p0 = 0.1 }"))
+    made(("{ nside = 8 }", "{ nside = 16, seed = 2, model = { p0 = 0.1 } }"))
     numbers = [(nside, seed, float(model.p0)) for nside, seed, model in asked]
     assert numbers == [(8, 0, 0.2)] * 4 + [(16, 2, 0.1)]
 
@@ -546,11 +548,11 @@ def test_keys_of_instruments_and_of_the_embedded_sky(folder, monkeypatch):
 def test_keys_of_the_cmb_reach_camb(folder, monkeypatch):
     asked = []
     monkeypatch.setattr(
-        setup, "camb_spectra", lambda *a, **k: asked.append((a, k)) or np.zeros((4, 17))
+        experiment, "camb_spectra", lambda *a, **k: asked.append((a, k)) or np.zeros((4, 17))
     )
     spectra = 'spectra = "cmb.dat"\nformat = "camb"\n'
     for line in ("", "r = 0.05\n", "cosmology = { H0 = 70.0 }\n"):
-        build(load_experiment(write(folder, (spectra, line))))
+        build(load(write(folder, (spectra, line))))
     assert asked == [((16, 0.0), {}), ((16, 0.05), {}), ((16, 0.0), {"H0": 70.0})]
 
 
@@ -567,66 +569,52 @@ RMS = '{ rms = 1.0, unit = "uK_RJ" }'
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        (
-            [("nside = 8", "nside = 4")],
-            "pixels of 879 arcmin (nside 4) are too wide for the beam of 1200 arcmin of band '30'; "
-            "that takes nside 8, or a common fwhm of at least 1.32e+03 arcmin",
-        ),
-        ([("nside = 8", "nside = 9")], "experiment.nside: nside must be a power of two, not 9"),
-        (
-            [("fwhm = 1200.0", "fwhm = 700.0")],
-            "experiment.fwhm: 700 arcmin is finer than the beam of band '30', 800 arcmin",
-        ),
-        ([("fwhm = 1200.0", "fwhm = 0")], "fwhm must be positive, or 'own', not 0"),
-        (
-            [("fwhm = 1200.0", "fwhm = 850.0")],
-            "templates.dust: its resolution, 900 arcmin, is coarser than the 850 arcmin of band "
-            "'30'; add small scales, [small_scales.dust], or bring the maps to a common fwhm of "
-            "at least 900 arcmin",
-        ),
-        (
-            [("nside = 8", 'nside = 8\ninclude = ["dst"]')],
-            "experiment.include: 'dst' is none of dust, synchrotron, cmb, noise",
-        ),
-        ([("nside = 8", "nside = 8\ninclude = []")], "experiment.include: list should have"),
-        (
-            [("nside = 8", 'nside = 8\ninclude = ["noise"]'), (f"noise = {RMS}", "")],
-            "Nothing is left to be observed in band '143': no component, no CMB, no noise",
-        ),
-        ([("nside = 8", 'nside = 8\ninstrument = "core"')],
-         "give either experiment.instrument or bands"),
-        ([("nside = 8", 'nside = 8\nchannels = ["30"]')],
-         "experiment.channels chooses from an instrument, not from bands"),
-        ([("nside = 8", "nside = 8\nsamples = 9")],
-         "experiment.samples is of an instrument's bands, not of bands"),
-        ([(CMB, "[embedded]\n" + CMB)], "give either templates or the table embedded"),
+        ([("nside = 8", "nside = 4")],
+         "pixels of 879 arcmin (nside 4) are too wide for the beam of 1200 arcmin of band '30'; "
+         "that takes nside 8, or a common simulate.fwhm of at least 1.32e+03 arcmin"),
+        ([("nside = 8", "nside = 9")], "simulate.nside: nside must be a power of two, not 9"),
+        ([("fwhm = 1200.0", "fwhm = 700.0")],
+         "simulate.fwhm: 700 arcmin is finer than the beam of band '30', 800 arcmin"),
+        ([("fwhm = 1200.0", "fwhm = 0")], "simulate.fwhm: input should be greater than 0, not 0"),
+        ([("fwhm = 1200.0", "fwhm = 850.0")],
+         "sky.dust: its resolution, 900 arcmin, is coarser than the 850 arcmin of band '30'; "
+         "add small scales, [sky.dust.small_scales], or bring the maps to a common "
+         "simulate.fwhm of at least 900 arcmin"),
+        ([("nside = 8", 'nside = 8\ninclude = ["dst"]')],
+         "simulate.include: 'dst' is none of dust, synchrotron, cmb, noise"),
+        ([("nside = 8", "nside = 8\ninclude = []")], "simulate.include: list should have"),
+        ([("nside = 8", 'nside = 8\ninclude = ["noise"]'), (f"noise = {RMS}", "")],
+         "Nothing is left to be observed in band '143': no component, no CMB, no noise"),
+        ([('name = "30"', 'name = "30"\nchannels = ["30"]')],
+         "bands.0: channels choose from an instrument, in place of a name"),
+        ([('name = "30"', 'instrument = "core"\nchannels = ["45", "a"]')],
+         "bands.0.instrument: core has no channel 'a'; it has 45, 75, 105"),
         ([('name = "143"', 'name = "30"')], "the names of the bands must differ, but are 30, 30"),
         ([('name = "143"', 'name = "a/b"')], "bands.1.name: a name consists of letters"),
         ([('name = "143"', 'name = ".."')], "bands.1.name: a name consists of letters"),
-        ([("seed = 3", "seeds = 3")], "experiment.seeds: unknown key"),
-        ([("seed = 3", "seed = -3")], "experiment.seed: input should be greater than or equal"),
-        ([("sheet = false", 'outputs = ["parts"]')], "experiment.outputs.0: input should be"),
-        ([("sheet = false", 'unit = "mK"')], "experiment.unit: input should be 'uK_RJ' or"),
+        ([("seed = 3", "seeds = 3")], "seeds: unknown key"),
+        ([("seed = 3", "seed = -3")], "mistake.toml: seed: input should be greater than or equal"),
+        ([("sheet = false", 'outputs = ["parts"]')], "simulate.outputs.0: input should be"),
+        ([("sheet = false", 'unit = "mK"')], "simulate.unit: input should be 'uK_RJ' or"),
         # Templates.
         ([('"dust.fits"', '"dust_cut.fits"')],
-         "templates.dust: 5 pixels have no value; a simulation takes maps of the full sky"),
+         "sky.dust: 5 pixels have no value; a simulation takes maps of the full sky"),
         ([('"dust.fits"', '"absent.fits"')], "absent.fits"),
         ([(CMB, '[fixed]\n"dust.beta" = 1.0\n' + CMB)],
          "Unknown parameter 'dust.beta'; known parameters are dust.amplitude, dust.beta_dust"),
         ([(CMB, '[fixed]\n"ame.m60" = 1.0\n' + CMB)],
-         "fixed: there is no template 'ame'; templates are dust, synchrotron"),
+         "fixed: there is no component 'ame'; components are dust, synchrotron"),
         # Small scales.
         ([(CMB, SMALL + CMB), *IQU], "'dust' has small scales, which are added to Q and U only"),
-        ([(CMB, SMALL.replace("dust", "ame") + CMB)],
-         "small_scales.ame: there is no such component"),
+        ([(CMB, SMALL.replace("dust", "ame") + CMB)], "sky.ame: law is missing"),
         ([(CMB, SMALL + CMB), ("EE = [4, 10]", "EE = [4, 30]")],
          "Small scales of dust: A power law cannot be fitted from l = 4 to 30 to a spectrum that "
          "ends at 16"),
         ([(CMB, SMALL + CMB), ("EE = [4, 10]", "EE = [9, 10]")], "it needs four multipoles"),
-        ([(CMB, SMALL + CMB), ("EE = [4, 10]", "EE = [4, 10, 11]")], "small_scales.dust.EE"),
-        ([(CMB, SMALL + CMB), small("amplitude = -1.0")], "small_scales.dust.amplitude"),
+        ([(CMB, SMALL + CMB), ("EE = [4, 10]", "EE = [4, 10, 11]")], "sky.dust.small_scales.EE"),
+        ([(CMB, SMALL + CMB), small("amplitude = -1.0")], "sky.dust.small_scales.amplitude"),
         ([(CMB, SMALL + CMB), small("tilt = nan")],
-         "small_scales.dust.tilt: input should be a finite number, not nan"),
+         "sky.dust.small_scales.tilt: input should be a finite number, not nan"),
         ([(CMB, SMALL + CMB), small('correlated_with = "synchrotron"')],
          "The small scales of 'dust' are to be correlated with those of 'synchrotron'"),
         ([(CMB, BOTH + CMB), small('correlated_with = "dust"')],
@@ -642,7 +630,7 @@ RMS = '{ rms = 1.0, unit = "uK_RJ" }'
         # The CMB.
         ([('"cmb.dat"', '"short.dat"')], "short.dat: ends at l = 9, but lmax is 16"),
         ([('"cmb.dat"', '"cmb.dat"\nr = 0.1')],
-         "cmb: r and cosmology are for CAMB; leave them out with spectra"),
+         "cmb: r, A_lens and cosmology are for CAMB; leave them out with spectra"),
         ([('"cmb.dat"', '"cmb.dat"\nunit = "uK^2"')], "argument `unit` is for FITS files"),
         ([('spectra = "cmb.dat"\n', "")], "cmb: format and unit are those of spectra, a file"),
         # Bands.
@@ -651,7 +639,7 @@ RMS = '{ rms = 1.0, unit = "uK_RJ" }'
         ([("width = 6.0", "width = 70.0")], "bands.30.bandpass: Argument `nu` must be positive"),
         ([("level = 300.0", "level = 300.0, rms = 1.0")],
          "bands.0.noise: give the noise as exactly one of level, rms, map, covariance, hits"),
-        ([("level = 300.0", "level = 0.0")], "bands.0.noise.level: input should be greater than 0"),
+        ([("level = 300.0", "level = 0.0")], "bands.0.noise: must be greater than 0"),
         ([("level = 300.0", 'level = 300.0, unit = "MJy/sr"')],
          "bands.0.noise.unit: must be a temperature such as uK_RJ or mK_CMB, not 'MJy/sr'"),
         ([(RMS, '{ map = { file = "coarse.fits" } }')],
@@ -672,13 +660,13 @@ def test_refusals(folder, tmp_path, monkeypatch, capsys, changes, words):
     ("change", "words"),
     [
         (('"core"', '"cor"'), "Unknown instrument 'cor'; known are planck, wmap, core, litebird"),
-        (('"105"', '"106"'), "COrE has no channel '106'; it has 45, 75, 105"),
-        (("[embedded]", "[embedded]\nmodel = { height = 1.0 }"),
-         "embedded.model: 'height' is none of psi0, psi1"),
-        (("[embedded]", "[embedded]\nmodel = { dust_height = -1.0 }"),
-         "embedded.model: Argument `dust_height` must be positive"),
-        (("[embedded]\nnside = 8", "[embedded]\nnside = 4"),
-         "templates.dust: its resolution, 1.32e+03 arcmin, 1.5 pixels of nside 4, is coarser"),
+        (('"105"', '"106"'), "core has no channel '106'; it has 45, 75, 105"),
+        (("{ nside = 8 }", "{ nside = 8, model = { height = 1.0 } }"),
+         "sky.embedded.model: 'height' is none of psi0, psi1"),
+        (("{ nside = 8 }", "{ nside = 8, model = { dust_height = -1.0 } }"),
+         "sky.embedded.model: Argument `dust_height` must be positive"),
+        (("{ nside = 8 }", "{ nside = 4 }"),
+         "sky.dust: its resolution, 1.32e+03 arcmin, 1.5 pixels of nside 4, is coarser"),
     ],
 )  # fmt: skip
 def test_refusals_of_instruments(folder, tmp_path, monkeypatch, capsys, change, words):
@@ -693,8 +681,8 @@ def test_refusals_of_options(folder, tmp_path, monkeypatch, capsys):
     for options, words in {
         ("--only", "dust"): "--only must be one of noise, signal, foregrounds, cmb, not 'dust'",
         ("--resume", "--overwrite"): "--resume and --overwrite exclude each other",
-        ("--nside", "7"): "experiment.nside: nside must be a power of two, not 7",
-        ("--seed", "-1"): "experiment.seed: input should be greater than or equal to 0, not -1",
+        ("--set", "simulate.nside=7"): "simulate.nside: nside must be a power of two, not 7",
+        ("--set", "seed=-1"): "seed: input should be greater than or equal to 0, not -1",
     }.items():
         assert command(monkeypatch, path, "--out", out, *options) == 2
         assert words in one_sentence(capsys)
@@ -718,7 +706,7 @@ def test_a_folder_with_results_is_left_alone(folder, tmp_path, monkeypatch, caps
         return one_sentence(capsys)
 
     assert "holds a simulation already; go on with --resume, replace it" in refused(path)
-    for options in (("--seed", "4"), ("--only", "noise")):
+    for options in (("--set", "seed=4"), ("--only", "noise")):
         said = refused(path, "--resume", *options)
         assert "holds a simulation with other settings; choose another --out" in said
     # A mistake that only the small scales notice does not cost the old results.
@@ -738,9 +726,9 @@ def test_a_folder_with_results_is_left_alone(folder, tmp_path, monkeypatch, caps
     moved = write(folder, ('title = "A small sky"', 'data_dir = "."'), name="moved")
     assert command(monkeypatch, moved, "--out", out, "--resume") == 0
     assert content(out) == before
-    pictured = load_experiment(write(folder, ("sheet = false", "sheet = true"), name="sheet"))
+    pictured = load(write(folder, ("sheet = false", "sheet = true"), name="sheet"))
     montecarlo.check_folder(out, pictured, resume=True, overwrite=False)
-    assert command(monkeypatch, path, "--out", out, "--overwrite", "--seed", "4") == 0
+    assert command(monkeypatch, path, "--out", out, "--overwrite", "--set", "seed=4") == 0
     assert content(out).keys() == before.keys()
     assert all(content(out)[name] != before[name] for name in before)
 
@@ -756,53 +744,64 @@ def test_a_file_in_place_of_the_folder_is_left_alone(folder, tmp_path, monkeypat
 # Examples, titles and pictures.
 
 
-def test_init_writes_an_example_that_is_valid(tmp_path, monkeypatch, capsys):
+def test_init_writes_an_experiment_that_is_valid(tmp_path, monkeypatch, capsys):
     path = tmp_path / "mine.toml"
-    assert command(monkeypatch, path, "--init") == 0
-    assert path.read_text() == EXAMPLE.read_text()
-    settings = load_experiment(path)
+    assert jaxsky(monkeypatch, "init", "--out", path) == 0
+    assert path.read_text() == TEMPLATE.read_text()
+    settings = load(path)
     assert settings.included() == ["dust", "synchrotron", "cmb", "noise"]
-    channels = setup._channels(settings)
-    assert list(channels) == ["45", "105", "315"]
+    assert [band.name for band in settings.bands] == ["40", "68", "100", "140", "195", "280", "402"]
     path.write_text("mine")
     capsys.readouterr()
-    assert command(monkeypatch, path, "--init") == 2
+    assert jaxsky(monkeypatch, "init", "--out", path) == 2
     assert "exists already" in one_sentence(capsys)
     assert path.read_text() == "mine"
 
 
-def test_what_is_commented_out_in_the_example_is_valid(tmp_path):
-    text, path = EXAMPLE.read_text(), tmp_path / "example.toml"
-    lines = re.findall(r"^# (\w+ = .*)$", text.split("# ... or maps")[0], re.MULTILINE)
-    tail = text.split("[fixed]")[1].split("# Bands of one's own")[0]
-    lines += re.findall(r"^# (\w+ = .*)$", tail, re.MULTILINE)
-    assert len(lines) > 14
-    for line in lines:
-        changed = text.replace(f"# {line}", line, 1)
-        if line.startswith("spectra"):
-            changed = changed.replace("r = 0.01", "")
-        path.write_text(changed)
-        load_experiment(path)
-    # Tables: maps and bands of one's own.
-    own = text.split("# ... or maps of one's own")[1].split("[fixed]")[0].split("\n", 2)[2]
-    bands = text.split("instead of an instrument:\n")[1]
-    # Several ways to give the noise: the first one.
-    bands = re.sub(r"^# noise = \{ (rms|covariance|hits).*\n", "", bands, flags=re.MULTILINE)
-    tables = re.sub(r"^# ?", "", own + bands, flags=re.MULTILINE)
-    path.write_text(
-        "[experiment]\nnside = 512\n[small_scales.dust]\nEE=[60,300]\nBB=[60,300]\n" + tables
-    )
-    settings = load_experiment(path)
-    assert list(settings.templates) == ["dust", "ame"]
-    assert [band.name for band in settings.bands] == ["44"]
+TABLES = re.split(r"^(?=(?:# )?\[)", TEMPLATE.read_text(), flags=re.MULTILINE)
+#: What is commented out in the template and is not the default.
+ALTERNATIVES = {
+    "[cmb]": "cosmology spectra",
+    "[common]": "mask components maps",
+    "[regions]": "clean",
+    "[free]": "calibration.44 dust.beta_dust",
+    "[fixed]": "dust.beta_dust",
+    "[truth]": "synchrotron.curvature",
+    "[simulate]": "nside include small_scales_seed leakage",
+    "[compare]": "patches",
+    "[separate]": "nsteps lmax",
+    "[forecast]": "bands priors",
+    "[paper]": "ame beta_dust beta_syn",
+}
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda table: table.partition("\n")[0][:30])
+def test_what_is_commented_out_in_the_template_is_valid(tmp_path, table):
+    """Each line by itself, with the first ones of all keys if the table is commented out."""
+    path, plain = tmp_path / "mine.toml", load(TEMPLATE).model_dump(exclude={"data_dir"})
+    title = "" if table == TABLES[0] else table.partition("\n")[0]
+    found = re.findall(r'^(# )?(([\w."-]+) = .*)$', table, re.MULTILINE)
+    own, changed = title.startswith("# "), set()
+    used = {key: line for mark, line, key in reversed(found) if own or not mark}
+    # No parameter is both free and fixed.
+    others = [t for t in TABLES if t != table and (title, t[:6]) != ("[fixed]", "[free]")]
+    for mark, line, key in found:
+        if title == "[free]" and key == "regions":
+            line, key = f'"dust.beta_dust".{line}', '"dust.beta_dust"'
+        mine = "\n".join([title.removeprefix("# "), *(used | {key: line}).values(), ""])
+        path.write_text("".join([*others, mine] if title else [mine, *others]))
+        if mark and load(path).model_dump(exclude={"data_dir"}) != plain:
+            changed.add(key.strip('"'))
+    assert own or changed == set(ALTERNATIVES.get(title, "").split())
 
 
 def test_the_default_is_valid():
-    settings = load_experiment(DEFAULT)
-    channels = setup._channels(settings)
+    settings = load(DEFAULTS / "simulate.toml")
+    assert settings.sky.embedded.nside == 256
+    channels = {b.name: experiment.read_channel(settings, b, 256) for b in settings.bands}
     assert len(channels) == 15
     assert all(c.noise > 0 and c.target == 60.0 for c in channels.values())
-    setup._check_pixels(settings.experiment.nside, dict.fromkeys(channels, 60.0))
+    experiment._check_pixels(256, dict.fromkeys(channels, 60.0))
 
 
 def test_titles_of_all_kinds(folder, tmp_path, monkeypatch, capsys):
@@ -821,7 +820,7 @@ def test_intensity_and_the_sheet(folder, tmp_path, monkeypatch):
     (picture,) = out.glob("*.png")
     assert picture.name == "sim_00007.png"
     assert picture.read_bytes().startswith(b"\x89PNG")
-    setup = build(load_experiment(path))
+    setup = build(load(path))
     key = realisation_key(3, 7)
     expected = simulate(key, setup.sources, setup.observation, jnp.asarray(setup.cmb))
     found = read_maps(out / "sim_00007" / "30.fits", fields=["I", "Q", "U"])

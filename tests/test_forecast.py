@@ -12,7 +12,9 @@ from fits.forecast import fisher
 from fits.forecast.b_modes import BandLaw, noise_level, noise_spectrum
 from fits.forecast.fisher import Model, covariance, fiducial, fisher_errors, foreground_names
 from jaxsky import AME, Bandpass, Dust, Sky, Synchrotron, observe
-from jaxsky.instrument import Channel, load_instrument
+from jaxsky.instrument import Channel, Instrument, load_instrument
+from jaxsky.noise import uniform_covariance
+from jaxsky.observation import ObservedBand
 from jaxsky.parameters import set_parameters
 from systems import spread
 
@@ -202,15 +204,17 @@ def test_order_of_bands_does_not_matter():
 def test_noise_is_the_same_in_all_units():
     numbers = ("a", 150.0, 40.0, 30.0)
     band = Channel(*numbers, 3.0).band()
-    levels = [
-        noise_level(Channel(*numbers, 3.0 * float(band.conversion("uK_CMB", unit)), unit))
-        for unit in ("uK_CMB", "mK_CMB", "uK_RJ")
-    ]
+    levels = []
+    for unit in ("uK_CMB", "mK_CMB", "uK_RJ"):
+        channel = Channel(*numbers, 3.0 * float(band.conversion("uK_CMB", unit)), unit)
+        levels.append(noise_level(Instrument("one", [channel]).observed()["a"]))
+    per_pixel = uniform_covariance(3.0 * float(band.conversion("uK_CMB", "uK_RJ")), 4)
+    levels.append(noise_level(ObservedBand(band, 30.0, noise=per_pixel)))
     np.testing.assert_allclose(levels, 3.0 * np.pi / 180 / 60, rtol=1e-12)
-    channel = load_instrument("planck")["143"]
+    observed = load_instrument("planck").observed()["143"]
     sigma = np.radians(7.30 / 60) / np.sqrt(8 * np.log(2))
     expected = np.radians(70.2 / 60) ** 2 * np.exp(300 * 301 * sigma**2)
-    np.testing.assert_allclose(noise_spectrum(channel, 300)[300], expected, rtol=1e-6)
+    np.testing.assert_allclose(noise_spectrum(observed, 300)[300], expected, rtol=1e-6)
 
 
 def test_better_or_other_data():

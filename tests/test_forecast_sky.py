@@ -8,13 +8,17 @@ import numpy as np
 import pytest
 
 from commands import jaxsky, one_sentence
-from fits.forecast import DEFAULT, EXAMPLE, equal_r, fit_law, forecast, load_forecast
+from fits.commands.run import DEFAULTS
+from fits.forecast import equal_r, fit_law, forecast
 from fits.forecast.b_modes import BandLaw, correlation, foreground_powers, to_D
-from fits.forecast.setup import apodize
+from fits.forecast.report import warnings
 from fits.pseudo_cl import band_covariance, bin_edges, masked_spectra, sky_fraction
+from fits.regions import apodize
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe_band
 from jaxsky.harmonics import alm_ell, gaussian_beam, power_spectrum, synthesis
+from jaxsky.instrument import load_instrument
 from jaxsky.io import write_maps
+from jaxsky.settings.load import load
 
 NSIDE, LMAX = 32, 64
 #: D_l at l = 80 and slope of C_l, of EE and BB [uK_RJ^2].
@@ -158,49 +162,43 @@ SETTINGS = """
 title = "A small sky"
 [[bands]]
 name = "40"
-center = 40.0
-width = 10.0
+bandpass = { center = 40.0, width = 10.0 }
 fwhm = 60.0
-noise = 20.0
+noise = { level = 20.0 }
 [[bands]]
 name = "100"
-center = 100.0
-width = 25.0
+bandpass = { center = 100.0, width = 25.0 }
 fwhm = 40.0
-noise = 5.0
-noise_unit = "uK_RJ"
+noise = { level = 5.0, unit = "uK_RJ" }
 [[bands]]
 name = "300"
-center = 300.0
-width = 80.0
+bandpass = { center = 300.0, width = 80.0 }
 fwhm = 30.0
-noise = 0.02
-noise_unit = "mK_CMB"
-[templates.dust]
+noise = { level = 0.02, unit = "mK_CMB" }
+[sky.dust]
 law = "dust"
 file = "dust.fits"
 nu_ref = 353.0
 fwhm = 60.0
-[templates.synchrotron]
+[sky.synchrotron]
 law = "synchrotron"
 file = "synchrotron.fits"
 nu_ref = 30.0
 fwhm = 120.0
+[regions]
+used = { file = "masks.npz", key = "half" }
+[free]
+"dust.beta_dust" = { gaussian = [1.5, 0.5] }
+"synchrotron.beta_syn" = {}
 [fixed]
 "dust.T_dust" = 20.0
-[mask]
-file = "masks.npz"
-key = "half"
+[forecast]
+region = "used"
 apodization = 6.0
-[spectra]
 lmax = 60
 width = 8
 fit = [2, 60]
-[fisher]
-free = ["r", "dust.beta_dust", "synchrotron.beta_syn"]
-lmax = 80
-[fisher.priors]
-"dust.beta_dust" = 0.5
+fisher_lmax = 80
 """
 
 
@@ -260,7 +258,7 @@ def test_command_on_files(folder, tmp_path, monkeypatch, capsys):
     before = (out / "forecast.json").read_bytes()
     assert jaxsky(monkeypatch, "forecast", path, "--out", out) == 2
     assert "holds results already; replace them with --overwrite" in one_sentence(capsys)
-    other = written(folder, "other", "lmax = 80", 'lmax = 80\nspectra = ["EE", "BB"]')
+    other = written(folder, "other", "fisher_lmax = 80", 'fisher_lmax = 80\nspectra = ["EE", "BB"]')
     assert jaxsky(monkeypatch, "forecast", other, "--out", out, "--overwrite") == 0
     assert len(json.loads((out / "forecast.json").read_text())["fisher"]["free"]) == 3 + 10
     assert (out / "forecast.json").read_bytes() != before
@@ -272,67 +270,69 @@ def test_laws_that_vary_and_coarse_masks(folder):
     path = written(folder, "maps", "nu_ref = 353.0", 'nu_ref = 353.0\n'
                    'parameters = { beta_dust = { file = "beta.fits" } }')  # fmt: skip
     path.write_text(path.read_text().replace('"half"', '"coarse"'))
-    found = forecast(load_forecast(path))
+    found = forecast(load(path))
     # The northern half has the larger index.
     assert 1.53 < found.errors.fiducial["dust.beta_dust"] < 1.57
     assert 0.4 < sky_fraction(found.setup.mask) < 0.5
-    from fits.forecast.report import warnings
-
     assert any("Laws of dust vary over the sky" in sentence for sentence in warnings(found))
 
 
-def test_settings_that_come_along(tmp_path, monkeypatch, capsys):
-    default = load_forecast(DEFAULT)
-    assert default.experiment.instrument == "core"
-    assert default.spectra.bands == ["45", "105", "315"]
-    assert jaxsky(monkeypatch, "forecast", tmp_path / "mine.toml", "--init") == 0
-    assert (tmp_path / "mine.toml").read_text() == EXAMPLE.read_text()
-    example = load_forecast(tmp_path / "mine.toml")
-    # What is commented out as default is that.
-    fresh = type(example).model_validate(example.model_dump(exclude_unset=True))
-    assert fresh == example
-    text = EXAMPLE.read_text()
-    for line in text.splitlines():
-        if line.startswith("# ") and "=" in line and line[2:].split("=")[0].strip() in (
-            "lmin", "lmax", "width", "fit", "r", "A_lens", "apodization", "seed", "foregrounds",
-        ):  # fmt: skip
-            text = text.replace(line, line[2:])
-    text = text.replace("width = 24.0", "").replace("\nfwhm = 30.0", "")
-    (tmp_path / "all.toml").write_text(text)
-    said = load_forecast(tmp_path / "all.toml")
-    assert said.model_dump(exclude={"data_dir"}) == example.model_dump(exclude={"data_dir"})
+def test_settings_that_come_along():
+    default = load(DEFAULTS / "forecast.toml")
+    assert [band.name for band in default.bands] == list(load_instrument("core").names)
+    assert default.forecast.bands == ["45", "105", "315"]
+    assert default.forecast.free + list(default.free_in("forecast")) == [
+        "r", "dust.beta_dust", "dust.T_dust", "synchrotron.beta_syn", "synchrotron.curvature",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("center = 40.0\n", "", "bands.0.center: is missing"),
-        ("width = 10.0", "width = 90.0", "bands.0: Argument `center - width / 2` must be positive"),
+        ("center = 40.0, ", "", "bands.0.bandpass: give a bandpass either as file or as center"),
+        ("width = 10.0", "width = 90.0", "bands.40.bandpass: Argument `nu` must be positive"),
         ('name = "100"', 'name = "40"', "the names of the bands must differ, but are"),
-        ('"mK_CMB"', '"MJy/sr"', "bands.2.noise_unit: must be a temperature"),
-        ("[[bands]]", '[experiment]\ninstrument = "core"\n[[bands]]', "either experiment.instr"),
-        ("[templates.dust]", "[embedded]\n[templates.dust]", "either templates or the table"),
+        ('"mK_CMB"', '"MJy/sr"', "bands.2.noise.unit: must be a temperature"),
+        ("noise = { level = 20.0 }\n", "", "bands.40.noise: is missing"),
+        ('name = "40"', 'name = "40"\nfile = "dust.fits"', "bands.40.noise.unit: is missing"),
+        ('name = "40"', 'name = "40"\nfile = "dust.fits"\nunit = "MJy/sr"',
+         "bands.40.noise: Over a band MJy/sr needs"),
+        ('fwhm = 60.0\nnoise = { level = 20.0 }',
+         'fwhm = 60.0\nfile = "dust.fits"\nnoise = { estimate_above = 30.0 }',
+         "bands.40.noise.estimate_above: is of a map"),
+        ("level = 20.0", 'map = { file = "dust.fits" }, unit = "K_CMB"',
+         "argument `unit` is K_CMB, but column Q_STOKES is in uK_RJ"),
+        ("level = 20.0", "level = 0.0", "bands.0.noise: must be greater than 0"),
+        ('file = "dust.fits"\n', "", "fwhm and angles are of a map, but file is missing"),
+        ('file = "dust.fits"\nnu_ref = 353.0\nfwhm = 60.0', "", "sky.dust: file is missing"),
+        ("[fixed]", "[cmb]\ninclude = false\n[fixed]", "cmb.include: is false, but a forecast has"),
+        ("[fixed]", '[cmb]\nspectra = "cl.txt"\n[fixed]', "cmb.spectra: a forecast has r"),
         ('"half"', '"third"', "masks.npz: no mask 'third'"),
         ('"half"', '"odd"', "a mask has values 0 and 1, but 1536 of 3072 pixels have others"),
         ('"half"', '"few"', "The mask leaves too few pixels"),
-        ('key = "half"', 'key = "few"\nlatitude = 20.0', "either the file of a mask or a latitude"),
-        ('file = "masks.npz"', "latitude = 20.0", "mask: key and ordering are those of a file"),
-        ('file = "masks.npz"\nkey = "half"', "latitude = 89.9", "mask: leaves no pixel"),
-        ("apodization = 6.0", "apodization = -1.0", "mask.apodization: input should be greater"),
+        ('key = "half"', 'latitude = 20.0', "regions.used.latitude: unknown key"),
+        ('file = "masks.npz", ', "", "regions.used.file: is missing"),
+        ('{ file = "masks.npz", key = "half" }', '"|b| > 89.9"',
+         "forecast.region: leaves no pixel"),
+        ("apodization = 6.0", "apodization = -1.0", "forecast.apodization: input should be"),
         ("lmax = 60", "lmax = 64", "lmax: 64 is beyond what templates of nside 32 resolve, 63"),
         ("fwhm = 120.0", "fwhm = 600.0", "the templates' beam of 600 arcmin leaves"),
         ("fit = [2, 60]", "fit = [2, 20]", "takes three bins, but 2 of those"),
-        ("fit = [2, 60]", "fit = [60, 2]", "fit must increase, but is 60, 2"),
-        ("lmax = 60", 'lmax = 60\nbands = ["44"]', "A small sky has no channel '44'"),
-        ('["r", "dust.beta_dust"', '["q", "dust.beta_dust"', "Unknown parameter 'q'; known"),
-        ('["r", "dust.beta_dust"', '["r", "r"', "fisher.free: has 'r' twice"),
-        ('"dust.beta_dust" = 0.5', '"dust.T_dust" = 0.5', "prior of 'dust.T_dust' has no effect"),
-        ('"dust.beta_dust" = 0.5', '"dust.beta_dust" = 0', "fisher.priors.dust.beta_dust"),
-        ('"synchrotron.beta_syn"]', '"synchrotron.nu_ref"]',
+        ("fit = [2, 60]", "fit = [60, 2]", "forecast: fit must increase, but is 60, 2"),
+        ("lmax = 60", 'lmax = 60\nbands = ["44"]', "forecast.bands: '44' is none of 40, 100, 300"),
+        ("lmax = 60", 'lmax = 60\nfree = ["q"]', "forecast.free.0: input should be 'r' or"),
+        ("lmax = 60", 'lmax = 60\nfree = ["r", "r"]', "forecast.free: has 'r' twice"),
+        ('"synchrotron.beta_syn"', '"q"', "free: Unknown parameter 'q'; known"),
+        ("lmax = 60", 'lmax = 60\npriors = { "dust.T_dust" = 0.5 }',
+         "forecast: The prior of 'dust.T_dust' has no effect"),
+        ("lmax = 60", 'lmax = 60\npriors = { "dust.beta_dust" = 0 }',
+         "forecast.priors.dust.beta_dust"),
+        ("[1.5, 0.5]", "[1.5, 0]", "free.dust.beta_dust: gaussian needs a positive sigma"),
+        ('"synchrotron.beta_syn"', '"synchrotron.nu_ref"',
          "parameters apart: synchrotron.nu_ref, BB.synchrotron.amplitude; hold one"),
-        ('"synchrotron.beta_syn"]', '"synchrotron.nu_piv"]', "depends on synchrotron.nu_piv"),
-        ('"dust.T_dust" = 20.0', '"dust.T" = 20.0', "Unknown parameter 'dust.T'"),
-        ('"dust.T_dust" = 20.0', '"ame.m60" = 4.0', "there is no template 'ame'"),
+        ('"synchrotron.beta_syn"', '"synchrotron.nu_piv"', "depends on synchrotron.nu_piv"),
+        ('"dust.T_dust" = 20.0', '"dust.T" = 20.0', "fixed: Unknown parameter 'dust.T'"),
+        ('"dust.T_dust" = 20.0', '"ame.m60" = 4.0', "fixed: there is no component 'ame'"),
     ],
 )  # fmt: skip
 def test_mistakes_are_one_sentence(folder, tmp_path, monkeypatch, capsys, old, new, words):
@@ -340,3 +340,12 @@ def test_mistakes_are_one_sentence(folder, tmp_path, monkeypatch, capsys, old, n
     assert jaxsky(monkeypatch, "forecast", path, "--out", out) == 2
     assert words in one_sentence(capsys)
     assert not out.exists()
+
+
+def test_bands_and_a_sky_are_needed(folder, tmp_path, monkeypatch, capsys):
+    path, out = written(folder, "needed"), tmp_path / "out"
+    assert jaxsky(monkeypatch, "forecast", path, "--out", out, "--set", "bands=[]") == 2
+    assert "bands: there are none" in one_sentence(capsys)
+    path.write_text('[[bands]]\ninstrument = "core"')
+    assert jaxsky(monkeypatch, "forecast", path, "--out", out) == 2
+    assert "sky: has no components" in one_sentence(capsys)

@@ -15,6 +15,7 @@ from jaxsky import Bandpass, Component, Sky, observe, set_parameters
 from jaxsky.components import FreeFree, amplitude_from_emission_measure
 from jaxsky.io import read_maps, write_maps
 from jaxsky.settings import SettingsError
+from jaxsky.settings.experiment import Experiment
 
 NSIDE = 8
 NPIX = 12 * NSIDE**2
@@ -32,13 +33,13 @@ class Steep(Component):
         return sed.power_law(nu, self.slope, self.nu_ref)
 """
 SIMULATION = """
-[experiment]
+[simulate]
 nside = 8
 fwhm = 1200.0
 stokes = "IQU"
 include = ["x"]
 sheet = false
-[templates.x]
+[sky.x]
 law = "free_free"
 file = "intensity.fits"
 nu_ref = 30.0
@@ -50,15 +51,16 @@ bandpass = { center = 70.0, width = 0.0 }
 fwhm = 900.0
 """
 FIT = """
-[analysis]
+[common]
 nside = 8
 fwhm = 1200.0
+[fit]
 regions = ["full"]
 stokes = ["QU"]
 methods = ["gradient"]
 [free]
 "x.slope" = { start = 2.0, uniform = [1.0, 4.0] }
-[templates.x]
+[sky.x]
 law = "steep_law:Steep"
 file = "qu.fits"
 nu_ref = 30.0
@@ -159,9 +161,9 @@ def test_simulate_scales_an_intensity(folder, monkeypatch):
 @pytest.mark.parametrize(
     ("law", "sentence"),
     [
-        ("free_free", "templates.x: FreeFree is not polarized"),
-        ("free-free", "templates.x.law: there is no law 'free-free'; laws are ame, cmb, dust"),
-        ("cmb", "templates.x: the law 'cmb' has no nu_ref"),
+        ("free_free", "sky.x: FreeFree is not polarized"),
+        ("free-free", "sky.x.law: there is no law 'free-free'; laws are ame, cmb, dust"),
+        ("cmb", "sky.x.law: the CMB is described in the table cmb"),
         ("steep_law:Stepe", "'steep_law:Stepe' cannot be imported (AttributeError: module"),
         ("nowhere:Steep", "'nowhere:Steep' cannot be imported (ModuleNotFoundError"),
         ("json:loads", "'json:loads' is not a subclass of jaxsky.Component"),
@@ -191,17 +193,15 @@ def test_a_law_has_one_class():
 
 
 def test_separate_refuses_what_has_no_polarization():
-    from fits.separate.settings import SeparateSettings
     from fits.separate.setup import build
 
-    laws = {"cmb": {"law": "cmb"}, "dust": {"law": "dust"}, "ff": {"law": "free_free"}}
-    settings = SeparateSettings.model_validate(
+    settings = Experiment.model_validate(
         {
-            "separation": {"nside": NSIDE},
-            "embedded": {"nside": NSIDE},
-            "components": laws,
+            "common": {"nside": NSIDE},
+            "sky": {"embedded": {"nside": NSIDE}, "ff": {"law": "free_free"}},
+            "bands": [{"instrument": "litebird"}],
             "free": {"dust.beta_dust": {"start": 1.5}},
         }
     )
-    with pytest.raises(SettingsError, match=r"components\.ff: FreeFree is not polarized"):
+    with pytest.raises(SettingsError, match=r"sky\.ff: FreeFree is not polarized"):
         build(settings)

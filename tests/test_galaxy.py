@@ -114,6 +114,7 @@ def test_emission_of_the_plane_is_polarized_across_it(turbulence):
         assert np.all(abs(U) < Q)
 
 
+@pytest.mark.slow
 def test_maps_have_the_brightness_of_the_real_sky(galaxy, fine_galaxy):
     for maps, rms in ((galaxy.dust, DUST_RMS), (galaxy.synchrotron, SYNCHROTRON_RMS)):
         assert np.hypot(*np.std(maps[1:], axis=-1)) == pytest.approx(rms, rel=1e-12)

@@ -5,29 +5,19 @@ import numpy as np
 import pytest
 from astropy.io import fits as pyfits
 
-from fits import settings as fit_settings
-from fits.inputs import read_inputs
+from fits.inputs import inputs_of
 from jaxsky.bandpass import Bandpass
 from jaxsky.inputs import (
     read,
     read_bandpass_spec,
-    read_templates,
+    read_sky,
     set_parameters_of,
 )
 from jaxsky.io import InputError
 from jaxsky.noise_inputs import read_noise
-from jaxsky.settings import (
-    BandpassSpec,
-    MapFile,
-    NoiseFile,
-    SettingsError,
-    SettingsFile,
-    Table,
-    TemplateFile,
-    check_angles,
-)
-from jaxsky.settings_load import load
-from jaxsky.settings_types import Nside
+from jaxsky.settings import BandpassSpec, MapFile, NoiseTable, SettingsError
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.load import load
 
 NSIDE = 4
 NPIX = 12 * NSIDE**2
@@ -105,7 +95,7 @@ WMAP = MapFile(
 
 
 def noise_of(folder, spec, stokes="QU", unit="K_CMB", own=None):
-    noise = NoiseFile.model_validate(spec)
+    noise = NoiseTable.model_validate(spec)
     return read_noise(folder, noise, BAND, NSIDE, stokes, where="noise", unit=unit, own=own)
 
 
@@ -257,25 +247,16 @@ def test_files_that_cannot_be_read_are_named_once(folder):
         noise_of(folder, {"covariance": ["XX", *SIX[4:]]}, own=PLANCK)
 
 
-class Analysis(Table):
-    nside: Nside = 8
-    seed: int = 0
-
-
-class Example(SettingsFile):
-    analysis: Analysis = Analysis()
-    noise: NoiseFile = NoiseFile(rms=1.0)
-
-
 @pytest.mark.parametrize(
     ("noise", "words"),
     [
         (
             "{ }",
-            "exactly one of rms, map, covariance, hits, weights, not none.",
+            "one of level, rms, map, covariance, hits, weights, estimate_above, not none.",
         ),
         ("{ rms = 1.0, covariance = ['a', 'b', 'c'] }", "not rms, covariance."),
-        ("{ level = 1.0 }", "noise.level: unknown key"),
+        ("{ level = 1.0, rms = 2.0 }", "not level, rms."),
+        ("{ white = 1.0 }", "noise.white: unknown key"),
         ("{ covariance = ['a', 'b', 'c', 'd'] }", "noise.covariance: name the columns QQ, "),
         ("{ covariance = [] }", "not none."),
         ("{ covariance = 'QQ' }", "noise.covariance: input should be a valid table"),
@@ -292,43 +273,29 @@ class Example(SettingsFile):
 )
 def test_mistakes_in_the_table_of_noise_are_one_sentence(tmp_path, noise, words):
     path = tmp_path / "settings.toml"
-    path.write_text(f"noise = {noise}")
+    path.write_text(f"[[bands]]\nname = 'a'\nfile = 'a.fits'\nnoise = {noise}")
     with pytest.raises(SettingsError) as mistake:
-        load(path, Example)
+        load(path)
     assert str(mistake.value).startswith(f"{path}: ")
     assert words in str(mistake.value)
 
 
-def test_settings_of_any_model_with_values_replaced(tmp_path, monkeypatch):
+def test_settings_with_values_replaced(tmp_path, monkeypatch):
     path = tmp_path / "settings.toml"
-    path.write_text("data_dir = '$SKY_MAPS'\n[analysis]\nnside = 16\nseed = 3\n")
+    path.write_text("data_dir = '$SKY_MAPS'\nseed = 3\n[common]\nnside = 16\n")
     monkeypatch.setenv("SKY_MAPS", "maps")
-    settings = load(path, Example, {"analysis": {"nside": None, "seed": 5}, "noise": {}})
-    assert isinstance(settings, Example)
-    assert (settings.analysis.nside, settings.analysis.seed) == (16, 5)
-    assert settings.noise.rms == 1.0
+    settings = load(path, ["seed=5"])
+    assert (settings.common.nside, settings.seed) == (16, 5)
     assert settings.data_dir == str((tmp_path / "maps").resolve())
     # A table that the file does not have; one that is none is a mistake, as without.
     path.write_text("")
-    assert load(path, Example, {"analysis": {"nside": 2}}).analysis.nside == 2
-    path.write_text("analysis = 3")
-    with pytest.raises(SettingsError, match=r"analysis: input should be a valid table"):
-        load(path, Example, {"analysis": {"nside": 2}})
-    path.write_text("analysis.nside = 6")
-    with pytest.raises(SettingsError, match=r"analysis.nside: nside must be a power of two, not 6"):
-        load(path, Example)
-
-
-def test_a_model_of_noise_with_more_kinds(tmp_path):
-    class Levels(NoiseFile):
-        KINDS = (*NoiseFile.KINDS, "level")
-        level: float | None = None
-
-    assert Levels(level=2.0).level == 2.0
-    with pytest.raises(
-        ValueError, match=r"one of rms, map, covariance, hits, weights, level, not rms, lev"
-    ):
-        Levels(level=2.0, rms=1.0)
+    assert load(path, ["common.nside=2"]).common.nside == 2
+    path.write_text("common = 3")
+    with pytest.raises(SettingsError, match=r"common: input should be a valid table, not 3"):
+        load(path)
+    path.write_text("common.nside = 6")
+    with pytest.raises(SettingsError, match=r"common.nside: nside must be a power of two, not 6"):
+        load(path)
 
 
 def specs(file, **more):
@@ -336,11 +303,16 @@ def specs(file, **more):
     dust = {"law": "dust", "file": file, "nu_ref": 353.0, "fwhm": 10.0}
     dust["parameters"] = {"beta_dust": {"file": "beta.fits"}, "T_dust": 20.0}
     ame = {"law": "ame", "file": "ame.fits", "nu_ref": 22.8, "angles": "dust"}
-    return {name: TemplateFile(**spec) for name, spec in {"ame": ame, "dust": dust | more}.items()}
+    return {"ame": ame, "dust": dust | more}
+
+
+def templates_of(folder, sky, stokes="QU", **settings):
+    settings = Experiment.model_validate(settings | {"data_dir": str(folder), "sky": sky})
+    return read_sky(settings, stokes)[0]
 
 
 def test_templates_with_intensity(folder):
-    templates = read_templates(folder, specs("iqu.fits"), "IQU")
+    templates = templates_of(folder, specs("iqu.fits"), "IQU")
     maps = read(folder, MapFile(file="iqu.fits")).maps
     dust, ame = templates["dust"], templates["ame"].component
     np.testing.assert_array_equal(dust.component.amplitude, maps)
@@ -360,10 +332,10 @@ def test_templates_with_intensity(folder):
 
 
 def test_polarization_is_the_same_with_and_without_intensity(folder):
-    whole = read_templates(folder, specs("iqu.fits"), "IQU")
+    whole = templates_of(folder, specs("iqu.fits"), "IQU")
     for file in ("iqu.fits", "qu.fits"):
-        polarized = read_templates(folder, specs(file))
-        assert list(polarized) == list(whole) == ["dust", "ame"]
+        polarized = templates_of(folder, specs(file))
+        assert list(polarized) == list(whole) == ["ame", "dust"]
         for name, template in polarized.items():
             assert template.component.amplitude.shape == (2, NPIX)
             expected = whole[name].component.amplitude[1:]
@@ -373,41 +345,51 @@ def test_polarization_is_the_same_with_and_without_intensity(folder):
 @pytest.mark.parametrize(
     ("file", "more", "words"),
     [
-        ("qu.fits", {}, r"templates.dust: fields must name I, Q and U, not Q_STOKES, U_STOKES\."),
+        ("qu.fits", {}, r"sky.dust: fields must name I, Q and U, not Q_STOKES, U_STOKES\."),
         ("iqu.fits", {"fields": ["Q_STOKES", "U_STOKES", "I_STOKES"]}, "are not I, Q and U by"),
     ],
 )
 def test_templates_without_intensity_are_refused(folder, file, more, words):
     with pytest.raises(SettingsError, match=words):
-        read_templates(folder, specs(file, **more), "IQU")
+        templates_of(folder, specs(file, **more), "IQU")
 
 
 def test_one_column_is_no_polarization(folder):
-    words = r"templates.dust: fields must name Q and U, not Q_STOKES\."
+    words = r"sky.dust: fields must name Q and U, not Q_STOKES\."
     with pytest.raises(SettingsError, match=words):
-        read_templates(folder, specs("qu.fits", fields=["Q_STOKES"]))
+        templates_of(folder, specs("qu.fits", fields=["Q_STOKES"]))
 
 
-def test_angles_come_from_a_template_with_some():
-    spec = {"law": "ame", "file": "ame.fits", "nu_ref": 22.8}
-    first, second = TemplateFile(**spec, angles="b"), TemplateFile(**spec, angles="a")
-    check_angles({"a": first, "b": TemplateFile(**spec)})
-    with pytest.raises(ValueError, match=r"templates.a.angles: there is no template b"):
-        check_angles({"a": first})
-    with pytest.raises(ValueError, match=r"templates.a.angles: template b has none of its own"):
-        check_angles({"a": first, "b": second})
+def test_angles_come_from_a_template_with_some(tmp_path):
+    path = tmp_path / "settings.toml"
+    spec = 'sky.{} = {{ law = "ame", file = "ame.fits", nu_ref = 22.8{} }}\n'
+    first, second = spec.format("a", ', angles = "b"'), spec.format("b", ', angles = "a"')
+    path.write_text(first + spec.format("b", ""))
+    assert load(path).sky.templates == ["a", "b"]
+    for text, words in (
+        (first, "there is no map of b"),
+        (first + spec.format("b", "").replace('file = "ame.fits", ', ""), "there is no map of b"),
+        (first + second, "b has none of its own"),
+    ):
+        path.write_text(text)
+        with pytest.raises(SettingsError, match=rf"settings.toml: sky.a.angles: {words}\."):
+            load(path)
 
 
 def test_parameters_are_set_in_a_copy(folder):
-    templates = read_templates(folder, specs("qu.fits"))
+    templates = templates_of(folder, specs("qu.fits"))
     changed = set_parameters_of(templates, {"dust.T_dust": 25.0})
     assert float(changed["dust"].component.T_dust) == 25.0
     assert float(templates["dust"].component.T_dust) == 20.0
     assert changed["ame"] is templates["ame"]
-    with pytest.raises(SettingsError, match=r"no template 'cmb'; templates are dust, ame\."):
-        set_parameters_of(templates, {"cmb.T_cmb": 3.0})
     with pytest.raises(KeyError, match=r"Unknown parameter 'dust.T'"):
         set_parameters_of(templates, {"dust.T": 3.0})
+    for fixed, words in (
+        ("cmb.T_cmb", r"there is no component 'cmb'; components are ame, dust\."),
+        ("dust.T", r"Unknown parameter 'dust.T'"),
+    ):
+        with pytest.raises(SettingsError, match=f"fixed: {words}"):
+            templates_of(folder, specs("qu.fits"), fixed={fixed: 3.0})
 
 
 def test_bandpasses_of_settings(folder):
@@ -423,21 +405,20 @@ def test_bandpasses_of_settings(folder):
 
 def test_fits_take_hits_and_six_columns(folder, matrices, hits):
     """Both as noise of Q and U; pixels without either are not used."""
-    dust = specs("qu.fits")["dust"].model_dump(exclude_none=True)
     common = {"bandpass": {"center": 44.0, "width": 8.0}, "fwhm": 30.0}
     wmap = WMAP.model_dump() | {"noise": {"hits": {"fields": ["N_OBS"], "sigma0": 1.4}}}
     planck = PLANCK.model_dump() | {"noise": {"covariance": SIX}}
-    settings = fit_settings.Settings.model_validate(
+    settings = Experiment.model_validate(
         {
             "data_dir": str(folder),
             "free": {"dust.T_dust": {"start": 21.0}},
-            "templates": {"dust": dust},
+            "sky": {"dust": specs("qu.fits")["dust"]},
             "bands": [common | wmap | {"name": "W"}, common | planck | {"name": "P"}],
             "cmb": {"include": False},
         }
     )
     # What was written into a log is read again.
-    bands = read_inputs(fit_settings.Settings.model_validate(settings.model_dump())).bands
+    bands = inputs_of(Experiment.model_validate(settings.model_dump())).bands
     for band in bands.values():
         np.testing.assert_array_equal(band.used, others())
         assert not band.maps[:, HOLE].any()

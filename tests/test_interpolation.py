@@ -84,6 +84,7 @@ def test_the_fixed_count_under_jit_meets_the_stated_ranges():
     assert choose_nodes(wide, tuple(bands), 1e-10).counts <= (TRACED_NODES,) * 2
 
 
+@pytest.mark.slow
 def test_the_tolerance_holds_under_jit_where_the_fixed_count_does_not_do():
     for beta_range, T_range in ((0.5, 25.0), (3.5, 0.1)):
         harsh = Dust(MAPS, systems.spread(1.5, beta_range), systems.spread(35, T_range))
@@ -97,7 +98,14 @@ def test_the_tolerance_holds_under_jit_where_the_fixed_count_does_not_do():
             np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-8 * float(jnp.abs(b).max()))
 
 
-@pytest.mark.parametrize("case", ["beta_dust", "beta_dust and T_dust", "beta_syn"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        "beta_dust",
+        pytest.param("beta_dust and T_dust", marks=pytest.mark.slow),
+        pytest.param("beta_syn", marks=pytest.mark.slow),
+    ],
+)
 def test_gradients_through_maps_are_those_of_the_direct_sum(case):
     sky = Sky({"c": SKIES[case]})
 
@@ -207,7 +215,15 @@ def test_derivatives_of_weights_are_those_of_the_law():
     np.testing.assert_allclose(jax.jacfwd(by_terms)(200.0), exact, rtol=1e-5)
 
 
-@pytest.mark.parametrize("case", ["beta_dust and T_dust", "beta_syn", "both of two bodies", "wide"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        "beta_syn",
+        "wide",
+        pytest.param("beta_dust and T_dust", marks=pytest.mark.slow),
+        pytest.param("both of two bodies", marks=pytest.mark.slow),
+    ],
+)
 def test_all_bands_at_once_are_each_alone(case):
     """Outside of jit, and inside, where a range that is too wide is summed directly."""
     wide = Dust(MAPS, systems.spread(1.5, 3.0), systems.spread(40.0, 35.0))

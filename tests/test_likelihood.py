@@ -164,7 +164,7 @@ def test_calibration_offset_and_mask(pixelwise):
     assert float(chi2(like, params)) == pytest.approx(expected, rel=1e-11)
 
 
-@pytest.mark.parametrize("cmb", [False, True])
+@pytest.mark.parametrize("cmb", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_exact_covariance_is_the_dense_one(cmb):
     model = fluctuations(cmb)
     rows = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3, 2, NPIX)))
@@ -216,7 +216,7 @@ def white_covariance(sigma):
     return covariance_of
 
 
-@pytest.mark.parametrize("pixelwise", [False, True])
+@pytest.mark.parametrize("pixelwise", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("free", [START, {**START, "offset.44.Q": 0.0, "offset.70.U": 0.0}])
 def test_with_white_noise_the_two_likelihoods_agree(free, pixelwise):
     sky, data, sigma = problem()

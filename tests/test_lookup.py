@@ -6,23 +6,19 @@ import stat
 import numpy as np
 import pytest
 
-from fits.forecast.settings import load_forecast
 from fits.forecast.setup import build as build_forecast
-from fits.inputs import read_inputs
-from fits.paper.settings import load_paper
+from fits.inputs import inputs_of
 from fits.paper.sources import Sources
 from fits.record import write_log
 from fits.regions import region_masks
-from fits.separate.settings import load_separate
 from fits.separate.setup import build as build_separation
-from fits.settings import Settings, load_settings
 from jaxsky.archive import cache_folder
 from jaxsky.experiment import build as build_experiment
-from jaxsky.experiment import load_experiment
 from jaxsky.io import InputError, write_maps
 from jaxsky.lookup import find_file, found_files
-from jaxsky.settings import MapFile, SettingsError, SettingsFile
-from jaxsky.settings_load import load
+from jaxsky.settings import MapFile, SettingsError
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.load import load
 
 KNOWN = "LFI_RIMO_R3.31.fits"
 MASK = "wmap_polarization_analysis_mask_r9_9yr_v5.fits"
@@ -125,7 +121,7 @@ def test_settings_expand_their_folder_and_refuse_what_is_none(places):
     data, _, home = places
     path = data / "a.toml"
     path.write_text("data_dir = '~'")
-    assert load(path, SettingsFile).data_dir == str(home)
+    assert load(path).data_dir == str(home)
     (data / "circle").symlink_to("circle")
     for given, words in (
         ("a.toml", "a.toml: data_dir: .*a.toml is not a folder"),
@@ -133,7 +129,7 @@ def test_settings_expand_their_folder_and_refuse_what_is_none(places):
     ):
         path.write_text(f"data_dir = '{given}'")
         with pytest.raises(SettingsError, match=words):
-            load(path, SettingsFile)
+            load(path)
     with pytest.raises(ValueError, match="must be the name of a file"):
         MapFile(file="")
 
@@ -144,9 +140,9 @@ def test_the_log_names_the_paths_that_were_taken(places, tmp_path):
         (data / name).touch()
     (cache / "map.fits").touch()
     beta = {"file": "beta.fits", "fields": ["BETA"]}
-    settings = Settings(
+    settings = Experiment(
         data_dir=str(data),
-        templates={
+        sky={
             "dust": {
                 "law": "dust",
                 "file": "dust.fits",
@@ -162,7 +158,8 @@ def test_the_log_names_the_paths_that_were_taken(places, tmp_path):
                 "noise": {"covariance": ["QQ_COV", "QU_COV", "UU_COV"]},
             }
         ],
-        analysis={"regions": ["strip", "mask.fits"]},
+        regions={"mask": {"file": "mask.fits"}},
+        fit={"regions": ["strip", "mask"]},
     )
     paths = {"map.fits": str(cache / "map.fits")}
     paths |= {name: str(data / name) for name in ("dust.fits", "mask.fits", "beta.fits")}
@@ -172,7 +169,7 @@ def test_the_log_names_the_paths_that_were_taken(places, tmp_path):
 
 
 ANALYSIS = """
-[templates.dust]
+[sky.dust]
 law = "dust"
 file = "dust.fits"
 nu_ref = 353.0
@@ -183,17 +180,15 @@ file = "dust.fits"
 {band}
 bandpass = {bandpass}
 noise = {noise}
-[analysis]
+[common]
 nside = 4
-{analysis}
+{common}
 """
 SEPARATION = """
-[separation]
+[common]
 nside = 4
-{separation}
-[components.cmb]
-law = "cmb"
-[components.dust]
+{common}
+[sky.dust]
 law = "dust"
 nu_ref = 353.0
 {component}
@@ -207,25 +202,23 @@ bandpass = {{ center = 353.0, width = 0.0 }}
 noise = {{ rms = 1.0 }}
 """
 FORECAST = """
-[experiment]
+[[bands]]
 instrument = "core"
-[fisher]
-free = ["r"]
-[spectra]
+[forecast]
 lmax = 7
-{mask}
-[templates.dust]
+{forecast}
+[sky.dust]
 law = "dust"
 file = "dust.fits"
 nu_ref = 353.0
 """
 EXPERIMENT = """
-[experiment]
+[simulate]
 nside = 4
 fwhm = 1800.0
-{experiment}
-[embedded]
-nside = 8
+include = ["cmb", "noise"]
+[sky]
+embedded = {{ nside = 8 }}
 {cmb}
 [[bands]]
 name = "44"
@@ -236,7 +229,7 @@ noise = {noise}
 PAPER = (
     ANALYSIS
     + """
-[templates.synchrotron]
+[sky.synchrotron]
 law = "synchrotron"
 file = "dust.fits"
 nu_ref = 30.0
@@ -247,41 +240,29 @@ PLAIN = {
     "band": "",
     "bandpass": "{ center = 44.0, width = 0.0 }",
     "noise": "{ rms = 1.0 }",
-    "analysis": "",
-    "separation": "",
+    "common": "",
     "component": "",
     "free": "",
-    "mask": "[mask]\nlatitude = 20.0",
-    "experiment": 'include = ["cmb", "noise"]',
+    "forecast": "",
     "cmb": "",
     "beam": "fwhm = 30.0",
 }
 NONE = 'file = "none.fits"'
 
 
-def fit(path):
-    settings = load_settings(path)
-    region_masks(settings)
-    read_inputs(settings)
+REGION = f"[regions]\na = {{ {NONE} }}\n"
 
 
-def paper(path):
-    sources = Sources(load_paper(path))
+def fit(settings):
+    region_masks(settings, settings.fit.regions)
+    inputs_of(settings)
+
+
+def paper(settings):
+    sources = Sources(settings)
     sources.template("dust")
     sources.index("beta_syn")
     sources.ame()
-
-
-def separate(path):
-    build_separation(load_separate(path))
-
-
-def forecast(path):
-    build_forecast(load_forecast(path))
-
-
-def simulate(path):
-    build_experiment(load_experiment(path))
 
 
 @pytest.mark.parametrize(
@@ -294,26 +275,30 @@ def simulate(path):
         (fit, ANALYSIS, {"noise": f"{{ map = {{ {NONE} }} }}"}),
         (fit, ANALYSIS, {"noise": f"{{ covariance = {{ {NONE}, fields = ['a', 'b', 'c'] }} }}"}),
         (fit, ANALYSIS, {"noise": f"{{ hits = {{ {NONE}, fields = ['a'], sigma0 = 1.0 }} }}"}),
-        (fit, ANALYSIS, {"analysis": f"mask = {{ {NONE} }}"}),
-        (fit, ANALYSIS, {"analysis": "regions = ['none.fits']"}),
-        (separate, SEPARATION.replace('"dust.fits"', '"none.fits"'), {}),
-        (separate, SEPARATION, {"separation": f"mask = {{ {NONE} }}"}),
-        (separate, SEPARATION, {"component": f"parameters = {{ T_dust = {{ {NONE} }} }}"}),
-        (separate, SEPARATION, {"free": f", regions = {{ file = {{ {NONE} }} }}"}),
-        (separate, SEPARATION, {"free": f", regions = {{ clusters = 2, of = [{{ {NONE} }}] }}"}),
-        (forecast, FORECAST.replace('"dust.fits"', '"none.fits"'), {}),
-        (forecast, FORECAST, {"mask": f"[mask]\n{NONE}"}),
-        (simulate, EXPERIMENT, {"beam": 'beam = "none.fits"'}),
-        (simulate, EXPERIMENT, {"bandpass": f"{{ {NONE} }}"}),
-        (simulate, EXPERIMENT, {"noise": f"{{ map = {{ {NONE} }} }}"}),
-        (simulate, EXPERIMENT, {"cmb": '[cmb]\nspectra = "none.fits"'}),
+        (fit, ANALYSIS, {"common": f"mask = {{ {NONE} }}"}),
+        (fit, ANALYSIS, {"common": f"{REGION}[fit]\nregions = ['a']"}),
+        (build_separation, SEPARATION.replace('"dust.fits"', '"none.fits"'), {}),
+        (build_separation, SEPARATION, {"common": f"mask = {{ {NONE} }}"}),
+        (build_separation, SEPARATION, {"component": f"parameters = {{ T_dust = {{ {NONE} }} }}"}),
+        (build_separation, SEPARATION, {"free": f", regions = {{ file = {{ {NONE} }} }}"}),
+        (
+            build_separation,
+            SEPARATION,
+            {"free": f", regions = {{ clusters = 2, of = [{{ {NONE} }}] }}"},
+        ),
+        (build_forecast, FORECAST.replace('"dust.fits"', '"none.fits"'), {}),
+        (build_forecast, FORECAST, {"forecast": f"region = 'a'\n{REGION}"}),
+        (build_experiment, EXPERIMENT, {"beam": 'beam = "none.fits"'}),
+        (build_experiment, EXPERIMENT, {"bandpass": f"{{ {NONE} }}"}),
+        (build_experiment, EXPERIMENT, {"noise": f"{{ map = {{ {NONE} }} }}"}),
+        (build_experiment, EXPERIMENT, {"cmb": '[cmb]\nspectra = "none.fits"'}),
         (paper, PAPER.replace('"dust.fits"', '"none.fits"', 1), {}),
-        (paper, PAPER, {"analysis": f"[paper.ame]\nnu_ref = 23.0\n{NONE}"}),
-        (paper, PAPER, {"analysis": f"[paper.beta_syn]\n{NONE}"}),
+        (paper, PAPER, {"common": f"[paper.ame]\nnu_ref = 23.0\n{NONE}"}),
+        (paper, PAPER, {"common": f"[paper.beta_syn]\n{NONE}"}),
         (
             paper,
             PAPER,
-            {"analysis": "[paper.beta_syn]\nfile = 'beta.fits'\nspectrum = 'none.fits'"},
+            {"common": "[paper.beta_syn]\nfile = 'beta.fits'\nspectrum = 'none.fits'"},
         ),
     ],
 )
@@ -326,4 +311,4 @@ def test_all_settings_find_files_in_the_same_places(places, command, text, chang
     path.write_text(text.format(**PLAIN | changes))
     words = f"none.fits: no such file, and none in the cache {cache}"
     with pytest.raises(ValueError, match=words):
-        command(path)
+        command(load(path))

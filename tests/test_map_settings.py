@@ -1,20 +1,22 @@
 """Map entries of settings: files as the archives and other codes write them, through to values."""
 
+from pathlib import Path
+
 import healpy
 import numpy as np
 import pytest
 from astropy.io import fits as pyfits
 
-from fits import settings as fit_settings
-from fits.inputs import read_band, read_inputs
-from fits.paper.settings import PaperSettings
+from fits.commands.run import DEFAULTS
+from fits.inputs import inputs_of, read_band
 from fits.regions import region_masks
-from fits.separate.settings import SeparateSettings
 from fits.separate.setup import build
-from jaxsky.experiment.settings import Experiment
-from jaxsky.inputs import read, read_templates
+from jaxsky.inputs import read, read_sky
 from jaxsky.io import InputError
-from jaxsky.settings import MapFile, SettingsError, TemplateFile
+from jaxsky.settings import MapFile, SettingsError
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.load import load
+from jaxsky.settings.tables import BandTable
 
 NSIDE = 8
 NPIX = 12 * NSIDE**2
@@ -47,8 +49,14 @@ def write(path, *tables):
 def band(folder, entry, unit="uK_RJ"):
     """Q and U of a band at one frequency in the unit of its file, and where they are known."""
     full = {"name": "b", "bandpass": {"center": 30.0}, "noise": {"rms": 1.0}} | entry
-    found = read_band(folder, fit_settings.Band.model_validate(full))
+    found = read_band(folder, BandTable.model_validate(full))
     return np.asarray(found.maps) / float(found.bandpass.conversion(unit, "uK_RJ")), found
+
+
+def template(folder, entry):
+    """A template that is called t."""
+    settings = Experiment.model_validate({"data_dir": str(folder), "sky": {"t": entry}})
+    return read_sky(settings)[0]["t"]
 
 
 POLARIZED = ["Q_POLARISATION", "U_POLARISATION"]
@@ -178,7 +186,7 @@ def test_healpy_and_pysm(tmp_path):
         "T_dust": {"file": "pysm.fits", "fields": ["T_D"], "unit": "K"},
     }
     spec = {"law": "dust", "file": "pysm.fits", "nu_ref": 353.0, "parameters": parameters}
-    dust = read_templates(tmp_path, {"dust": TemplateFile(**spec)})["dust"].component
+    dust = template(tmp_path, spec).component
     np.testing.assert_array_equal(dust.amplitude, [Q, U])
     np.testing.assert_array_equal(dust.beta_dust, 1.5 + 0.01 * I)
     np.testing.assert_array_equal(dust.T_dust, 20 + I)
@@ -198,7 +206,7 @@ def test_footprints_and_marks_in_settings(tmp_path):
     assert band(tmp_path, {"file": "zeros.fits", "missing": []})[1].used.all()
     spec = {"law": "dust", "file": "zeros.fits", "nu_ref": 353.0}
     with pytest.raises(InputError, match=r"zeros.fits.*give `missing`"):
-        read_templates(tmp_path, {"dust": TemplateFile(**spec)})
+        template(tmp_path, spec)
     # A correction is zero where there is nothing to correct.
     write(tmp_path / "m.fits", table({"Q": Q, "U": U}, ["uK_RJ"] * 2))
     leakage = band(tmp_path, {"file": "m.fits", "leakage": {"file": "zeros.fits"}})[1].leakage
@@ -228,15 +236,17 @@ def test_mistakes_in_map_entries(entry, words):
 
 def test_masks_that_are_coarser_are_named_with_their_key(tmp_path):
     write(tmp_path / "mask.fits", table({"M": np.ones(48)}, ["1"]))
-    mask = {"mask": {"file": "mask.fits"}, "nside": NSIDE}
+    mask, common = {"file": "mask.fits"}, {"nside": NSIDE, "fwhm": 900.0}
     words = "`nside` must be a power of 2 up to that of the mask, 2, not 8"
-    for analysis, key in ((mask, "mask"), ({"nside": NSIDE, "regions": ["mask.fits"]}, "regions")):
-        raw = {"data_dir": str(tmp_path), "embedded": {}, "analysis": analysis}
-        with pytest.raises(SettingsError, match=rf"analysis.{key}: .*{words}"):
-            region_masks(fit_settings.Settings.model_validate(raw))
-    main = {"sampler": "none"} | mask
-    with pytest.raises(SettingsError, match=rf"separation.mask: .*{words}"):
-        build(separation(tmp_path, separation=main))
+    for key, change in (
+        ("common.mask", {"common": common | {"mask": mask}}),
+        ("regions.m", {"common": common, "regions": {"m": mask}, "separate": {"region": "m"}}),
+    ):
+        settings = separation(tmp_path, **change)
+        with pytest.raises(SettingsError, match=rf"{key}: .*{words}"):
+            region_masks(settings, list(settings.regions))
+        with pytest.raises(SettingsError, match=rf"{key}: .*{words}"):
+            build(settings)
 
 
 def test_too_many_columns_or_others(tmp_path):
@@ -261,8 +271,8 @@ def test_units_that_are_none_are_named_with_their_key(tmp_path):
     with pytest.raises(SettingsError, match=r"bands.b.unit: Unit 'K' does not convert to 'uK_RJ'"):
         band(tmp_path, entry)
     spec = {"law": "dust", "nu_ref": 353.0} | entry
-    with pytest.raises(SettingsError, match=r"templates.t.unit: Unit 'K' does not convert"):
-        read_templates(tmp_path, {"t": TemplateFile(**spec)})
+    with pytest.raises(SettingsError, match=r"sky.t.unit: Unit 'K' does not convert"):
+        template(tmp_path, spec)
     entry = {"file": "m.fits", "unit": "K_RJ"}
     with pytest.raises(SettingsError, match=r"leakage.unit: Unit 'K' does not convert"):
         band(tmp_path, entry | {"leakage": {"file": "m.fits", "unit": "K"}})
@@ -308,7 +318,7 @@ SYNCHROTRON = {"law": "synchrotron", "file": "m.fits", "nu_ref": 30.0}
 
 def parameter(folder, spec, name, entry):
     full = spec | {"parameters": {name: {"file": "p.fits"} | entry}}
-    found = read_templates(folder, {"t": TemplateFile.model_validate(full)})["t"]
+    found = template(folder, full)
     return np.asarray(getattr(found.component, name)), found.used
 
 
@@ -334,7 +344,7 @@ def parameter(folder, spec, name, entry):
     ],
 )
 def test_maps_of_parameters_are_checked(folder, spec, name, entry, words):
-    with pytest.raises(SettingsError, match=rf"templates.t.parameters.{name}: .*{words}"):
+    with pytest.raises(SettingsError, match=rf"sky.t.parameters.{name}: .*{words}"):
         parameter(folder, spec, name, entry)
 
 
@@ -371,13 +381,14 @@ def test_maps_of_parameters_that_are_right(folder):
 )
 def test_numbers_of_templates_are_checked(change, words):
     with pytest.raises(ValueError, match=words):
-        TemplateFile.model_validate(DUST | change)
+        Experiment.model_validate({"sky": {"t": DUST | change}})
 
 
 @pytest.mark.parametrize(
     "table_",
     [
         {"fixed": {"synchrotron.beta_syn": -3.1}},
+        {"truth": {"synchrotron.beta_syn": -3.1}},
         {"free": {"synchrotron.beta_syn": {"start": -3.1}}},
         {"free": {"synchrotron.beta_syn": {"start": -3.1, "uniform": [-4.0, -2.0]}}},
         {"free": {"synchrotron.beta_syn": {"start": 3.1, "gaussian": [-3.1, 0.3]}}},
@@ -386,26 +397,16 @@ def test_numbers_of_templates_are_checked(change, words):
 def test_the_other_sign_of_beta_syn_is_named_with_its_key(table_):
     key = next(iter(table_))
     words = rf"{key}.synchrotron.beta_syn: beta_syn is the index in T ~ nu\^-beta_syn"
-    templates = {"synchrotron": SYNCHROTRON}
     entry = {"name": "b", "file": "m.fits", "bandpass": {"center": 30.0}, "noise": {"rms": 1.0}}
-    with pytest.raises(ValueError, match=words):
-        PaperSettings.model_validate({"templates": templates, "bands": [entry]} | table_)
-    separate = {
-        "components": {"cmb": {"law": "cmb"}, "s": {"law": "synchrotron"}},
-        "bands": [entry],
-    }
-    if key == "free":
+    raw = {"sky": {"synchrotron": SYNCHROTRON}, "bands": [entry]}
+    for change in ({}, {"sky": {"s": {"law": "synchrotron"}}}, {"bands": [{"instrument": "wmap"}]}):
         with pytest.raises(ValueError, match=words):
-            SeparateSettings.model_validate(separate | table_)
-    else:
-        raw = {"templates": templates, "experiment": {"instrument": "wmap"}} | table_
-        with pytest.raises(ValueError, match=words):
-            Experiment.model_validate(raw)
+            Experiment.model_validate(raw | change | table_)
     twice = {"fixed": {"synchrotron.nu_ref": 23.0}}
-    with pytest.raises(ValueError, match=r"fixed.synchrotron.nu_ref: nu_ref is given twice"):
-        PaperSettings.model_validate({"templates": templates, "bands": [entry]} | twice)
+    with pytest.raises(ValueError, match=r"fixed.synchrotron.nu_ref: is given twice"):
+        Experiment.model_validate(raw | twice)
     offset = {"free": {"synchrotron.beta_syn.offset": {"start": -0.1, "uniform": [-1.0, 0.5]}}}
-    PaperSettings.model_validate({"templates": templates, "bands": [entry]} | offset)
+    Experiment.model_validate(raw | offset)
 
 
 def separation(folder, **change):
@@ -416,26 +417,26 @@ def separation(folder, **change):
     ]
     raw = {
         "data_dir": str(folder),
-        "separation": {"nside": NSIDE, "fwhm": 900.0, "sampler": "none"},
-        "components": {"cmb": {"law": "cmb"}, "dust": {"law": "dust"}},
+        "common": {"nside": NSIDE, "fwhm": 900.0},
+        "separate": {"sampler": "none"},
+        "sky": {"dust": {"law": "dust"}},
         "free": {"dust.beta_dust": {"start": 1.5}},
         "bands": bands,
     }
-    return SeparateSettings.model_validate(raw | change)
+    return Experiment.model_validate(raw | change)
 
 
 def test_maps_of_parameters_in_separations(folder):
     def with_(name, **entry):
         parameters = {name: {"file": "p.fits"} | entry}
-        components = {"cmb": {"law": "cmb"}, "dust": {"law": "dust", "parameters": parameters}}
-        return build(separation(folder, components=components))
+        return build(separation(folder, sky={"dust": {"law": "dust", "parameters": parameters}}))
 
     for entry, words in [
-        ({"name": "beta_dust", "file": "coarse.fits"}, "nside is 2, but separation.nside is 8"),
+        ({"name": "beta_dust", "file": "coarse.fits"}, "nside is 2, but common.nside is 8"),
         ({"name": "beta_dust", "fields": ["K"], "unit": "K"}, "beta_dust is a pure number"),
         ({"name": "T_dust", "fields": ["BETA", "ZEROS"]}, "fields must name one"),
     ]:
-        where = rf"components.dust.parameters.{entry['name']}: {words}"
+        where = rf"sky.dust.parameters.{entry['name']}: {words}"
         with pytest.raises(SettingsError, match=where):
             with_(**entry)
     found = with_("T_dust", fields=["HOLES"], unit="K")
@@ -445,14 +446,9 @@ def test_maps_of_parameters_in_separations(folder):
     words = r"free.dust.beta_dust.regions.file: 40 of 768 used pixels have no value"
     with pytest.raises(SettingsError, match=words):
         build(separation(folder, free=free))
+    dust = {"law": "dust", "nu_ref": 353.0, "parameters": {"nu_ref": 545.0}}
     with pytest.raises(ValueError, match="nu_ref is given twice"):
-        separation(
-            folder,
-            components={
-                "cmb": {"law": "cmb"},
-                "dust": {"law": "dust", "nu_ref": 353.0, "parameters": {"nu_ref": 545.0}},
-            },
-        )
+        separation(folder, sky={"dust": dust})
 
 
 def test_what_a_log_holds_is_read_again(tmp_path):
@@ -462,13 +458,17 @@ def test_what_a_log_holds_is_read_again(tmp_path):
     entry = {"file": ["q.fits", "u.fits"], "hdu": [1, 1], "stokes": ["Q", "U"], "missing": [-1.0]}
     raw = {
         "data_dir": str(tmp_path),
-        "templates": {"synchrotron": SYNCHROTRON | entry},
+        "sky": {"synchrotron": SYNCHROTRON | entry},
         "bands": [entry | {"name": "b", "bandpass": {"center": 30.0}, "noise": {"rms": 1.0}}],
         "cmb": {"include": False},
     }
-    settings = fit_settings.Settings.model_validate(raw)
-    again = fit_settings.Settings.model_validate(settings.model_dump(mode="json"))
-    found = read_inputs(again)
+    settings = Experiment.model_validate(raw)
+    again = Experiment.model_validate(settings.model_dump(mode="json"))
+    found = inputs_of(again)
     np.testing.assert_allclose(found.bands["b"].maps, [Q, -U], rtol=1e-6)
     assert again.bands[0].label == "q.fits, u.fits"
     assert read(tmp_path, again.bands[0]).stokes == ("Q", "U")
+    for path in [*DEFAULTS.glob("*.toml"), *Path(__file__).parents[1].glob("examples/*.toml")]:
+        settings = load(path)
+        again = Experiment.model_validate(settings.model_dump(mode="json", exclude_none=True))
+        assert again == settings

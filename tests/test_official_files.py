@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from astropy.io import fits as pyfits
 
-from fits import settings as fit_settings
-from fits.inputs import leak, read_inputs
+from fits.inputs import inputs_of
 from fits.resolution import prepare
+from jaxsky.experiment import leak
 from jaxsky.harmonics import gaussian_beam, resample, synthesis
 from jaxsky.inputs import read
 from jaxsky.io import InputError
 from jaxsky.noise import weights_covariance
 from jaxsky.settings import MapFile, SettingsError
+from jaxsky.settings.experiment import Experiment
 
 NSIDE = 8
 NPIX = 12 * NSIDE**2
@@ -107,10 +108,10 @@ LEAKAGE = {"file": CORRECTION, "fields": ["Q_STOKES", "U_STOKES"], "fwhm": 700.0
 
 
 def settings(folder, band):
-    return fit_settings.Settings.model_validate(
+    return Experiment.model_validate(
         {
             "data_dir": str(folder),
-            "templates": {"dust": DUST},
+            "sky": {"dust": DUST},
             "bands": [band],
             "cmb": {"include": False},
         }
@@ -126,7 +127,7 @@ def test_wmaps_weights_are_the_inverse_covariance(folder):
         "bandpass": {"center": 23.0},
         "noise": {"weights": {"fields": ["QQ", "QU", "UU"], "hdu": 2, "sigma0": 1.435}},
     }
-    found = read_inputs(settings(folder, band)).bands["K"]
+    found = inputs_of(settings(folder, band)).bands["K"]
     factor = float(found.bandpass.conversion("mK_CMB", "uK_RJ"))
     assert (~found.used).sum() == 1
     with pyfits.open(folder / band["file"]) as hdus:
@@ -153,7 +154,7 @@ def test_weights_have_their_sigma0s():
 
 def test_leakage_is_subtracted_at_the_common_resolution(folder):
     """The correction has its own nside and beam, and what is left is the sky that did not leak."""
-    inputs = read_inputs(settings(folder, PLANCK | {"leakage": LEAKAGE}))
+    inputs = inputs_of(settings(folder, PLANCK | {"leakage": LEAKAGE}))
     factor = float(inputs.bands["70"].bandpass.conversion("uK_CMB", "uK_RJ"))
     prepared = prepare(inputs, NSIDE, 800.0)
     alone = resample(smooth_maps(2, 2 * NSIDE, 0.0), gaussian_beam(800.0, 16), NSIDE)
@@ -161,7 +162,7 @@ def test_leakage_is_subtracted_at_the_common_resolution(folder):
     np.testing.assert_allclose(prepared.data[0], factor * alone, atol=1e-4 * factor)
     assert float(jnp.abs(prepared.leakage["70"]).max()) > 0.1 * factor
     # Without it the map is as it was, but for the last multipoles, to which the coarser limits it.
-    before = prepare(read_inputs(settings(folder, PLANCK)), NSIDE, 800.0)
+    before = prepare(inputs_of(settings(folder, PLANCK)), NSIDE, 800.0)
     assert not before.leakage
     np.testing.assert_allclose(
         before.data[0], prepared.data[0] + prepared.leakage["70"], atol=1e-5 * factor
@@ -202,10 +203,10 @@ def test_corrections_of_another_release_are_refused(folder, band, words):
 def test_a_correction_without_its_columns_is_named(folder):
     band = PLANCK | {"leakage": LEAKAGE | {"file": "LFI_CorrMap_070_R2.01.fits"}}
     with pytest.raises(InputError, match=r"LFI_CorrMap_070_R2.01.fits.*U_STOKES.*Q_STOKES"):
-        read_inputs(settings(folder, band))
+        inputs_of(settings(folder, band))
     band = PLANCK | {"leakage": LEAKAGE | {"file": "LFI_CorrMap_070_R2.01.fits", "fields": None}}
     with pytest.raises(SettingsError, match=r"bands.70.leakage: fields must name Q and U"):
-        read_inputs(settings(folder, band))
+        inputs_of(settings(folder, band))
 
 
 def test_a_cut_file_is_named(folder, tmp_path):

@@ -10,30 +10,32 @@ import numpy as np
 import pytest
 
 import commands
+from fits.commands.run import DEFAULTS
 from fits.paper import STEPS, Impossible, Item, Number, Sources, Step, run
 from fits.paper.experiment import _observation, _prepared
 from fits.paper.item import NUMBERS
 from fits.paper.run import labels_of
-from fits.paper.settings import EMBEDDED, EXAMPLE, PaperSettings, load_paper
 from jaxsky.harmonics import gaussian_beam, power_spectrum
 from jaxsky.io import read_maps
 from jaxsky.observation import Source
 from jaxsky.power_law import fit_power_law
 from jaxsky.preparation import prepare
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.load import load
 
 LABELS = [*(f"Figure {n}" for n in (1, 2, 3, 4, 13)), "Table 1", "Figure 14"]
 REAL = """
 title = "Maps of the real sky"
 data_dir = "{folder}"
-[analysis]
+[common]
 nside = 32
 fwhm = 0
-[templates.sky_dust]
+[sky.sky_dust]
 law = "dust"
 file = "templates/dust_d1_353GHz_n64.fits"
 fields = ["Q_STOKES", "U_STOKES"]
 nu_ref = 353.0
-[templates.sky_synchrotron]
+[sky.sky_synchrotron]
 law = "synchrotron"
 file = "templates/synch_s1_30GHz_n64.fits"
 fields = ["Q_STOKES", "U_STOKES"]
@@ -64,13 +66,9 @@ spectrum = "{spectrum}"
 
 
 @pytest.fixture(scope="module")
-def small() -> PaperSettings:
+def small() -> Experiment:
     """The embedded sky at the resolution of the real maps, so that programs serve both."""
-    settings = load_paper(EMBEDDED)
-    raw = settings.model_dump()
-    raw["embedded"] |= {"nside": 64}
-    raw["paper"] |= {"fwhm": 80.0}
-    return PaperSettings.model_validate(raw)
+    return load(DEFAULTS / "paper.toml", ["sky.embedded.nside=64", "paper.fwhm=80.0"])
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +78,7 @@ def made(small, tmp_path_factory) -> tuple[Path, dict[str, Item]]:
 
 
 @pytest.fixture(scope="module")
-def real(data_dir, tmp_path_factory) -> tuple[PaperSettings, Path, dict[str, Item]]:
+def real(data_dir, tmp_path_factory) -> tuple[Experiment, Path, dict[str, Item]]:
     folder = tmp_path_factory.mktemp("paper")
     nu = np.geomspace(0.4, 40, 300)
     # 2.7 below 5 GHz, 2.83 above: steeper by the paper's 0.13.
@@ -88,7 +86,7 @@ def real(data_dir, tmp_path_factory) -> tuple[PaperSettings, Path, dict[str, Ite
     np.savetxt(folder / "spectrum.txt", np.stack([nu, temperature], axis=1))
     text = REAL.format(folder=data_dir.resolve(), spectrum=folder / "spectrum.txt")
     (folder / "paper.toml").write_text(text)
-    settings = load_paper(folder / "paper.toml")
+    settings = load(folder / "paper.toml")
     items = run(settings, folder / "out", LABELS)
     return settings, folder / "out", {item.label: item for item in items}
 
@@ -113,7 +111,7 @@ def check_items(out: Path, items: dict[str, Item]) -> None:
     assert items["Table 1"].table.rows[0][1:4] == ("23.3", "14.0", "10.0")
 
 
-def check_slopes(settings: PaperSettings, items: dict[str, Item]) -> None:
+def check_slopes(settings: Experiment, items: dict[str, Item]) -> None:
     """Against healpy's transform of the templates."""
     sources, numbers = Sources(settings), numbers_of(items)
     for name in ("dust", "synchrotron"):
@@ -128,7 +126,7 @@ def check_slopes(settings: PaperSettings, items: dict[str, Item]) -> None:
             assert shown == pytest.approx(float(law.slope), abs=0.01)
 
 
-def check_correlations(settings: PaperSettings, items: dict[str, Item]) -> None:
+def check_correlations(settings: Experiment, items: dict[str, Item]) -> None:
     ame, numbers = Sources(settings).ame(), numbers_of(items)
     for i, stokes in enumerate("QU"):
         r = np.corrcoef(np.asarray(ame.maps[i]), np.asarray(ame.dust[i]))[0, 1]
@@ -151,6 +149,7 @@ def test_embedded_sky(small, made):
     assert numbers["mean of β_syn"].note == "by construction"
 
 
+@pytest.mark.slow
 def test_real_sky(real, data_dir):
     settings, out, items = real
     check_items(out, items)
@@ -326,8 +325,10 @@ def test_labels():
 
 
 def test_example_is_valid():
-    settings = load_paper(EXAMPLE)
-    assert settings.paper.ame.nu_ref == 22.8
+    ame = '{ file = "ame.fits", fields = ["I_ML"], nu_ref = 22.8, fwhm = 60.0 }'
+    text = (DEFAULTS / "experiment.toml").read_text()
+    assert f"ame = {ame}" in text
+    assert load(DEFAULTS / "experiment.toml", [f"paper.ame={ame}"]).paper.ame.nu_ref == 22.8
 
 
 def jaxsky(monkeypatch, capsys, *arguments) -> tuple[int, str]:
@@ -353,9 +354,6 @@ def test_command_line(monkeypatch, capsys, tmp_path):
     code, said = jaxsky(monkeypatch, capsys, "--out", __file__)
     assert code == 2
     assert "is not a folder" in said
-    monkeypatch.chdir(tmp_path)
-    assert jaxsky(monkeypatch, capsys, "--init", "mine.toml")[0] == 0
-    assert (tmp_path / "mine.toml").read_text() == EXAMPLE.read_text()
 
 
 def test_settings_that_cannot_work(real):
@@ -363,10 +361,10 @@ def test_settings_that_cannot_work(real):
     raw = settings.model_dump()
     raw["paper"]["ame"] |= {"fields": ["I_STOKES", "Q_STOKES"]}
     with pytest.raises(ValueError, match=r"paper.ame.fields: must name one intensity map"):
-        Sources(PaperSettings.model_validate(raw)).ame()
+        Sources(Experiment.model_validate(raw)).ame()
     raw["paper"]["beta_syn"] |= {"spectrum": "absent.txt"}
     with pytest.raises(ValueError, match=r"paper.beta_syn.spectrum: .*absent.txt"):
-        Sources(PaperSettings.model_validate(raw)).index("beta_syn")
-    del raw["templates"]["sky_synchrotron"]
+        Sources(Experiment.model_validate(raw)).index("beta_syn")
+    del raw["sky"]["sky_synchrotron"]
     with pytest.raises(Impossible, match="one template of the law 'synchrotron', but there are 0"):
-        Sources(PaperSettings.model_validate(raw)).template("synchrotron")
+        Sources(Experiment.model_validate(raw)).template("synchrotron")

@@ -4,29 +4,33 @@ from pathlib import Path
 
 import pytest
 
+from fits.commands.run import DEFAULTS
 from fits.comparison import compare
 from fits.forecast.forecast import forecast
 from fits.inputs import inputs_of
 from fits.paper import STEPS, run
 from fits.paper.forecasts import _settings
-from fits.paper.settings import EMBEDDED, PaperSettings, load_paper
 from fits.paper.sources import Sources
 from fits.record import with_error
 from fits.regions import region_masks
 from fits.resolution import prepare
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.load import load
 
 LABELS = [f"Figure {n}" for n in range(5, 13)]
 EXAMPLE = Path(__file__).parents[1] / "examples" / "paper_real_sky.toml"
 
 
 @pytest.fixture(scope="module")
-def small() -> PaperSettings:
-    raw = load_paper(EMBEDDED).model_dump()
-    raw["embedded"] |= {"nside": 64}
-    raw["embedded"]["channels"] = {"planck": ["44", "70", "353"], "wmap": ["K"]}
-    raw["analysis"] |= {"nside": 32, "fwhm": 120.0}
-    raw["compare"] |= {"nsims": 30, "lmax": 60, "patches_nside": 64}
-    return PaperSettings.model_validate(raw)
+def small() -> Experiment:
+    values = [
+        "sky.embedded.nside=64",
+        'bands.0.channels=["44", "70", "353"]',
+        'bands.1.channels=["K"]',
+        "common={ nside = 32, fwhm = 120.0 }",
+        "compare={ nsims = 30, lmax = 60, patches_nside = 64 }",
+    ]
+    return load(DEFAULTS / "paper.toml", values)
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +43,7 @@ def numbers(items):
     return {number.what: number for item in items.values() for number in item.numbers}
 
 
+@pytest.mark.slow
 def test_figures(made):
     out, items = made
     assert set(LABELS) <= set(items)
@@ -54,8 +59,8 @@ def test_figures(made):
 def test_numbers_are_those_of_the_comparison(small, made):
     found = compare(
         small,
-        prepare(inputs_of(small), small.analysis.nside, small.analysis.fwhm),
-        region_masks(small),
+        prepare(inputs_of(small), small.common.nside, small.common.fwhm),
+        region_masks(small, small.compare.regions),
     )
     shown = numbers(made[1])
     for band in ("44", "70", "353", "K"):
@@ -81,10 +86,11 @@ def test_b_modes_are_those_of_the_forecast(small, made):
         assert shown[f"r with as much BB at l = 80, {band} GHz"].ours == f"{equal['l = 80']:.3g}"
 
 
+@pytest.mark.slow
 def test_without_bands_of_the_paper(data_dir, monkeypatch, tmp_path):
     """The real maps are WMAP's: no Planck spectra, no leakage, and patches of the template."""
     monkeypatch.setenv("JAXSKY_DATA", str(data_dir))
-    settings = load_paper(EXAMPLE)
+    settings = load(EXAMPLE)
     how = settings.compare.model_copy(update={"nsims": 30})
     settings = settings.model_copy(update={"compare": how})
     items = {i.label: i for i in run(settings, tmp_path / "out", [str(n) for n in range(5, 13)])}

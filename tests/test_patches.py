@@ -84,6 +84,7 @@ def test_amplitudes_and_slopes_are_true_on_average_with_the_right_errors(noise, 
     np.testing.assert_array_less(np.mean(pte < 0.01, axis=0), 0.05)
 
 
+@pytest.mark.slow
 def test_another_slope_is_found():
     """The prior does not make the answer, and neither does the slope that errors are taken for."""
     steeper = TO_C * (np.maximum(ELL, 40) / 80) ** (-4.5 + 2) * WINDOW**2
@@ -97,6 +98,7 @@ def test_another_slope_is_found():
     np.testing.assert_allclose(alpha.mean(axis=0), expected, atol=0.35)
 
 
+@pytest.mark.slow
 def test_noise_alone_is_no_detection():
     A, _, A_error, alpha_error, rows = simulated(1.0, 4, signal=0.0)
     for name in ("A", "alpha", "covariance", "chi2", "pte", "powers", "errors"):
@@ -118,6 +120,7 @@ def test_units_do_not_matter():
     np.testing.assert_allclose(1e24 * other.covariance[..., 0, 0], one.covariance[..., 0, 0], 1e-5)
 
 
+@pytest.mark.slow
 def test_noise_may_be_a_level_or_a_spectrum():
     level = 30.0
     maps = sky(jax.random.key(4), *jnp.asarray(SEEN))

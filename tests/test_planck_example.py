@@ -8,16 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fits import settings as fit_settings
-from fits.inputs import Band, Inputs, embedded_inputs, read_band, read_inputs
-from fits.paper.settings import EXAMPLE as PAPER
-from fits.paper.settings import load_paper
+from fits import inputs as fit_inputs
+from fits.commands.run import DEFAULTS
+from fits.inputs import Band, Inputs, read_band
 from fits.preparation import Preparation
+from fits.record import leaks
 from fits.report import result_json, warnings
 from fits.resolution import prepare
-from fits.separate.settings import EXAMPLE as SEPARATE
-from fits.separate.settings import load_separate
-from fits.settings import EXAMPLE, leaks, load_settings
 from fits.spectral_index import run
 from fits.template_noise import TemplateNoise, prepared_variance
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, inputs, observe
@@ -26,18 +23,22 @@ from jaxsky.inputs import Template
 from jaxsky.io import write_maps
 from jaxsky.noise import draw, uniform_covariance
 from jaxsky.settings import SettingsError
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.load import load
+from jaxsky.settings.tables import BandTable
 
 NSIDE = 8
 NPIX = healpy.nside2npix(NSIDE)
 START = {"dust.beta_dust": 1.5, "synchrotron.beta_syn": 3.0}
-SHIPPED = Path(__file__).parents[1] / "examples" / "planck_44_70.toml"
+EXAMPLES = Path(__file__).parents[1] / "examples"
+SHIPPED = EXAMPLES / "planck_44_70.toml"
 
 
 def test_the_example_is_what_init_writes():
-    assert SHIPPED.read_text() == EXAMPLE.read_text()
-    settings = load_settings(SHIPPED)
-    assert settings.analysis.regions == ["strip", "full"]
-    assert settings.analysis.methods == ["grid", "gradient", "mcmc"]
+    assert SHIPPED.read_text() == (DEFAULTS / "planck-44-70.toml").read_text()
+    settings = load(SHIPPED)
+    assert settings.fit.regions == ["strip", "full"]
+    assert settings.fit.methods == ["grid", "gradient", "mcmc"]
     assert settings.fixed == {"dust.T_dust": 21.0}
     for band, channel in zip(settings.bands, ("044", "070"), strict=True):
         assert band.file == f"LFI_SkyMap_{channel}-BPassCorrected_1024_R3.00_full.fits"
@@ -46,14 +47,13 @@ def test_the_example_is_what_init_writes():
 
 
 @pytest.mark.parametrize(
-    "bands",
-    [load_settings(EXAMPLE).bands, load_separate(SEPARATE).bands, load_paper(PAPER).bands],
-    ids=["fit", "separate", "paper"],
+    "path", [*DEFAULTS.glob("*.toml"), *EXAMPLES.glob("*.toml")], ids=lambda path: path.stem
 )
-def test_no_example_has_noise_in_a_unit_of_its_own_or_leakage(bands):
-    assert len(bands) >= 2
-    assert all(band.noise.rms is None for band in bands)
-    assert leaks(bands) == []
+def test_no_example_has_noise_in_a_unit_of_its_own_or_leakage(path):
+    settings = load(path)
+    assert len(settings.bands) >= 2
+    assert all(band.noise.rms is None for band in settings.bands)
+    assert leaks(settings) == []
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_no_example_has_noise_in_a_unit_of_its_own_or_leakage(bands):
     ],
 )
 def test_maps_that_hold_leakage_are_known_by_name(name, corrected, correction):
-    (warning,) = leaks([band_of(name)])
+    (warning,) = leaks(Experiment(bands=[band_of(name)]))
     for word in ("bands.x", Path(name).name, corrected, correction):
         assert word in warning
 
@@ -101,7 +101,7 @@ def test_maps_that_hold_leakage_are_known_by_name(name, corrected, correction):
     ],
 )
 def test_other_maps_are_not(name):
-    assert leaks([band_of(name)]) == []
+    assert leaks(Experiment(bands=[band_of(name)])) == []
 
 
 def test_a_leakage_that_is_subtracted_is_no_leak():
@@ -109,12 +109,12 @@ def test_a_leakage_that_is_subtracted_is_no_leak():
         "LFI_SkyMap_044_1024_R3.00_full.fits",
         leakage={"file": "LFI_CorrMap_044-BPassCorr_1024_R3.00_full.fits"},
     )
-    assert leaks([band]) == []
+    assert leaks(Experiment(bands=[band])) == []
 
 
-def band_of(file: str, **more) -> fit_settings.Band:
+def band_of(file: str, **more) -> BandTable:
     noise = more.pop("noise", {"rms": 1.0})
-    return fit_settings.Band(name="x", file=file, bandpass={"center": 44.0}, noise=noise, **more)
+    return BandTable(name="x", file=file, bandpass={"center": 44.0}, noise=noise, **more)
 
 
 @pytest.fixture(scope="module")
@@ -194,11 +194,11 @@ def sky_of(seed: int, scale: float = 100.0) -> Sky:
     return Sky({"dust": Dust(maps()), "synchrotron": Synchrotron(maps())})
 
 
-def settings_of(**analysis) -> fit_settings.Settings:
-    return fit_settings.Settings(
-        analysis={"methods": ["gradient"], "nside": NSIDE, "fwhm": 0.0} | analysis,
+def settings_of() -> Experiment:
+    return Experiment(
+        common={"nside": NSIDE, "fwhm": 0.0},
         free={name: {"start": value} for name, value in START.items()},
-        embedded={},
+        fit={"methods": ["gradient"], "stokes": ["QU"]},
     )
 
 
@@ -214,10 +214,11 @@ def inputs_of(sky: Sky, seen: dict[str, tuple[float, float]], noise=(), template
     return Inputs(given, bands, None, None, "", dict(noise))
 
 
+@pytest.mark.slow
 def test_a_band_without_weight_is_named_and_not_counted():
     inside = {"all": np.ones(NPIX, bool)}
     bands = {"30": (30.0, 10.0), "353": (353.0, 10.0)}
-    settings, sky = settings_of(stokes=["QU"]), sky_of(2)
+    settings, sky = settings_of(), sky_of(2)
     (plain,) = run(settings, prepare(inputs_of(sky, bands), NSIDE, 0.0), inside)
     made = inputs_of(sky, bands | {"70": (70.0, 1e12)})
     (fit,) = run(settings, prepare(made, NSIDE, 0.0), inside)
@@ -230,9 +231,10 @@ def test_a_band_without_weight_is_named_and_not_counted():
     assert found["warnings"] == warnings(made, settings, [fit])
 
 
+@pytest.mark.slow
 def test_noise_of_templates_moves_a_fit_as_computed():
     """The mean over many noisy templates, against the first order from one of them."""
-    sky, settings, inside = sky_of(3), settings_of(stokes=["QU"]), {"all": np.ones(NPIX, bool)}
+    sky, settings, inside = sky_of(3), settings_of(), {"all": np.ones(NPIX, bool)}
     bands = {str(nu): (nu, 1.0) for nu in (30.0, 44.0, 353.0)}
     covariance = uniform_covariance(2000.0, NSIDE)
     noise = {"dust": TemplateNoise(), "synchrotron": TemplateNoise(covariance=covariance)}
@@ -273,7 +275,7 @@ def test_a_level_is_seen_through_the_beam():
 
 
 def test_templates_without_a_word_on_their_noise_are_warned_of():
-    sky, settings, inside = sky_of(4), settings_of(stokes=["QU"]), {"all": np.ones(NPIX, bool)}
+    sky, settings, inside = sky_of(4), settings_of(), {"all": np.ones(NPIX, bool)}
     bands = {"30": (30.0, 10.0), "353": (353.0, 10.0)}
     made = inputs_of(sky, bands)
     fit = fitted(made, settings, inside)
@@ -292,19 +294,19 @@ def test_templates_without_a_word_on_their_noise_are_warned_of():
 
 
 def test_the_embedded_templates_are_exact():
-    settings = fit_settings.Settings(embedded={"nside": 16})
-    made = embedded_inputs(settings)
+    bands = [{"instrument": "planck", "channels": ["44", "70"]}]
+    made = fit_inputs.inputs_of(Experiment(sky={"embedded": {"nside": 16}}, bands=bands))
     assert list(made.template_noise) == list(made.templates)
     assert not any(n.level for n in made.template_noise.values())
 
 
 TEMPLATES = """
-[analysis]
+[common]
 nside = 8
 fwhm = 0
 [cmb]
 include = false
-[templates.dust]
+[sky.dust]
 law = "dust"
 file = "map.fits"
 fields = ["Q_STOKES", "U_STOKES"]
@@ -333,7 +335,7 @@ noise = {{ rms = 5e-5 }}
 def test_noise_of_templates_from_settings(folder, noise, level, variance):
     path = folder / "templates.toml"
     path.write_text(TEMPLATES.format(noise=noise))
-    found = read_inputs(load_settings(path)).template_noise["dust"]
+    found = fit_inputs.inputs_of(load(path)).template_noise["dust"]
     factor = float(Bandpass.delta(353.0).conversion("K_CMB", "uK_RJ"))
     assert found.level == pytest.approx(level * factor)
     if variance is None:
@@ -346,17 +348,17 @@ def test_noise_of_templates_from_settings(folder, noise, level, variance):
 @pytest.mark.parametrize(
     ("noise", "words"),
     [
-        ("{ rms = 160.0 }", r"templates.dust.noise: the noise of a pixel is 160 K_CMB"),
-        ("{ rms = -1.0 }", r"templates.dust.noise.rms: .*greater than or equal to 0"),
-        ("{ level = 1.0, rms = 1.0 }", r"templates.dust.noise: give the noise as exactly one of"),
-        ("{}", r"templates.dust.noise: give the noise as exactly one of level, rms"),
+        ("{ rms = 160.0 }", r"sky.dust.noise: the noise of a pixel is 160 K_CMB"),
+        ("{ rms = -1.0 }", r"sky.dust.noise.rms: .*greater than or equal to 0"),
+        ("{ level = 1.0, rms = 1.0 }", r"sky.dust.noise: give the noise as exactly one of"),
+        ("{}", r"sky.dust.noise: give the noise as exactly one of level, rms"),
     ],
 )
 def test_noise_of_templates_that_cannot_be(folder, noise, words):
     path = folder / "wrong.toml"
     path.write_text(TEMPLATES.format(noise=noise))
     with pytest.raises(SettingsError, match=words):
-        read_inputs(load_settings(path))
+        fit_inputs.inputs_of(load(path))
 
 
 def test_large_maps_are_kept_in_single_precision(folder, monkeypatch):

@@ -65,6 +65,7 @@ def test_a_second_process_adds_nothing_and_transforms_are_not_kept(tmp_path):
     assert "cache" not in said
 
 
+@pytest.mark.slow
 def test_processes_that_import_in_another_order_agree(tmp_path):
     """With the same addresses in both, where a program that holds one would find another object."""
     if shutil.which("setarch") is None or subprocess.run(["setarch", "-R", "true"]).returncode:
@@ -75,6 +76,7 @@ def test_processes_that_import_in_another_order_agree(tmp_path):
         assert found == direct, order
 
 
+@pytest.mark.slow
 def test_it_can_be_turned_off_and_put_elsewhere(tmp_path):
     process(tmp_path / "a", JAX_ENABLE_COMPILATION_CACHE="0")
     assert not (tmp_path / "a").exists()
@@ -83,6 +85,7 @@ def test_it_can_be_turned_off_and_put_elsewhere(tmp_path):
     assert any((tmp_path / "b").iterdir())
 
 
+@pytest.mark.slow
 def test_a_damaged_program_is_made_again(tmp_path):
     first, _ = process(tmp_path)
     for path in programs.program_folder(tmp_path).iterdir():

@@ -101,6 +101,7 @@ def simulated(pure, count=300):
     return spectra, np.stack([band_powers(spectra, sky(key, *seen)) for key in keys])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pure", [False, True])
 def test_band_powers_are_those_of_the_sky_with_the_right_errors(pure):
     spectra, powers = simulated(pure)
@@ -139,6 +140,7 @@ def test_errors_with_a_mask_that_is_not_a_disc():
     np.testing.assert_allclose(predicted / error, 1, atol=0.2)
 
 
+@pytest.mark.slow
 def test_simulations_correct_the_errors_of_purified_B():
     spectra, error = oblong(True)
     alone = band_covariance(spectra, *DUST)

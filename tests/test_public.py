@@ -16,13 +16,13 @@ from pydantic import BaseModel, ValidationError
 import fits
 import jaxsky
 from fits.pseudo_cl import band_powers, masked_spectra
-from fits.settings import Analysis
 from jaxsky import Bandpass, Sky, Synchrotron, observe, set_parameters
 from jaxsky.checks import as_array
 from jaxsky.harmonics import smooth
 from jaxsky.io import Maps, unit_factor
 from jaxsky.keys import realisation_key
 from jaxsky.noise import estimate_variance
+from jaxsky.settings.experiment import Common
 
 #: Annotations of arguments that may be numbers, or hold some.
 NUMERIC = re.compile(
@@ -161,7 +161,7 @@ def test_what_is_refused_inside_of_other_things():
     with pytest.raises(TypeError, match="Argument `tolerance` carries the unit GHz"):
         observe(sky, [Bandpass.delta(44.0)], tolerance=QUANTITY)
     with pytest.raises(ValidationError, match="fwhm\\n  Input should be a valid number"):
-        Analysis(fwhm=60 * u.arcmin)
+        Common(fwhm=60 * u.arcmin)
 
 
 def test_arrays_of_other_packages_are_refused():

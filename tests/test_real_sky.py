@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 
 from commands import jaxsky
-from fits import settings as fit_settings
-from fits.inputs import read_inputs
+from fits.inputs import inputs_of
 from fits.regions import region_masks
 from fits.resolution import prepare
 from fits.spectral_index import run
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.load import load
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "wmap7_vw.toml"
 
@@ -18,9 +19,10 @@ EXAMPLE = Path(__file__).parents[1] / "examples" / "wmap7_vw.toml"
 @pytest.fixture
 def wmap(data_dir, monkeypatch):
     monkeypatch.setenv("JAXSKY_DATA", str(data_dir))
-    return fit_settings.load_settings(EXAMPLE)
+    return load(EXAMPLE)
 
 
+@pytest.mark.slow
 def test_wmap_from_the_command_line(wmap, tmp_path, monkeypatch):
     assert jaxsky(monkeypatch, "fit", EXAMPLE, "--out", tmp_path) == 0
     results = json.loads((tmp_path / "result.json").read_text())["results"]
@@ -40,32 +42,33 @@ def test_wmap_from_the_command_line(wmap, tmp_path, monkeypatch):
 
 def test_published_noise_is_recovered_from_the_maps(wmap):
     """About 5.5 uK_CMB a pixel in V and 8.6 in W at high latitude, large scales included."""
-    inputs = read_inputs(wmap)
+    inputs = inputs_of(wmap)
     sigma = prepare(inputs, 32, 0.0).sigma[:, :, 0]
     for (name, expected), row in zip({"V": 5.5, "W": 8.6}.items(), sigma, strict=True):
         factor = float(inputs.bands[name].bandpass.conversion("uK_CMB", "uK_RJ"))
         assert float(row[0]) / factor == pytest.approx(expected, rel=0.06)
 
 
+@pytest.mark.slow
 def test_a_map_of_the_dust_index_shifts_as_a_whole(wmap):
     """The per-pixel path on real index maps: a fitted offset to a map of beta_dust."""
     raw = wmap.model_dump()
     maps = "templates/pysm2_d1_QU353GHz_betad_Td_n64.fits"
-    raw["templates"]["dust"]["parameters"] = {
+    raw["sky"]["dust"]["parameters"] = {
         "beta_dust": {"file": maps, "fields": ["BETA_D"], "unit": ""}
     }
     raw["free"] = {
         "dust.beta_dust.offset": {"start": 0.0, "uniform": [-1.0, 1.0]},
         "synchrotron.beta_syn": {"start": 3.0, "uniform": [1.0, 6.0]},
     }
-    raw["analysis"] |= {"methods": ["gradient"], "stokes": ["QU"], "regions": ["strip"]}
-    settings = fit_settings.Settings.model_validate(raw)
-    inputs = read_inputs(settings)
-    (fit,) = run(settings, prepare(inputs, 32, 0.0), region_masks(settings))
+    raw["fit"] |= {"methods": ["gradient"], "stokes": ["QU"], "regions": ["strip"]}
+    settings = Experiment.model_validate(raw)
+    inputs = inputs_of(settings)
+    (fit,) = run(settings, prepare(inputs, 32, 0.0), region_masks(settings, ["strip"]))
     (constant,) = run(
-        wmap.model_copy(update={"analysis": settings.analysis}),
-        prepare(read_inputs(wmap), 32, 0.0),
-        region_masks(settings),
+        wmap.model_copy(update={"fit": settings.fit}),
+        prepare(inputs_of(wmap), 32, 0.0),
+        region_masks(settings, ["strip"]),
     )
     by_map, by_number = fit.results["gradient"], constant.results["gradient"]
     # The index map's mean over the strip, weighted by the dust, is 1.52 ... 1.56.

@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fits.commands.run import DEFAULTS
+from fits.priors import priors_of
 from fits.pseudo_cl import band_powers
 from fits.separate import report
 from fits.separate import separate as module
 from fits.separate.report import tables, warnings
 from fits.separate.separate import separate
-from fits.separate.settings import EMBEDDED, EXAMPLE, SeparateSettings, load_separate
 from fits.separate.setup import build
 from fits.separation import fit_spectra
 from fits.separation.response import Response, widened
@@ -23,41 +24,38 @@ from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis
 from jaxsky.io import InputError
 from jaxsky.progress import Progress
 from jaxsky.settings import SettingsError
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.load import load
 
 NSIDE, FWHM = 16, 360.0
 CHANNELS = ["40", "68", "100", "140", "195", "280", "402"]
-LAWS = {
-    "cmb": {"law": "cmb"},
-    "dust": {"law": "dust", "nu_ref": 353.0},
-    "synchrotron": {"law": "synchrotron", "nu_ref": 30.0},
-}
 FREE = {
     "dust.beta_dust": {"start": 1.6, "uniform": [0.5, 2.5]},
     "dust.T_dust": {"start": 19.0, "gaussian": [21.0, 2.0]},
     "synchrotron.beta_syn": {"start": 3.0},
 }
-OF = [{"file": "beta.fits"}]
+SKY = {"embedded": {"nside": NSIDE}}
 
 
 def settings(**changes):
     tables = {
         "title": "small",
-        "separation": {"nside": NSIDE, "fwhm": FWHM, "latitude": 20.0, "nsims": 20, "seed": 2},
-        "embedded": {"channels": CHANNELS, "nside": NSIDE},
-        "components": LAWS,
+        "seed": 2,
+        "sky": SKY,
+        "bands": [{"instrument": "litebird", "channels": CHANNELS}],
+        "common": {"nside": NSIDE, "fwhm": FWHM},
         "free": FREE,
-        "tensors": {"width": 4, "apodization": 20.0},
+        "separate": {"region": "outside", "nsims": 20, "width": 4, "apodization": 20.0},
     }
     for name, value in changes.items():
-        both = isinstance(value, dict) and name in ("separation", "embedded", "tensors")
+        both = name in ("common", "separate")
         tables[name] = tables[name] | value if both else value
-    tables = {name: value for name, value in tables.items() if value is not None}
-    return SeparateSettings.model_validate(tables)
+    return Experiment.model_validate(tables)
 
 
 @functools.cache
 def separated(domain: str = "pixel", nsims: int = 20, sampler: str = "none"):
-    how = settings(separation={"domain": domain, "nsims": nsims, "sampler": sampler})
+    how = settings(separate={"domain": domain, "nsims": nsims, "sampler": sampler})
     setup = build(how)
     return how, setup, separate(how, setup)
 
@@ -83,7 +81,7 @@ def test_pulls_of_laws_and_r():
         data = np.where(domain.used, setup.foregrounds + np.asarray(cmb(key)) + noise, 0.0)
         like = domain.likelihood(data)
         # A prior's mean is measured, too.
-        prior = how.priors()
+        prior = priors_of(how, "separate")
         mean = 21.0 + 2.0 * float(jax.random.normal(jax.random.fold_in(key, 2)))
         prior["dust.T_dust"] = type(prior["dust.T_dust"])(mean, 2.0)
         fit = fit_spectra(like, found.fit.best_fit, priors=prior)
@@ -99,12 +97,12 @@ def test_pulls_of_laws_and_r():
     assert min(found.sigma[n] / found.fit.sigma[n] for n in found.fit.free) > 1.5
 
 
-@pytest.mark.parametrize("domain", ["pixel", "harmonic"])
+@pytest.mark.parametrize("domain", ["pixel", pytest.param("harmonic", marks=pytest.mark.slow)])
 def test_both_domains_find_the_sky(domain):
     _, setup, found = separated(domain)
-    for name, value in setup.truth.items():
-        assert abs(found.fit.best_fit[name] - value) < 4 * found.sigma[name]
-    assert abs(found.tensors.r - setup.r) < 4 * found.tensors.sigma
+    for name in found.fit.free:
+        assert abs(found.fit.best_fit[name] - setup.truth[name]) < 4 * found.sigma[name]
+    assert abs(found.tensors.r - setup.truth["r"]) < 4 * found.tensors.sigma
     assert found.tensors.probability > 1e-3
     assert abs(found.tensors.shift(found.left)) < 0.5 * found.tensors.sigma
     assert np.nanmin(found.degradation) > 1
@@ -142,11 +140,13 @@ def test_noise_of_multipoles_has_its_spectrum():
         )
 
 
+@pytest.mark.slow
 def test_a_law_that_is_wrong_shows_in_r():
     """Synchrotron with a curvature that the fit does not know."""
     how = settings(
-        embedded={"truth": {"synchrotron.curvature": -0.5}},
-        separation={"sampler": "none", "latitude": 10.0},
+        truth={"synchrotron.curvature": -0.5},
+        regions={"wide": "|b| > 10"},
+        separate={"sampler": "none", "region": "wide"},
     )
     found = separate(how, build(how))
     _, _, right = separated()
@@ -156,17 +156,18 @@ def test_a_law_that_is_wrong_shows_in_r():
     assert "the laws do not describe the maps" in said
 
 
+@pytest.mark.slow
 def test_regions_have_values_of_their_own():
     regions = {"dust.beta_dust": {"latitudes": [40.0]}, "synchrotron.beta_syn": {"clusters": 3}}
     free = {name: value | {"regions": regions.get(name)} for name, value in FREE.items()}
-    how = settings(free=free, separation={"latitude": 15.0})
+    how = settings(free=free, regions={"wide": "|b| > 15"}, separate={"region": "wide"})
     setup = build(how)
     found = separate(how, setup)
     assert np.shape(found.fit.best_fit["dust.beta_dust"]) == (2,)
     assert np.shape(found.sigma["synchrotron.beta_syn"]) == (3,)
     assert found.chain.free == found.fit.labels
-    for name, value in setup.truth.items():
-        off = np.abs(np.asarray(found.fit.best_fit[name]) - value)
+    for name in found.fit.free:
+        off = np.abs(np.asarray(found.fit.best_fit[name]) - setup.truth[name])
         assert np.all(off < 4.5 * np.asarray(found.sigma[name]))
     shown = found.of_pixel("dust.beta_dust", found.fit.best_fit)
     latitude = np.abs(healpy.pix2ang(NSIDE, np.arange(shown.size), lonlat=True)[1])
@@ -177,7 +178,7 @@ def test_regions_have_values_of_their_own():
 def test_the_response_is_that_of_a_new_fit():
     """To first order in the noise; Gaussian priors draw their mean anew."""
     how, setup, found = separated()
-    domain, priors = setup.domain, how.priors()
+    domain, priors = setup.domain, priors_of(how, "separate")
     response = Response(found.like, found.fit.best_fit, {})
     amplitude = np.array(found.found.amplitude)
     data = domain.emission(found.like, found.fit.best_fit, amplitude)
@@ -198,6 +199,7 @@ def test_the_response_is_that_of_a_new_fit():
     assert np.sqrt(scatter[at, at]) == pytest.approx(expected, rel=0.15)
 
 
+@pytest.mark.slow
 def test_widened_samples_have_the_errors_of_simulations():
     _, _, found = separated("pixel", 20, "nuts")
     chain = found.chain
@@ -217,7 +219,7 @@ def test_widened_samples_have_the_errors_of_simulations():
 def test_lensing_is_what_the_settings_say():
     """In the simulations that set errors as well as in the model."""
     _, setup, whole = separated()
-    how = settings(tensors={"A_lens": 0.25}, separation={"sampler": "none"})
+    how = settings(cmb={"A_lens": 0.25}, separate={"sampler": "none"})
     found = separate(how, setup)
     one, other = whole.tensors.model, found.tensors.model
     leak = whole.spectra.windows[1, :, 0] @ camb_spectra(whole.spectra.lmax)[1]
@@ -251,58 +253,47 @@ def test_simulations_are_kept_and_gone_on_with(tmp_path):
     again = separate(how, setup, tmp_path, Counted())
     assert counts == list(range(21))
     counts.clear()
-    more = how.model_copy(update={"separation": how.separation.model_copy(update={"nsims": 22})})
+    more = how.model_copy(update={"separate": how.separate.model_copy(update={"nsims": 22})})
     found = separate(more, setup, tmp_path, Counted())
     assert counts == [20, 21, 22]
     np.testing.assert_array_equal(found.simulated.total[:20], again.simulated.total)
-    other = settings(tensors={"A_lens": 0.5}, separation={"sampler": "none"})
+    other = settings(cmb={"A_lens": 0.5}, separate={"sampler": "none"})
     with pytest.raises(InputError, match="holds realisations of other data or settings"):
         separate(other, setup, tmp_path)
 
 
 def test_the_settings_that_come_along_are_valid():
-    assert load_separate(EMBEDDED).embedded.instrument == "litebird"
-    assert [band.name for band in load_separate(EXAMPLE).bands] == ["30", "70", "143", "353"]
+    default = load(DEFAULTS / "separate.toml")
+    assert len(default.bands) == 15
+    assert default.bands[0].name == "40"
+    template = load(DEFAULTS / "experiment.toml")
+    assert [band.name for band in template.bands] == CHANNELS
+    assert template.start("separate")["dust.T_dust"] == 19.0
+
+
+def beta(**changes):
+    """A free index."""
+    return {"free": {"dust.beta_dust": {"start": 1.5} | changes}}
 
 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"embedded": None}, "give either bands or the table embedded"),
-        ({"components": {"dust": LAWS["dust"], "s": LAWS["synchrotron"]}}, "must have the law"),
+        ({"sky": SKY | {"cmb": {"law": "dust"}}}, "the name 'cmb' has a meaning of its own"),
+        ({"sky": SKY | {"a": {"law": "cmb"}}}, "(?s)sky.*a.law: the CMB is described"),
+        (beta(start=3.0, uniform=[1.0, 2.0]), "start 3 is not inside the uniform prior"),
         (
-            {"components": LAWS | {"cmb": {"law": "cmb", "nu_ref": 100.0}}},
-            "the law 'cmb' has no nu_ref",
-        ),
-        ({"free": {}}, "at least 1 item"),
-        (
-            {"free": {"dust.beta_dust": {"start": 3.0, "uniform": [1.0, 2.0]}}},
-            "start 3 is not inside the uniform prior",
-        ),
-        (
-            {"free": {"dust.beta_dust": {"start": 1.5, "regions": {"nside": 4, "clusters": 3}}}},
+            beta(regions={"nside": 4, "clusters": 3}),
             "exactly one of nside, latitudes, clusters, file, not nside, clusters",
         ),
+        (beta(regions={}), "exactly one of .*, not none"),
+        (beta(regions={"nside": 2, "of": [{"file": "a"}]}), "of goes with clusters only"),
+        ({"separate": {"nsims": 3}}, "greater than or equal to 20"),
+        ({"separate": {"region": "none"}}, "separate.region: 'none' is none of strip, outside"),
         (
-            {"free": {"dust.beta_dust": {"start": 1.5, "regions": {}}}},
-            "exactly one of .*, not none",
+            {"bands": [{"instrument": "litebird", "channels": ["40", "41"]}]},
+            "litebird has no channel '41'",
         ),
-        (
-            {
-                "free": {
-                    "dust.beta_dust": {"start": 1.5, "regions": {"nside": 2, "of": [{"file": "a"}]}}
-                }
-            },
-            "of goes with clusters only",
-        ),
-        (
-            {
-                "separation": {"domain": "harmonic"},
-                "free": {"dust.beta_dust": {"start": 1.5, "regions": {"nside": 2}}},
-            },
-            "free.dust.beta_dust: regions are those of pixels",
-        ),
-        ({"separation": {"nsims": 3}}, "greater than or equal to 20"),
     ],
 )
 def test_settings_that_contradict_themselves_are_refused(changes, words):
@@ -311,51 +302,44 @@ def test_settings_that_contradict_themselves_are_refused(changes, words):
 
 
 @pytest.mark.parametrize(
-    ("changes", "error", "words"),
+    ("changes", "words"),
     [
-        ({"separation": {"fwhm": 30.0}}, ValueError, "target beam of 30 arcmin is finer than"),
-        ({"separation": {"nside": 32}}, ValueError, "common nside 32 is larger than that of"),
+        ({"bands": []}, "bands: there are none"),
+        ({"cmb": {"include": False}}, "cmb.include: is false"),
+        ({"free": {}}, "free: name at least one parameter"),
         (
-            {"embedded": {"channels": ["40", "41"]}},
-            SettingsError,
-            "embedded.channels: .* has no channel '41'",
+            {"separate": {"domain": "harmonic"}} | beta(regions={"nside": 2}),
+            "free.dust.beta_dust: regions are those of pixels",
         ),
+        ({"common": {"fwhm": 0.0}}, "common.fwhm: must be positive"),
+        ({"common": {"fwhm": 30.0}}, "common: .*beam of 30 arcmin is finer than"),
+        ({"common": {"nside": 32}}, "common nside 32 is larger than that of"),
+        ({"truth": {"dust.beta": 1.0}}, "truth: Unknown parameter 'dust.beta'"),
+        ({"sky": SKY | {"dust": {"parameters": {"beta": 1.5}}}}, "sky.dust: .*beta"),
         (
-            {"embedded": {"truth": {"dust.beta": 1.0}}},
-            SettingsError,
-            "embedded.truth: Unknown parameter 'dust.beta'",
-        ),
-        (
-            {"components": LAWS | {"dust": {"law": "dust", "parameters": {"beta": 1.5}}}},
-            SettingsError,
-            "components.dust: .*beta",
-        ),
-        (
-            {"free": {"dust.beta_dust": {"start": 1.5, "regions": {"nside": 64}}}},
-            SettingsError,
+            beta(regions={"nside": 64}),
             "free.dust.beta_dust.regions: .* at most that of the map, 16",
         ),
         (
-            {"free": {"dust.beta_dust": {"start": 1.5, "regions": {"latitudes": [50.0, 40.0]}}}},
-            SettingsError,
+            beta(regions={"latitudes": [50.0, 40.0]}),
             "free.dust.beta_dust.regions: Argument `edges` must increase",
         ),
     ],
 )
-def test_settings_that_cannot_work_are_refused(changes, error, words):
-    with pytest.raises(error, match=words):
+def test_settings_that_cannot_work_are_refused(changes, words):
+    with pytest.raises(SettingsError, match=words):
         build(settings(**changes))
 
 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"tensors": {"lmax": 40}}, "tensors.lmax: 40 is beyond what nside 16"),
-        ({"tensors": {"lmin": 20, "width": 30}}, "no bin of 30 multipoles fits"),
+        ({"lmax": 40}, "separate.lmax: 40 is beyond what nside 16"),
+        ({"lmin": 20, "width": 30}, "no bin of 30 multipoles fits"),
     ],
 )
 def test_spectra_that_cannot_be_taken_are_refused(changes, words):
     _, setup, _ = separated()
-    how = settings(**changes)
+    how = settings(separate=changes)
     with pytest.raises(SettingsError, match=words):
         separate(how, setup)

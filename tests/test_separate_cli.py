@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from commands import jaxsky, one_sentence
-from fits.commands.separate import RESULTS
+from commands import jaxsky, one_sentence, said
+from fits.commands.separate import KIND
 from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.harmonics import alm_ell, gaussian_beam, resample, synthesis
 from jaxsky.io import read_maps, write_maps
@@ -20,20 +20,19 @@ BANDS = {"40": 90.0, "100": 80.0, "195": 80.0, "280": 80.0, "402": 80.0}
 SIGMA = 0.5
 SETTINGS = """
 title = "A small sky"
-[separation]
+[common]
 nside = 8
 fwhm = 600.0
-nsims = 20
-sampler = "emcee"
-nsteps = 1500
-[components]
-cmb = { law = "cmb" }
+[sky]
 dust = { law = "dust", nu_ref = 353.0, parameters = { T_dust = 20.0 } }
 synchrotron = { law = "synchrotron", nu_ref = 30.0 }
 [free]
 "dust.beta_dust" = { start = 1.5, gaussian = [1.6, 0.3], regions = REGIONS }
 "synchrotron.beta_syn" = { start = 3.1, uniform = [2.0, 4.5] }
-[tensors]
+[separate]
+nsims = 20
+sampler = "emcee"
+nsteps = 1500
 width = 4
 """
 BAND = """
@@ -98,7 +97,7 @@ def test_maps_of_ones_own(folder, tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr()
     assert "dust.beta_dust, median of 2 regions" in printed.out
     names = {p.name for p in out.iterdir()}
-    assert names == {*RESULTS, "index.html", "log.txt"}
+    assert names == {*KIND.results, "index.html", "log.txt"}
     for picture in out.glob("*.png"):
         assert picture.read_bytes().startswith(b"\x89PNG")
     result = json.loads((out / "result.json").read_text())
@@ -125,21 +124,23 @@ def test_maps_of_ones_own(folder, tmp_path, monkeypatch, capsys):
     assert jaxsky(monkeypatch, "separate", path, "--out", out, "--resume") == 0
     again = json.loads((out / "result.json").read_text())
     assert again == json.loads(before)
-    assert jaxsky(monkeypatch, "separate", path, "--out", out, "--resume", "--seed", "8") == 2
-    capsys.readouterr()
+    assert jaxsky(monkeypatch, "separate", path, "--out", out, "--resume", "--set", "seed=8") == 2
+    assert "holds realisations of other data or settings" in said(capsys)
 
 
+@pytest.mark.slow
 def test_multipoles_of_files(folder, tmp_path, monkeypatch):
     path = settings(folder, "harmonic", regions="REGIONS", **{", regions = REGIONS": ""})
     out = tmp_path / "out"
-    assert jaxsky(monkeypatch, "separate", path, "--out", out, "--domain", "harmonic") == 0
+    domain = "separate.domain=harmonic"
+    assert jaxsky(monkeypatch, "separate", path, "--out", out, "--set", domain) == 0
     result = json.loads((out / "result.json").read_text())
     for name, truth in {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}.items():
         found = result["parameters"][name]
         assert abs(found["best_fit"] - truth) < 5 * found["sigma"]
     assert not (out / "parameters.png").exists()
     names = {p.name for p in out.iterdir()}
-    assert names == {*RESULTS, "index.html", "log.txt"} - {"parameters.fits", "parameters.png"}
+    assert names == {*KIND.results, "index.html", "log.txt"} - {"parameters.fits", "parameters.png"}
 
 
 def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
@@ -172,13 +173,13 @@ def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"nside = 8": "nside = 7"}, "separation.nside: nside must be a power of two"),
+        ({"nside = 8": "nside = 7"}, "common.nside: nside must be a power of two"),
         ({"domain": "wave"}, ""),
-        ({"[components]": "[parts]"}, "components: is missing; parts: unknown key"),
-        ({"fwhm = 600.0": "fwhm = 60.0"}, "target beam of 60 arcmin is finer than"),
+        ({"[sky]": "[parts]"}, "parts: unknown key"),
+        ({"fwhm = 600.0": "fwhm = 60.0"}, "beam of 60 arcmin is finer than"),
         ({"'labels.fits'": "'shares.fits'"}, "labels must be whole numbers"),
         ({"'labels.fits'": "'40.fits', fields = ['Q_STOKES', 'U_STOKES']"}, "must name one column"),
-        ({"'labels.fits'": "'40.fits', fields = ['QQ_COV']"}, "nside is 16, but separation.nside"),
+        ({"'labels.fits'": "'40.fits', fields = ['QQ_COV']"}, "nside is 16, but common.nside"),
         ({"'labels.fits'": "'none.fits'"}, "none.fits: "),
         ({'beta_syn"': 'beta"'}, "Unknown parameter 'synchrotron.beta'"),
         (
@@ -192,24 +193,15 @@ def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
 def test_mistakes_are_one_sentence(folder, tmp_path, monkeypatch, capsys, changes, words):
     options = []
     if "domain" in changes:
-        options, changes = ["--domain", changes["domain"]], {}
-        words = "separation.domain: input should be 'pixel' or 'harmonic'"
+        options, changes = ["--set", f"separate.domain={changes['domain']}"], {}
+        words = "separate.domain: input should be 'pixel' or 'harmonic'"
     path, out = settings(folder, "wrong", **changes), tmp_path / "out"
     assert jaxsky(monkeypatch, "separate", path, "--out", out, *options) == 2
     assert words in one_sentence(capsys)
     assert not (out / "result.json").exists()
 
 
-def test_the_example_is_written(tmp_path, monkeypatch, capsys):
-    path = tmp_path / "separation.toml"
-    assert jaxsky(monkeypatch, "separate", "--init", path) == 0
-    assert path.read_text().startswith("# Settings of `jaxsky separate`")
-    assert jaxsky(monkeypatch, "separate", "--init", path) == 2
-    capsys.readouterr()
-    assert jaxsky(monkeypatch, "separate", path, "--out", tmp_path / "out") == 2
-    assert "LFI_SkyMap_030-BPassCorrected_1024_R3.00_full.fits" in one_sentence(capsys)
-
-
+@pytest.mark.slow
 def test_noise_that_varies(folder, tmp_path, monkeypatch):
     """Weights of pixels of their own; the likelihood goes through all of them."""
     variance = SIGMA**2 * np.linspace(0.5, 2.0, 12 * NSIDE**2)

@@ -142,8 +142,8 @@ TURNED = START | {"angle.95": 1.5, "gain.145": 1.02, "shift.220": 0.01, "width.2
     ("kind", "stokes", "params"),
     [
         ("stokes", 3, START),
-        ("separable", 3, TURNED),
-        ("covariance", 2, TURNED),
+        pytest.param("separable", 3, TURNED, marks=pytest.mark.slow),
+        pytest.param("covariance", 2, TURNED, marks=pytest.mark.slow),
     ],
 )
 def test_value_amplitudes_and_fisher_are_the_dense_ones(kind, stokes, params):
@@ -256,7 +256,9 @@ slope = jax.jit(jax.grad(lambda theta, like: like.total(theta[like.index])))
 chi2_slope = jax.jit(jax.grad(lambda params, like: chi2(like, params)))
 
 
-@pytest.mark.parametrize(("kind", "params"), [("band", START), ("separable", TURNED)])
+@pytest.mark.parametrize(
+    ("kind", "params"), [("band", START), pytest.param("separable", TURNED, marks=pytest.mark.slow)]
+)
 def test_compressed_and_pixel_likelihoods_are_one(kind, params):
     _, data, given, _ = problem(kind, 3)
     mask = np.ones(NPIX)
@@ -334,6 +336,7 @@ def test_a_band_in_K_CMB_is_calibrated_on_the_CMB():
     np.testing.assert_allclose(in_cmb, in_rj / in_rj[:, :1], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_other_ways_to_fit_give_the_same():
     sky, data, given, _ = problem()
     like = spectral_likelihood(sky, BANDS, data, given, START)

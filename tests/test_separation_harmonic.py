@@ -120,8 +120,8 @@ def dense(alm, spectra, window, params):
     ("kind", "stokes", "params", "fwhm"),
     [
         ("band", 2, START, FWHM),
-        ("stokes", 3, START, WIDE),
-        ("ell", 3, TURNED, WIDE),
+        pytest.param("stokes", 3, START, WIDE, marks=pytest.mark.slow),
+        pytest.param("ell", 3, TURNED, WIDE, marks=pytest.mark.slow),
     ],
 )
 def test_value_amplitudes_and_fisher_are_the_dense_ones(kind, stokes, params, fwhm):
@@ -232,6 +232,7 @@ def test_parameters_of_bands_are_found():
         assert fit.best_fit[name] == pytest.approx(value, rel=1e-8, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_estimates_scatter_as_they_say():
     number, truth = 200, components()
     signal, given = observed(truth, FWHM), LEVELS

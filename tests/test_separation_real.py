@@ -8,9 +8,9 @@ import healpy
 import numpy as np
 import pytest
 
-from fits.forecast.setup import apodize
 from fits.priors import Gaussian
 from fits.pseudo_cl import band_powers, bin_edges, masked_spectra
+from fits.regions import apodize
 from fits.separation import (
     as_noise,
     component_maps,
@@ -153,6 +153,7 @@ def recovered(fits, truth, name, key):
     return values[inside], sigma[inside], mean[inside], (alone - mean)[inside], variation[inside]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "least", "widest"),
     [
@@ -202,6 +203,7 @@ def test_with_less_noise_what_varies_within_regions_decides(fits, truth):
 
 
 #: Pixels of nside 4 at (l, b) = (315, 54), (345, 54) and at (315, -30), (75, -54).
+@pytest.mark.slow
 @pytest.mark.parametrize("patch", [(22, 23), (150, 170)])
 def test_finer_regions_converge_to_the_truth(sky, maps, patch):
     """Without noise, where signals are bright; each region has an index of each kind.
@@ -257,6 +259,7 @@ def left(fits, maps, ratio, key):
     return rms(cleaned.map("cmb")[:, USED]), powers / lensing, tensors.shift(powers)
 
 
+@pytest.mark.slow
 def test_what_constant_indices_leave_in_the_cmb_and_in_r(fits, maps, ratio):
     """Foregrounds without noise through the separation, with the laws fitted to noisy maps."""
     constant, regions, alone = (

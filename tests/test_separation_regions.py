@@ -342,6 +342,7 @@ def test_pixels_that_fail_are_counted_with_the_prior_that_helps():
     np.testing.assert_allclose(held.best_fit["dust.beta_dust"][:3], 1.6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_chi2_that_is_astronomical_is_no_fit():
     _, data, given, _ = problem("full")
     marred = np.array(data)

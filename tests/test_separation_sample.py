@@ -91,6 +91,7 @@ PRIORS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_a_cut_posterior_is_that_of_integrals_on_a_grid(sampler):
     """Correlated, with a long tail, and cut half a standard deviation below the maximum."""
@@ -195,6 +196,7 @@ def test_without_data_the_posterior_is_the_prior():
         assert not nothing.details
 
 
+@pytest.mark.slow
 def test_regions_have_labels_and_those_without_pixels_none():
     priors = {"dust.T_dust": Gaussian(19.5, 0.5)}
     like = regions()

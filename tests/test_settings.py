@@ -1,215 +1,173 @@
-"""Settings of all commands: values of their types, within bounds, names that results can bear."""
+"""Experiment files: values of their types, within bounds, and names that results can bear."""
 
 import pytest
 
-from fits.forecast.settings import ForecastSettings
-from fits.paper.settings import PaperSettings
-from fits.separate.settings import SeparateSettings
-from fits.settings import Settings
-from jaxsky.experiment.settings import Experiment
 from jaxsky.settings import SettingsError
-from jaxsky.settings_load import load
+from jaxsky.settings.load import load
 
-TEMPLATE = '[templates."{component}"]\nfile = "a.fits"\nlaw = "dust"\nnu_ref = 353\n'
+#: The least that a file has to say of a band and of a component.
 BAND = '[[bands]]\nname = "{band}"\n'
 MAP = BAND + 'file = "a.fits"\nbandpass = {{ center = 30 }}\nnoise = {{ rms = 1 }}\n'
-ANALYSIS = "[analysis]\n{main}\n" + MAP + TEMPLATE
-#: Command -> its settings, the least that a file has to say, and its table of components.
-FORMATS = {
-    "simulate": (
-        Experiment,
-        f"[experiment]\n{{main}}\n{BAND}bandpass = {{{{ center = 30 }}}}\nfwhm = 60\n{TEMPLATE}",
-        "templates",
-    ),
-    "fit": (Settings, ANALYSIS, "templates"),
-    "paper": (PaperSettings, ANALYSIS, "templates"),
-    "separate": (
-        SeparateSettings,
-        '[separation]\n{main}\n[free."x.beta_dust"]\nstart = 1.5\n[components.cmb]\nlaw = "cmb"\n'
-        '[components."{component}"]\nlaw = "dust"\n' + MAP,
-        "components",
-    ),
-    "forecast": (
-        ForecastSettings,
-        f"[fisher]\n{{main}}\n[mask]\nlatitude = 20\n{BAND}center = 30\nwidth = 3\n"
-        f"fwhm = 60\nnoise = 1\n{TEMPLATE}",
-        "templates",
-    ),
+SKY = '[sky."{component}"]\nlaw = "dust"\n'
+TEMPLATE = SKY + 'file = "a.fits"\nnu_ref = 353\n'
+#: What commands are given: something to simulate, maps, and maps with laws alone.
+FILES = {
+    "simulated": BAND + "bandpass = {{ center = 30 }}\nfwhm = 60\n" + TEMPLATE,
+    "observed": MAP + TEMPLATE,
+    "separated": MAP + SKY + '[free."x.beta_dust"]\nstart = 1.5\n',
 }
-RESOLVED = [name for name in FORMATS if name != "forecast"]
+NSIDES = ["common.nside", "simulate.nside", "sky.embedded.nside", "compare.panel_nside"]
+BEAMS = ["common.fwhm", "simulate.fwhm", "paper.fwhm"]
+SEEDS = ["seed", "sky.embedded.seed", "simulate.small_scales_seed"]
+TABLES = ["simulate", "fit", "compare", "separate", "forecast", "paper", "common", "cmb"]
 
 
-def read(folder, command, main="", band="30", component="dust"):
-    model, text, _ = FORMATS[command]
+def read(folder, text, main="", band="30", component="dust"):
     path = folder / "settings.toml"
-    path.write_text(text.format(main=main, band=band, component=component))
-    return load(path, model)
+    path.write_text(f"{main}\n" + text.format(band=band, component=component))
+    return load(path)
 
 
-def refused(folder, command, words, **arguments):
+def refused(folder, words, text="", **arguments):
     with pytest.raises(SettingsError) as mistake:
-        read(folder, command, **arguments)
+        read(folder, text, **arguments)
     sentence = str(mistake.value)
     assert sentence.startswith(f"{folder / 'settings.toml'}: ")
     assert words in sentence
     assert "\n" not in sentence
 
 
-@pytest.mark.parametrize("command", FORMATS)
-def test_files_that_are_right(tmp_path, command):
+@pytest.mark.parametrize("text", FILES.values(), ids=FILES)
+def test_files_that_are_right(tmp_path, text):
     for band in ("30", "Ka", "100-1a", "44.1", "L1+040_x", "b" * 40):
-        assert read(tmp_path, command, band=band).bands[0].name == band
+        assert read(tmp_path, text, band=band).bands[0].name == band
     for component in ("dust", "Dust_1", "2nd-dust", "d" * 40):
-        settings = read(tmp_path, command, component=component)
-        assert component in getattr(settings, FORMATS[command][2])
+        assert component in read(tmp_path, text, component=component).sky.components
 
 
-@pytest.mark.parametrize("command", RESOLVED)
 @pytest.mark.parametrize(
-    ("main", "words"),
+    ("keys", "value", "words"),
     [
-        ("nside = true", "nside: input should be a valid integer, not True."),
-        ('nside = "16"', "nside: input should be a valid integer, not '16'."),
-        ("nside = 16.0", "nside: input should be a valid integer, not 16.0."),
-        ("nside = 12", "nside: nside must be a power of two, not 12."),
-        ("nside = 0", "nside: input should be greater than 0, not 0."),
-        ("nside = -8", "nside: input should be greater than 0, not -8."),
-        ("nside = 16384", "nside: input should be less than or equal to 8192, not 16384."),
-        (f"nside = {2**40}", "nside: input should be less than or equal to 8192, not 10995116"),
-        ("nside = [16]", "nside: input should be a valid integer, not [16]."),
-        ('fwhm = "60"', "fwhm: input should be a valid number"),
-        ("fwhm = true", "fwhm: input should be a valid number"),
-        ("fwhm = nan", "fwhm: input should be a finite number"),
-        ("seed = true", "seed: input should be a valid integer, not True."),
-        ('seed = "1"', "seed: input should be a valid integer, not '1'."),
-        ("seed = 1.0", "seed: input should be a valid integer, not 1.0."),
-        ("seed = -1", "seed: input should be greater than or equal to 0, not -1."),
-        (f"seed = {2**32}", "seed: input should be less than 4294967296, not 4294967296."),
-        (f"seed = {2**53}", "seed: input should be less than 4294967296, not 9007199254740992."),
-        ("nonsense = 1", "nonsense: unknown key."),
+        (NSIDES, "true", "input should be a valid integer, not True."),
+        (NSIDES, '"16"', "input should be a valid integer, not '16'."),
+        (NSIDES, "16.0", "input should be a valid integer, not 16.0."),
+        (NSIDES, "12", "nside must be a power of two, not 12."),
+        (NSIDES, "0", "input should be greater than 0, not 0."),
+        (NSIDES, "-8", "input should be greater than 0, not -8."),
+        (NSIDES, "16384", "input should be less than or equal to 8192, not 16384."),
+        (NSIDES, f"{2**40}", "input should be less than or equal to 8192, not 10995116"),
+        (NSIDES, "[16]", "input should be a valid integer, not [16]."),
+        (BEAMS, '"60"', "input should be a valid number"),
+        (BEAMS, "true", "input should be a valid number"),
+        (BEAMS, "nan", "input should be a finite number"),
+        (SEEDS, "true", "input should be a valid integer, not True."),
+        (SEEDS, '"1"', "input should be a valid integer, not '1'."),
+        (SEEDS, "1.0", "input should be a valid integer, not 1.0."),
+        (SEEDS, "-1", "input should be greater than or equal to 0, not -1."),
+        (SEEDS, f"{2**32}", "input should be less than 4294967296, not 4294967296."),
+        (SEEDS, f"{2**53}", "input should be less than 4294967296, not 9007199254740992."),
+        (["nonsense", *(f"{table}.nonsense" for table in TABLES)], "1", "unknown key."),
     ],
 )
-def test_numbers_of_other_types_or_out_of_bounds(tmp_path, command, main, words):
-    refused(tmp_path, command, words, main=main)
+def test_numbers_of_other_types_or_out_of_bounds(tmp_path, keys, value, words):
+    for key in keys:
+        refused(tmp_path, f"{key}: {words}", FILES["observed"], main=f"{key} = {value}")
 
 
 @pytest.mark.parametrize(
-    ("command", "main", "words"),
+    ("text", "words"),
     [
-        ("simulate", "outputs = []", "experiment.outputs: list should have at least 1 item"),
-        ("simulate", 'outputs = ["total", "total"]', "experiment.outputs: has 'total' twice."),
-        ("simulate", 'outputs = "total"', "experiment.outputs: input should be a valid list, not"),
-        ("simulate", "include = []", "experiment.include: list should have at least 1 item"),
-        ("simulate", 'include = [""]', "experiment.include.0: string should have at least 1"),
-        ("simulate", 'include = ["cmb", "cmb"]', "experiment.include: has 'cmb' twice."),
-        ("simulate", "sheet = 1", "experiment.sheet: input should be a valid boolean, not 1."),
+        ("simulate.outputs = []", "simulate.outputs: list should have at least 1 item"),
+        ('simulate.outputs = ["total", "total"]', "simulate.outputs: has 'total' twice."),
+        ('simulate.outputs = "total"', "simulate.outputs: input should be a valid list, not"),
+        ("simulate.include = []", "simulate.include: list should have at least 1 item"),
+        ('simulate.include = [""]', "simulate.include.0: string should have at least 1"),
+        ('simulate.include = ["cmb", "cmb"]', "simulate.include: has 'cmb' twice."),
+        ("simulate.sheet = 1", "simulate.sheet: input should be a valid boolean, not 1."),
+        ('simulate.sheet = "no"', "simulate.sheet: input should be a valid boolean, not 'no'."),
+        ('bands = [{ instrument = "" }]', "bands.0.instrument: must not be empty."),
+        ("fit.regions = []", "fit.regions: list should have at least 1 item"),
+        ('fit.regions = ["full", "full"]', "fit.regions: has 'full' twice."),
+        ('fit.stokes = ["Q", "Q"]', "fit.stokes: has 'Q' twice."),
+        ('fit.methods = ["grid", "grid"]', "fit.methods: has 'grid' twice."),
+        ("fit.methods = []", "fit.methods: list should have at least 1 item"),
+        ("regions.strip = 20", "regions.strip: input should be a valid string or a valid table, "),
+        ('regions.strip = "20"', 'regions.strip: must be "full", latitudes such as "|b| > 20"'),
+        ("common.mask = 1", "common.mask: input should be a valid table, not 1."),
+        ('common.mask = { file = "" }', "common.mask.file: "),
+        ("fit.points = 200.0", "fit.points: input should be a valid integer, not 200.0"),
+        ("cmb.include = 1", "cmb.include: input should be a valid boolean, not 1."),
         (
-            "simulate",
-            'sheet = "no"',
-            "experiment.sheet: input should be a valid boolean, not 'no'.",
-        ),
-        ("simulate", 'instrument = ""', "experiment.instrument: must not be empty."),
-        ("fit", "regions = []", "analysis.regions: list should have at least 1 item"),
-        ("fit", 'regions = ["full", "full"]', "analysis.regions: has 'full' twice."),
-        ("fit", 'stokes = ["Q", "Q"]', "analysis.stokes: has 'Q' twice."),
-        ("fit", 'methods = ["grid", "grid"]', "analysis.methods: has 'grid' twice."),
-        ("fit", "methods = []", "analysis.methods: list should have at least 1 item"),
-        ("fit", 'latitude = "20"', "analysis.latitude: input should be a valid number, not '20'."),
-        ("fit", "mask = 1", "analysis.mask: input should be a valid table, not 1."),
-        ("fit", 'mask = { file = "" }', "analysis.mask.file: "),
-        (
-            "fit",
-            "[grid]\npoints = 200.0",
-            "grid.points: input should be a valid integer, not 200.0",
-        ),
-        ("fit", "[cmb]\ninclude = 1", "cmb.include: input should be a valid boolean, not 1."),
-        (
-            "fit",
-            '[free."dust.beta_dust"]\nstart = "1.5"',
+            'free."dust.beta_dust" = { start = "1.5" }',
             "free.dust.beta_dust.start: input should be a valid number, not '1.5'.",
         ),
         (
-            "fit",
-            '[free."dust.beta_dust"]\nstart = 1.5\nuniform = [1, true]',
+            'free."dust.beta_dust" = { start = 1.5, uniform = [1, true] }',
             "free.dust.beta_dust.uniform.1: input should be a valid number, not True.",
         ),
         (
-            "fit",
-            '[free."dust.beta_dust"]\nstart = 1.5\nuniform = [1, 2, 3]',
+            'free."dust.beta_dust" = { start = 1.5, uniform = [1, 2, 3] }',
             "free.dust.beta_dust.uniform: tuple should have at most 2 items",
         ),
         (
-            "fit",
-            '[fixed]\n"dust.beta_dust" = "1.5"',
+            'fixed."dust.beta_dust" = "1.5"',
             "fixed.dust.beta_dust: input should be a valid number, not '1.5'.",
         ),
+        ("separate.nsims = true", "separate.nsims: input should be a valid integer, not True."),
+        ("separate.nsteps = 200.0", "separate.nsteps: input should be a valid integer"),
+        ("separate.purify = 0", "separate.purify: input should be a valid boolean"),
+        ('forecast.spectra = ["BB", "BB"]', "forecast.spectra: has 'BB' twice."),
+        ("forecast.spectra = []", "forecast.spectra: list should have at least 1 item"),
+        ('forecast.free = ["r", "r"]', "forecast.free: has 'r' twice."),
         (
-            "separate",
-            "nsims = true",
-            "separation.nsims: input should be a valid integer, not True.",
+            "forecast.fisher_lmax = 300.0",
+            "forecast.fisher_lmax: input should be a valid integer, not 300.0.",
         ),
-        ("separate", "nsteps = 200.0", "separation.nsteps: input should be a valid integer"),
-        ("separate", "[tensors]\npurify = 0", "tensors.purify: input should be a valid boolean"),
-        ("forecast", 'spectra = ["BB", "BB"]', "fisher.spectra: has 'BB' twice."),
-        ("forecast", "spectra = []", "fisher.spectra: list should have at least 1 item"),
-        ("forecast", 'free = ["r", "r"]', "fisher.free: has 'r' twice."),
-        ("forecast", "lmax = 300.0", "fisher.lmax: input should be a valid integer, not 300.0."),
-        ("forecast", "r = false", "fisher.r: input should be a valid number, not False."),
-        ("forecast", "[spectra]\nr = [0.1, 0.1]", "spectra.r: has 0.1 twice."),
-        (
-            "forecast",
-            "[spectra]\nfit = [20, true]",
-            "spectra.fit.1: input should be a valid integer",
-        ),
-        (
-            "paper",
-            "[paper]\ncenter = [180, true]",
-            "paper.center.1: input should be a valid number",
-        ),
-        ("paper", '[paper]\nfwhm = "5"', "paper.fwhm: input should be a valid number, not '5'."),
-        ("paper", "[paper]\nmask = 'm.fits'", "paper.mask: input should be a valid table, not"),
+        ("cmb.r = false", "cmb.r: input should be a valid number, not False."),
+        ("forecast.show_r = [0.1, 0.1]", "forecast.show_r: has 0.1 twice."),
+        ("forecast.fit = [20, true]", "forecast.fit.1: input should be a valid integer"),
+        ("paper.center = [180, true]", "paper.center.1: input should be a valid number"),
+        ('paper.fwhm = "5"', "paper.fwhm: input should be a valid number, not '5'."),
+        ("compare.regions = 'm.fits'", "compare.regions: input should be a valid list, not"),
     ],
 )
-def test_lists_and_switches(tmp_path, command, main, words):
-    refused(tmp_path, command, words, main=main)
+def test_lists_and_switches(tmp_path, text, words):
+    refused(tmp_path, words, main=text)
 
 
-@pytest.mark.parametrize("command", FORMATS)
+@pytest.mark.parametrize("text", FILES.values(), ids=FILES)
 @pytest.mark.parametrize("name", ["", " ", "a b", "a/b", "..", ".a", "-a", "\u03b2", "a:b", "a$b$"])
-def test_names_that_files_or_columns_cannot_bear(tmp_path, command, name):
+def test_names_that_files_or_columns_cannot_bear(tmp_path, text, name):
     letters = "a name consists of letters, digits and _ + -"
-    refused(tmp_path, command, f"bands.0.name: {letters} ., and", band=name)
-    refused(tmp_path, command, f"{FORMATS[command][2]}.{name}: {letters}, and", component=name)
+    refused(tmp_path, f"bands.0.name: {letters} ., and", text, band=name)
+    refused(tmp_path, f"sky.{name}: {letters}, and", text, component=name)
+    refused(tmp_path, f"regions.{name}: {letters}, and", main=f'regions."{name}" = "full"')
 
 
-@pytest.mark.parametrize("command", FORMATS)
-def test_names_that_are_long_dotted_or_taken(tmp_path, command):
-    table = FORMATS[command][2]
+@pytest.mark.parametrize("text", FILES.values(), ids=FILES)
+def test_names_that_are_long_dotted_or_taken(tmp_path, text):
     long = "a" * 80
-    refused(tmp_path, command, "bands.0.name: a name has at most 40 characters, not 80", band=long)
-    refused(tmp_path, command, f"{table}.{long}: a name has at most 40", component=long)
-    refused(tmp_path, command, f"{table}.a.b: a name consists of", component="a.b")
+    words = "bands.0.name: a name has at most 40 characters, not 80"
+    refused(tmp_path, words, text, band=long)
+    refused(tmp_path, f"sky.{long}: a name has at most 40", text, component=long)
+    refused(tmp_path, "sky.a.b: a name consists of", text, component="a.b")
     taken = ["noise", "Total", "residual", "r", "A_lens", "calibration", "offset", "center"]
-    for name in (*taken, *([] if command == "separate" else ["cmb", "CMB"])):
-        words = f"{table}.{name}: the name {name!r} has a meaning of its own in results"
-        refused(tmp_path, command, words, component=name)
+    for name in (*taken, "gain", "shift", "width", "angle", "cmb", "CMB"):
+        words = f"sky.{name}: the name {name!r} has a meaning of its own in results"
+        refused(tmp_path, words, text, component=name)
 
 
 def test_names_that_are_alike(tmp_path):
-    second = MAP.replace("{band}", "{}")
+    second = MAP.replace("{band}", "{{}}") + MAP
     for name, words in [("30a", "must differ, but"), ("30A", "must differ by more than capitals")]:
-        refused(
-            tmp_path, "fit", f"names of the bands {words}", main=second.format(name), band="30a"
-        )
-    second = '[templates.Dust]\nfile = "b.fits"\nlaw = "dust"\nnu_ref = 353'
-    refused(tmp_path, "fit", "names of the templates must differ by more than", main=second)
+        text = second.replace("{{}}", name)
+        refused(tmp_path, f"names of the bands {words}", text, band="30a")
+    second = '[sky.Dust]\nlaw = "dust"\n'
+    words = "names of the components must differ by more than"
+    refused(tmp_path, words, second + TEMPLATE)
 
 
-def test_the_name_of_the_cmb_is_that_of_the_cmb(tmp_path):
-    path = tmp_path / "settings.toml"
-    path.write_text(
-        '[components]\ncmb.law = "dust"\nother.law = "cmb"\n[free."cmb.beta_dust"]\nstart = 1.5\n'
-        "[embedded]\n"
-    )
-    with pytest.raises(SettingsError, match=r"components.cmb: must have the law 'cmb'; choose"):
-        load(path, SeparateSettings)
+def test_the_cmb_is_described_in_its_table(tmp_path):
+    refused(tmp_path, "sky.other.law: the CMB is described in", main='sky.other.law = "cmb"')
+    words = "sky.cmb: the name 'cmb' has a meaning of its own"
+    refused(tmp_path, words, main='sky.cmb.law = "dust"')

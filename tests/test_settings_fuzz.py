@@ -4,8 +4,9 @@ import pytest
 
 from jaxsky.io import InputError
 from jaxsky.settings import SettingsError
-from jaxsky.settings_keys import at_key, of_file
-from settings_fuzz import KINDS, fault, faults, small
+from jaxsky.settings.keys import at_key, of_file
+from jaxsky.settings.load import load
+from settings_fuzz import KINDS, changed, fault, faults, small, written
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -16,25 +17,40 @@ def test_settings_load_or_are_refused(tmp_path, kind):
 @pytest.mark.parametrize(
     ("kind", "at", "value"),
     [
-        ("experiment", ("experiment", "instrument"), "spt"),
-        ("experiment", ("experiment", "channels"), ["44"]),
-        ("experiment", ("fixed",), {"dust.beta": 1.5}),
-        ("experiment", ("cmb",), {"r": 0.1, "cosmology": {"H0": -1e300}}),
-        ("experiment", ("cmb",), {"r": 1e300}),
-        ("forecast", ("experiment", "channels"), ["44"]),
-        ("forecast", ("spectra", "bands"), ["44"]),
-        ("separate", ("embedded", "instrument"), "spt"),
-        ("separate", ("embedded", "channels"), ["44"]),
+        ("simulate", ("bands", 0, "instrument"), "spt"),
+        ("simulate", ("bands", 0, "channels"), ["44"]),
+        ("simulate", ("fixed",), {"dust.beta": 1.5}),
+        ("simulate", ("cmb",), {"r": 0.1, "cosmology": {"H0": -1e300}}),
+        ("simulate", ("cmb",), {"r": 1e300}),
+        ("forecast", ("bands", 0, "channels"), ["44"]),
+        ("forecast", ("forecast", "bands"), ["44"]),
+        ("separate", ("bands", 0, "instrument"), "spt"),
+        ("separate", ("bands", 0, "channels"), ["44"]),
     ],
 )
 def test_settings_that_cannot_work_are_refused(tmp_path, kind, at, value):
-    raw, path = small(kind), tmp_path / "settings.toml"
-    raw.setdefault(at[0], {})
-    table = raw if len(at) == 1 else raw[at[0]]
-    table[at[-1]] = value
+    path = tmp_path / "settings.toml"
+    raw = changed(small(kind), at, value)
     assert fault(kind, raw, at, path) is None
-    with pytest.raises(SettingsError, match=rf"^{path}: {at[0]}"), of_file(path):
-        KINDS[kind].build(KINDS[kind].load(path))
+    key = ".".join(map(str, at[:2]))
+    with pytest.raises(SettingsError, match=rf"^{path}: {key}"), of_file(path):
+        KINDS[kind].build(load(path))
+
+
+def test_what_a_command_leaves_out_of_free_parameters_is_said(tmp_path):
+    free = {
+        "dust.beta_dust": {"uniform": [0.5, 2.5], "regions": {"nside": 2}},
+        "calibration.44": {"gaussian": [1.0, 0.1]},
+        "dust.T_dust": {},
+    }
+    settings = load(written(tmp_path / "settings.toml", {"free": free}))
+    said = {name: settings.left_out(name) for name in ("fit", "separate", "forecast")}
+    assert [len(sentences) for sentences in said.values()] == [1, 1, 3]
+    assert "jaxsky fit does not have regions of parameters: dust.beta_dust." in said["fit"][0]
+    assert "jaxsky separate does not have them: calibration.44." in said["separate"][0]
+    assert "jaxsky forecast does not have uniform ones: dust.beta_dust." in said["forecast"][2]
+    with pytest.raises(SettingsError, match=r"^free\.dust\.T_dust: start is missing\.$"):
+        settings.start("fit")
 
 
 def test_a_key_is_named_once():
@@ -51,7 +67,7 @@ def test_deep_settings_are_refused(tmp_path):
     for text in ("a = " + 10000 * "[" + 10000 * "]", "a = " + toml_of_depth(3000)):
         path.write_text(text)
         with pytest.raises(SettingsError, match=rf"^{path}: "):
-            KINDS["fit"].load(path)
+            load(path)
 
 
 def toml_of_depth(depth: int) -> str:

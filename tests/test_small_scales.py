@@ -197,6 +197,7 @@ def test_final_spectra_of_a_power_law(coefficients, template):
     np.testing.assert_allclose(steps, 1, atol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["dust", "synchrotron"])
 def test_final_spectra_of_the_real_sky(data_dir, name):
     maps, small = jnp.asarray(real(data_dir, name)), REAL[name]
@@ -408,6 +409,7 @@ def coefficients_of(alms, weight):
     return products / np.outer(scale, scale)
 
 
+@pytest.mark.slow
 def test_dust_and_ame_stay_as_correlated_as_they_are(pair):
     alms, parts, _, templates = pair
     ell = alm_ell(128)
@@ -457,6 +459,7 @@ def test_repaired_multipoles_are_counted(pair):
     assert int(repaired) == bad
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_pair(coefficients, template):
     # A second template that is much like the first; many multipoles are repaired.
     other = 0.3 * coefficients + 0.2 * coefficients[::-1]
@@ -517,6 +520,7 @@ def test_refuses_correlated_ranges_that_do_not_overlap(template):
         continue_templates(KEY, [template, template], [OWN, OWN], small, NSIDE)
 
 
+@pytest.mark.slow
 def test_a_coarse_template_is_correlated_with_what_is_known_of_a_finer_one(data_dir):
     # Dust is known up to l = 128, AME at 3 degrees up to l = 50: there it follows the dust's own
     # coefficients, beyond both it is drawn with them.

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fits import settings as fit_settings
+from fits.commands.run import DEFAULTS
 from fits.covariance import Fluctuations, uniform_level
-from fits.inputs import Band, Inputs, embedded_inputs
+from fits.inputs import Band, Inputs, inputs_of
 from fits.likelihood import likelihood
 from fits.optimize import best_fit
 from fits.preparation import Preparation, prepare_component
@@ -30,6 +30,9 @@ from jaxsky.inputs import Template
 from jaxsky.instrument import load_instrument
 from jaxsky.noise import draw, fit_knee, knee_spectrum, uniform_covariance
 from jaxsky.settings import SettingsError
+from jaxsky.settings.load import load
+
+QUICK = ["common.nside=16", "common.fwhm=300.0", "seed=3", "sky.embedded.nside=32"]
 
 
 def random_alm(lmax: int, seed: int = 0) -> jnp.ndarray:
@@ -229,18 +232,17 @@ def test_knee_of_correlated_noise_is_recovered():
 
 @pytest.fixture(scope="module")
 def quick_settings():
-    settings = fit_settings.load_settings(fit_settings.EMBEDDED, {"nside": 16, "seed": 3})
-    embedded = settings.embedded.model_copy(update={"nside": 32})
-    analysis = settings.analysis.model_copy(update={"fwhm": 300.0})
-    return settings.model_copy(update={"embedded": embedded, "analysis": analysis})
+    return load(DEFAULTS / "fit.toml", QUICK)
 
 
 def test_embedded_run_recovers_the_truth(quick_settings, tmp_path):
-    inputs = embedded_inputs(quick_settings)
-    assert inputs.truth == pytest.approx({"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1})
+    inputs = inputs_of(quick_settings)
+    free = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1}
+    assert {name: inputs.truth[name] for name in free} == pytest.approx(free)
     assert "not data" in inputs.description
     prepared = prepare(inputs, 16, 300.0)
-    fits = run(quick_settings, prepared, region_masks(quick_settings), tmp_path / "chain.h5")
+    regions = region_masks(quick_settings, quick_settings.fit.regions)
+    fits = run(quick_settings, prepared, regions, tmp_path / "chain.h5")
     assert [(f.region, f.stokes) for f in fits] == [
         (region, stokes) for region in ("strip", "full") for stokes in ("Q", "U", "QU")
     ]
@@ -250,7 +252,7 @@ def test_embedded_run_recovers_the_truth(quick_settings, tmp_path):
         assert all(r.converged for r in results.values())
         assert fit.chi2["gradient"] / fit.dof < 1.5
         assert fit.probability_to_exceed("gradient") > 1e-3
-        for name, truth in inputs.truth.items():
+        for name, truth in free.items():
             sigma = results["gradient"].sigma(name)
             for r in results.values():
                 assert abs(r.best_fit[name] - truth) < 4 * sigma
@@ -259,26 +261,30 @@ def test_embedded_run_recovers_the_truth(quick_settings, tmp_path):
 
 
 def test_what_a_band_shows_does_not_depend_on_the_others(quick_settings):
-    whole = embedded_inputs(quick_settings).bands
-    embedded = quick_settings.embedded.model_copy(update={"channels": {"planck": ["70", "353"]}})
-    other = embedded_inputs(quick_settings.model_copy(update={"embedded": embedded})).bands
+    whole = inputs_of(quick_settings).bands
+    bands = "bands=[{instrument='planck', channels=['70', '353']}]"
+    other = inputs_of(load(DEFAULTS / "fit.toml", [*QUICK, bands])).bands
     assert list(other) == ["70", "353"]
     # Finer beams take more steps of an analysis, which changes the sky by less than 1e-7.
     maps = np.asarray(whole["70"].maps)
     np.testing.assert_allclose(other["70"].maps, maps, rtol=0, atol=1e-6 * maps.std())
 
 
-def test_masks_with_names_that_results_cannot_bear(quick_settings, tmp_path):
-    for name, words in [("strip.fits", "is called as a region"), ("m" * 210, "at most 200 bytes")]:
-        healpy.write_map(tmp_path / name, np.ones(48), dtype=np.float64)
-        analysis = quick_settings.analysis.model_copy(update={"regions": [str(tmp_path / name)]})
-        with pytest.raises(SettingsError, match=rf"analysis.regions: .*{words}"):
-            region_masks(quick_settings.model_copy(update={"analysis": analysis}))
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("Strip", "regions must differ by more than capitals"),
+        ("m" * 41, "at most 40 characters"),
+        ("../m", "begins with a letter or digit"),
+    ],
+)
+def test_regions_with_names_that_results_cannot_bear(name, words):
+    with pytest.raises(SettingsError, match=rf"fit.toml: .*{words}"):
+        load(DEFAULTS / "fit.toml", [f"regions.{name!r} = {{ file = 'mask.fits' }}"])
 
 
 def test_regions(quick_settings):
-    analysis = quick_settings.analysis.model_copy(update={"regions": ["strip", "outside", "full"]})
-    masks = region_masks(quick_settings.model_copy(update={"analysis": analysis}))
+    masks = region_masks(quick_settings, ["strip", "outside", "full"])
     np.testing.assert_array_equal(masks["strip"] ^ masks["outside"], masks["full"])
     # |b| <= 20 deg covers sin(20 deg) of the sphere.
     assert masks["strip"].mean() == pytest.approx(np.sin(np.radians(20)), abs=0.03)

@@ -367,6 +367,7 @@ def _fetch(wanted, folder):
     fetch(wanted, folder)
 
 
+@pytest.mark.slow
 def test_processes_do_not_fetch_twice(server, tmp_path, log):
     wanted = product(f"{server}/steady/{NAME}", hash=SHA)
     context = multiprocessing.get_context("spawn")
@@ -393,6 +394,7 @@ def test_leftovers_of_a_process_that_ended_are_removed(server, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == [NAME]
 
 
+@pytest.mark.slow
 def test_killed_downloads_are_resumed(server, tmp_path):
     begun = kill_fetches(server, tmp_path, kills=2)
     assert len(begun) >= 2

@@ -29,9 +29,11 @@ def test_wheel_imports_from_an_empty_environment(tmp_path):
     subprocess.run(venv, check=True)
     paths = os.pathsep.join([str(site), sysconfig.get_paths()["purelib"]])
     code = (
-        "import jaxsky, fits, fits.settings as s; from jaxsky.instrument import load_instrument;"
+        "import jaxsky, fits; from fits.commands.run import DEFAULTS;"
+        "from jaxsky.instrument import load_instrument; from jaxsky.settings.load import load;"
         f"assert all(p.__file__.startswith({str(site)!r}) for p in (jaxsky, fits));"
-        "s.load_settings(s.EMBEDDED); load_instrument('litebird')"
+        "assert 'fit' in [load(path) and path.stem for path in DEFAULTS.glob('*.toml')];"
+        "load_instrument('litebird')"
     )
     subprocess.run(
         [environment / "bin" / "python", "-c", code],

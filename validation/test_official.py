@@ -6,16 +6,16 @@ there is nothing to test.
 
 import importlib.util
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fits.inputs import read_inputs
+from fits.commands.run import DEFAULTS
+from fits.inputs import inputs_of
 from fits.optimize import best_fit
 from fits.regions import region_masks
 from fits.resolution import prepare
-from fits.settings import EXAMPLE, load_settings
+from jaxsky.settings.load import load
 
 TRUTH = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1}
 SEEDS = range(1, 51)
@@ -44,19 +44,19 @@ def settings(data_dir, tmp_path_factory):
     folder = tmp_path_factory.mktemp("official")
     (folder / "LFI_RIMO_R3.31.fits").symlink_to(data_dir / "bandpass" / "LFI_RIMO_R3.31.fits")
     path = folder / "planck_44_70.toml"
-    path.write_text(Path(EXAMPLE).read_text())
-    return load_settings(path)
+    path.write_text((DEFAULTS / "planck-44-70.toml").read_text())
+    return load(path)
 
 
 def test_pulls_over_fifty_skies(maker, settings, monkeypatch):
-    folder, start, pulls = settings.data_dir, settings.start(), []
+    folder, start, pulls = settings.data_dir, settings.start("fit"), []
     for seed in SEEDS:
         line = ["make_files.py", folder, "--nside", "128", "--seed", str(seed)]
         monkeypatch.setattr(sys, "argv", line)
         maker.main()
-        prepared = prepare(read_inputs(settings), settings.analysis.nside, settings.analysis.fwhm)
+        prepared = prepare(inputs_of(settings), settings.common.nside, settings.common.fwhm)
         row = []
-        for inside in region_masks(settings).values():
+        for inside in region_masks(settings, settings.fit.regions).values():
             fit = best_fit(prepared.likelihood(start, region=inside), start)
             row.append([(fit.best_fit[n] - truth) / fit.sigma(n) for n, truth in TRUTH.items()])
         pulls.append(row)

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from fits.commands.run import DEFAULTS
 from fits.inputs import inputs_of
 from fits.optimize import best_fit
 from fits.resolution import prepare
-from fits.settings import EMBEDDED, load_settings
 from jaxsky.galaxy import embedded_sky
+from jaxsky.settings.load import load
 
 SKIES = 200
 
@@ -15,15 +16,12 @@ SKIES = 200
 @pytest.fixture(scope="module")
 def pulls():
     """(best fit - truth) / sigma of both indices in each sky."""
-    settings = load_settings(EMBEDDED, {"nside": 16, "fwhm": 300.0})
-    embedded = settings.embedded.model_copy(update={"nside": 32})
-    settings, galaxy = settings.model_copy(update={"embedded": embedded}), embedded_sky(32)
-    rows = []
+    values = ["common.nside=16", "common.fwhm=300.0", "sky.embedded.nside=32"]
+    settings, galaxy = load(DEFAULTS / "fit.toml", values), embedded_sky(32)
+    start, rows = settings.start("fit"), []
     for seed in range(SKIES):
-        analysis = settings.analysis.model_copy(update={"seed": seed})
-        inputs = inputs_of(settings.model_copy(update={"analysis": analysis}), galaxy)
-        like = prepare(inputs, 16, 300.0).likelihood(settings.start())
-        found = best_fit(like, settings.start())
+        inputs = inputs_of(settings.model_copy(update={"seed": seed}), galaxy=galaxy)
+        found = best_fit(prepare(inputs, 16, 300.0).likelihood(start), start)
         rows.append(
             [(found.best_fit[name] - inputs.truth[name]) / found.sigma(name) for name in found.free]
         )

@@ -1,4 +1,4 @@
-"""Values of every format of settings, replaced by values that they cannot have."""
+"""Values of the settings of every command, replaced by values that they cannot have."""
 
 import pytest
 

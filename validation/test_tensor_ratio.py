@@ -3,35 +3,38 @@
 import jax
 import numpy as np
 
+from fits.priors import priors_of
 from fits.pseudo_cl import band_powers
 from fits.separate.separate import separate
-from fits.separate.settings import SeparateSettings
 from fits.separate.setup import build
 from fits.separation import fit_spectra
 from fits.separation.tensor_ratio import fit_tensors
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.harmonics import expand, gaussian_beam, synthesis
+from jaxsky.settings.experiment import Experiment
 
 NSIDE, FWHM, R, SKIES = 32, 180.0, 0.01, 100
 SETTINGS = {
     "title": "gravitational waves",
-    "separation": {"nside": NSIDE, "fwhm": FWHM, "latitude": 20.0, "nsims": 50, "seed": 5},
-    "embedded": {"channels": ["40", "68", "100", "140", "195", "280", "402"], "nside": NSIDE},
-    "components": {
-        "cmb": {"law": "cmb"},
-        "dust": {"law": "dust", "nu_ref": 353.0},
-        "synchrotron": {"law": "synchrotron", "nu_ref": 30.0},
-    },
+    "seed": 5,
+    "sky": {"embedded": {"nside": NSIDE}},
+    "bands": [
+        {
+            "instrument": "litebird",
+            "channels": ["40", "68", "100", "140", "195", "280", "402"],
+        }
+    ],
+    "common": {"nside": NSIDE, "fwhm": FWHM},
     "free": {
         "dust.beta_dust": {"start": 1.6, "uniform": [0.5, 2.5]},
         "synchrotron.beta_syn": {"start": 3.0},
     },
-    "tensors": {"width": 5, "apodization": 20.0},
+    "separate": {"region": "outside", "nsims": 50, "width": 5, "apodization": 20.0},
 }
 
 
 def test_r_comes_back():
-    how = SeparateSettings.model_validate(SETTINGS)
+    how = Experiment.model_validate(SETTINGS)
     setup = build(how)
     found = separate(how, setup)
     domain, lmax = setup.domain, 2 * NSIDE
@@ -50,7 +53,7 @@ def test_r_comes_back():
         noise = domain.noise_realisation(jax.random.fold_in(key, 1))
         data = np.where(domain.used, setup.foregrounds + np.asarray(cmb(key)) + noise, 0.0)
         like = domain.likelihood(data)
-        fit = fit_spectra(like, found.fit.best_fit, priors=how.priors())
+        fit = fit_spectra(like, found.fit.best_fit, priors=priors_of(how, "separate"))
         maps = domain.components(like, fit.best_fit, data, covariance=False).amplitude
         powers = band_powers(found.spectra, maps[found.components.index("cmb")])[1]
         pulls.append((fit_tensors(model, powers).r - R) / sigma)

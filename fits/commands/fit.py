@@ -6,39 +6,25 @@ from typing import Annotated
 import typer
 
 from fits.commands import run
-from jaxsky.settings_keys import at_key
+from jaxsky.settings.keys import at_key
 
 __all__ = ["fit"]
 
-RESULTS = ("result.json", "log.json", "grid.png", "marginals.png", "posterior.png", "chain.h5")
+KIND = run.Kind(
+    "fit", ("result.json", "log.json", "grid.png", "marginals.png", "posterior.png", "chain.h5")
+)
 
 
 def fit(
     settings_file: run.SettingsPath = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/fit"),
-    init: run.Init = False,
-    seed: Annotated[int | None, typer.Option(help="Seed of simulated maps and chains.")] = None,
-    region: Annotated[
-        list[str] | None, typer.Option(help="strip, outside, full or a mask file; repeatable.")
-    ] = None,
-    stokes: Annotated[list[str] | None, typer.Option(help="Q, U or QU; repeatable.")] = None,
-    nside: Annotated[int | None, typer.Option(help="Common nside of the comparison.")] = None,
+    maps: run.Maps = None,
     values: run.Values = None,
     resume: run.Resume = False,
     overwrite: run.Overwrite = False,
 ) -> None:
     """Fit spectral indices to polarization maps: on a grid, by gradient and by MCMC."""
-    from fits.settings import EMBEDDED, EXAMPLE, Settings
-
-    kind = run.Kind(Settings, EMBEDDED, EXAMPLE, "analysis.toml", RESULTS)
-    overrides = {"seed": seed, "regions": region_files(region), "stokes": stokes, "nside": nside}
-    options = run.Options(settings_file, out, init, values, resume, overwrite)
-    run.run(kind, _work, options, {"analysis": overrides})
-
-
-def region_files(regions: list[str] | None) -> list[str] | None:
-    """Regions of the command line: files are relative to the folder one is in."""
-    return [str(Path(r).resolve()) if Path(r).is_file() else r for r in regions or []] or None
+    run.run(KIND, _work, run.Options(settings_file, out, values, resume, overwrite, maps))
 
 
 def _work(settings, command: run.Run) -> run.Report:
@@ -48,10 +34,10 @@ def _work(settings, command: run.Run) -> run.Report:
     from fits.resolution import prepare
 
     command.steps.step("reading and preparing maps")
-    regions = region_masks(settings)
+    regions = region_masks(settings, settings.fit.regions)
     inputs = inputs_of(settings)
-    with at_key("analysis"):
-        prepared = prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
+    with at_key("common"):
+        prepared = prepare(inputs, settings.common.nside, settings.common.fwhm)
     inputs = inputs._replace(bands={})  # their maps have served
     command.begin()
     chains = command.out / "chain.h5"
@@ -60,7 +46,7 @@ def _work(settings, command: run.Run) -> run.Report:
     written = report.write_report(command.out, inputs, settings, fits, command.steps.seconds)
     return run.Report(
         inputs.description,
-        [report.result_table(fits, inputs.truth)],
+        [report.result_table(fits, report.known_truth(inputs, fits))],
         report.warnings(inputs, settings, fits),
         [*written, *([chains] if chains.exists() else [])],
     )

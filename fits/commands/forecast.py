@@ -9,21 +9,17 @@ from fits.commands import run
 
 __all__ = ["forecast"]
 
-RESULTS = ("forecast.json", "log.json", "bb.png", "fisher.png")
+KIND = run.Kind("forecast", ("forecast.json", "log.json", "bb.png", "fisher.png"), resumable=False)
 
 
 def forecast(
     settings_file: run.SettingsPath = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/forecast"),
-    init: run.Init = False,
     values: run.Values = None,
     overwrite: run.Overwrite = False,
 ) -> None:
     """Forecast B modes: foregrounds against primordial ones, and errors on r and the laws."""
-    from fits.forecast.settings import DEFAULT, EXAMPLE, ForecastSettings
-
-    kind = run.Kind(ForecastSettings, DEFAULT, EXAMPLE, "forecast.toml", RESULTS, resumable=False)
-    run.run(kind, _work, run.Options(settings_file, out, init, values, overwrite=overwrite))
+    run.run(KIND, _work, run.Options(settings_file, out, values, overwrite=overwrite))
 
 
 def _work(settings, command: run.Run) -> run.Report:
@@ -35,5 +31,8 @@ def _work(settings, command: run.Run) -> run.Report:
     command.begin()
     written = report.write_report(command.out, found, settings, command.steps.seconds)
     return run.Report(
-        found.setup.description, report.tables(found), report.warnings(found), written
+        found.setup.description,
+        report.tables(found),
+        [*report.warnings(found), *settings.left_out("forecast")],
+        written,
     )

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from fits.commands import run
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["paper"]
 
@@ -13,7 +14,6 @@ __all__ = ["paper"]
 def paper(
     settings_file: run.SettingsPath = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/paper"),
-    init: run.Init = False,
     only: Annotated[
         list[str] | None,
         typer.Option(help="A figure by its number, or 'table 1'; repeatable. Default all."),
@@ -23,9 +23,8 @@ def paper(
     overwrite: run.Overwrite = False,
 ) -> None:
     """Make the figures and tables of the paper again, and a page that shows them."""
-    from fits.paper.settings import EMBEDDED, EXAMPLE, PaperSettings
 
-    def work(settings: PaperSettings, command: run.Run) -> run.Report:
+    def work(settings: Experiment, command: run.Run) -> run.Report:
         from fits.paper.run import run as make
 
         options = command.options
@@ -35,12 +34,13 @@ def paper(
             only or (),
             resume=options.resume,
             overwrite=options.overwrite,
+            begin=command.begin,
             progress=command.steps,
         )
         missing = [f"{i.label}: {i.differs}" for i in items if not (i.picture or i.table)]
         count = f"{len(items)} figures and tables ({command.steps.seconds:.1f} s)"
-        return run.Report("", (), missing, (), f"Written: {command.out / 'index.html'}, {count}.")
+        page = command.out / run.PAGE
+        return run.Report("", (), missing, [page], f"{count}.", page=False)
 
     # What is kept and what is replaced is seen to figure by figure.
-    kind = run.Kind(PaperSettings, EMBEDDED, EXAMPLE, "paper.toml", ())
-    run.run(kind, work, run.Options(settings_file, out, init, values, resume, overwrite))
+    run.run(run.Kind("paper", ()), work, run.Options(settings_file, out, values, resume, overwrite))

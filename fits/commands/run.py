@@ -3,11 +3,12 @@
 A command is a function from its settings to a `Report`; the rest is here, once.
 """
 
+import json
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import typer
 from rich.table import Table
@@ -17,13 +18,13 @@ from fits.commands.errors import logged
 from fits.commands.interrupt import interruptible
 from fits.commands.page import Section, table_of, write_page
 from jaxsky.io.folders import ALL, Folder, occupied
-from jaxsky.settings import SettingsFile
-from jaxsky.settings_keys import of_file
-from jaxsky.settings_load import load
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import of_file
+from jaxsky.settings.load import load
 
 __all__ = [
-    "Init",
     "Kind",
+    "Maps",
     "Options",
     "Overwrite",
     "Report",
@@ -37,17 +38,22 @@ __all__ = [
 
 #: Steps and their times, and the page that shows the results, in every folder.
 LOG, PAGE = "log.txt", "index.html"
+#: Steps of a process that makes a part of the results, from its first one.
+PART_LOG = "log_{:05d}.txt"
+#: Experiments that commands have without a file.
+DEFAULTS = Path(__file__).parents[1] / "defaults"
 
 SettingsPath = Annotated[
     Path | None,
-    typer.Argument(metavar="[SETTINGS.toml]", help="Settings; without, those of the embedded sky."),
-]
-Init = Annotated[
-    bool, typer.Option("--init", help="Write a commented example of the settings and stop.")
+    typer.Argument(metavar="[EXPERIMENT.toml]", help="Without, one with the embedded sky."),
 ]
 Values = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Any key of the settings; repeatable."),
+    typer.Option("--set", metavar="KEY=VALUE", help="Any key of the file; repeatable."),
+]
+Maps = Annotated[
+    Path | None,
+    typer.Option(help="Folder of a realisation of `jaxsky simulate`, for bands without a file."),
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Keep what is in --out, and go on with it.")]
 Overwrite = Annotated[
@@ -56,20 +62,15 @@ Overwrite = Annotated[
 
 
 class Kind(NamedTuple):
-    """What a command works with.
+    """What a command is.
 
     Parameters
     ----------
-    settings : their type
-    embedded, example : settings that are taken without a file, and those that --init writes
-    name : of the file that --init writes
+    name : of the command, and of the settings that it takes without a file
     results : patterns of what is in the folder of the results
     resumable : whether a stopped command can be gone on with
     """
 
-    settings: type[SettingsFile]
-    embedded: Path
-    example: Path
     name: str
     results: tuple[str, ...]
     resumable: bool = True
@@ -80,10 +81,10 @@ class Options(NamedTuple):
 
     settings_file: Path | None
     out: Path
-    init: bool = False
     values: Sequence[str] | None = None
     resume: bool = False
     overwrite: bool = False
+    maps: Path | None = None
 
 
 class Report(NamedTuple):
@@ -95,6 +96,7 @@ class Report(NamedTuple):
     tables, warnings : results, and what a user should know before using them
     written : files, but for log and page
     remark : what else is said at the end
+    page : whether a page of tables and pictures is made of it
     """
 
     description: str
@@ -102,6 +104,7 @@ class Report(NamedTuple):
     warnings: Sequence[str] = ()
     written: Sequence[Path] = ()
     remark: str = ""
+    page: bool = True
 
 
 class Run(NamedTuple):
@@ -111,6 +114,7 @@ class Run(NamedTuple):
     kind: Kind
     folder: Folder
     steps: Steps
+    part: range = ALL
 
     @property
     def out(self) -> Path:
@@ -121,14 +125,19 @@ class Run(NamedTuple):
         """Nothing is wrong with the input: what is to be replaced goes, and the log begins."""
         if self.options.overwrite:
             self.folder.remove(self.kind.results)
-        self.steps.keep(self.out / LOG)
+        self.steps.keep(self.log)
+
+    @property
+    def log(self) -> Path:
+        """File of the steps."""
+        whole = self.part.start == 0
+        return self.out / (LOG if whole else PART_LOG.format(self.part.start))
 
 
 def run(
     kind: Kind,
-    work: Callable[[Any, Run], Report],
+    work: Callable[[Experiment, Run], Report],
     options: Options,
-    overrides: Mapping[str, Mapping[str, Any]] | None = None,
     part: range = ALL,
 ) -> None:
     """Run a command.
@@ -138,7 +147,6 @@ def run(
     kind : what it works with
     work : from settings to what was found; calls `Run.begin` before it writes
     options : of the command line
-    overrides : by table, values of options that are called as a key is
     part : of the results that is made, see `jaxsky.io.folders.occupied`
 
     Raises
@@ -147,11 +155,11 @@ def run(
         For settings that cannot work, and for a folder with results that are neither to be kept
         nor replaced, or in which another command works.
     """
-    if options.init:
-        _write_example(options.settings_file or Path(kind.name), kind.example)
-        return
-    path, out = options.settings_file or kind.embedded, options.out
-    settings = load(path, kind.settings, overrides, options.values or ())
+    path, out = options.settings_file or DEFAULTS / f"{kind.name}.toml", options.out
+    values = list(options.values or ())
+    if options.maps is not None:
+        values.append(f"common.maps={json.dumps(str(options.maps.resolve()))}")
+    settings = load(path, values)
     with (
         of_file(path),
         results_folder(
@@ -166,17 +174,17 @@ def run(
         import matplotlib as mpl
 
         mpl.use("Agg")  # pictures go to files
-        report = work(settings, Run(options, kind, folder, steps))
-        if kind.results:
+        command = Run(options, kind, folder, steps, part)
+        report = work(settings, command)
+        if report.page:
             _show(out, settings.title, report, steps.seconds)
     if report.description:
         console.print(report.description)
     print_tables(report.tables)
     for sentence in report.warnings:
         warn(sentence)
-    if report.written:
-        pages = [out / PAGE] if kind.results else []
-        print_written([*pages, *report.written, out / LOG])
+    pages = [out / PAGE] if report.page else []
+    print_written([*pages, *report.written, command.log])
     if report.remark:
         console.print(report.remark, soft_wrap=True)
 
@@ -248,11 +256,3 @@ def _show(out: Path, title: str, report: Report, seconds: float) -> None:
     end = f"Written by `{command}` in {seconds:.0f} s,"
     intro = [report.description, *warnings]
     write_page(out / PAGE, title or "jaxsky", intro, [*tables, *pictures], end)
-
-
-def _write_example(path: Path, example: Path) -> None:
-    """Write an example of the settings, unless the file exists."""
-    if path.exists():
-        raise ValueError(f"{path}: exists already and is left as it is.")
-    path.write_text(example.read_text())
-    print_written([path])

@@ -9,49 +9,36 @@ from fits.commands import run
 
 __all__ = ["separate"]
 
-RESULTS = (
-    "result.json",
-    "log.json",
-    "components.fits",
-    "residuals.fits",
-    "parameters.fits",
-    "components.png",
-    "residuals.png",
-    "parameters.png",
-    "spectra.png",
-    "r.png",
-    "posterior.png",
-    "simulations.npz",
-    "chain.h5",
+KIND = run.Kind(
+    "separate",
+    (
+        "result.json",
+        "log.json",
+        "components.fits",
+        "residuals.fits",
+        "parameters.fits",
+        "components.png",
+        "residuals.png",
+        "parameters.png",
+        "spectra.png",
+        "r.png",
+        "posterior.png",
+        "simulations.npz",
+        "chain.h5",
+    ),
 )
 
 
 def separate(
     settings_file: run.SettingsPath = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/separate"),
-    init: run.Init = False,
-    seed: Annotated[
-        int | None,
-        typer.Option(help="Seed of simulations, chains, and maps of the embedded sky."),
-    ] = None,
-    nside: Annotated[int | None, typer.Option(help="Common nside of the maps.")] = None,
-    domain: Annotated[
-        str | None, typer.Option(help="pixel, or harmonic with a beam for each band.")
-    ] = None,
-    nsims: Annotated[
-        int | None, typer.Option(min=20, help="Number of simulations of the noise.")
-    ] = None,
+    maps: run.Maps = None,
     values: run.Values = None,
     resume: run.Resume = False,
     overwrite: run.Overwrite = False,
 ) -> None:
     """Separate CMB and foregrounds by their laws, and measure r from the cleaned B modes."""
-    from fits.separate.settings import EMBEDDED, EXAMPLE, SeparateSettings
-
-    kind = run.Kind(SeparateSettings, EMBEDDED, EXAMPLE, "separation.toml", RESULTS)
-    overrides = {"seed": seed, "nside": nside, "domain": domain, "nsims": nsims}
-    options = run.Options(settings_file, out, init, values, resume, overwrite)
-    run.run(kind, _work, options, {"separation": overrides})
+    run.run(KIND, _work, run.Options(settings_file, out, values, resume, overwrite, maps))
 
 
 def _work(settings, command: run.Run) -> run.Report:

@@ -9,6 +9,7 @@ import typer
 
 from fits.commands import run
 from jaxsky.io.folders import ALL
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["simulate"]
 
@@ -24,39 +25,32 @@ ONLY: dict[str, Callable[[list[str]], list[str]]] = {
 def simulate(
     settings_file: run.SettingsPath = None,
     out: Annotated[Path, typer.Option(help="Folder for the maps.")] = Path("results/simulate"),
-    init: run.Init = False,
     nsims: Annotated[int, typer.Option(min=1, help="Number of realisations.")] = 1,
     first: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Number of the first one.")] = 0,
     only: Annotated[
         str | None, typer.Option(help=f"Simulate one thing only: {', '.join(ONLY)}.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of all realisations.")] = None,
-    nside: Annotated[int | None, typer.Option(help="Resolution of the maps.")] = None,
     values: run.Values = None,
     resume: run.Resume = False,
     overwrite: run.Overwrite = False,
 ) -> None:
     """Simulate maps of the microwave sky as an experiment observes it."""
-    from jaxsky.experiment import DEFAULT, EXAMPLE, Experiment
-
     if only is not None and only not in ONLY:
         raise ValueError(f"--only must be one of {', '.join(ONLY)}, not {only!r}.")
     indices = range(first, first + nsims)
 
     def work(settings: Experiment, command: run.Run) -> run.Report:
         if only is not None:
-            main = {"include": ONLY[only](settings.foregrounds())}
-            settings = settings.model_copy(
-                update={"experiment": settings.experiment.model_copy(update=main)}
-            )
+            include = {"include": ONLY[only](list(settings.sky.components))}
+            spec = settings.simulate.model_copy(update=include)
+            settings = settings.model_copy(update={"simulate": spec})
         return _work(settings, command, indices)
 
     # What is kept and what is replaced is seen to map by map. With --overwrite all realisations
     # are removed, so nobody else may be making any.
-    kind = run.Kind(Experiment, DEFAULT, EXAMPLE, "experiment.toml", ())
-    options = run.Options(settings_file, out, init, values, resume, overwrite)
+    options = run.Options(settings_file, out, values, resume, overwrite)
     part = ALL if overwrite else indices
-    run.run(kind, work, options, {"experiment": {"seed": seed, "nside": nside}}, part)
+    run.run(run.Kind("simulate", ()), work, options, part)
 
 
 def _work(settings, command: run.Run, indices: range) -> run.Report:
@@ -78,29 +72,33 @@ def _work(settings, command: run.Run, indices: range) -> run.Report:
             indices,
             options.overwrite,
             lambda note: notes.setdefault(note),
-            lambda: command.folder.narrow(indices),
+            lambda: _begin(command, indices),
         )
     ):
         steps.advance(done + 1, count)
         if file.seconds is not None:
             seconds[file.path] = file.seconds
-    written = [out / "sim_*"]
-    if settings.experiment.sheet:
+    if settings.simulate.sheet:
         steps.step("drawing")
-        written.append(out / f"sim_{indices.start:05d}.png")
         plots.contact_sheet(
-            written[-1],
+            out / f"sim_{indices.start:05d}.png",
             montecarlo.paths(out, names, indices.start),
             lambda path: read_maps(path, fields=["Q", "U"], missing=[]).maps,
             setup.observation.lmax,
-            settings.experiment.unit,
+            settings.simulate.unit,
             settings.title,
         )
     kept = count - len(seconds)
     rate = f"{statistics.median(seconds.values()):.2g} s a band, " if seconds else ""
     remark = (
-        f"Written: {len(seconds)} maps in {' and '.join(map(str, written))}"
+        f"{len(seconds)} maps in {out / 'sim_*'}"
         + (f"; {kept} maps were there already" if kept else "")
         + f" ({rate}{steps.seconds:.1f} s in all)."
     )
-    return run.Report(setup.description, (), list(notes), (), remark)
+    return run.Report(setup.description, (), list(notes), sorted(out.glob("sim_*.png")), remark)
+
+
+def _begin(command: run.Run, indices: range) -> None:
+    """The folder is this simulation's: others may make other realisations in it."""
+    command.folder.narrow(indices)
+    command.begin()

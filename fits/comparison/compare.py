@@ -14,9 +14,9 @@ from fits.patches import EDGES
 from fits.pseudo_cl import bin_edges
 from fits.record import fingerprint
 from fits.resolution import Prepared
-from fits.settings import Settings
 from jaxsky.progress import QUIET
 from jaxsky.settings import SettingsError
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["Comparison", "check_comparison", "compare"]
 
@@ -49,7 +49,7 @@ class Comparison(NamedTuple):
 
 
 def check_comparison(
-    settings: Settings, prepared: Prepared, regions: Mapping[str, Bool[np.ndarray, " pix"]]
+    settings: Experiment, prepared: Prepared, regions: Mapping[str, Bool[np.ndarray, " pix"]]
 ) -> None:
     """Refuse at once what `compare` and `compare_patches` would find out late.
 
@@ -63,9 +63,9 @@ def check_comparison(
     for name, inside in regions.items():
         if (inside & prepared.used).sum() < LEAST_PIXELS:
             raise SettingsError(
-                f"analysis.regions: region {name!r} leaves fewer than {LEAST_PIXELS} pixels."
+                f"compare.regions: region {name!r} leaves fewer than {LEAST_PIXELS} pixels."
             )
-    if how.lmax > (limit := 2 * settings.analysis.nside):
+    if how.lmax > (limit := 2 * settings.common.nside):
         raise SettingsError(
             f"compare.lmax: multipoles reach to 2 nside, {limit}, but {how.lmax} is asked for."
         )
@@ -93,7 +93,7 @@ def check_comparison(
 
 
 def compare(
-    settings: Settings,
+    settings: Experiment,
     prepared: Prepared,
     regions: Mapping[str, Bool[np.ndarray, " pix"]],
     simulations: Path | None = None,
@@ -125,9 +125,9 @@ def compare(
         used,
         how.lmax,
         how.nsims,
-        settings.analysis.seed,
+        settings.seed,
         simulations,
-        f"{fingerprint((prepared, used))} {settings.analysis.seed} {how.lmax}",
+        f"{fingerprint((prepared, used))} {settings.seed} {how.lmax}",
         report,
     )
     scatters = compare_pixels(prepared, model, used, simulated)

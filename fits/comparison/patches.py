@@ -11,9 +11,9 @@ from fits.discs import paper_patches
 from fits.inputs import Band, Inputs
 from fits.patches import PatchFits, PreparedPatches, fit_patches, prepare_patches
 from fits.resolution import Prepared, prepare
-from fits.settings import Settings
-from jaxsky.harmonics import average_pixels, gaussian_beam, pixel_window
+from jaxsky.harmonics import average_pixels, beam_ratio, gaussian_beam, pixel_window
 from jaxsky.keys import realisation_key, stream
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["PatchComparison", "compare_patches", "template_patches"]
 
@@ -78,7 +78,7 @@ def _window(band: Band, nside: int, fwhm: float, lmax: int) -> Float[Array, " el
     """Window of prepared maps: the common beam, or the band's own and that of averaged pixels."""
     if fwhm:
         return gaussian_beam(fwhm, lmax)
-    return gaussian_beam(band.fwhm, lmax) * pixel_window(nside, lmax)
+    return beam_ratio(band.beam, 0.0, lmax) * pixel_window(nside, lmax)
 
 
 def _noise(
@@ -112,7 +112,7 @@ def _overlap(patches: PreparedPatches) -> Float[np.ndarray, "patch patch"]:
     return products / np.outer(own, own)
 
 
-def compare_patches(settings: Settings, inputs: Inputs) -> PatchComparison:
+def compare_patches(settings: Experiment, inputs: Inputs) -> PatchComparison:
     """The paper's 48 discs and the field of BICEP2, in the band that the settings name.
 
     Parameters
@@ -126,7 +126,7 @@ def compare_patches(settings: Settings, inputs: Inputs) -> PatchComparison:
         If the maps do not have the multipoles.
     """
     name, nside = str(settings.compare.patches), settings.compare.patches_nside
-    fwhm = settings.analysis.fwhm
+    fwhm = settings.common.fwhm
     band = inputs.bands[name]
     prepared = prepare(inputs._replace(bands={name: band}), nside, fwhm)
     lmax = 2 * nside
@@ -134,7 +134,7 @@ def compare_patches(settings: Settings, inputs: Inputs) -> PatchComparison:
     patches = prepare_patches(paper_patches(nside), window)
     noise = _noise(band, prepared, patches)
     # Realisations of their own, unlike those of what is observed.
-    key = stream(realisation_key(settings.analysis.seed), "patches")
+    key = stream(realisation_key(settings.seed), "patches")
     model = prepared.model()[0]
     fluctuations = prepared.fluctuations
     model = model + fluctuations.noise_realisation(key)[0] + fluctuations.cmb_realisation(key)[0]

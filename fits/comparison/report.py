@@ -10,8 +10,8 @@ from fits.comparison import plots
 from fits.comparison.compare import Comparison
 from fits.comparison.patches import PatchComparison
 from fits.inputs import Inputs
-from fits.record import probability, with_error, write_json, write_log
-from fits.settings import Settings, leaks
+from fits.record import leaks, probability, with_error, write_json, write_log
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["comparison_json", "comparison_table", "warnings", "write_report"]
 
@@ -84,9 +84,9 @@ def comparison_table(comparison: Comparison) -> Table:
     return table
 
 
-def warnings(comparison: Comparison, settings: Settings) -> list[str]:
+def warnings(comparison: Comparison, settings: Experiment) -> list[str]:
     """What a user should know before using the numbers, a sentence each."""
-    sentences = leaks(settings.bands)
+    sentences = leaks(settings)
     if not comparison.spectra:
         missing = int((~comparison.prepared.used).sum())
         sentences.append(
@@ -117,7 +117,7 @@ def warnings(comparison: Comparison, settings: Settings) -> list[str]:
 def write_report(
     out: Path,
     inputs: Inputs,
-    settings: Settings,
+    settings: Experiment,
     comparison: Comparison,
     seconds: float,
     patches: PatchComparison | None = None,
@@ -130,7 +130,7 @@ def write_report(
     for region in comparison.regions:
         written.append(out / f"scatter_{region}.png")
         plots.plot_scatter(written[-1], comparison, region, bands, f"{title}\n{region}")
-    nside = min(settings.compare.panel_nside, settings.analysis.nside)
+    nside = min(settings.compare.panel_nside, settings.common.nside)
     for stokes in "QU":
         written.append(out / f"maps_{stokes}.png")
         plots.plot_maps(written[-1], comparison, stokes, bands, nside, title)

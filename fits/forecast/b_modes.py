@@ -3,13 +3,14 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import healpy
 import numpy as np
 from jaxtyping import Float
 
 from fits.pseudo_cl import MaskedSpectra, band_powers
 from jaxsky import Bandpass, Sky, observe_band
-from jaxsky.harmonics import gaussian_beam
-from jaxsky.instrument import Channel
+from jaxsky.harmonics import beam_ratio
+from jaxsky.observation import ObservedBand
 
 __all__ = [
     "PIVOT",
@@ -60,15 +61,20 @@ def foreground_powers(
     }
 
 
-def noise_level(channel: Channel) -> float:
-    """Noise of Q and U of a channel [uK_CMB rad]."""
-    factor = channel.band().conversion(channel.noise_unit, "uK_CMB")
-    return float(channel.noise * factor) * np.radians(1 / 60)
+def noise_level(band: ObservedBand) -> float:
+    """Noise of Q and U of a band [uK_CMB rad]; of noise that varies, pixels by their weights."""
+    noise = np.asarray(band.noise)
+    if noise.ndim:
+        pixel = healpy.nside2resol(healpy.npix2nside(noise.shape[-1]))
+        level = pixel / np.sqrt(np.mean([1 / noise[-2, -2], 1 / noise[-1, -1]]))
+    else:
+        level = float(noise) * np.radians(1 / 60)
+    return level * float(band.band.conversion("uK_RJ", "uK_CMB"))
 
 
-def noise_spectrum(channel: Channel, lmax: int) -> Float[np.ndarray, " ell"]:
-    """Spectrum N_l / b_l^2 of the noise of a channel, its beam taken out [uK_CMB^2]."""
-    return noise_level(channel) ** 2 / np.asarray(gaussian_beam(channel.fwhm, lmax)) ** 2
+def noise_spectrum(band: ObservedBand, lmax: int) -> Float[np.ndarray, " ell"]:
+    """Spectrum N_l / b_l^2 of the noise of a band, its beam taken out [uK_CMB^2]."""
+    return noise_level(band) ** 2 / np.asarray(beam_ratio(band.beam, 0.0, lmax)) ** 2
 
 
 def _modes(spectra: MaskedSpectra) -> Float[np.ndarray, " bin"]:

@@ -10,7 +10,6 @@ from jaxtyping import Float
 from fits.forecast import b_modes
 from fits.forecast.b_modes import BandLaw
 from fits.forecast.fisher import Errors, Model, fiducial, fisher_errors, foreground_names, unit_sky
-from fits.forecast.settings import ForecastSettings
 from fits.forecast.setup import Setup, build
 from fits.pseudo_cl import (
     MaskedSpectra,
@@ -21,9 +20,11 @@ from fits.pseudo_cl import (
 )
 from jaxsky.checks import check_double
 from jaxsky.cmb import camb_spectra, tensor_spectra
-from jaxsky.harmonics import gaussian_beam
+from jaxsky.harmonics import beam_ratio, gaussian_beam
+from jaxsky.parameters import unknown_parameter
 from jaxsky.progress import QUIET, Progress
-from jaxsky.settings_keys import at_key
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import at_key
 
 __all__ = ["FIELDS", "Forecast", "forecast"]
 
@@ -59,7 +60,7 @@ class Forecast(NamedTuple):
     without_foregrounds: float | None
 
 
-def forecast(settings: ForecastSettings, progress: Progress = QUIET) -> Forecast:
+def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
     """Foreground B modes against primordial ones, and errors from the Fisher matrix.
 
     Parameters
@@ -77,19 +78,22 @@ def forecast(settings: ForecastSettings, progress: Progress = QUIET) -> Forecast
     """
     check_double("A forecast")
     progress.step("reading templates and mask")
-    setup, spec = build(settings), settings.spectra
+    setup, spec = build(settings), settings.forecast
     progress.step("spectra outside the mask")
     edges = bin_edges(spec.lmin, spec.lmax, spec.width)
     window = np.asarray(gaussian_beam(setup.fwhm, 2 * edges[-1]))
     spectra = masked_spectra(setup.mask, edges, window=window)
-    bands = setup.instrument.select(setup.shown).bands()
+    bands = {name: setup.bands[name].band for name in setup.shown}
     powers = b_modes.foreground_powers(setup.sky, bands, spectra)
-    laws = {
-        name: b_modes.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
-        for name, D in powers.items()
-    }
-    highest = max(spectra.lmax, settings.fisher.lmax, b_modes.PIVOT)
-    tensors, lensed = tensor_spectra(highest), camb_spectra(highest)
+    with at_key("forecast.fit"):
+        laws = {
+            name: b_modes.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
+            for name, D in powers.items()
+        }
+    highest = max(spectra.lmax, spec.fisher_lmax, b_modes.PIVOT)
+    with at_key("cmb.cosmology"):
+        tensors = tensor_spectra(highest, **settings.cmb.cosmology)
+        lensed = camb_spectra(highest, **settings.cmb.cosmology)
     equal = {
         name: b_modes.equal_r(spectra, powers[name], law, tensors) for name, law in laws.items()
     }
@@ -102,14 +106,14 @@ def forecast(settings: ForecastSettings, progress: Progress = QUIET) -> Forecast
 
 
 def _model(
-    settings: ForecastSettings,
+    settings: Experiment,
     setup: Setup,
     spectra: MaskedSpectra,
     tensors: np.ndarray,
     lensed: np.ndarray,
 ) -> tuple[Model, dict[str, float]]:
     """The covariance of all bands, with the foregrounds' spectra measured outside the mask."""
-    spec, fit = settings.fisher, settings.spectra.fit
+    spec = settings.forecast
     sky, fields = setup.sky, tuple(f for f in FIELDS if f in spec.spectra)
     rows = [FIELDS.index(field) for field in fields]
     maps = {name: sky[name].amplitude for name in sky}
@@ -118,22 +122,22 @@ def _model(
     correlations: dict[tuple[str, str, str], float] = {}
     for field, row in zip(fields, rows, strict=True):
         for name, D in auto.items():
-            laws[field, name] = b_modes.fit_law(spectra, D[row], fit, f"{field} of {name!r}")
+            laws[field, name] = b_modes.fit_law(spectra, D[row], spec.fit, f"{field} of {name!r}")
     for first, second in itertools.combinations(maps, 2):
         cross = band_powers(spectra, maps[first], maps[second])
         for field, row in zip(fields, rows, strict=True):
             correlations[field, first, second] = b_modes.correlation(
-                spectra, cross[row], auto[first][row], auto[second][row], fit
+                spectra, cross[row], auto[first][row], auto[second][row], spec.fit
             )
-    ell = np.arange(spec.lmin, spec.lmax + 1)
+    ell = np.arange(spec.lmin, spec.fisher_lmax + 1)
     weights = [
-        np.asarray(gaussian_beam(channel.fwhm, spec.lmax))[ell] / b_modes.noise_level(channel)
-        for channel in setup.instrument
+        np.asarray(beam_ratio(band.beam, 0.0, spec.fisher_lmax))[ell] / b_modes.noise_level(band)
+        for band in setup.bands.values()
     ]
     cmb_rows = np.array(rows) + 1
     model = Model.of(
         unit_sky(sky, setup.mask),
-        list(setup.instrument.bands().values()),
+        [band.band for band in setup.bands.values()],
         jnp.asarray(np.stack(weights, axis=1)),
         jnp.asarray(tensors[cmb_rows[:, None], ell]),
         jnp.asarray(lensed[cmb_rows[:, None], ell]),
@@ -141,17 +145,23 @@ def _model(
         jnp.asarray(sky_fraction(setup.mask)),
         fields,
     )
-    return model, fiducial(model.sky, laws, correlations, spec.r, spec.A_lens)
+    return model, fiducial(model.sky, laws, correlations, settings.cmb.r, settings.cmb.A_lens)
 
 
 def _errors(
-    settings: ForecastSettings, model: Model, parameters: dict[str, float]
+    settings: Experiment, model: Model, parameters: dict[str, float]
 ) -> tuple[Errors, float | None]:
-    spec = settings.fisher
+    spec = settings.forecast
     nuisance = foreground_names(model.sky, model.fields, spec.foregrounds)
-    free = list(dict.fromkeys((*spec.free, *nuisance)))
-    with at_key("fisher"):
-        errors = fisher_errors(model, parameters, free, spec.priors)
+    spectral = settings.free_in("forecast")
+    widths = {n: one.gaussian[1] for n, one in spectral.items() if one.gaussian is not None}
+    with at_key("free"):
+        for name in spectral:
+            if name not in parameters:
+                raise unknown_parameter(name, parameters)
+    with at_key("forecast"):
+        free = list(dict.fromkeys((*spec.free, *spectral, *nuisance)))
+        errors = fisher_errors(model, parameters, free, widths | spec.priors)
     if "r" not in spec.free:
         return errors, None
     none = {n: 0.0 if n.endswith(".amplitude") else v for n, v in parameters.items()}

@@ -10,9 +10,9 @@ import numpy as np
 from fits.forecast.b_modes import noise_spectrum, to_D
 from fits.forecast.fisher import Errors
 from fits.forecast.forecast import Forecast
-from fits.forecast.settings import ForecastSettings
 from fits.plots import label
 from jaxsky.plots import COLORS, STYLE, UNITS, plain, save
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["plot_b_modes", "plot_errors"]
 
@@ -23,20 +23,20 @@ LENSING = "#888888"
 COLUMN = 3.5
 
 
-def plot_b_modes(path: Path, found: Forecast, settings: ForecastSettings) -> None:
+def plot_b_modes(path: Path, found: Forecast, settings: Experiment) -> None:
     """BB of the foregrounds in some bands and their noise, against primordial BB."""
-    lmax = settings.spectra.lmax
+    lmax = settings.forecast.lmax
     ell, D = np.arange(2, lmax + 1), to_D(lmax)[2:]
     with mpl.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(COLUMN, 3.9), layout="constrained")
         for (name, powers), color in zip(found.powers.items(), COLORS, strict=False):
             BB = np.where(powers[1] > 0, powers[1], np.nan)
             axes.loglog(found.spectra.centers, BB, color=color, lw=1.8, label=plain(_band(name)))
-            noise = noise_spectrum(found.setup.instrument[name], lmax)[2:]
+            noise = noise_spectrum(found.setup.bands[name], lmax)[2:]
             axes.loglog(ell, D * noise, color=color, lw=0.7)
         axes.loglog(ell, D * found.lensed[2, 2 : lmax + 1], color=LENSING, lw=1.2)
         bottom = 1.0
-        for r, dashes in zip(sorted(settings.spectra.r, reverse=True), DASHES, strict=False):
+        for r, dashes in zip(sorted(settings.forecast.show_r, reverse=True), DASHES, strict=False):
             primordial = r * D * found.tensors[2, 2 : lmax + 1]
             axes.loglog(ell, primordial, color="k", ls=dashes, lw=1.1, label=f"$r = {r:g}$")
             bottom = min(bottom, primordial[: min(100, len(ell))].min())

@@ -9,20 +9,20 @@ from rich.table import Table
 from fits.forecast import plots
 from fits.forecast.b_modes import PIVOT
 from fits.forecast.forecast import Forecast
-from fits.forecast.settings import ForecastSettings
 from fits.pseudo_cl import sky_fraction
 from fits.record import write_json, write_log
 from jaxsky.components import declared
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["forecast_json", "tables", "warnings", "write_report"]
 
 
-def forecast_json(found: Forecast, settings: ForecastSettings) -> dict[str, Any]:
+def forecast_json(found: Forecast, settings: Experiment) -> dict[str, Any]:
     """All numbers, D_l in uK_CMB^2 unless their key says otherwise."""
-    errors, spectra, lmax = found.errors, found.spectra, settings.spectra.lmax
+    errors, spectra, lmax = found.errors, found.spectra, settings.forecast.lmax
     results: dict[str, Any] = {
         "description": found.setup.description,
-        "instrument": found.setup.instrument.name,
+        "bands": list(found.setup.bands),
         "sky_fraction": sky_fraction(found.setup.mask),
         "bins": {"first": spectra.edges[:-1], "last": [e - 1 for e in spectra.edges[1:]]},
         "foregrounds": {
@@ -108,9 +108,7 @@ def warnings(found: Forecast) -> list[str]:
     return sentences
 
 
-def write_report(
-    out: Path, found: Forecast, settings: ForecastSettings, seconds: float
-) -> list[Path]:
+def write_report(out: Path, found: Forecast, settings: Experiment, seconds: float) -> list[Path]:
     """Write forecast.json, the pictures and log.json to a folder; returns what was written."""
     written = [out / name for name in ("forecast.json", "log.json", "bb.png", "fisher.png")]
     write_json(written[0], forecast_json(found, settings))

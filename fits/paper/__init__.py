@@ -3,7 +3,6 @@
 from fits.commands.page import Table
 from fits.paper.item import Impossible, Item, Number
 from fits.paper.run import STEPS, Step, run
-from fits.paper.settings import PaperSettings, load_paper
 from fits.paper.sources import Sources
 
 __all__ = [
@@ -11,10 +10,8 @@ __all__ = [
     "Impossible",
     "Item",
     "Number",
-    "PaperSettings",
     "Sources",
     "Step",
     "Table",
-    "load_paper",
     "run",
 ]

@@ -10,11 +10,11 @@ from fits.comparison.patches import template_patches
 from fits.comparison.spectra import BandSpectra
 from fits.inputs import Inputs, inputs_of
 from fits.paper.item import Impossible, Item, Number, picture_of
-from fits.paper.settings import PaperSettings
 from fits.paper.sources import Sources, listed
 from fits.record import probability, with_error
-from fits.regions import region_masks
+from fits.regions import region_masks, region_words
 from fits.resolution import prepare
+from jaxsky.settings.experiment import Experiment
 
 __all__ = [
     "figure_leakage",
@@ -31,17 +31,17 @@ PLANCK, WMAP = ("30", "44", "70", "353"), ("K", "Ka", "Q", "V", "W")
 SHOWN = ("30", "44", "70", "353", "K", "W")
 
 
-def shared_inputs(settings: PaperSettings, sources: Sources) -> Inputs:
+def shared_inputs(settings: Experiment, sources: Sources) -> Inputs:
     """Templates and maps, read or drawn once."""
     galaxy = sources.galaxy if sources.embedded else None
-    return sources.once("inputs", lambda: inputs_of(settings, galaxy))
+    return sources.once("inputs", lambda: inputs_of(settings, galaxy=galaxy))
 
 
-def _compared(settings: PaperSettings, sources: Sources) -> Comparison:
+def _compared(settings: Experiment, sources: Sources) -> Comparison:
     def make() -> Comparison:
         inputs = shared_inputs(settings, sources)
-        prepared = prepare(inputs, settings.analysis.nside, settings.analysis.fwhm)
-        return compare(settings, prepared, region_masks(settings))
+        prepared = prepare(inputs, settings.common.nside, settings.common.fwhm)
+        return compare(settings, prepared, region_masks(settings, settings.compare.regions))
 
     return sources.once("comparison", make)
 
@@ -57,35 +57,25 @@ def _region(comparison: Comparison) -> str:
     return "strip" if "strip" in comparison.regions else next(iter(comparison.regions))
 
 
-def _where(settings: PaperSettings, region: str) -> str:
-    latitude = f"{settings.analysis.latitude:g} deg"
-    words = {
-        "strip": f"|b| <= {latitude}",
-        "outside": f"|b| > {latitude}",
-        "full": "the full sky",
-    }
-    return words.get(region, f"the mask {region}")
-
-
-def _beam(settings: PaperSettings) -> str:
-    fwhm = settings.analysis.fwhm
+def _beam(settings: Experiment) -> str:
+    fwhm = settings.common.fwhm
     return f"smoothed to {fwhm:g} arcmin" if fwhm else "averaged, not smoothed"
 
 
-def _set_up(settings: PaperSettings, bands: Sequence[str], wanted: Sequence[str]) -> str:
+def _set_up(settings: Experiment, bands: Sequence[str], wanted: Sequence[str]) -> str:
     """What of the comparison is not as in the paper, in a sentence; or nothing."""
-    analysis, found = settings.analysis, []
+    common, found = settings.common, []
     if set(wanted) - set(bands):
         found.append(f"the bands are {listed(bands)}")
-    if analysis.nside != 64:
-        found.append(f"nside is {analysis.nside} rather than 64")
-    if analysis.fwhm != 60:
+    if common.nside != 64:
+        found.append(f"nside is {common.nside} rather than 64")
+    if common.fwhm != 60:
         found.append(f"maps are {_beam(settings)} (the paper: to 60 arcmin)")
     return f"Here, {listed(found)}." if found else ""
 
 
 def _differs(sources: Sources, *more: str) -> str:
-    if sources.embedded:
+    if sources.simulated:
         first = (
             "The observed maps are simulated from the model, with CMB and noise: what differs is "
             "chance."
@@ -95,7 +85,7 @@ def _differs(sources: Sources, *more: str) -> str:
     return " ".join(filter(None, (first, *more)))
 
 
-def figure_scatter(settings: PaperSettings, sources: Sources, out: Path) -> Item:
+def figure_scatter(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 5: observed against modelled pixels along the plane."""
     found, picture = _compared(settings, sources), picture_of("Figure 5")
     bands, region = _chosen(found, SHOWN), _region(found)
@@ -114,7 +104,7 @@ def figure_scatter(settings: PaperSettings, sources: Sources, out: Path) -> Item
     return Item(
         "Figure 5",
         "observed and modelled pixels",
-        f"Pixels of nside {settings.analysis.nside}, {_where(settings, region)}, "
+        f"Pixels of nside {settings.common.nside} in {region_words(settings, region)}, "
         f"{_beam(settings)}: Q in the upper row of each pair, U in the lower. "
         "Slopes have the errors of noise and CMB; PTE is the probability that these alone "
         "leave larger differences.",
@@ -128,10 +118,10 @@ def figure_scatter(settings: PaperSettings, sources: Sources, out: Path) -> Item
     )
 
 
-def figure_maps(settings: PaperSettings, sources: Sources, out: Path) -> Item:
+def figure_maps(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 6: observed maps beside the model."""
     found, picture = _compared(settings, sources), picture_of("Figure 6")
-    nside = min(settings.compare.panel_nside, settings.analysis.nside)
+    nside = min(settings.compare.panel_nside, settings.common.nside)
     plots.plot_maps(out / picture, found, "QU", _chosen(found, SHOWN), nside, settings.title)
     return Item(
         "Figure 6",
@@ -148,7 +138,7 @@ def figure_maps(settings: PaperSettings, sources: Sources, out: Path) -> Item:
 
 
 def _spectra(
-    settings: PaperSettings, sources: Sources, out: Path, label: str, wanted: Sequence[str]
+    settings: Experiment, sources: Sources, out: Path, label: str, wanted: Sequence[str]
 ) -> Item:
     found, picture = _compared(settings, sources), picture_of(label)
     spectra = [s for s in found.spectra if s.band in wanted]
@@ -187,12 +177,12 @@ def _spectra(
     )
 
 
-def _spectra_set_up(settings: PaperSettings, bands: Sequence[str], wanted: Sequence[str]) -> str:
-    nside, lmax, r = settings.analysis.nside, settings.compare.lmax, settings.cmb.r
+def _spectra_set_up(settings: Experiment, bands: Sequence[str], wanted: Sequence[str]) -> str:
+    nside, lmax, r = settings.common.nside, settings.compare.lmax, settings.cmb.r
     found = [f"the spectra are of maps of nside {nside} rather than 256"]
     if set(wanted) - set(bands):
         found.append(f"the bands are {listed(bands)}")
-    if settings.analysis.fwhm != 60:
+    if settings.common.fwhm != 60:
         found.append(f"maps are {_beam(settings)} (the paper: to 60 arcmin)")
     if lmax != 100:
         found.append(f"they end at l = {lmax} rather than 100")
@@ -206,17 +196,17 @@ def _probabilities(spectra: BandSpectra) -> Number:
     return Number(f"PTE of the spectra, {spectra.band}", "not given", f"EE {EE}, BB {BB}")
 
 
-def figure_planck(settings: PaperSettings, sources: Sources, out: Path) -> Item:
+def figure_planck(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 7: spectra of the Planck bands."""
     return _spectra(settings, sources, out, "Figure 7", PLANCK)
 
 
-def figure_wmap(settings: PaperSettings, sources: Sources, out: Path) -> Item:
+def figure_wmap(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 8: spectra of the WMAP bands."""
     return _spectra(settings, sources, out, "Figure 8", WMAP)
 
 
-def figure_leakage(settings: PaperSettings, sources: Sources, out: Path) -> Item:
+def figure_leakage(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 9: BB at 70 GHz before and after leakage is subtracted."""
     found, picture = _compared(settings, sources), picture_of("Figure 9")
     leaky = [s for s in found.spectra if s.uncorrected is not None]
@@ -224,11 +214,11 @@ def figure_leakage(settings: PaperSettings, sources: Sources, out: Path) -> Item
         raise Impossible("No band has a map of leakage to subtract.")
     plots.plot_leakage(out / picture, leaky, settings.title)
     differs = _differs(sources)
-    if settings.embedded is not None:
+    if sources.simulated:
         fractions = listed(
             f"{100 * fraction:g} % of the intensity at {name} GHz leaks along the meridians of the "
             "ecliptic"
-            for name, fraction in settings.embedded.leakage.items()
+            for name, fraction in settings.simulate.leakage.items()
         )
         differs = (
             f"The leakage is simulated: {fractions}. Its correction is exact, where Planck's takes "
@@ -253,7 +243,7 @@ def figure_leakage(settings: PaperSettings, sources: Sources, out: Path) -> Item
     )
 
 
-def figure_patches(settings: PaperSettings, sources: Sources, out: Path) -> Item:
+def figure_patches(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 10: power laws on small patches."""
     picture = picture_of("Figure 10")
     if settings.compare.patches is None:
@@ -286,7 +276,7 @@ def figure_patches(settings: PaperSettings, sources: Sources, out: Path) -> Item
     )  # fmt: skip
 
 
-def _template_patches(settings: PaperSettings, sources: Sources, out: Path, picture: str) -> Item:
+def _template_patches(settings: Experiment, sources: Sources, out: Path, picture: str) -> Item:
     layer = sources.template("dust")
     found = template_patches(layer.maps, layer.fwhm)
     plots.plot_template_patches(out / picture, found, settings.title)

@@ -8,13 +8,13 @@ import numpy as np
 from fits.commands.page import Table
 from fits.paper.item import Item, Number, picture_of
 from fits.paper.patches import disc, draw_patches
-from fits.paper.settings import PaperSettings
 from fits.paper.sources import PAPER_FWHM, Sources
 from jaxsky.cmb import camb_spectra
 from jaxsky.instrument import load_instrument
 from jaxsky.interpolation import term_weights
 from jaxsky.observation import Observation, ObservedBand, Source
 from jaxsky.preparation import Prepared, plan, prepare
+from jaxsky.settings.experiment import Experiment
 from jaxsky.simulate import observe_bands
 
 __all__ = ["figure_patch", "table_core"]
@@ -26,7 +26,7 @@ CMB_FWHM, DOMINANT = 4.0, {"45": "synchrotron", "105": "CMB", "315": "dust"}
 SIZE = 30.0
 
 
-def _observation(settings: PaperSettings, sources: Sources) -> Observation:
+def _observation(settings: Experiment, sources: Sources) -> Observation:
     """Three of COrE's bands; beams are COrE's, or that of the small scales if it is wider."""
     fwhm = settings.paper.fwhm
     channels = {
@@ -62,7 +62,7 @@ def _prepared(sources: Sources, observation: Observation) -> dict[str, Prepared]
     }
 
 
-def figure_patch(settings: PaperSettings, sources: Sources, out: Path) -> Item:
+def figure_patch(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 13: Q of the CMB and of three bands in a patch."""
     center, fwhm = settings.paper.center, settings.paper.fwhm
     observation = _observation(settings, sources)
@@ -124,7 +124,7 @@ def _word(name: str) -> str:
     return "CMB" if name == "cmb" else name
 
 
-def table_core(settings: PaperSettings, sources: Sources, out: Path) -> Item:
+def table_core(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Table 1: COrE."""
     channels = list(load_instrument("core"))
     header = ("Band [GHz]", *(f"{float(channel.center):g}" for channel in channels))

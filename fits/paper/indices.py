@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.paper.settings import IndexFile, SynchrotronIndexFile
 from jaxsky.harmonics import expand, gaussian_beam, synthesis
 from jaxsky.inputs import read
 from jaxsky.io import InputError
@@ -18,6 +17,7 @@ from jaxsky.lookup import find_file
 from jaxsky.parameter_maps import parameter_map
 from jaxsky.presets import from_pysm_beta
 from jaxsky.settings import SettingsError
+from jaxsky.settings.experiment import IndexFile
 from jaxsky.templates import dust_index, steepening
 
 __all__ = ["STEEPENING", "SYMBOLS", "Index", "drawn_index", "held_index", "read_index"]
@@ -80,7 +80,8 @@ def read_index(folder: Path, name: str, spec: IndexFile) -> Index:
     SettingsError, jaxsky.io.InputError
         For files that cannot be read as what they should be.
     """
-    where, found = f"paper.{name}", read(folder, spec, stokes="", zeros_are_data=True)
+    pure = spec if spec.unit is not None else spec.model_copy(update={"unit": ""})
+    where, found = f"paper.{name}", read(folder, pure, stokes="", zeros_are_data=True)
     origin, fwhm, by = f"{SYMBOLS[name]} is that of {spec.label}", max(FWHM[name], spec.fwhm), 0.0
     if name == "beta_syn" and bool(np.all(found.maps[:, found.mask] < 0)):
         found = dataclasses.replace(found, maps=np.asarray(from_pysm_beta(found.maps)))
@@ -88,7 +89,7 @@ def read_index(folder: Path, name: str, spec: IndexFile) -> Index:
     stated = spec.missing is not None
     values, used = parameter_map(found, name, found.nside, where, stated=stated)
     smooth = dust_index(values, spec.fwhm, fwhm, found.nside, None if used.all() else used)
-    if isinstance(spec, SynchrotronIndexFile):
+    if name == "beta_syn":
         by = spec.steepening + _of_spectrum(folder, spec.spectrum)
         origin += f", made steeper by {by:.2f}" if by else ", not made steeper"
     return Index(smooth + by, fwhm, by, origin)

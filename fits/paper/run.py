@@ -18,11 +18,11 @@ from fits.paper import (
     templates,
 )
 from fits.paper.item import NUMBERS, Impossible, Item
-from fits.paper.settings import PaperSettings
 from fits.paper.sources import Sources
 from fits.paper.store import Store
 from fits.record import write_log
 from jaxsky.progress import QUIET, Progress
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["LOG", "STEPS", "Step", "labels_of", "run"]
 
@@ -45,7 +45,7 @@ class Step(NamedTuple):
     """
 
     label: str
-    make: Callable[[PaperSettings, Sources, Path], Item]
+    make: Callable[[Experiment, Sources, Path], Item]
 
 
 #: In the order of the paper.
@@ -114,12 +114,13 @@ def _numbers(items: Iterable[Item]) -> Item | None:
 
 
 def run(
-    settings: PaperSettings,
+    settings: Experiment,
     out: Path,
     only: Iterable[str] = (),
     *,
     resume: bool = False,
     overwrite: bool = False,
+    begin: Callable[[], None] = lambda: None,
     progress: Progress = QUIET,
     steps: Iterable[Step] | None = None,
 ) -> list[Item]:
@@ -133,6 +134,7 @@ def run(
     resume : keep what is in the folder and make what is missing
     overwrite : make again what is wanted; what else is in the folder is kept if it is of these
         settings
+    begin : called when nothing is wrong with what is wanted, before anything is written
     progress : told of each item
     steps : instead of `STEPS`
 
@@ -151,6 +153,7 @@ def run(
     steps = list(STEPS if steps is None else steps)
     order, wanted = [step.label for step in steps], labels_of(only, steps)
     store, sources = Store(out, settings, resume, overwrite), Sources(settings)
+    begin()
     todo = [s for s in steps if s.label in wanted and (overwrite or not store.has(s.label))]
     for done, step in enumerate(todo):
         progress.step(step.label)
@@ -170,7 +173,7 @@ def run(
     return items
 
 
-def _show(settings: PaperSettings, sources: Sources, store: Store, order: list[str]) -> list[Item]:
+def _show(settings: Experiment, sources: Sources, store: Store, order: list[str]) -> list[Item]:
     """Write the page."""
     items = store.ordered(order)
     numbers = _numbers(items)

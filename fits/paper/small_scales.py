@@ -9,7 +9,6 @@ from jaxtyping import Array, Float
 
 from fits.paper.item import Item, Number, picture_of
 from fits.paper.patches import disc, draw_patches
-from fits.paper.settings import PaperSettings
 from fits.paper.sources import Layer, Sources, listed
 from fits.paper.templates import COLUMN
 from fits.record import with_error
@@ -23,6 +22,7 @@ from jaxsky.harmonics import (
 )
 from jaxsky.keys import stream
 from jaxsky.plots import COLORS, STYLE, draw_spectra, save
+from jaxsky.settings.experiment import Experiment
 from jaxsky.small_scales import DUST, SYNCHROTRON, SmallScales, continue_templates
 from jaxsky.templates import polarization_template
 
@@ -78,7 +78,7 @@ def _ranges(sources: Sources) -> str:
     return "The fits have other ranges of multipoles than the paper's, as the settings say."
 
 
-def figure_spectra(settings: PaperSettings, sources: Sources, out: Path) -> Item:
+def figure_spectra(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 2: EE of both templates, of what continues them, and of both together."""
     fwhm, picture = settings.paper.fwhm, picture_of("Figure 2")
     with plt.rc_context(STYLE):
@@ -135,7 +135,7 @@ def _varied(
     return continued.alms[0]
 
 
-def figure_randomised(settings: PaperSettings, sources: Sources, out: Path) -> Item:
+def figure_randomised(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 14: a patch of the synchrotron, its small scales, and two others."""
     layer, nside = sources.template("synchrotron"), sources.nside_fine
     small, fwhm, center = layer.small, settings.paper.fwhm, settings.paper.center

@@ -12,13 +12,13 @@ from jaxtyping import Array, Float
 
 from fits.paper.indices import Index, drawn_index, held_index, read_index
 from fits.paper.item import Impossible
-from fits.paper.settings import IndexFile, PaperSettings
 from jaxsky import AME, Dust, Synchrotron
-from jaxsky.experiment.settings import SmallScalesTable
 from jaxsky.galaxy import EmbeddedSky, embedded_sky
-from jaxsky.inputs import Template, read, read_templates, set_parameters_of, uK_RJ_per
+from jaxsky.inputs import Template, embedded_galaxy, read, read_sky, uK_RJ_per
 from jaxsky.keys import realisation_key, stream
-from jaxsky.settings import SettingsError, TemplateFile
+from jaxsky.settings import SettingsError
+from jaxsky.settings.experiment import Experiment, IndexFile
+from jaxsky.settings.tables import ComponentTable, SmallScalesTable
 from jaxsky.small_scales import Continued, SmallScales, continue_templates
 from jaxsky.templates import dust_index, polarization_template
 
@@ -96,10 +96,10 @@ class Sources:
     settings : of the figures
     """
 
-    def __init__(self, settings: PaperSettings) -> None:
+    def __init__(self, settings: Experiment) -> None:
         self.settings = settings
         self.folder = Path(settings.data_dir)
-        self.key = realisation_key(settings.analysis.seed)
+        self.key = realisation_key(settings.seed)
         self._made: dict[str, Any] = {}
 
     def once(self, name: str, make: Callable[[], T]) -> T:
@@ -110,25 +110,35 @@ class Sources:
 
     @property
     def embedded(self) -> bool:
-        """True if the sky is the embedded model."""
-        return self.settings.embedded is not None
+        """True if dust and synchrotron are those of the embedded model."""
+        tables = self.settings.sky.components.values()
+        return self.settings.sky.embedded is not None and all(
+            one.file is None for one in tables if one.law in PAPER_FWHM
+        )
+
+    @property
+    def simulated(self) -> bool:
+        """True if the observed maps are simulated."""
+        bands = self.settings.bands
+        return self.settings.common.maps is not None or all(band.file is None for band in bands)
 
     @property
     def description(self) -> str:
         """What the sky is, in a sentence."""
         if self.embedded:
             return MODEL
-        files = ", ".join(f"{name} {t.label}" for name, t in self.settings.templates.items())
+        tables = self.settings.sky.components.items()
+        files = ", ".join(f"{name} {one.label}" for name, one in tables if one.file is not None)
         return f"Templates from files: {files}."
 
     @property
     def sky_differs(self) -> str:
         """The part of a line that says what the sky is, for an item that shows it."""
         if self.embedded:
-            assert self.settings.embedded is not None
+            assert self.settings.sky.embedded is not None
             return (
                 "No maps are given: the sky is the embedded model of the Galaxy at nside "
-                f"{self.settings.embedded.nside} rather than Planck's Commander maps."
+                f"{self.settings.sky.embedded.nside} rather than Planck's Commander maps."
             )
         files = (
             f"{law} from {self._spec(law)[1].label} (nside {self.template(law).nside})"
@@ -139,12 +149,12 @@ class Sources:
     @property
     def galaxy(self) -> EmbeddedSky:
         """The embedded model; where templates come from files, at low resolution."""
-        embedded = self.settings.embedded
-        nside = embedded.nside if embedded else NSIDE
-        return self.once("galaxy", lambda: embedded_sky(nside))
+        if self.settings.sky.embedded is not None:
+            return self.once("galaxy", lambda: embedded_galaxy(self.settings))
+        return self.once("galaxy", lambda: embedded_sky(NSIDE))
 
-    def _spec(self, law: str) -> tuple[str, TemplateFile]:
-        found = [(n, spec) for n, spec in self.settings.templates.items() if spec.law == law]
+    def _spec(self, law: str) -> tuple[str, ComponentTable]:
+        found = [(n, spec) for n, spec in self.settings.sky.components.items() if spec.law == law]
         if len(found) != 1:
             raise Impossible(
                 f"It takes one template of the law {law!r}, but there are {len(found)}."
@@ -152,15 +162,10 @@ class Sources:
         return found[0]
 
     def _templates(self) -> dict[str, Template]:
-        if self.embedded:
-            sky = self.galaxy.sky("QU")
-            used = np.ones(sky.shape[1], bool)
-            templates = {name: Template(sky[name], 0.0, used) for name in sky}
-            return set_parameters_of(templates, self.settings.fixed)
-        templates = set_parameters_of(
-            read_templates(self.folder, self.settings.templates), self.settings.fixed
-        )
-        return {law: templates[self._spec(law)[0]] for law in PAPER_FWHM}
+        names = {law: self._spec(law)[0] for law in PAPER_FWHM}
+        galaxy = None if self.settings.sky.embedded is None else self.galaxy
+        templates, _ = read_sky(self.settings, names=list(names.values()), galaxy=galaxy)
+        return {law: templates[name] for law, name in names.items()}
 
     def template(self, name: str) -> Layer:
         """The dust or the synchrotron."""
@@ -170,7 +175,7 @@ class Sources:
         own = self.once("templates", self._templates)[name]
         if missing := int(np.sum(~own.used)):
             raise SettingsError(
-                f"templates.{name}: {missing} pixels have no value; the figures of the paper take "
+                f"sky.{name}: {missing} pixels have no value; the figures of the paper take "
                 "maps of the full sky."
             )
         fwhm = max(own.fwhm, PAPER_FWHM[name])
@@ -224,9 +229,9 @@ class Sources:
                 )
             if missing := int(np.sum(~np.asarray(found.mask))):
                 raise SettingsError(f"paper.ame: {missing} pixels have no value.")
-            factor = uK_RJ_per(found.unit, spec.nu_ref, "paper.ame")
+            factor = uK_RJ_per(found.unit, float(spec.nu_ref or NU_AME), "paper.ame")
             intensity = jnp.asarray(found.maps[0] * factor)
-            nu_ref, own = spec.nu_ref, spec.fwhm
+            nu_ref, own = float(spec.nu_ref or NU_AME), spec.fwhm
             origin = f"the intensity of AME is {spec.label}"
             origin += f", from {nu_ref:g} to 23 GHz by the paper's law" * (nu_ref != NU_AME)
         else:

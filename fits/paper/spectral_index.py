@@ -5,13 +5,13 @@ from pathlib import Path
 from fits import plots
 from fits.paper.comparisons import shared_inputs
 from fits.paper.item import Impossible, Item, Number, picture_of
-from fits.paper.settings import PaperSettings
 from fits.paper.sources import Sources, listed
-from fits.regions import region_masks
-from fits.report import with_errors
+from fits.regions import region_masks, region_words
+from fits.report import known_truth, with_errors
 from fits.resolution import prepare
 from fits.spectral_index import run
 from jaxsky.settings import SettingsError
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["figure_probability"]
 
@@ -26,22 +26,22 @@ PAPER = {
 }
 
 
-def figure_probability(settings: PaperSettings, sources: Sources, out: Path) -> Item:
+def figure_probability(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 11: the probability of beta_dust and beta_syn on a grid, from Q and from U."""
     inputs, picture = shared_inputs(settings, sources), picture_of("Figure 11")
     bands = {name: inputs.bands[name] for name in BANDS if name in inputs.bands} or inputs.bands
-    if len(settings.free) != 2:
+    if len(settings.free_in("fit")) != 2:
         raise Impossible("A grid takes two free parameters, in the table `free`.")
-    analysis = settings.analysis.model_copy(
+    spec = settings.fit.model_copy(
         update={"methods": ["grid"], "stokes": ["Q", "U", "QU"], "regions": ["strip", "full"]}
     )
-    chosen = settings.model_copy(update={"analysis": analysis})
-    prepared = prepare(inputs._replace(bands=bands), analysis.nside, analysis.fwhm)
+    chosen, common = settings.model_copy(update={"fit": spec}), settings.common
+    prepared = prepare(inputs._replace(bands=bands), common.nside, common.fwhm)
     try:
-        fits = run(chosen, prepared, region_masks(chosen))
+        fits = run(chosen, prepared, region_masks(chosen, spec.regions))
     except SettingsError as error:
         raise Impossible(str(error)) from None
-    plots.plot_grids(out / picture, fits, inputs.truth, settings.title)
+    plots.plot_grids(out / picture, fits, known_truth(inputs, fits), settings.title)
     numbers, truth = [], inputs.truth or {}
     for fit in fits:
         result = fit.results["grid"]
@@ -60,11 +60,11 @@ def figure_probability(settings: PaperSettings, sources: Sources, out: Path) -> 
         "Figure 11",
         "probability of the spectral indices",
         f"Probability of the free parameters from the bands {names}: Q, U and both together, "
-        f"pixels at |b| <= {analysis.latitude:g} deg (above) and the full sky (below); contours "
+        f"in {region_words(settings, 'strip')} (above) and the full sky (below); contours "
         "hold 68 and 95 per cent.",
         "Noise after smoothing is correlated between pixels and the CMB between bands: the "
         "likelihood has both, where the paper's sum over pixels has neither. "
-        + ("The maps are simulated." if sources.embedded else sources.sky_differs),
+        + ("The maps are simulated." if sources.simulated else sources.sky_differs),
         picture,
         numbers=tuple(numbers),
     )

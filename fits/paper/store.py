@@ -7,8 +7,8 @@ from typing import Any
 
 from fits.commands.page import Table
 from fits.paper.item import Item, Number
-from fits.paper.settings import PaperSettings
 from fits.record import write_json
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["FILE", "Store"]
 
@@ -49,7 +49,7 @@ class Store:
     """
 
     def __init__(
-        self, out: Path, settings: PaperSettings, resume: bool = False, overwrite: bool = False
+        self, out: Path, settings: Experiment, resume: bool = False, overwrite: bool = False
     ) -> None:
         self.out, self.items = out, dict[str, Item]()
         self._stale = False

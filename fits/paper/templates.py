@@ -10,11 +10,11 @@ import numpy as np
 
 from fits.paper.indices import STEEPENING, SYMBOLS, Index
 from fits.paper.item import Item, Number, picture_of
-from fits.paper.settings import PaperSettings
 from fits.paper.sources import NSIDE, Sources
 from fits.record import with_error
 from jaxsky.plots import STYLE, UNITS, draw_map, save
 from jaxsky.presets import preset
+from jaxsky.settings.experiment import Experiment
 from jaxsky.templates import coarse_pixels, correlation, polarization_template, steepening
 
 __all__ = ["COLUMN", "figure_ame", "figure_indices", "figure_templates", "limit"]
@@ -48,7 +48,7 @@ def _draw(path: Path, panels: Mapping[str, tuple[np.ndarray, str, float | None]]
         save(figure, path)
 
 
-def figure_templates(settings: PaperSettings, sources: Sources, out: Path) -> Item:
+def figure_templates(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 1: Q of both templates."""
     panels, beams = {}, {}
     for name in ("dust", "synchrotron"):
@@ -70,7 +70,7 @@ def figure_templates(settings: PaperSettings, sources: Sources, out: Path) -> It
     )
 
 
-def figure_indices(settings: PaperSettings, sources: Sources, out: Path) -> Item:
+def figure_indices(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 3: maps of both spectral indices."""
     panels, origins, numbers = {}, [], []
     paper = {"beta_dust": ("1.53", "not given"), "beta_syn": ("2.9", "0.1")}
@@ -126,7 +126,7 @@ def _steepening(index: Index) -> Number:
     )
 
 
-def figure_ame(settings: PaperSettings, sources: Sources, out: Path) -> Item:
+def figure_ame(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 4: Q of AME, and its correlation with the dust."""
     ame = sources.ame()
     picture = picture_of("Figure 4")

@@ -181,8 +181,8 @@ def plot_ratio(path: Path, found: Separation, title: str) -> None:
             label=f"95 %: $r < {_two_digits(ratio.upper_95)}$",
         )
         _interval(axes, ratio.r, ratio.sigma)
-        if found.setup.r is not None:
-            axes.axvline(found.setup.r, color=TRUTH, lw=1.6, label="truth")
+        if (known := (found.setup.truth or {}).get("r")) is not None:
+            axes.axvline(known, color=TRUTH, lw=1.6, label="truth")
         low = min(0.0, ratio.r - 1.3 * ratio.sigma)
         shown = ratio.grid[ratio.posterior > 2e-3].max()
         axes.set(

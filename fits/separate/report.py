@@ -7,14 +7,13 @@ import numpy as np
 from rich.table import Table
 
 from fits.plots import plot_chains
-from fits.record import probability, with_error, write_json, write_log
+from fits.record import leaks, probability, with_error, write_json, write_log
 from fits.separate import plots
 from fits.separate.separate import SAMPLED, Separation
-from fits.separate.settings import SeparateSettings
 from fits.separation.maps import ComponentMaps
-from fits.settings import leaks
 from jaxsky.io import write_maps
 from jaxsky.parameter_maps import parameter_unit
+from jaxsky.settings.experiment import Experiment
 
 __all__ = ["result_json", "tables", "warnings", "write_report"]
 
@@ -34,14 +33,14 @@ def _pixel_probability(found: Separation) -> dict[str, float] | None:
     return {f"below_{p:g}": float(np.mean(values < p)) for p in (0.05, 0.01, 0.001)}
 
 
-def result_json(found: Separation, settings: SeparateSettings) -> dict[str, Any]:
+def result_json(found: Separation, settings: Experiment) -> dict[str, Any]:
     """All numbers; band powers are D_l of BB in uK_CMB^2."""
     fit, ratio, spectra = found.fit, found.tensors, found.spectra
     bands = list(found.setup.domain.bands)
     results: dict[str, Any] = {
         "description": found.setup.description,
         "warnings": warnings(found, settings),
-        "domain": settings.separation.domain,
+        "domain": settings.separate.domain,
         "components": found.components,
         "bands": bands,
         "parameters": {
@@ -67,7 +66,7 @@ def result_json(found: Separation, settings: SeparateSettings) -> dict[str, Any]
             "best_fit": ratio.r,
             "sigma": ratio.sigma,
             "upper_95": ratio.upper_95,
-            "truth": found.setup.r,
+            "truth": (found.setup.truth or {}).get("r"),
             "shift_by_foregrounds_left": None if found.left is None else ratio.shift(found.left),
             "shift_by_errors_of_laws": ratio.shift(found.simulated.residual.mean(axis=0)),
             "chi2": ratio.chi2,
@@ -119,7 +118,7 @@ def tables(found: Separation) -> list[Table]:
         table.add_row(f"{name}, median of {int(np.isfinite(value).sum())} regions", typical, *known)
     ratio = found.tensors
     table.add_section()
-    shown = [] if not truth else [f"{found.setup.r:g}"]
+    shown = [] if not truth else [f"{truth.get('r', 0.0):g}"]
     table.add_row("r", with_error(ratio.r, ratio.sigma), *shown)
     table.add_row("r, 95 % below", f"{ratio.upper_95:.2g}", *([""] * bool(truth)))
     if found.left is not None:
@@ -133,9 +132,9 @@ def tables(found: Separation) -> list[Table]:
     return [table]
 
 
-def warnings(found: Separation, settings: SeparateSettings) -> list[str]:
+def warnings(found: Separation, settings: Experiment) -> list[str]:
     """What a user should know before using the numbers, a sentence each."""
-    sentences = leaks(settings.bands)
+    sentences = [*leaks(settings), *settings.left_out("separate")]
     fit, ratio, simulated = found.fit, found.tensors, found.simulated
     sentences += [
         f"Band {band} carries no weight: its noise is too large. It is not counted in degrees of "
@@ -159,26 +158,26 @@ def warnings(found: Separation, settings: SeparateSettings) -> list[str]:
         sentences.append(
             f"E that leaks into B at the edge of the mask is up to {share.max():.1f} standard "
             "deviations of BB in a bin. It is part of the model, but a larger "
-            "tensors.apodization makes it and the errors smaller."
+            "separate.apodization makes it and the errors smaller."
         )
-    if settings.separation.sampler != "none" and len(fit.labels) > SAMPLED:
+    if settings.separate.sampler != "none" and len(fit.labels) > SAMPLED:
         sentences.append(
             f"The posterior was not sampled: {len(fit.labels)} parameters are more than {SAMPLED}."
         )
     if found.chain is not None and not found.chain.converged:
         sentences.append(f"posterior: {found.chain.message}")
-    if settings.tensors.A_lens != 1:
-        A_lens = settings.tensors.A_lens
+    if settings.cmb.A_lens != 1:
+        A_lens = settings.cmb.A_lens
         sentences.append(f"The lensing B modes are taken as known, A_lens = {A_lens:g}.")
     return sentences
 
 
-def _write_maps(out: Path, found: Separation, settings: SeparateSettings) -> list[Path]:
+def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path]:
     """Maps of components, residuals, and parameters that have regions."""
     domain, mask = found.setup.domain, np.isfinite(found.maps).all(axis=(0, 1))
     names, units, columns = [], [], []
     for name, maps in zip(found.components, found.maps, strict=True):
-        unit = "uK_CMB" if name == settings.cmb else "uK_RJ"
+        unit = "uK_CMB" if name == "cmb" else "uK_RJ"
         for stokes, values in zip("QU", maps[-2:], strict=True):
             names.append(f"{name.upper()}_{stokes}")
             units.append(unit)
@@ -193,14 +192,14 @@ def _write_maps(out: Path, found: Separation, settings: SeparateSettings) -> lis
         units += ["", ""]
         columns += [found.found.chi2, found.found.probability]
     written = [out / "components.fits", out / "residuals.fits"]
-    header = {"FWHM": (settings.separation.fwhm, "[arcmin]")}
+    header = {"FWHM": (settings.common.fwhm, "[arcmin]")}
     options: dict[str, Any] = {"mask": mask, "overwrite": True, "single": True}
     write_maps(
         written[0], np.stack(columns), names=names, unit=units, extra_header=header, **options
     )
     labels = [f"{band}_{stokes}" for band in domain.bands for stokes in "QU"]
     rest = found.residuals[:, -2:].reshape(len(labels), -1)
-    write_maps(written[1], rest, names=labels, unit=settings.separation.unit, **options)
+    write_maps(written[1], rest, names=labels, unit=settings.separate.unit, **options)
     varying = [name for name in found.fit.free if np.ndim(found.fit.best_fit[name])]
     if varying:
         written.append(out / "parameters.fits")
@@ -212,11 +211,9 @@ def _write_maps(out: Path, found: Separation, settings: SeparateSettings) -> lis
     return written
 
 
-def write_report(
-    out: Path, found: Separation, settings: SeparateSettings, seconds: float
-) -> list[Path]:
+def write_report(out: Path, found: Separation, settings: Experiment, seconds: float) -> list[Path]:
     """Write result.json, maps, pictures and log.json to a folder; returns what was written."""
-    title, unit = settings.title, settings.separation.unit
+    title, unit = settings.title, settings.separate.unit
     write_json(out / "result.json", result_json(found, settings))
     written = [out / "result.json", *_write_maps(out, found, settings)]
     plots.plot_components(out / "components.png", found, title)

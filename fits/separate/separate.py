@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 from fits.chains import kept_chain
+from fits.priors import priors_of
 from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra
 from fits.realisations import realisations
 from fits.record import fingerprint
 from fits.results import FitResult, misfit
 from fits.separate.domains import PixelDomain
-from fits.separate.settings import SeparateSettings, Tensors
 from fits.separate.setup import Setup
 from fits.separate.simulations import Realisation, Simulated
 from fits.separation.fit import fit_spectra
@@ -24,10 +24,13 @@ from fits.separation.results import SpectralFit
 from fits.separation.sample import sample_spectra
 from fits.separation.tensor_ratio import TensorFit, fit_tensors, power_model
 from jaxsky.checks import check_double
-from jaxsky.cmb import camb_spectra, tensor_spectra
+from jaxsky.cmb import tensor_spectra
+from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import SettingsError
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import at_key
 
 __all__ = ["SAMPLED", "Separation", "separate"]
 
@@ -89,7 +92,7 @@ class Separation(NamedTuple):
 
 
 def separate(
-    settings: SeparateSettings,
+    settings: Experiment,
     setup: Setup,
     out: Path | None = None,
     progress: Progress = QUIET,
@@ -113,11 +116,10 @@ def separate(
         For parameters that do not exist and settings that cannot work.
     """
     check_double("A separation")
-    main, domain, priors = settings.separation, setup.domain, settings.priors()
-    cmb = settings.cmb
-    assert cmb is not None  # as the settings see to
+    spec, domain, priors = settings.separate, setup.domain, priors_of(settings, "separate")
     progress.step("spectral parameters")
-    like = domain.likelihood(setup.data)
+    with at_key("free"):
+        like = domain.likelihood(setup.data)
     fit = fit_spectra(like, priors=priors, throw=False)
     # What no law describes is separated nevertheless, and said.
     fit.checked(throw=fit.message != misfit(fit.chi2, fit.dof))
@@ -126,20 +128,28 @@ def separate(
     best = like.named(jnp.asarray(response.theta))
     found = domain.components(like, best, setup.data)
     maps = domain.maps(found)
-    row = tuple(like.sky).index(cmb)
+    row = tuple(like.sky).index("cmb")
 
     progress.step("simulations")
-    window, spectra = _spectra(settings.tensors, setup.mask, main.nside, main.fwhm)
-    tensors = tensor_spectra(window.size - 1)
+    window, spectra = _spectra(settings, setup.mask)
+    highest = window.size - 1
+    with at_key("cmb.cosmology"):
+        tensors = tensor_spectra(highest, **settings.cmb.cosmology)
     # Simulated and modelled, lensing is what the settings say.
-    lensed = camb_spectra(window.size - 1) * np.array([1, 1, settings.tensors.A_lens, 1])[:, None]
+    lensed = cmb_spectra(settings, highest, r=0.0)
     emission = domain.emission(like, best, _without(found.amplitude, row))
     realisation = Realisation(domain, like, best, response, emission, row, spectra, window, lensed)
     kept = None if out is None else out / "simulations.npz"
     mark = _mark(settings, setup)
     simulated = Simulated(
         *realisations(
-            realisation.of, Simulated._fields, main.nsims, main.seed, kept, mark, progress.advance
+            realisation.of,
+            Simulated._fields,
+            spec.nsims,
+            settings.seed,
+            kept,
+            mark,
+            progress.advance,
         )
     )
     progress.step("tensor-to-scalar ratio")
@@ -162,7 +172,7 @@ def separate(
         left = band_powers(spectra, alone[row])[1]
     sigma, covariance = _errors(settings, like, fit, simulated)
     chain = None
-    if main.sampler != "none" and len(fit.labels) <= SAMPLED:
+    if spec.sampler != "none" and len(fit.labels) <= SAMPLED:
         progress.step("posterior")
         chain = _chain(settings, setup, like, fit, simulated, out, progress)
     return Separation(
@@ -173,7 +183,7 @@ def separate(
         covariance,
         found,
         maps,
-        domain.degradation(like, best, cmb),
+        domain.degradation(like, best, "cmb"),
         domain.residuals(like, best, setup.data, found),
         simulated,
         spectra,
@@ -191,9 +201,10 @@ def _without(amplitude: np.ndarray, row: int) -> np.ndarray:
 
 
 def _spectra(
-    how: Tensors, mask: np.ndarray, nside: int, fwhm: float
+    settings: Experiment, mask: np.ndarray
 ) -> tuple[Float[np.ndarray, " ell"], MaskedSpectra]:
     """The beam of the maps, and how their spectra are taken."""
+    how, nside, fwhm = settings.separate, settings.common.nside, settings.common.fwhm
     highest = 2 * nside
     window = np.asarray(gaussian_beam(fwhm, highest))
     reach = int(np.flatnonzero(window > LEAST_WINDOW).max())
@@ -201,28 +212,28 @@ def _spectra(
     lmax = min(reach, highest - how.width) if how.lmax is None else how.lmax
     if lmax > min(reach, highest - 1):
         raise SettingsError(
-            f"tensors.lmax: {lmax} is beyond what nside {nside} and a beam of {fwhm:g} arcmin "
+            f"separate.lmax: {lmax} is beyond what nside {nside} and a beam of {fwhm:g} arcmin "
             f"resolve, {min(reach, highest - 1)}."
         )
     if how.lmin + how.width > lmax:
         raise SettingsError(
-            f"tensors: no bin of {how.width} multipoles fits between lmin, {how.lmin}, and {lmax}."
+            f"separate: no bin of {how.width} multipoles fits between lmin, {how.lmin}, and {lmax}."
         )
     pure = how.purify and not np.all(mask == 1)
     edges = bin_edges(how.lmin, lmax, how.width)
     return window, masked_spectra(mask, edges, window=window, pure=pure)
 
 
-def _mark(settings: SeparateSettings, setup: Setup) -> str:
+def _mark(settings: Experiment, setup: Setup) -> str:
     """What the simulations depend on."""
-    left_out = {"separation": {"nsims", "sampler", "nsteps"}}
+    left_out = {"separate": {"nsims", "sampler", "nsteps"}}
     said = settings.model_dump_json(exclude=left_out)
     return f"{fingerprint((setup.data, setup.mask))} {said}"
 
 
 def _errors(settings, like, fit, simulated):
     """Standard deviations by name, and the covariance."""
-    if settings.separation.domain == "harmonic":
+    if settings.separate.domain == "harmonic":
         return fit.sigma, fit.covariance
     sigma = simulated.theta.std(axis=0, ddof=1)
     determined = np.isfinite(np.asarray(like.flat(fit.best_fit))) & (sigma > 0)
@@ -236,25 +247,25 @@ def _errors(settings, like, fit, simulated):
 
 def _chain(settings, setup, like, fit, simulated, out, progress):
     """Samples of the posterior; in pixels with the errors of the simulations."""
-    main = settings.separation
+    spec = settings.separate
     size = int(np.isfinite(np.asarray(like.flat(fit.best_fit))).sum())
     nwalkers = max(WALKERS, 2 * size + 2)
     backend = None
-    if main.sampler == "emcee" and out is not None:
+    if spec.sampler == "emcee" and out is not None:
         backend = kept_chain(out / "chain.h5", "mcmc", (nwalkers, size), _mark(settings, setup))
     samples = sample_spectra(
         like,
         fit.best_fit,
-        priors=settings.priors(),
-        sampler=main.sampler,
-        nsteps=main.nsteps,
-        nwalkers=nwalkers if main.sampler == "emcee" else None,
-        seed=main.seed,
+        priors=priors_of(settings, "separate"),
+        sampler=spec.sampler,
+        nsteps=spec.nsteps,
+        nwalkers=nwalkers if spec.sampler == "emcee" else None,
+        seed=settings.seed,
         backend=backend,
         progress=progress.advance,
         throw=False,
     )
-    if main.domain == "harmonic" or not samples.details:
+    if spec.domain == "harmonic" or not samples.details:
         return samples
     at = [fit.labels.index(name) for name in samples.free]
     center = np.asarray(like.flat(fit.best_fit))[at]

@@ -8,29 +8,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fits import settings as analysis_settings
 from fits.covariance import uniform_level
-from fits.forecast.setup import apodize
-from fits.inputs import Band, Inputs, embedded_inputs, read_band
+from fits.inputs import Band, Inputs, inputs_of
 from fits.preparation import Preparation
+from fits.regions import apodize, region_mask
 from fits.resolution import prepare
 from fits.separate.domains import Domain, HarmonicDomain, PixelDomain
-from fits.separate.settings import Regions, SeparateSettings
 from fits.separation.harmonic import harmonic_coefficients
 from fits.separation.mixing import NOMINAL
 from fits.separation.noise import Noise, as_noise
 from fits.separation.regions import clusters, latitude_bands, superpixels
-from jaxsky import Component, Sky, get_parameters, observe, parameter_names, set_parameters
+from jaxsky import Component, Sky, set_parameters
 from jaxsky.components import component_class
-from jaxsky.galaxy import embedded_sky
-from jaxsky.harmonics import gaussian_beam, resample
-from jaxsky.inputs import mask_at, read, read_parameter
-from jaxsky.instrument import load_instrument
-from jaxsky.io import read_mask
-from jaxsky.lookup import find_file
+from jaxsky.inputs import read, read_parameter
 from jaxsky.parameter_maps import one_column
 from jaxsky.settings import MapFile, SettingsError
-from jaxsky.settings_keys import at_key
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import at_key
+from jaxsky.settings.tables import Regions
 
 __all__ = ["Setup", "build"]
 
@@ -48,8 +43,7 @@ class Setup(NamedTuple):
     data : observed, as the domain takes it
     foregrounds : those of a simulation alone, likewise; None for real maps
     mask : weight of each pixel in spectra, 0 to 1, its edges smooth
-    truth : values of the free parameters in a simulation, by name
-    r : that of the simulation
+    truth : parameters of a simulation that are numbers, "r" among them; None for real maps
     description : what the maps are
     """
 
@@ -58,11 +52,10 @@ class Setup(NamedTuple):
     foregrounds: Float[np.ndarray, "band stokes _"] | None
     mask: Float[np.ndarray, " pix"]
     truth: dict[str, float] | None
-    r: float | None
     description: str
 
 
-def build(settings: SeparateSettings) -> Setup:
+def build(settings: Experiment) -> Setup:
     """Read or simulate what the settings name, and check that it can work.
 
     Raises
@@ -71,65 +64,74 @@ def build(settings: SeparateSettings) -> Setup:
         For files that are not what they should be, names that do not exist, maps that are coarser
         than the common resolution, and a mask that leaves nothing.
     """
-    main, folder = settings.separation, Path(settings.data_dir)
-    inside = _inside(settings)
+    spec, common = settings.separate, settings.common
+    if not settings.cmb.include:
+        raise SettingsError("cmb.include: is false, but a separation has a CMB.")
+    if not common.fwhm:
+        raise SettingsError("common.fwhm: must be positive for a separation.")
+    if not settings.free_in("separate"):
+        raise SettingsError("free: name at least one parameter to fit.")
+    if spec.domain == "harmonic":
+        for name, parameter in settings.free_in("separate").items():
+            if parameter.regions:
+                raise SettingsError(
+                    f"free.{name}: regions are those of pixels; the domain 'harmonic' takes one "
+                    "value for the whole sky."
+                )
+    inside = region_mask(settings, spec.region, common.nside)
+    if not inside.any():
+        raise SettingsError("separate.region: leaves no pixel.")
     sky, known = _sky(settings)
     inside &= known
     if not inside.any():
-        raise SettingsError("separation.mask: leaves no pixel in which parameters are known.")
-    if settings.embedded is not None:
-        inputs, foregrounds = _observed(settings)
-    else:
-        bands = {spec.name: read_band(folder, spec) for spec in settings.bands}
-        inputs, foregrounds = Inputs({}, bands, None, None, settings.title), None
-    if main.domain == "pixel":
+        raise SettingsError("separate.region: leaves no pixel in which parameters are known.")
+    inputs = inputs_of(settings, templates=False, foregrounds=True)
+    foregrounds = None if inputs.foregrounds is None else list(inputs.foregrounds.values())
+    if spec.domain == "pixel":
         domain, data, shown = _pixels(settings, sky, inputs, foregrounds, inside)
         used = domain.used
     else:
         domain, data, shown = _multipoles(settings, sky, inputs, foregrounds)
         used = inside
-    mask = apodize(used, settings.tensors.apodization)
+    mask = apodize(used, spec.apodization)
     if not mask.any():
-        raise SettingsError("separation.mask: leaves no pixel.")
-    truth = None if settings.embedded is None else inputs.truth
-    r = None if settings.embedded is None else settings.embedded.r
-    return Setup(domain, data, shown, mask, truth, r, inputs.description)
+        raise SettingsError("separate.region: leaves no pixel.")
+    truth = inputs.truth
+    if truth is not None:  # bands are simulated as they are described
+        words = {name: name.split(".")[0] for name in settings.free_in("separate")}
+        truth |= {name: NOMINAL[word] for name, word in words.items() if word in NOMINAL}
+    return Setup(domain, data, shown, mask, truth, inputs.description)
 
 
-def _inside(settings: SeparateSettings) -> Bool[np.ndarray, " pix"]:
-    """Pixels that the settings leave."""
-    main = settings.separation
-    latitude = healpy.pix2ang(main.nside, np.arange(12 * main.nside**2), lonlat=True)[1]
-    inside = np.abs(latitude) > main.latitude if main.latitude else np.ones(latitude.size, bool)
-    if main.mask is not None:
-        path = find_file(Path(settings.data_dir), main.mask.file)
-        found = read_mask(path, key=main.mask.key, ordering=main.mask.ordering)
-        inside &= mask_at(found, main.nside, "separation.mask")
-    if not inside.any():
-        raise SettingsError("separation.mask: leaves no pixel.")
-    return inside
-
-
-def _sky(settings: SeparateSettings) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
+def _sky(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
     """The laws, on one pixel, or on all if parameters are maps; and where these are known."""
-    folder, nside = Path(settings.data_dir), settings.separation.nside
-    given = settings.components.values()
+    folder, nside = Path(settings.data_dir), settings.common.nside
+    laws = {name: settings.sky.components[name] for name in settings.modelled()}
+    given = laws.values()
     maps = any(isinstance(value, MapFile) for c in given for value in c.parameters.values())
     amplitude = jnp.ones((2, 12 * nside**2 if maps else 1))
-    components: dict[str, Component] = {}
+    components: dict[str, Component] = {"cmb": component_class("cmb")(amplitude)}
     known = np.ones(12 * nside**2, bool)
-    for name, spec in settings.components.items():
+    for name, spec in laws.items():
         numbers: dict = {} if spec.nu_ref is None else {"nu_ref": spec.nu_ref}
         for key, value in spec.parameters.items():
             if isinstance(value, MapFile):
-                place = f"components.{name}.parameters.{key}"
-                column, has = read_parameter(folder, value, key, nside, place, "separation.nside")
+                place = f"sky.{name}.parameters.{key}"
+                column, has = read_parameter(folder, value, key, nside, place, "common.nside")
                 numbers[key], known = jnp.asarray(column), known & has
             else:
                 numbers[key] = tuple(value) if isinstance(value, list) else value
-        with at_key(f"components.{name}"):
+        with at_key(f"sky.{name}"):
+            assert spec.law is not None  # as the settings see to
             components[name] = component_class(spec.law)(amplitude, **numbers)
-    return Sky(components), known
+    fixed = {n: v for n, v in settings.fixed.items() if n.split(".")[0] not in _others(settings)}
+    with at_key("fixed"):
+        return set_parameters(Sky(components), fixed), known
+
+
+def _others(settings: Experiment) -> set[str]:
+    """Components that are not modelled."""
+    return set(settings.sky.components) - set(settings.modelled())
 
 
 def _map(
@@ -137,16 +139,16 @@ def _map(
 ) -> Float[np.ndarray, " pix"]:
     """A map of one column at the resolution of the separation, with values where it is used."""
     found = read(folder, spec, stokes="", zeros_are_data=True)
-    values = one_column(found, nside, where, "separation.nside")
+    values = one_column(found, nside, where, "common.nside")
     if empty := int(np.sum(used & ~np.asarray(found.mask))):
         raise SettingsError(f"{where}: {empty} of {used.sum()} used pixels have no value.")
     return values
 
 
-def _labels(settings: SeparateSettings, used: Bool[np.ndarray, " pix"]) -> dict[str, np.ndarray]:
+def _labels(settings: Experiment, used: Bool[np.ndarray, " pix"]) -> dict[str, np.ndarray]:
     """Regions of the free parameters that have them."""
     labels = {}
-    for name, parameter in settings.free.items():
+    for name, parameter in settings.free_in("separate").items():
         if parameter.regions is None:
             continue
         with at_key(f"free.{name}.regions"):
@@ -155,9 +157,9 @@ def _labels(settings: SeparateSettings, used: Bool[np.ndarray, " pix"]) -> dict[
 
 
 def _regions(
-    settings: SeparateSettings, regions: Regions, used: Bool[np.ndarray, " pix"], where: str
+    settings: Experiment, regions: Regions, used: Bool[np.ndarray, " pix"], where: str
 ) -> np.ndarray:
-    folder, nside = Path(settings.data_dir), settings.separation.nside
+    folder, nside = Path(settings.data_dir), settings.common.nside
     if regions.nside is not None:
         return superpixels(nside, regions.nside)
     if regions.latitudes is not None:
@@ -171,69 +173,30 @@ def _regions(
     # Without maps, pixels are alike that lie close together.
     rows = [_map(folder, spec, nside, f"{where}.of", used) for spec in regions.of]
     maps = np.stack(rows) if rows else np.stack(healpy.pix2vec(nside, np.arange(used.size)))
-    return clusters(np.where(used, maps, np.nan), regions.clusters, seed=settings.separation.seed)
+    return clusters(np.where(used, maps, np.nan), regions.clusters, seed=settings.seed)
 
 
-def _observed(settings: SeparateSettings) -> tuple[Inputs, list[Array]]:
-    """The embedded sky in all bands, and its foregrounds alone [uK_RJ]."""
-    embedded, main = settings.embedded, settings.separation
-    assert embedded is not None  # as called
-    with at_key("embedded.instrument"):
-        instrument = load_instrument(embedded.instrument)
-    if embedded.channels is not None:
-        with at_key("embedded.channels"):
-            instrument = instrument.select(embedded.channels)
-    galaxy = embedded_sky(embedded.nside)
-    with at_key("embedded.truth"):
-        sky = set_parameters(galaxy.sky("QU"), embedded.truth)
-    inputs = embedded_inputs(
-        analysis_settings.Settings(
-            embedded=analysis_settings.Embedded(
-                channels={embedded.instrument: list(instrument.names)}, nside=embedded.nside
-            ),
-            analysis=analysis_settings.Analysis(seed=main.seed),
-            fixed=embedded.truth,
-            cmb=analysis_settings.CMBSettings(r=embedded.r),
-        ),
-        galaxy,
-    )
-    seen = observe(sky, [band.bandpass for band in inputs.bands.values()])
-    foregrounds = [
-        resample(maps, gaussian_beam(band.fwhm, 2 * embedded.nside), embedded.nside)
-        for maps, band in zip(seen, inputs.bands.values(), strict=True)
-    ]
-    return inputs._replace(truth=_truth(settings, sky)), foregrounds
-
-
-def _truth(settings: SeparateSettings, sky: Sky) -> dict[str, float]:
-    """What the free parameters are in the simulated sky."""
-    known = parameter_names(sky)
-    laws = get_parameters(sky, [name for name in settings.free if name in known])
-    bands = {n: NOMINAL[n.split(".")[0]] for n in settings.free if n.split(".")[0] in NOMINAL}
-    return {name: float(value) for name, value in laws.items()} | bands
-
-
-def _factors(settings: SeparateSettings, inputs: Inputs) -> Float[np.ndarray, " band"]:
+def _factors(settings: Experiment, inputs: Inputs) -> Float[np.ndarray, " band"]:
     """Units of the data per uK_RJ."""
-    unit = settings.separation.unit
+    unit = settings.separate.unit
     return np.array([float(b.bandpass.conversion("uK_RJ", unit)) for b in inputs.bands.values()])
 
 
 def _pixels(settings, sky, inputs, foregrounds, inside):
-    main = settings.separation
-    with at_key("separation"):
-        prepared = prepare(inputs, main.nside, main.fwhm)
+    common = settings.common
+    with at_key("common"):
+        prepared = prepare(inputs, common.nside, common.fwhm)
     used = prepared.used & inside
     if not used.any():
-        raise SettingsError("separation.mask: leaves no pixel.")
+        raise SettingsError("separate.region: leaves no pixel.")
     factors = _factors(settings, inputs)
     sigma = np.asarray(prepared.sigma) * factors[:, None, None]
     domain = PixelDomain(
         sky,
         prepared.bands,
-        settings.start(),
+        settings.start("separate"),
         _labels(settings, used),
-        main.unit,
+        settings.separate.unit,
         _noise(sigma, used),
         used,
         prepared.fluctuations,
@@ -262,14 +225,14 @@ def _noise(sigma: Float[np.ndarray, "band stokes pix"], used: np.ndarray) -> Noi
 
 
 def _multipoles(settings, sky, inputs, foregrounds):
-    main, factors = settings.separation, _factors(settings, inputs)
+    common, factors = settings.common, _factors(settings, inputs)
     for name, band in inputs.bands.items():
         if missing := int(np.sum(~np.asarray(band.used))):
             raise SettingsError(
                 f"bands.{name}: {missing} pixels have no value; the domain 'harmonic' takes maps "
                 "of the full sky."
             )
-    lmax = 2 * min(main.nside, *(_nside(band) for band in inputs.bands.values()))
+    lmax = 2 * min(common.nside, *(_nside(band) for band in inputs.bands.values()))
     covariance = tuple(
         jnp.asarray(band.noise) * f**2
         for band, f in zip(inputs.bands.values(), factors, strict=True)
@@ -291,19 +254,28 @@ def _multipoles(settings, sky, inputs, foregrounds):
     domain = HarmonicDomain(
         sky,
         {name: band.bandpass for name, band in inputs.bands.items()},
-        settings.start(),
-        main.unit,
-        np.array([band.fwhm for band in inputs.bands.values()]),
+        settings.start("separate"),
+        settings.separate.unit,
+        _fwhms(inputs),
         np.stack(spectra),
         covariance,
         tuple(map(uniform_level, covariance)),
         correlated,
         lmax,
-        main.nside,
-        main.fwhm,
+        common.nside,
+        common.fwhm,
     )
     data = coefficients([_less_leakage(band) for band in inputs.bands.values()])
     return domain, data, None if foregrounds is None else coefficients(foregrounds)
+
+
+def _fwhms(inputs: Inputs) -> Float[np.ndarray, " band"]:
+    for name, band in inputs.bands.items():
+        if np.ndim(band.beam):
+            raise SettingsError(
+                f"bands.{name}.beam: is a table; the domain 'harmonic' takes Gaussian beams, fwhm."
+            )
+    return np.array([float(band.beam) for band in inputs.bands.values()])
 
 
 def _nside(band: Band) -> int:

@@ -262,6 +262,7 @@ def write_maps(
     overwrite: bool = False,
     extra_header: Mapping[str, Any] | None = None,
     single: bool = False,
+    tables: Sequence[pyfits.BinTableHDU] = (),
 ) -> None:
     """Maps as a HEALPix table in a FITS file, with a header that leaves nothing open.
 
@@ -277,6 +278,7 @@ def write_maps(
     overwrite : replace a file that is there
     extra_header : further header keywords and their values, or values and comments
     single : write single precision instead of double
+    tables : what else is in the file, after the maps
 
     Raises
     ------
@@ -326,4 +328,4 @@ def write_maps(
         table.header[key] = value
     table.header.update(required)
     with whole(path) as beside:
-        pyfits.HDUList([pyfits.PrimaryHDU(), table]).writeto(beside, overwrite=True)
+        pyfits.HDUList([pyfits.PrimaryHDU(), table, *tables]).writeto(beside, overwrite=True)

@@ -2,7 +2,6 @@
 
 import os
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -17,16 +16,14 @@ from pydantic import (
     model_validator,
 )
 
-from jaxsky.components import AME, component_class
-from jaxsky.settings_types import Law, Several, Word
-from jaxsky.settings_values import (
-    check_reference,
-    check_signs,
+from jaxsky.settings.types import Several, Word
+from jaxsky.settings.values import (
     file_names,
     hdu_numbers,
     missing_numbers,
     stokes_words,
 )
+from jaxsky.units import UNITS
 
 __all__ = [
     "BandpassSpec",
@@ -34,16 +31,15 @@ __all__ = [
     "FileName",
     "Hits",
     "MapFile",
+    "MapKeys",
     "MaskFile",
     "NamedFile",
     "NoiseColumns",
-    "NoiseFile",
+    "NoiseTable",
     "SettingsError",
     "SettingsFile",
     "Table",
-    "TemplateFile",
     "Weights",
-    "check_angles",
     "expand",
 ]
 
@@ -92,25 +88,40 @@ class _Columns(Table):
     missing: Missing | None = None
 
 
-class MapFile(_Columns):
-    """Columns of a FITS map, or of several with a column each; see `jaxsky.io.read_maps`.
+class MapKeys(_Columns):
+    """Columns of a FITS map, or of several with a column each, where there may be none.
 
-    What a header says, or the name of a column for certain, need not be given.
+    What a header says, or the name of a column for certain, need not be given; see
+    `jaxsky.io.read_maps`.
     """
 
-    file: Files
+    file: Files | None = None
     hdu: Hdus = 1
     stokes: Stokes | None = None
 
     @property
     def files(self) -> list[str]:
         """Names of the files, however many."""
-        return [self.file] if isinstance(self.file, str) else self.file
+        return [self.file] if isinstance(self.file, str) else self.file or []
 
     @property
     def label(self) -> str:
         """Names of the files without folders, to be shown."""
         return ", ".join(Path(file).name for file in self.files)
+
+    @model_validator(mode="after")
+    def _of_a_file(self) -> "MapKeys":
+        # Those that are as by default may be from a log.
+        of_file = [k for k, one in MapKeys.model_fields.items() if getattr(self, k) != one.default]
+        if self.file is None and of_file:
+            raise ValueError(f"{', '.join(of_file)}: of a file, but file is missing")
+        return self
+
+
+class MapFile(MapKeys):
+    """Columns of a FITS map, or of several with a column each; see `jaxsky.io.read_maps`."""
+
+    file: Files
 
 
 class MaskFile(Table):
@@ -119,28 +130,6 @@ class MaskFile(Table):
     file: FileName
     key: str | None = None
     ordering: Literal["RING", "NESTED"] | None = None
-
-
-class TemplateFile(MapFile):
-    """A component: its map at a reference frequency, its law, parameters that are not default."""
-
-    law: Law
-    nu_ref: float = Field(gt=0)
-    fwhm: float = Field(0.0, ge=0)
-    angles: str | None = None
-    parameters: dict[str, float | list[float] | MapFile] = {}
-
-    @model_validator(mode="after")
-    def _angles(self) -> "TemplateFile":
-        if self.angles and component_class(self.law) is not AME:
-            raise ValueError("angles are for the law 'ame' only")
-        return self
-
-    @model_validator(mode="after")
-    def _plausible(self) -> "TemplateFile":
-        check_reference(self.law, self.nu_ref, self.parameters)
-        check_signs("parameters", self.parameters)
-        return self
 
 
 class BandpassSpec(Table):
@@ -218,61 +207,56 @@ class Weights(Hits):
     fields: list[str | int] = Field(min_length=3, max_length=3)
 
 
-class NoiseFile(Table):
-    """Noise of a map: exactly one of these; per pixel of the map as it is in the file.
+class NoiseTable(Table):
+    """Noise of a band or of a template: exactly one of its kinds.
 
-    `plausible` says that noise is meant which is far from the rms of its map.
+    A level is white noise [unit arcmin]; that of a template is seen through its beam. The others
+    are of a pixel of the map as it is in the file. `unit` is that of level, rms, map, covariance
+    (squared) and sigma0, by default that of the map, or uK_CMB where there is no map. `plausible`
+    says that noise is meant which is far from the rms of its map; `correlated`, that noise
+    estimated from a map has a spectrum.
     """
 
-    KINDS: ClassVar[tuple[str, ...]] = ("rms", "map", "covariance", "hits", "weights")
+    KINDS: ClassVar[tuple[str, ...]] = (
+        "level", "rms", "map", "covariance", "hits", "weights", "estimate_above"
+    )  # fmt: skip
 
-    rms: float | None = Field(None, gt=0)
+    level: float | None = Field(None, ge=0)
+    rms: float | None = Field(None, ge=0)
     map: MapFile | None = None
     covariance: CovarianceColumns | None = None
     hits: Hits | None = None
     weights: Weights | None = None
+    estimate_above: float | None = Field(None, ge=0, lt=90)
+    correlated: bool = False
     plausible: bool = False
+    unit: str | None = None
+
+    @field_validator("unit")
+    @classmethod
+    def _temperature(cls, value: str | None) -> str | None:
+        if value is not None and UNITS.get(value, (1.0, ""))[1] not in ("K_RJ", "K_CMB"):
+            raise ValueError(f"must be a temperature such as uK_RJ or mK_CMB, not {value!r}")
+        return value
 
     @model_validator(mode="after")
-    def _one_kind(self) -> "NoiseFile":
+    def _one_kind(self) -> "NoiseTable":
         given = [kind for kind in self.KINDS if getattr(self, kind) is not None]
         if len(given) != 1:
             raise ValueError(
                 f"give the noise as exactly one of {', '.join(self.KINDS)}, "
                 f"not {', '.join(given) or 'none'}"
             )
+        if self.correlated and self.estimate_above is None:
+            raise ValueError("correlated goes with estimate_above only")
         return self
 
 
 class SettingsFile(Table):
-    """What any file of settings has; a command's settings derive from it."""
+    """What any file of settings has."""
 
     title: str = ""
     data_dir: str = "."
-
-    @model_validator(mode="after")
-    def _signs(self) -> "SettingsFile":
-        fixed, templates = getattr(self, "fixed", {}), getattr(self, "templates", {})
-        check_signs("fixed", fixed)
-        for name in templates:
-            if f"{name}.nu_ref" in fixed:
-                raise ValueError(
-                    f"fixed.{name}.nu_ref: nu_ref is given twice, here and in templates.{name}"
-                )
-        return self
-
-
-def check_angles(templates: Mapping[str, TemplateFile]) -> None:
-    """Raise ValueError if a template takes its angles from one that has none of its own."""
-    for name, template in templates.items():
-        if not template.angles:
-            continue
-        if template.angles not in templates:
-            raise ValueError(f"templates.{name}.angles: there is no template {template.angles}")
-        if templates[template.angles].angles:
-            raise ValueError(
-                f"templates.{name}.angles: template {template.angles} has none of its own"
-            )
 
 
 def expand(text: str) -> str:

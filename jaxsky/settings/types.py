@@ -7,19 +7,20 @@ from typing import Annotated, TypeVar
 from pydantic import AfterValidator, Field, Strict
 
 from jaxsky.components import component_class
+from jaxsky.settings.values import MistakeAt
 
 __all__ = [
     "BandName",
-    "ComponentName",
     "Distinct",
     "Law",
     "Nside",
     "Pair",
+    "RegionName",
     "Seed",
-    "SeparatedName",
     "Several",
     "TensorRatio",
     "Word",
+    "check_component_names",
     "check_names",
 ]
 
@@ -28,7 +29,10 @@ T = TypeVar("T")
 #: Names are parts of file names and of columns in FITS files.
 LONGEST = 40
 #: What else is called by a name in results, columns, and parameters such as "calibration.44".
-RESERVED = ("noise", "total", "residual", "r", "a_lens", "calibration", "offset", "center", "width")
+RESERVED = (
+    "cmb", "noise", "total", "residual", "r", "a_lens", "calibration", "offset", "gain", "shift",
+    "width", "angle", "center", "embedded",
+)  # fmt: skip
 
 
 def _power_of_two(value: int) -> int:
@@ -76,9 +80,7 @@ Pair = Annotated[tuple[T, T], Strict(False)]
 #: The law of a component: a name, or "module:Class" (`jaxsky.components.component_class`).
 Law = Annotated[str, AfterValidator(_law)]
 BandName = Annotated[str, AfterValidator(lambda value: _name(value, "."))]
-#: A component of what is separated; one of them is the CMB.
-SeparatedName = Annotated[str, AfterValidator(lambda value: _name(value, "", RESERVED))]
-ComponentName = Annotated[str, AfterValidator(lambda value: _name(value, "", (*RESERVED, "cmb")))]
+RegionName = Annotated[str, AfterValidator(lambda value: _name(value, ""))]
 
 
 def check_names(kind: str, names: Iterable[str]) -> None:
@@ -89,3 +91,14 @@ def check_names(kind: str, names: Iterable[str]) -> None:
             raise ValueError(
                 f"the names of the {kind} must differ{more}, but are {', '.join(names)}"
             )
+
+
+def check_component_names(names: Iterable[str]) -> None:
+    """Raise MistakeAt its name if a component cannot be called so."""
+    names = list(names)
+    check_names("components", names)
+    for name in names:
+        try:
+            _name(name, "", RESERVED)
+        except ValueError as error:
+            raise MistakeAt(name, error) from None

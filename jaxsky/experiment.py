@@ -1,0 +1,397 @@
+"""What an experiment file names, brought together as a simulation; refusals with the numbers."""
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import healpy
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsky.cmb import camb_spectra
+from jaxsky.galaxy import EmbeddedSky
+from jaxsky.harmonics import beam_ratio, gaussian_beam, resample
+from jaxsky.inputs import Template, read_bandpass_spec, read_sky, set_parameters_of
+from jaxsky.io import read_beam, read_spectra
+from jaxsky.io.observations import Observed
+from jaxsky.keys import realisation_key
+from jaxsky.lookup import find_file
+from jaxsky.noise_inputs import read_noise
+from jaxsky.observation import DTYPES, Observation, ObservedBand, Source
+from jaxsky.parameters import get_parameters, parameter_names
+from jaxsky.settings import SettingsError
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.keys import at_key
+from jaxsky.settings.tables import BandTable
+from jaxsky.sky import Sky, observe_band
+from jaxsky.small_scales import SmallScales
+
+__all__ = ["Setup", "build", "cmb_spectra", "leak", "map_nside", "read_channel"]
+
+#: A map resolves beams of so many pixels: there b_l is down to 0.43 at l = 2 nside.
+PIXELS = 1.5
+#: A beam below this lets nothing through that would be seen.
+UNSEEN_WINDOW = 1e-8
+
+
+class Setup(NamedTuple):
+    """What is simulated, ready for `jaxsky.simulate`.
+
+    Parameters
+    ----------
+    sources : components by name, as they are
+    observation : the experiment
+    cmb : spectra TT, EE, BB, TE [uK_CMB^2], or None
+    leakage : Q and U [uK_RJ] that have leaked from the intensity, by band, with its beam
+    truth : parameters of the sky that are numbers, by dotted name
+    small_scales_seed : of small scales that are the same for all realisations
+    description : what the templates are
+    """
+
+    sources: dict[str, Source]
+    observation: Observation
+    cmb: Float[np.ndarray, "4 ell"] | None
+    leakage: dict[str, Float[Array, "2 pix"]]
+    truth: dict[str, float]
+    small_scales_seed: int | None
+    description: str
+
+    def small_scales_key(self, key: Array) -> Array:
+        """Key of the small scales in the realisation of a key."""
+        seed = self.small_scales_seed
+        return key if seed is None else realisation_key(seed)
+
+    def observed(self, name: str) -> Observed:
+        """How a band is observed, as its maps are."""
+        channel = self.observation.channels[name]
+        beam = channel.beam if channel.target is None else channel.target
+        level = spectrum = covariance = None
+        smoothed, noise = channel.target is not None, channel.noise
+        if noise is not None and jnp.ndim(noise):
+            covariance = None if smoothed else np.asarray(noise)
+        elif noise is not None and not smoothed:
+            level = float(noise)
+        elif noise is not None:
+            lmax = self.observation.lmax
+            window = np.asarray(beam_ratio(beam, channel.beam, lmax, f"band {name!r}"))
+            spectrum = (float(noise) * np.radians(1 / 60) * window) ** 2
+            spectrum[:2] = 0.0
+        return Observed(
+            channel.band,
+            jnp.asarray(beam) if jnp.ndim(beam) else float(beam),
+            level,
+            spectrum,
+            covariance,
+            None if name not in self.leakage else np.asarray(self.leakage[name]),
+            self.truth,
+        )
+
+
+def build(
+    settings: Experiment,
+    names: Collection[str] | None = None,
+    *,
+    written: bool = True,
+    galaxy: EmbeddedSky | None = None,
+) -> Setup:
+    """Read what the settings name, and check that it can work.
+
+    Parameters
+    ----------
+    settings : of the experiment
+    names : of the bands, by default all; what they show does not depend on it
+    written : for files, in Stokes parameters and precision of the settings, and in pixels that
+        resolve all beams; else Q and U in double precision, to be smoothed
+    galaxy : the embedded model, if it is made already
+
+    Raises
+    ------
+    jaxsky.io.InputError, SettingsError, KeyError
+        For files that are not what they should be, names that do not exist, pixels too wide for
+        a beam, a beam finer than a template without small scales, or one that is finer than the
+        beam of a band.
+    """
+    spec = settings.simulate
+    stokes, precision = (spec.stokes, spec.precision) if written else ("QU", "double")
+    target = None if spec.fwhm == "own" else spec.fwhm
+    included = settings.included()
+    foregrounds = [name for name in settings.sky.components if name in included]
+    sky, description = read_sky(
+        settings, stokes, DTYPES[precision], names=foregrounds, galaxy=galaxy
+    )
+    with at_key("truth"):
+        templates = set_parameters_of(sky, settings.truth)
+    nside = map_nside(settings, templates)
+    channels = {
+        str(band.name): read_channel(settings, band, nside, stokes, "noise" in included)
+        for band in settings.bands
+        if names is None or band.name in names
+    }
+    if not channels:
+        raise SettingsError("bands: there are none.")
+    seen = {n: _width(c.beam) if target is None else target for n, c in channels.items()}
+    if written:
+        _check_pixels(nside, seen)
+    for name, channel in channels.items():
+        if target is not None and target < (own := _width(channel.beam)):
+            raise SettingsError(
+                f"simulate.fwhm: {target:g} arcmin is finer than the beam of band {name!r}, "
+                f"{own:g} arcmin."
+            )
+    _check_templates(settings, templates, seen, written)
+    sources = {name: _source(settings, name, template) for name, template in templates.items()}
+    lmax = _lmax(channels, target, nside)
+    observation = Observation(channels, nside, stokes, min(seen.values()), lmax, precision)
+    cmb = cmb_spectra(settings, lmax) if "cmb" in included else None
+    leakage = _leakage(settings, foregrounds, observation, galaxy)
+    return Setup(
+        sources,
+        observation,
+        cmb,
+        leakage,
+        _truth(settings, sources, cmb is not None),
+        spec.small_scales_seed,
+        description,
+    )
+
+
+def map_nside(settings: Experiment, templates: Mapping[str, Template]) -> int:
+    """Resolution of simulated maps: what the settings say, or that of the coarsest template.
+
+    Raises
+    ------
+    SettingsError
+        If neither is there.
+    """
+    if settings.simulate.nside is not None:
+        return settings.simulate.nside
+    if not templates and settings.sky.templates:  # nothing of the sky is simulated
+        templates, _ = read_sky(settings, names=settings.sky.templates)
+    if not templates:
+        raise SettingsError("simulate.nside: is missing; there is no map of the sky that has one.")
+    return min(healpy.npix2nside(template.used.size) for template in templates.values())
+
+
+def _width(beam: Array | float) -> float:
+    """FWHM [arcmin] of a Gaussian beam, or of the Gaussian that falls to 1/2 where a table does."""
+    table = np.asarray(beam)
+    if not table.ndim:
+        return float(table)
+    below = np.flatnonzero(table < 0.5)
+    ell = int(below[0]) if below.size else len(table)
+    return float(np.degrees(4 * np.log(2) / np.sqrt(ell * (ell + 1))) * 60)
+
+
+def _lmax(channels: Mapping[str, ObservedBand], target: float | None, nside: int) -> int:
+    """The last multipole that any of the maps shows, at most 2 nside."""
+    beams = [c.beam for c in channels.values()] if target is None else [target]
+    return int(min(2 * nside, max(2.0, *map(_reach, beams))))
+
+
+def _reach(beam: Array | float) -> float:
+    """The last multipole that a beam lets through; a table may fall less fast than a Gaussian."""
+    table = np.asarray(beam)
+    if table.ndim:
+        return float(np.flatnonzero(np.abs(table) > UNSEEN_WINDOW).max())
+    sigma = np.radians(float(table) / 60) / np.sqrt(8 * np.log(2))
+    return float(np.sqrt(-2 * np.log(UNSEEN_WINDOW)) / max(sigma, 1e-9))
+
+
+def _check_pixels(nside: int, beams: Mapping[str, float]) -> None:
+    name = min(beams, key=beams.__getitem__)
+    pixel, beam = healpy.nside2resol(nside, arcmin=True), beams[name]
+    if beam < PIXELS * pixel:
+        needed = nside
+        while beam < PIXELS * healpy.nside2resol(needed, arcmin=True) and needed < 2**20:
+            needed *= 2
+        raise SettingsError(
+            f"simulate.nside: pixels of {pixel:.3g} arcmin (nside {nside}) are too wide for the "
+            f"beam of {beam:g} arcmin of band {name!r}; that takes nside {needed}, or a common "
+            f"simulate.fwhm of at least {PIXELS * pixel:.3g} arcmin."
+        )
+
+
+def _check_templates(
+    settings: Experiment,
+    templates: Mapping[str, Template],
+    beams: Mapping[str, float],
+    written: bool,
+) -> None:
+    band = min(beams, key=beams.__getitem__)
+    for name, template in templates.items():
+        if missing := int(np.sum(~template.used)):
+            raise SettingsError(
+                f"sky.{name}: {missing} pixels have no value; a simulation takes maps of the full "
+                "sky."
+            )
+        nside = healpy.npix2nside(template.used.size)
+        pixel = healpy.nside2resol(nside, arcmin=True)
+        own = max(template.fwhm, PIXELS * pixel) if written else template.fwhm
+        if settings.sky.components[name].small_scales is None and beams[band] < own:
+            why = (
+                f"{template.fwhm:g} arcmin"
+                if template.fwhm == own
+                else (f"{own:.3g} arcmin, {PIXELS:g} pixels of nside {nside}")
+            )
+            raise SettingsError(
+                f"sky.{name}: its resolution, {why}, is coarser than the {beams[band]:g} arcmin of "
+                f"band {band!r}; add small scales, [sky.{name}.small_scales], or bring the maps to "
+                f"a common simulate.fwhm of at least {own:.3g} arcmin."
+            )
+
+
+def _source(settings: Experiment, name: str, template: Template) -> Source:
+    spec = settings.sky.components[name].small_scales
+    if spec is None:
+        return Source(template.component, template.fwhm)
+    numbers = spec.model_dump(exclude={"correlated_with"})
+    with at_key(f"sky.{name}.small_scales"):
+        small = SmallScales(**numbers)
+    return Source(template.component, template.fwhm, small, spec.correlated_with)
+
+
+def _truth(settings: Experiment, sources: Mapping[str, Source], cmb: bool) -> dict[str, float]:
+    """Parameters of what is simulated, by dotted name, and r where it is known."""
+    numbers = {"r": settings.cmb.r} if cmb and settings.cmb.spectra is None else {}
+    if not sources:
+        return numbers
+    sky = Sky({name: source.component for name, source in sources.items()})
+    values = get_parameters(sky, parameter_names(sky))
+    return {n: float(value) for n, value in values.items() if not jnp.ndim(value)} | numbers
+
+
+def read_channel(
+    settings: Experiment, spec: BandTable, nside: int, stokes: str = "QU", noisy: bool = True
+) -> ObservedBand:
+    """How a band observes, from what its table says.
+
+    Parameters
+    ----------
+    settings : of the experiment
+    spec : one of its bands
+    nside, stokes : of the maps
+    noisy : with the noise [uK_RJ]
+
+    Raises
+    ------
+    jaxsky.io.InputError, SettingsError
+        For files that cannot be read as what they should be, and a table that says too little.
+    """
+    folder, where = Path(settings.data_dir), f"bands.{spec.name}"
+    if spec.bandpass is None:
+        raise SettingsError(f"{where}.bandpass: is missing.")
+    with at_key(f"{where}.bandpass"):
+        band = read_bandpass_spec(folder, spec.bandpass, spec.samples)
+    if spec.beam is not None:
+        with at_key(f"{where}.beam"):
+            beam = jnp.asarray(read_beam(find_file(folder, spec.beam), 2 * nside))
+    elif spec.fwhm is not None:
+        beam = jnp.asarray(spec.fwhm)
+    else:
+        raise SettingsError(f"{where}: give the beam either as fwhm or as a window, beam.")
+    noise: Array | float | None = None
+    if spec.noise is not None and noisy:
+        unit = _noise_unit(spec, f"{where}.noise")
+        if spec.noise.level is not None:
+            with at_key(f"{where}.noise"):
+                noise = spec.noise.level * band.conversion(unit, "uK_RJ")
+        else:
+            noise, known = read_noise(
+                folder,
+                spec.noise,
+                band,
+                nside,
+                stokes,
+                where=f"{where}.noise",
+                unit=unit,
+                own=None if spec.file is None else spec,
+            )
+            if missing := int(np.sum(~known)):
+                raise SettingsError(
+                    f"{where}.noise: {missing} pixels have no noise; a simulation takes maps of "
+                    "the full sky."
+                )
+    target = None if settings.simulate.fwhm == "own" else settings.simulate.fwhm
+    return ObservedBand(band, beam, target, noise, settings.simulate.diagonal_noise)
+
+
+def _noise_unit(spec: BandTable, where: str) -> str:
+    """Unit of the noise of a band whose map, if it has one, is not read."""
+    noise = spec.noise
+    assert noise is not None  # as called
+    if noise.estimate_above is not None:
+        raise SettingsError(f"{where}.estimate_above: is of a map, but here none is read.")
+    observations = noise.hits or noise.weights
+    own = noise.map or noise.covariance or (observations and observations.sigma0_unit)
+    if unit := noise.unit or spec.unit or ("uK_CMB" if own or spec.file is None else None):
+        return unit
+    raise SettingsError(f"{where}.unit: is missing; it is that of the map, which is not read here.")
+
+
+def cmb_spectra(settings: Experiment, lmax: int, r: float | None = None) -> np.ndarray:
+    """Spectra TT, EE, BB, TE of the CMB [uK_CMB^2] up to lmax, of shape (4, ell).
+
+    Parameters
+    ----------
+    settings : of the experiment, with its r
+    lmax : largest multipole
+    r : in place of that; only for spectra that CAMB makes
+
+    Raises
+    ------
+    jaxsky.io.InputError, SettingsError
+        For a file that cannot be read or ends before lmax, and a cosmology that cannot be.
+    """
+    spec = settings.cmb
+    if spec.spectra is None:
+        with at_key("cmb.cosmology"):
+            total = camb_spectra(lmax, spec.r if r is None else r, **spec.cosmology)
+            if spec.A_lens == 1:
+                return total
+            lensed = camb_spectra(lmax, **spec.cosmology)
+            return total + (spec.A_lens - 1) * np.array([0, 0, 1, 0])[:, None] * lensed
+    if r is not None:
+        raise SettingsError("cmb.spectra: here r is changed, which takes spectra of CAMB.")
+    with at_key("cmb.spectra"):
+        path = find_file(Path(settings.data_dir), spec.spectra)
+        return read_spectra(path, lmax, format=spec.format, unit=spec.unit)
+
+
+def _leakage(
+    settings: Experiment,
+    names: Collection[str],
+    observation: Observation,
+    galaxy: EmbeddedSky | None,
+) -> dict[str, Float[Array, "2 pix"]]:
+    """What leaks from the intensity of the foregrounds into Q and U of some bands [uK_RJ]."""
+    fractions = {n: f for n, f in settings.simulate.leakage.items() if n in observation.channels}
+    if not any(fractions.values()):
+        return {}
+    with at_key("simulate.leakage"):
+        whole, _ = read_sky(settings, "IQU", names=names, galaxy=galaxy)
+        whole = set_parameters_of(whole, settings.truth)
+        sky = Sky({name: one.component for name, one in whole.items()})
+        maps = {}
+        for name, fraction in fractions.items():
+            channel = observation.channels[name]
+            beam = channel.beam if channel.target is None else channel.target
+            leaked = leak(fraction * observe_band(sky, channel.band)[0])
+            window = beam if jnp.ndim(beam) else gaussian_beam(beam, 2 * observation.nside)
+            maps[name] = resample(leaked, window, observation.nside)
+    return maps
+
+
+def leak(intensity: Float[Array, " pix"]) -> Float[Array, "2 pix"]:
+    """Q and U of an intensity that is polarized along the meridians of the ecliptic.
+
+    As detectors with different bandpasses see it that turn about the Sun's direction once a
+    minute and always have the same angle to the direction in which they move.
+    """
+    nside = healpy.npix2nside(intensity.size)
+    theta, phi = healpy.pix2ang(nside, np.arange(intensity.size))
+    pole = healpy.Rotator(coord=["E", "G"])(np.array([0.0, 0.0, 1.0]))
+    south = [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)]
+    east = [-np.sin(phi), np.cos(phi), np.zeros_like(phi)]
+    angle = 2 * np.arctan2(np.einsum("i,ip", pole, east), np.einsum("i,ip", pole, south))
+    return intensity * jnp.stack([jnp.cos(angle), jnp.sin(angle)])

@@ -1,0 +1,396 @@
+"""The experiment file: one grammar for all commands, a sentence for each mistake."""
+
+import re
+from collections.abc import Collection, Iterable
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, ValidationInfo, model_validator
+
+from jaxsky.instrument import band_tables
+from jaxsky.settings import FileName, MapFile, MaskFile, SettingsError, SettingsFile, Table
+from jaxsky.settings.tables import (
+    BandTable,
+    CMBTable,
+    FreeParameter,
+    SkyTable,
+    SmallScalesTable,
+)
+from jaxsky.settings.types import (
+    Distinct,
+    Nside,
+    Pair,
+    RegionName,
+    Seed,
+    Several,
+    Word,
+    check_names,
+)
+from jaxsky.settings.values import MistakeAt, check_reference, check_signs
+from jaxsky.small_scales import DUST, SYNCHROTRON
+
+__all__ = [
+    "Common",
+    "Compare",
+    "Experiment",
+    "Fit",
+    "Forecast",
+    "Paper",
+    "Separate",
+    "Simulate",
+    "parse_region",
+]
+
+Positive = Annotated[float, Field(gt=0)]
+Multipole = Annotated[int, Field(ge=2)]
+
+#: Regions that need not be named.
+REGIONS: dict[str, str | MaskFile] = {"strip": "|b| <= 20", "outside": "|b| > 20", "full": "full"}
+#: First parts of free parameters that are no components, and the commands that have them.
+WORDS = {
+    "calibration": "fit", "offset": "fit",
+    "gain": "separate", "shift": "separate", "width": "separate", "angle": "separate",
+    "r": "forecast", "A_lens": "forecast",
+}  # fmt: skip
+
+
+def parse_region(text: str) -> tuple[str, float] | None:
+    """The comparison and the latitude [deg] of "|b| > 20" and its like; None for the full sky.
+
+    Raises
+    ------
+    ValueError
+        For other words.
+
+    Examples
+    --------
+    >>> parse_region("|b| <= 20")
+    ('<=', 20.0)
+    """
+    if text == "full":
+        return None
+    match = re.fullmatch(r"\|b\|\s*(<=|<|>=|>)\s*(\d+(?:\.\d*)?)", text.strip())
+    if match is None or not 0 <= float(match[2]) < 90:
+        raise ValueError(
+            f'must be "full", latitudes such as "|b| > 20" or "|b| <= 20" below 90 deg, or the '
+            f"file of a mask, {{ file = ... }}, not {text!r}"
+        )
+    return match[1], float(match[2])
+
+
+def _latitudes(value: str) -> str:
+    parse_region(value)
+    return value
+
+
+Region = Annotated[str, AfterValidator(_latitudes)] | MaskFile
+
+
+class Common(Table):
+    """How templates and maps are brought together: for fit, compare, separate and paper.
+
+    Parameters
+    ----------
+    nside, fwhm : common resolution [arcmin]; fwhm = 0 averages pixels without smoothing
+    mask : of all regions
+    components : those of the sky that are modelled, by default all
+    maps : folder of a realisation that `jaxsky simulate` wrote, for bands without a file
+    """
+
+    nside: Nside = 64
+    fwhm: float = Field(60.0, ge=0)
+    mask: MaskFile | None = None
+    components: Several[Word] | None = None
+    maps: FileName | None = None
+
+
+class Simulate(Table):
+    """How bands without a map are simulated, and what `jaxsky simulate` writes.
+
+    Parameters
+    ----------
+    nside : of the maps, by default that of the coarsest map of the sky
+    fwhm : common beam [arcmin] of the maps that are written; "own" is that of each band
+    stokes, unit, outputs, precision, sheet : of what is written
+    include : what is simulated, "cmb" and "noise" among the names; by default all
+    diagonal_noise : the paper's diagonal of the Cholesky factor
+    small_scales_seed : one set of small scales for all realisations
+    leakage : fraction of the intensity that leaks into Q and U, by band; it is known and subtracted
+    """
+
+    nside: Nside | None = None
+    fwhm: Positive | Literal["own"] = "own"
+    stokes: Literal["QU", "IQU"] = "QU"
+    unit: Literal["uK_RJ", "uK_CMB"] = "uK_RJ"
+    outputs: Several[Literal["total", "components"]] = Field(["total"])
+    precision: Literal["single", "double"] = "single"
+    sheet: bool = True
+    include: Several[Word] | None = None
+    diagonal_noise: bool = False
+    small_scales_seed: Seed | None = None
+    leakage: dict[str, float] = Field(default={})
+
+
+class Fit(Table):
+    """How spectral parameters are fitted to templates."""
+
+    regions: Several[Word] = Field(["strip", "full"])
+    stokes: Several[Literal["Q", "U", "QU"]] = Field(["Q", "U", "QU"])
+    methods: Several[Literal["grid", "gradient", "mcmc"]] = Field(["grid", "gradient", "mcmc"])
+    likelihood: Literal["exact", "diagonal"] = "exact"
+    points: int = Field(200, ge=20, le=2000)
+    nwalkers: int = Field(32, ge=4)
+    nsteps: int = Field(3000, ge=1)
+
+
+class Compare(Table):
+    """How maps are compared with the model."""
+
+    regions: Several[Word] = Field(["strip", "outside", "full"])
+    nsims: int = Field(100, ge=30)
+    lmax: int = Field(100, ge=10)
+    width: int = Field(10, ge=1)
+    panel_nside: Nside = 32
+    patches: str | None = None
+    patches_nside: Nside = 256
+
+
+class Separate(Table):
+    """How components are separated, and r taken from the cleaned BB."""
+
+    domain: Literal["pixel", "harmonic"] = "pixel"
+    region: Word = "full"
+    unit: Literal["uK_CMB", "uK_RJ"] = "uK_CMB"
+    nsims: int = Field(100, ge=20)
+    sampler: Literal["nuts", "emcee", "none"] = "nuts"
+    nsteps: int | None = Field(None, ge=100)
+    lmin: Multipole = 2
+    lmax: Multipole | None = None
+    width: int = Field(10, ge=1)
+    apodization: float = Field(15.0, ge=0, lt=90)
+    purify: bool = True
+
+
+class Forecast(Table):
+    """Spectra of the foregrounds outside of a mask, and the Fisher matrix.
+
+    Parameters
+    ----------
+    region, apodization : what is used, and over which angle [deg] its edge rises
+    bands : whose spectra are shown
+    lmin, lmax, width : of the bins
+    fit : multipoles of the power laws
+    show_r : of the primordial spectra that are drawn
+    free : of the CMB, besides the spectral parameters of the table free
+    foregrounds : what is free of the foregrounds' spectra
+    priors : standard deviations of Gaussian priors on what is not in the table free
+    spectra, fisher_lmax : of the Fisher matrix
+    """
+
+    region: Word = "outside"
+    apodization: float = Field(4.0, ge=0, lt=90)
+    bands: Annotated[Several[Word], Field(max_length=7)] | None = None
+    lmin: Multipole = 2
+    lmax: Multipole = 250
+    width: int = Field(10, ge=1)
+    fit: Pair[Multipole] = (20, 200)
+    show_r: Several[Positive] = Field([0.1, 0.01, 0.001], max_length=4)
+    free: Distinct[Literal["r", "A_lens"]] = Field(["r"])
+    foregrounds: Distinct[Literal["amplitude", "slope", "correlation"]] = Field(
+        ["amplitude", "slope", "correlation"]
+    )
+    priors: dict[str, Positive] = Field(default={})
+    spectra: Several[Literal["EE", "BB"]] = Field(["BB"])
+    fisher_lmax: Annotated[int, Field(ge=2, le=3000)] = 300
+
+    @model_validator(mode="after")
+    def _ranges(self) -> "Forecast":
+        for key, last in (("lmax", self.lmax), ("fisher_lmax", self.fisher_lmax)):
+            if not self.lmin < last:
+                raise ValueError(f"{key}, {last}, must be above lmin, {self.lmin}")
+        if not self.fit[0] < self.fit[1]:
+            raise ValueError(f"fit must increase, but is {self.fit[0]}, {self.fit[1]}")
+        return self
+
+
+class IndexFile(MapFile):
+    """A map of spectral indices, beta_syn in either sign; or an intensity, at `nu_ref` [GHz].
+
+    A map of beta_syn at radio frequencies is made steeper: by a number, the paper's is 0.13, or as
+    a spectrum says, a table of frequency [GHz] and antenna temperature.
+    """
+
+    nu_ref: float | None = Field(None, gt=0)
+    fwhm: float = Field(0.0, ge=0)
+    steepening: float = 0.0
+    spectrum: FileName | None = None
+
+
+class Paper(Table):
+    """What only the figures of the paper need.
+
+    Parameters
+    ----------
+    fwhm : beam of the templates with small scales [arcmin]
+    center : of the patches: l, b [deg]
+    dust, synchrotron : small scales of the figures; the maps that are compared have none of these
+    ame : an intensity, to be polarized along the dust
+    beta_dust, beta_syn : maps of indices
+    """
+
+    fwhm: Positive = 5.0
+    center: Pair[float] = (180.0, 30.0)
+    dust: SmallScalesTable = SmallScalesTable(EE=DUST.EE, BB=DUST.BB)
+    synchrotron: SmallScalesTable = SmallScalesTable(EE=SYNCHROTRON.EE, BB=SYNCHROTRON.BB)
+    ame: IndexFile | None = None
+    beta_dust: IndexFile | None = None
+    beta_syn: IndexFile | None = None
+
+    @model_validator(mode="after")
+    def _plausible(self) -> "Paper":
+        if self.ame is not None and self.ame.nu_ref is None:
+            raise MistakeAt("ame.nu_ref", "is missing")
+        steeper = {"steepening", "spectrum"}
+        others = {"ame": steeper, "beta_dust": {"nu_ref", *steeper}, "beta_syn": {"nu_ref"}}
+        fields = IndexFile.model_fields  # what is as by default may be from a log
+        for key, keys in others.items():
+            one: IndexFile | None = getattr(self, key)
+            wrong = [k for k in keys if one and getattr(one, k) != fields[k].default]
+            if wrong:
+                raise MistakeAt(f"{key}.{min(wrong)}", "unknown key")
+        if self.ame is not None:
+            check_reference("ame", self.ame.nu_ref, {})
+        return self
+
+
+class Experiment(SettingsFile):
+    """All settings: a sky, the bands in which it is observed, and what is done with them.
+
+    Parameters
+    ----------
+    seed : of all that is random, but for the model of the Galaxy
+    sky, bands, cmb : what is observed, and how; bands without a map are simulated
+    common, regions : the resolution at which maps are compared, and parts of the sky by name
+    free, fixed : parameters by dotted name, free ones with start and prior
+    truth : parameters of the simulated sky where they differ from those that are modelled
+    simulate, fit, compare, separate, forecast, paper : of the command of this name
+    """
+
+    seed: Seed = 0
+    sky: SkyTable = SkyTable()
+    bands: list[BandTable] = Field(default=[])
+    cmb: CMBTable = CMBTable()
+    common: Common = Common()
+    regions: dict[RegionName, Region] = Field(default={})
+    free: dict[str, FreeParameter] = Field(default={})
+    fixed: dict[str, float] = Field(default={})
+    truth: dict[str, float] = Field(default={})
+    simulate: Simulate = Simulate()
+    fit: Fit = Fit()
+    compare: Compare = Compare()
+    separate: Separate = Separate()
+    forecast: Forecast = Forecast()
+    paper: Paper = Paper()
+
+    @model_validator(mode="after")
+    def _consistent(self, info: ValidationInfo) -> "Experiment":
+        folder = Path((info.context or {}).get("folder", "."))
+        self.bands = [
+            band for i, entry in enumerate(self.bands) for band in _bands(entry, i, folder)
+        ]
+        self.regions = REGIONS | self.regions
+        names = [str(band.name) for band in self.bands]
+        check_names("bands", names)
+        check_names("regions", self.regions)
+        if both := set(self.free) & set(self.fixed):
+            raise ValueError(f"{', '.join(sorted(both))} cannot be both free and fixed")
+        check_signs("fixed", self.fixed)
+        check_signs("truth", self.truth)
+        check_signs("free", {name: one.numbers() for name, one in self.free.items()})
+        for name, one in self.sky.given.items():
+            if one.nu_ref is not None and f"{name}.nu_ref" in self.fixed:
+                raise MistakeAt(f"fixed.{name}.nu_ref", f"is given twice, here and in sky.{name}")
+        if not self.forecast.free and not self.free_in("forecast"):
+            raise MistakeAt("forecast.free", "is empty, and so is the table free")
+        if "cmb" in (self.simulate.include or ()) and not self.cmb.include:
+            raise MistakeAt("simulate.include", "has 'cmb', but cmb.include is false")
+        components = list(self.sky.components)
+        simulated = [*components, "cmb", "noise"]
+        known: list[tuple[str, Iterable[str], Collection[str]]] = [
+            ("common.components", self.common.components or (), components),
+            ("simulate.include", self.simulate.include or (), simulated),
+            ("simulate.leakage", self.simulate.leakage, names),
+            ("compare.patches", filter(None, [self.compare.patches]), names),
+            ("fit.regions", self.fit.regions, self.regions),
+            ("compare.regions", self.compare.regions, self.regions),
+            ("separate.region", [self.separate.region], self.regions),
+            ("forecast.region", [self.forecast.region], self.regions),
+        ]
+        for key, values, allowed in known:
+            for value in values:
+                if value not in allowed:
+                    there = ", ".join(allowed) or "none is there"
+                    raise MistakeAt(key, f"{value!r} is none of {there}")
+        return self
+
+    def modelled(self) -> list[str]:
+        """Names of the components that are modelled."""
+        return [n for n in self.sky.components if n in (self.common.components or [n])]
+
+    def included(self) -> list[str]:
+        """Names of all that is simulated, "cmb" and "noise" among them."""
+        include = self.simulate.include
+        everything = [*self.sky.components, *(["cmb"] if self.cmb.include else []), "noise"]
+        return [n for n in everything if include is None or n in include]
+
+    def free_in(self, command: str) -> dict[str, FreeParameter]:
+        """The free parameters that a command has: those of components, and words of its own."""
+        return {
+            name: one
+            for name, one in self.free.items()
+            if WORDS.get(name.split(".")[0], command) == command
+        }
+
+    def left_out(self, command: str) -> list[str]:
+        """Warnings about what is said of free parameters that a command does not have."""
+        here = self.free_in(command)
+        regions = [n for n, one in here.items() if one.regions and command != "separate"]
+        uniform = [n for n, one in here.items() if one.uniform and command == "forecast"]
+        parts = {
+            "Not free here, as jaxsky {} does not have them": [
+                n for n in self.free if n not in here
+            ],
+            "One value for all, as jaxsky {} does not have regions of parameters": regions,
+            "Without a prior, as jaxsky {} does not have uniform ones": uniform,
+        }
+        return [f"{w.format(command)}: {', '.join(names)}." for w, names in parts.items() if names]
+
+    def start(self, command: str) -> dict[str, float]:
+        """Start values of the free parameters of a command.
+
+        Raises
+        ------
+        SettingsError
+            For one without a start and a prior.
+        """
+        values = {}
+        for name, one in self.free_in(command).items():
+            if (value := one.first()) is None:
+                raise SettingsError(f"free.{name}: start is missing.")
+            values[name] = value
+        return values
+
+
+def _bands(entry: BandTable, index: int, folder: Path) -> list[BandTable]:
+    """The bands that an entry of the list stands for."""
+    if entry.instrument is None:
+        return [entry]
+    wanted = entry.channels if entry.name is None else [entry.name]
+    try:
+        return entry.merged(band_tables(entry.instrument, wanted, folder))
+    except (KeyError, ValueError, OSError) as error:
+        what = error.args[0] if isinstance(error, KeyError) else str(error)
+        raise MistakeAt(f"bands.{index}.instrument", what) from None
+
+
+Experiment.model_rebuild()

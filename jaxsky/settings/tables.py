@@ -1,0 +1,311 @@
+"""Tables of an experiment file that describe the sky and the bands in which it is observed."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Literal
+
+from pydantic import ConfigDict, Field, ValidationError, model_validator
+
+from jaxsky.components import AME, component_class
+from jaxsky.settings import BandpassSpec, FileName, MapFile, MapKeys, NoiseTable, Table
+from jaxsky.settings.planck_names import check_release
+from jaxsky.settings.types import (
+    BandName,
+    Law,
+    Nside,
+    Pair,
+    Seed,
+    Several,
+    TensorRatio,
+    Word,
+    check_component_names,
+)
+from jaxsky.settings.values import MistakeAt, check_reference, check_signs, mistakes
+
+__all__ = [
+    "BandTable",
+    "CMBTable",
+    "ComponentTable",
+    "Embedded",
+    "FreeParameter",
+    "Leakage",
+    "Regions",
+    "SkyTable",
+    "SmallScalesTable",
+]
+
+#: Laws of the components of the embedded model.
+EMBEDDED = {"dust": "dust", "synchrotron": "synchrotron"}
+
+
+class Embedded(Table):
+    """The embedded model of the Galaxy; `model` are numbers of `jaxsky.galaxy.GalaxyModel`."""
+
+    nside: Nside = 128
+    seed: Seed = 0
+    model: dict[str, float] = Field(default={})
+
+
+class SmallScalesTable(Table):
+    """Small scales of a component; see `jaxsky.small_scales.SmallScales`."""
+
+    EE: Pair[int]
+    BB: Pair[int]
+    slope: float | Pair[float] | None = None
+    tilt: float = 0.0
+    amplitude: float = Field(1.0, ge=0)
+    modulation_fwhm: float = Field(180.0, gt=0)
+    correlated_with: str | None = None
+
+
+class ComponentTable(MapKeys):
+    """A component: its law, parameters that are not default, and its map at `nu_ref` [GHz].
+
+    Maps may take the place of parameters. `angles` names the component along which an intensity
+    is polarized. A component without a map is one of the embedded model, or one that a separation
+    finds by its law alone.
+    """
+
+    law: Law | None = None
+    nu_ref: float | None = Field(None, gt=0)
+    fwhm: float = Field(0.0, ge=0)
+    angles: str | None = None
+    parameters: dict[str, float | list[float] | MapFile] = Field(default={})
+    noise: NoiseTable | None = None
+    small_scales: SmallScalesTable | None = None
+
+    @model_validator(mode="after")
+    def _plausible(self) -> "ComponentTable":
+        if self.noise is not None and self.noise.estimate_above is not None:
+            raise MistakeAt("noise.estimate_above", "is of bands")
+        check_signs("parameters", self.parameters)
+        if self.file is None:
+            if self.angles or self.fwhm:
+                raise ValueError("fwhm and angles are of a map, but file is missing")
+            return self
+        for key in ("law", "nu_ref"):
+            if getattr(self, key) is None and not (key == "nu_ref" and key in self.parameters):
+                raise ValueError(f"{key} is missing")
+        return self
+
+    def check(self, law: str) -> None:
+        """Raise ValueError for keys that do not go with a law."""
+        if law == "cmb":
+            raise MistakeAt("law", "the CMB is described in the table cmb")
+        if self.angles and component_class(law) is not AME:
+            raise ValueError("angles are for the law 'ame' only")
+        check_reference(law, self.nu_ref, self.parameters)
+
+
+class SkyTable(Table):
+    """Components of the sky by name, and the embedded model, whose maps those replace."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, ComponentTable] = Field(init=False)
+
+    embedded: Embedded | None = None
+
+    @property
+    def given(self) -> dict[str, ComponentTable]:
+        """The components that have a table."""
+        return self.__pydantic_extra__ or {}
+
+    @property
+    def components(self) -> dict[str, ComponentTable]:
+        """All components, each with its law."""
+        laws = EMBEDDED if self.embedded is not None else {}
+        found = {name: ComponentTable() for name in laws} | self.given
+        return {
+            name: one if one.law else one.model_copy(update={"law": laws.get(name)})
+            for name, one in found.items()
+        }
+
+    @property
+    def templates(self) -> list[str]:
+        """Names of the components that have maps."""
+        known = EMBEDDED if self.embedded is not None else ()
+        return [n for n, one in self.components.items() if one.file is not None or n in known]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "SkyTable":
+        check_component_names(self.given)
+        for name, one in self.components.items():
+            try:
+                if one.law is None:
+                    raise ValueError("law is missing")
+                one.check(one.law)
+                own = self.embedded is not None and one.file is None and EMBEDDED.get(name)
+                if own and (one.law != own or one.nu_ref is not None):
+                    raise ValueError("law and nu_ref are those of the embedded map; give a file")
+            except ValueError as error:
+                raise MistakeAt(name, error) from None
+            if one.angles is None:
+                continue
+            if one.angles not in self.templates:
+                raise MistakeAt(f"{name}.angles", f"there is no map of {one.angles}")
+            if self.components[one.angles].angles:
+                raise MistakeAt(f"{name}.angles", f"{one.angles} has none of its own")
+        return self
+
+
+class CMBTable(Table):
+    """The CMB: from CAMB, or from a file of spectra.
+
+    It is part of what is observed and of what is known about it. `A_lens` multiplies the B modes
+    of lensing.
+    """
+
+    include: bool = True
+    r: TensorRatio = 0.0
+    A_lens: float = Field(1.0, ge=0)
+    cosmology: dict[str, float] = Field(default={})
+    spectra: FileName | None = None
+    format: Literal["camb", "planck"] | None = None
+    unit: str | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> "CMBTable":
+        if self.spectra is not None and (self.r or self.cosmology or self.A_lens != 1):
+            raise ValueError("r, A_lens and cosmology are for CAMB; leave them out with spectra")
+        if self.spectra is None and (self.format or self.unit):
+            raise ValueError("format and unit are those of spectra, a file")
+        return self
+
+
+class Leakage(MapFile):
+    """What leaked from intensity into Q and U, to be subtracted; in the map's unit."""
+
+    fwhm: float = Field(0.0, ge=0)
+
+
+class BandTable(MapKeys):
+    """A band: how it observes, and its map; without a map it is simulated.
+
+    Parameters
+    ----------
+    name : of the band; a choice of several of an instrument is `channels`
+    instrument : of which it is a channel, for what is not given here
+    samples : of the top-hat of a bandpass that is no table
+    fwhm, beam : FWHM of a Gaussian beam [arcmin], or the file of a window
+    """
+
+    name: BandName | None = None
+    instrument: str | None = None
+    channels: Several[Word] | None = None
+    bandpass: BandpassSpec | None = None
+    samples: int = Field(51, ge=2)
+    fwhm: float | None = Field(None, ge=0)
+    beam: FileName | None = None
+    noise: NoiseTable | None = None
+    leakage: Leakage | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "BandTable":
+        if self.instrument is None and self.name is None:
+            raise ValueError("name is missing")
+        if self.channels is not None and (self.instrument is None or self.name is not None):
+            raise ValueError("channels choose from an instrument, in place of a name")
+        if self.file is not None and self.name is None:
+            raise MistakeAt("file", "is of one band; give its name")
+        if self.fwhm is not None and self.beam is not None:
+            raise ValueError("give the beam either as fwhm or as the file of a window, beam")
+        if (
+            self.samples != type(self).model_fields["samples"].default
+            and self.bandpass
+            and not self.bandpass.width
+        ):
+            raise MistakeAt("samples", "is of a top-hat, but the bandpass has no width")
+        if self.noise is not None and 0 in (self.noise.level, self.noise.rms):
+            raise MistakeAt("noise", "must be greater than 0, not 0")
+        if self.file is None:
+            if self.leakage is not None:
+                raise MistakeAt("leakage", "is subtracted from a map, but file is missing")
+            if self.noise is not None and self.noise.estimate_above is not None:
+                raise MistakeAt("noise.estimate_above", "is of a map, but file is missing")
+        if self.leakage is not None:
+            check_release(self.files, self.leakage.files, self.label, self.leakage.label)
+        return self
+
+    def merged(self, channels: Sequence[Mapping[str, Any]]) -> list["BandTable"]:
+        """The bands that this stands for: channels of an instrument, with what is given here.
+
+        Levels of noise of an instrument are in uK_CMB, whatever the unit of a map that is given
+        here.
+        """
+        own = self.model_dump(exclude_unset=True, exclude={"instrument", "channels", "name"})
+        beam = {"fwhm", "beam"} if {"fwhm", "beam"} & set(own) else set()
+        bands = []
+        for channel in channels:
+            raw = {k: v for k, v in channel.items() if k not in beam}
+            noise = raw.get("noise")
+            if "file" not in raw and isinstance(noise, dict) and {"level", "rms"} & set(noise):
+                raw["noise"] = {"unit": "uK_CMB"} | noise
+            raw |= own
+            try:
+                if "instrument" in channel:
+                    raise MistakeAt("instrument", "a band of an instrument has none")
+                bands.append(BandTable.model_validate(raw))
+            except ValueError as error:
+                what = mistakes(raw, error) if isinstance(error, ValidationError) else str(error)
+                raise ValueError(f"{self.instrument}, band {channel['name']}: {what}") from None
+        return bands
+
+
+class Regions(Table):
+    """Where a parameter has values of its own: exactly one of these."""
+
+    KINDS: ClassVar[tuple[str, ...]] = ("nside", "latitudes", "clusters", "file")
+
+    nside: Nside | None = None
+    latitudes: list[float] | None = Field(None, min_length=1)
+    clusters: int | None = Field(None, ge=1)
+    of: list[MapFile] = Field(default=[])
+    file: MapFile | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "Regions":
+        given = [kind for kind in self.KINDS if getattr(self, kind) is not None]
+        if len(given) != 1:
+            raise ValueError(
+                f"give the regions as exactly one of {', '.join(self.KINDS)}, "
+                f"not {', '.join(given) or 'none'}"
+            )
+        if self.of and self.clusters is None:
+            raise ValueError("of goes with clusters only")
+        return self
+
+
+class FreeParameter(Table):
+    """A free parameter: where to start, its prior, and its regions if it has several values.
+
+    Without a start it is the middle of the prior.
+    """
+
+    start: float | None = None
+    uniform: Pair[float] | None = None
+    gaussian: Pair[float] | None = None
+    regions: Regions | None = None
+
+    @model_validator(mode="after")
+    def _one_prior(self) -> "FreeParameter":
+        if self.uniform and self.gaussian:
+            raise ValueError("give one prior, either uniform or gaussian")
+        if self.uniform and not self.uniform[0] < self.uniform[1]:
+            raise ValueError(f"uniform must increase, but is {self.uniform}")
+        start = self.start
+        if self.uniform and start is not None and not self.uniform[0] < start < self.uniform[1]:
+            raise ValueError(f"start {start:g} is not inside the uniform prior {self.uniform}")
+        if self.gaussian and not self.gaussian[1] > 0:
+            raise ValueError(f"gaussian needs a positive sigma, not {self.gaussian[1]:g}")
+        return self
+
+    def first(self) -> float | None:
+        """Where to start; None if that is not said."""
+        if self.start is not None or not (self.uniform or self.gaussian):
+            return self.start
+        return self.gaussian[0] if self.gaussian else sum(self.uniform or ()) / 2
+
+    def numbers(self) -> list[float]:
+        """All values that it names, for a check of their sign."""
+        mean = [self.gaussian[0]] if self.gaussian else []
+        end = [self.uniform[1]] if self.uniform else []
+        return [*([] if self.start is None else [self.start]), *mean, *end]

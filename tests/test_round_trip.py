@@ -1,0 +1,277 @@
+"""One experiment file through all commands: simulated maps are read back as they were made."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from commands import jaxsky, one_sentence
+from fits.inputs import inputs_of
+from jaxsky.experiment import build, cmb_spectra
+from jaxsky.harmonics import gaussian_beam
+from jaxsky.io import write_maps
+from jaxsky.montecarlo import run
+from jaxsky.settings import SettingsError
+from jaxsky.settings.load import load
+
+NSIDE, NPIX = 16, 12 * 16**2
+SETTINGS = """
+seed = 5
+title = "round trip"
+[sky]
+embedded = { nside = 16 }
+[[bands]]
+instrument = "litebird"
+channels = ["40", "68", "100", "140", "195", "280", "402"]
+[truth]
+"synchrotron.beta_syn" = 3.05
+[common]
+nside = 16
+fwhm = 480.0
+[free]
+"dust.beta_dust" = { uniform = [0.5, 2.5] }
+"synchrotron.beta_syn" = { start = 3.0, uniform = [2.0, 4.5] }
+[simulate]
+precision = "double"
+fwhm = 400.0
+sheet = false
+[fit]
+methods = ["gradient"]
+regions = ["full"]
+[compare]
+regions = ["full"]
+nsims = 30
+lmax = 22
+[separate]
+nsims = 20
+sampler = "none"
+lmax = 20
+width = 4
+"""
+
+
+def settings_in(folder, text=SETTINGS, **replaced):
+    for old, new in replaced.items():
+        text = text.replace(old.replace("_", " "), new)
+    (folder / "x.toml").write_text(text)
+    return folder / "x.toml"
+
+
+def written(path, out):
+    """The maps of the first realisation that settings describe; their folder."""
+    settings = load(path)
+    assert len(list(run(settings, build(settings), out, range(1)))) == len(settings.bands)
+    return out / "sim_00000"
+
+
+def assert_same_bands(first, second, rtol=1e-9):
+    assert list(first) == list(second)
+    for name, one in first.items():
+        other = second[name]
+        scale = float(jnp.abs(one.maps).max())
+        np.testing.assert_allclose(one.maps, other.maps, rtol=0, atol=rtol * scale)
+        np.testing.assert_allclose(one.noise, other.noise, rtol=rtol, atol=0)
+        np.testing.assert_array_equal(one.beam, other.beam)
+        np.testing.assert_array_equal(one.bandpass.nu, other.bandpass.nu)
+        np.testing.assert_array_equal(one.bandpass.quadrature, other.bandpass.quadrature)
+        assert (one.correlated is None) == (other.correlated is None)
+        if one.correlated is not None:
+            np.testing.assert_allclose(one.correlated, other.correlated, rtol=rtol)
+        assert (one.leakage is None) == (other.leakage is None)
+        if one.leakage is not None:
+            np.testing.assert_allclose(one.leakage.maps, other.leakage.maps, rtol=0, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Maps at a common beam."""
+    folder = tmp_path_factory.mktemp("round trip")
+    written(settings_in(folder), folder / "sims")
+    return folder
+
+
+def test_simulated_maps_are_read_as_commands_simulate_them(folder):
+    settings = load(folder / "x.toml")
+    maps = load(folder / "x.toml", [f'common.maps = "{folder / "sims/sim_00000"}"'])
+    own, read = inputs_of(settings), inputs_of(maps)
+    assert_same_bands(own.bands, read.bands)
+    assert own.truth == read.truth
+    assert own.truth["synchrotron.beta_syn"] == 3.05
+    assert own.truth["r"] == 0.0
+
+
+def near(value, truth, sigma):
+    assert abs(value - truth) < 3 * sigma, (value, truth, sigma)
+
+
+TRUTH = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.05}
+
+
+@pytest.mark.parametrize("command", ["fit", "separate", "compare"])
+def test_commands_find_the_truth_in_simulated_maps(folder, command, monkeypatch):
+    out, maps = folder / command, folder / "sims/sim_00000"
+    # With "compare" the model is the sky itself.
+    more = ("--set", "truth = {}") if command == "compare" else ()
+    if command == "compare":
+        path = settings_in(folder, SETTINGS.replace("3.05", "3.1"))
+        maps = written(path, folder / "sims of the model")
+    arguments = (command, folder / "x.toml", "--maps", maps, "--out", out, *more)
+    assert jaxsky(monkeypatch, *arguments) == 0
+    if command == "compare":
+        found = json.loads((out / "comparison.json").read_text())
+        for band in found["pixels"].values():
+            near(band["full"]["QU"]["slope"], 1.0, band["full"]["QU"]["error"])
+    elif command == "fit":
+        found = json.loads((out / "result.json").read_text())
+        result = found["results"]["full"]["QU"]["gradient"]
+        for i, name in enumerate(result["free"]):
+            near(result["best_fit"][name], TRUTH[name], result["covariance"][i][i] ** 0.5)
+            assert found["truth"][name] == TRUTH[name]
+    else:
+        found = json.loads((out / "result.json").read_text())
+        for name, value in found["parameters"].items():
+            near(value["best_fit"], TRUTH[name], value["sigma"])
+            assert value["truth"] == TRUTH[name]
+        near(found["r"]["best_fit"], 0.0, found["r"]["sigma"])
+        assert found["r"]["truth"] == 0.0
+
+
+def test_what_a_band_sees_does_not_depend_on_the_others(folder):
+    settings = load(folder / "x.toml")
+    alone = load(folder / "x.toml", ['bands.0.channels = ["140"]'])
+    for name in ("40", "140"):
+        assert (name in inputs_of(alone).bands) == (name == "140")
+    np.testing.assert_allclose(
+        inputs_of(alone).bands["140"].maps, inputs_of(settings).bands["140"].maps, atol=1e-9
+    )
+
+
+BANDS = """
+[[bands]]
+instrument = "planck"
+channels = ["44"]
+fwhm = 340.0
+noise = { rms = 2.0, unit = "uK_RJ" }
+[[bands]]
+name = "70"
+instrument = "planck"
+beam = "beam.txt"
+[[bands]]
+name = "own"
+bandpass = { file = "band.txt", convention = "power" }
+fwhm = 330.0
+noise = { covariance = { file = "noise.fits", fields = ["QQ", "QU", "UU"] } }
+"""
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Bands with a table of a bandpass, a window and noise in pixels; one leaks."""
+    ell = np.arange(2 * NSIDE + 1)
+    beam = np.asarray(gaussian_beam(350.0, 2 * NSIDE)) * (1 + 1e-3 * np.sin(ell))
+    np.savetxt(tmp_path / "beam.txt", np.stack([ell, beam / beam[0]], axis=1))
+    nu = np.linspace(95.0, 105.0, 21)
+    np.savetxt(
+        tmp_path / "band.txt", np.stack([nu, 1 + 0.1 * np.cos(nu)], axis=1), header="GHz weight"
+    )
+    level = np.linspace(1.0, 4.0, NPIX)
+    noise = np.stack([level, 0.3 * level, 2 * level])
+    write_maps(tmp_path / "noise.fits", noise, names=["QQ", "QU", "UU"], unit="uK_RJ^2")
+    start, rest = SETTINGS.split("[[bands]]")[0], SETTINGS.split('"402"]')[1]
+    text = (start + BANDS + rest).replace("fwhm = 400.0", 'leakage = { "70" = 0.02 }')
+    return settings_in(tmp_path, text)
+
+
+def test_tables_of_bands_are_read_back(files, tmp_path):
+    settings, maps = load(files), written(files, tmp_path / "sims")
+    own, read = inputs_of(settings), inputs_of(load(files, [f'common.maps = "{maps}"']))
+    assert_same_bands(own.bands, read.bands)
+    assert np.ndim(own.bands["70"].beam) == 1
+    assert float(own.bands["own"].noise[0, 1, 5]) > 0
+    assert own.bands["70"].leakage is not None
+
+
+def test_a_band_may_be_a_simulated_file(files, tmp_path):
+    path = written(files, tmp_path / "sims") / "own.fits"
+    band = f'\n[[bands]]\nname = "x"\nfile = "{path}"\nfields = ["Q", "U"]\n'
+    text = SETTINGS.split("[[bands]]")[0] + band + SETTINGS.split('"402"]')[1]
+    inputs = inputs_of(load(settings_in(tmp_path, text)))
+    assert inputs.bands["x"].beam == 330.0
+    assert inputs.truth["dust.beta_dust"] == 1.53
+    with pytest.raises(SettingsError, match=r"bands.x.fwhm: 60 arcmin, but .*330 arcmin"):
+        inputs_of(load(settings_in(tmp_path, text), ["bands.0.fwhm = 60.0"]))
+
+
+def test_smoothed_noise_of_pixels_is_not_guessed(files, tmp_path):
+    values = ["simulate.fwhm = 400.0", 'bands.1 = { name = "70", instrument = "planck" }']
+    settings = load(files, values)
+    out = tmp_path / "sims"
+    assert list(run(settings, build(settings), out, range(1)))
+    with pytest.raises(SettingsError, match=r"bands.44.noise: .*smoothed"):
+        inputs_of(load(files, [*values, f'common.maps = "{out / "sim_00000"}"']))
+
+
+def test_maps_of_others_are_refused(files, tmp_path):
+    (tmp_path / "maps").mkdir()
+    maps = np.ones((2, NPIX))
+    write_maps(tmp_path / "maps/44.fits", maps, names=["Q", "U"], unit="uK_RJ")
+    with pytest.raises(SettingsError, match=r"common.maps: .*44.fits was not written by"):
+        inputs_of(load(files, ['common.maps = "maps"']))
+    missing = r"common.maps: .*none/44.fits: no such file, nor folder"
+    with pytest.raises(SettingsError, match=missing):
+        inputs_of(load(files, ['common.maps = "none"']))
+
+
+def test_an_instrument_is_a_list_of_bands(files, tmp_path):
+    own_44 = 'name = "44"\nbandpass = { center = 44.1, width = 10.72 }'
+    own_70 = "bandpass = { center = 70.4, width = 14.9 }\nnoise = { level = 300.0 }"
+    bands = BANDS.replace('instrument = "planck"\nchannels = ["44"]', own_44)
+    (tmp_path / "mine.toml").write_text(bands.replace('instrument = "planck"', own_70))
+    entry = '\n[[bands]]\ninstrument = "mine.toml"\n'
+    start, rest = SETTINGS.split("[[bands]]")[0], SETTINGS.split('"402"]')[1]
+    text = (start + entry + rest).replace("fwhm = 400.0", 'leakage = { "70" = 0.02 }')
+    own, same = inputs_of(load(files)), inputs_of(load(settings_in(tmp_path, text)))
+    assert_same_bands(own.bands, same.bands)
+    with pytest.raises(SettingsError, match=r"bands.0.instrument: .*no channel '9'.*44, 70, own"):
+        load(settings_in(tmp_path, text), ['bands.0.channels = ["9"]'])
+    with pytest.raises(SettingsError, match=r"bands.0.instrument: Unknown instrument 'acme'"):
+        load(settings_in(tmp_path, text), ['bands.0.instrument = "acme"'])
+
+
+def test_embedded_and_file_components_mix(tmp_path):
+    rng = np.random.default_rng(2)
+    maps = rng.normal(size=(2, NPIX))
+    write_maps(tmp_path / "dust.fits", maps, names=["Q", "U"], unit="uK_RJ")
+    write_maps(tmp_path / "ame.fits", np.abs(maps[:1]), names=["I"], unit="uK_RJ")
+    text = SETTINGS + (
+        '[sky.dust]\nlaw = "dust"\nfile = "dust.fits"\nnu_ref = 353.0\n'
+        '[sky.synchrotron]\nparameters = { beta_syn = 2.9 }\n'
+        '[sky.ame]\nlaw = "ame"\nfile = "ame.fits"\nangles = "dust"\nnu_ref = 22.8\n'
+    )  # fmt: skip
+    inputs = inputs_of(load(settings_in(tmp_path, text)))
+    assert list(inputs.templates) == ["dust", "synchrotron", "ame"]
+    np.testing.assert_allclose(inputs.templates["dust"].component.amplitude, maps)
+    assert float(inputs.templates["synchrotron"].component.beta_syn) == 2.9
+    assert inputs.truth["synchrotron.beta_syn"] == 3.05  # as the table truth says
+    fewer = inputs_of(load(tmp_path / "x.toml", ['common.components = ["dust"]']))
+    assert list(fewer.templates) == ["dust"]
+    np.testing.assert_array_equal(fewer.bands["40"].maps, inputs.bands["40"].maps)
+    with pytest.raises(SettingsError, match=r"sky.x: file is missing"):
+        inputs_of(load(tmp_path / "x.toml", ['sky.x.law = "dust"']))
+
+
+def test_lensing_and_cosmology_are_those_of_the_settings(tmp_path):
+    path = settings_in(tmp_path)
+    plain, half = cmb_spectra(load(path), 30), cmb_spectra(load(path, ["cmb.A_lens = 0.5"]), 30)
+    np.testing.assert_allclose(half[2], 0.5 * plain[2])
+    np.testing.assert_array_equal(half[[0, 1, 3]], plain[[0, 1, 3]])
+    other = cmb_spectra(load(path, ["cmb.cosmology = { H0 = 70.0, As = 4e-9 }"]), 30)
+    assert other[1, 5] > 1.5 * plain[1, 5]
+
+
+def test_a_folder_without_the_maps_is_named(folder, monkeypatch, capsys):
+    arguments = ("--maps", folder / "nothing", "--out", folder / "none")
+    assert jaxsky(monkeypatch, "fit", folder / "x.toml", *arguments) == 2
+    assert "nothing/40.fits: no such file" in one_sentence(capsys)
+    assert not (folder / "none").exists()

@@ -181,6 +181,7 @@ def test_options_replace_settings_and_results_are_kept(folder, tmp_path, monkeyp
     assert jaxsky(monkeypatch, "fit", path, *other, "--overwrite") == 0
 
 
+@pytest.mark.slow
 def test_resume_goes_on_with_a_cut_chain(folder, tmp_path, monkeypatch):
     path, out = write_settings(folder, "resume"), tmp_path / "out"
     options = ["--out", out, "--set", 'fit.stokes=["QU"]']

@@ -125,6 +125,7 @@ def test_refuses_nonsense():
         cmb.realisation(jax.random.key(0), jnp.ones((4, 5)), "Q")
 
 
+@pytest.mark.slow
 def test_spectra_are_kept_from_one_process_to_the_next(tmp_path, monkeypatch):
     monkeypatch.setenv("JAXSKY_CACHE", str(tmp_path))
 

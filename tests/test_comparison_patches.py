@@ -66,6 +66,7 @@ def test_noise_is_that_of_each_patch(inputs):
     assert levels.max() / levels.min() == pytest.approx(4.0, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_map_and_model_agree(found):
     """The same sky with noise of its own: amplitudes agree, and correlate."""
     assert found.band == "353"
@@ -94,6 +95,7 @@ def test_a_template_alone(inputs, tmp_path):
     assert (tmp_path / "patches.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_picture(found, tmp_path):
     plot_patches(tmp_path / "patches.png", found, "small")
     assert (tmp_path / "patches.png").stat().st_size > 10_000

@@ -123,6 +123,7 @@ def test_maps_have_the_brightness_of_the_real_sky(galaxy, fine_galaxy):
         assert np.hypot(*np.std(maps[1:], axis=-1)) == pytest.approx(rms, rel=0.03)
 
 
+@pytest.mark.slow
 def test_one_seed_is_one_sky_at_every_resolution(galaxy, fine_galaxy):
     coarse = embedded_sky(16, seed=0)
     for name in ("dust", "synchrotron"):
@@ -139,6 +140,7 @@ def turbulence(nside, slope=-2.4):
     return _turbulence(jax.random.key(5), slope, _geometry(nside), basis)
 
 
+@pytest.mark.slow
 def test_turbulence_is_a_power_law_whose_multipoles_do_not_depend_on_the_resolution():
     coarse, fine = turbulence(16), turbulence(64)
     shells = len(coarse)
@@ -207,6 +209,7 @@ def test_gradients_of_all_parameters():
         assert abs(exact) > 1e-4
 
 
+@pytest.mark.slow
 def test_gradients_with_the_normalisation():
     def maps(scale):
         model = GalaxyModel(chi0=25.0 * scale, dust_height=0.2 * scale, slope=-2.4 * scale)

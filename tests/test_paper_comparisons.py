@@ -56,6 +56,7 @@ def test_figures(made):
     assert all(items[label].picture in page for label in LABELS)
 
 
+@pytest.mark.slow
 def test_numbers_are_those_of_the_comparison(small, made):
     found = compare(
         small,
@@ -70,6 +71,7 @@ def test_numbers_are_those_of_the_comparison(small, made):
     assert f"after {leaky.pte[1]:.2f}" in shown["PTE of BB, 70"].ours
 
 
+@pytest.mark.slow
 def test_indices_agree_with_the_truth(made):
     shown = numbers(made[1])
     for name, truth in (("dust.beta_dust", 1.53), ("synchrotron.beta_syn", 3.1)):
@@ -79,6 +81,7 @@ def test_indices_agree_with_the_truth(made):
         assert abs(best - truth) < 2 * (high - low)
 
 
+@pytest.mark.slow
 def test_b_modes_are_those_of_the_forecast(small, made):
     found = forecast(_settings(small, Sources(small)))
     shown = numbers(made[1])

@@ -158,6 +158,7 @@ def test_simulations_correct_the_errors_of_purified_B():
             band_covariance(spectra, *DUST, simulations=count, key=key)
 
 
+@pytest.mark.slow
 def test_terms_add_up_to_the_covariance_of_the_sum():
     spectra, _ = simulated(True)
     noise = np.full((2, LMAX + 1), 1e-4)

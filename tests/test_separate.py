@@ -118,6 +118,7 @@ def test_both_domains_find_the_sky(domain):
     assert len(tables(found)) == 1
 
 
+@pytest.mark.slow
 def test_errors_of_multipoles_are_those_of_simulations():
     """There the likelihood is exact; 60 simulations measure to 9 %."""
     _, _, found = separated("harmonic", 60)

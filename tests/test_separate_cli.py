@@ -143,6 +143,7 @@ def test_multipoles_of_files(folder, tmp_path, monkeypatch):
     assert names == {*KIND.results, "index.html", "log.txt"} - {"parameters.fits", "parameters.png"}
 
 
+@pytest.mark.slow
 def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
     from fits.separate import separate as module
 

@@ -24,6 +24,8 @@ from jaxsky.cmb import camb_spectra, tensor_spectra
 from jaxsky.instrument import load_instrument
 from jaxsky.io import read_maps
 
+pytestmark = pytest.mark.slow
+
 NSIDE = 64
 NPIX = healpy.nside2npix(NSIDE)
 UNIT = "uK_CMB"
@@ -153,7 +155,6 @@ def recovered(fits, truth, name, key):
     return values[inside], sigma[inside], mean[inside], (alone - mean)[inside], variation[inside]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "least", "widest"),
     [
@@ -203,7 +204,6 @@ def test_with_less_noise_what_varies_within_regions_decides(fits, truth):
 
 
 #: Pixels of nside 4 at (l, b) = (315, 54), (345, 54) and at (315, -30), (75, -54).
-@pytest.mark.slow
 @pytest.mark.parametrize("patch", [(22, 23), (150, 170)])
 def test_finer_regions_converge_to_the_truth(sky, maps, patch):
     """Without noise, where signals are bright; each region has an index of each kind.
@@ -259,7 +259,6 @@ def left(fits, maps, ratio, key):
     return rms(cleaned.map("cmb")[:, USED]), powers / lensing, tensors.shift(powers)
 
 
-@pytest.mark.slow
 def test_what_constant_indices_leave_in_the_cmb_and_in_r(fits, maps, ratio):
     """Foregrounds without noise through the separation, with the laws fitted to noisy maps."""
     constant, regions, alone = (

@@ -485,6 +485,7 @@ def parametrised(p):
     return there, Observation(channels, NSIDE, finest=900.0)
 
 
+@pytest.mark.slow
 def test_the_procedure_is_a_differentiable_function():
     """With a fixed key, each number of the whole procedure against finite differences."""
     theta = jnp.array(list(NUMBERS.values()))

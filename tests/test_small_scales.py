@@ -189,6 +189,7 @@ def test_a_template_above_the_law_is_brought_down_to_it(coefficients):
     np.testing.assert_allclose(part.injected[:, 65:], laws(100)[:, 65:], rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_final_spectra_of_a_power_law(coefficients, template):
     # All modes count here, so 20 realisations have the law within 2 %: the spectra of single
     # bins and their step at the join.
@@ -335,6 +336,7 @@ AT = (-2.3, 0.1, 1.2, OWN, 150.0, 1200.0, 1.1)
 NAMES = ["slope", "tilt", "amplitude", "own", "fwhm", "modulation_fwhm", "maps"]
 
 
+@pytest.mark.slow
 def test_inside_jit(result, template):
     small = SmallScales(*RANGES, -2.3, 0.1, 1.2, 1200.0)
     eager = add_small_scales(KEY, template, OWN, 150.0, NSIDE, small)
@@ -366,6 +368,7 @@ def test_derivatives(result, tangent, i):
     np.testing.assert_allclose(slope, difference, atol=1e-5 * largest)
 
 
+@pytest.mark.slow
 def test_derivatives_backwards(result, tangent):
     weights = jax.random.normal(KEY, (2, 12 * NSIDE**2))
     back = jax.grad(lambda args: jnp.vdot(weights, result(*args)))(AT)

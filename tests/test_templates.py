@@ -325,6 +325,7 @@ def save(path, columns, units, **header):
     return path
 
 
+@pytest.mark.slow
 def test_synchrotron_from_commander_at_full_resolution(tmp_path):
     alm = coefficients(512, 40.0)
     Q, U = polarization(alm, 256)

@@ -400,6 +400,7 @@ def test_killed_downloads_are_resumed(server, tmp_path):
     assert len(begun) >= 2
 
 
+@pytest.mark.slow
 def test_stopped_downloads_say_how_to_resume(server, tmp_path, log):
     name = "LFI_RIMO_R2.50.fits"
     Handler.files[name] = 20 * CONTENT

@@ -270,6 +270,44 @@ def test_lensing_and_cosmology_are_those_of_the_settings(tmp_path):
     assert other[1, 5] > 1.5 * plain[1, 5]
 
 
+def test_truth_about_what_is_not_simulated_is_left_out(tmp_path):
+    path = settings_in(tmp_path)
+    for include in (["dust", "noise"], ["cmb"]):
+        setup = build(load(path, [f"simulate.include = {include}"]))
+        assert not any(name.startswith("synchrotron") for name in setup.truth)
+    with pytest.raises(SettingsError, match=r"truth: there is no component 'ame'"):
+        build(load(path, ['truth."ame.m60" = 1.0']))
+
+
+def test_only_is_of_what_is_included(tmp_path, monkeypatch, capsys):
+    path, out = settings_in(tmp_path), tmp_path / "sims"
+    include = ("--set", 'simulate.include = ["dust", "noise"]')
+    arguments = ("simulate", path, "--out", out, *include, "--only")
+    assert jaxsky(monkeypatch, *arguments, "signal") == 0
+    log = json.loads((out / "simulation.json").read_text())
+    assert log["settings"]["simulate"]["include"] == ["dust"]
+    capsys.readouterr()
+    assert jaxsky(monkeypatch, *arguments, "cmb") == 2
+    assert "--only cmb: nothing is left" in one_sentence(capsys)
+
+
+def test_intensity_alone_has_no_part_in_maps_of_q_and_u(tmp_path):
+    rng = np.random.default_rng(3)
+    write_maps(tmp_path / "ff.fits", rng.random((1, NPIX)), names=["I"], unit="uK_RJ")
+    path = settings_in(
+        tmp_path, SETTINGS + '[sky.ff]\nlaw = "free_free"\nfile = "ff.fits"\nnu_ref = 30.0\n'
+    )
+    fewer = 'common.components = ["dust", "synchrotron"]'
+    with pytest.raises(SettingsError, match=r"sky.ff: FreeFree is not polarized.*components"):
+        inputs_of(load(path))
+    own = inputs_of(load(path, [fewer]))
+    (tmp_path / "without").mkdir()
+    without = inputs_of(load(settings_in(tmp_path / "without")))
+    assert_same_bands(own.bands, without.bands)
+    with pytest.raises(SettingsError, match=r"sky.ff: FreeFree is not polarized.*simulate.stokes"):
+        build(load(path))
+
+
 def test_a_folder_without_the_maps_is_named(folder, monkeypatch, capsys):
     arguments = ("--maps", folder / "nothing", "--out", folder / "none")
     assert jaxsky(monkeypatch, "fit", folder / "x.toml", *arguments) == 2

@@ -87,6 +87,11 @@ class ComponentTable(MapKeys):
                 raise ValueError(f"{key} is missing")
         return self
 
+    @property
+    def polarized(self) -> bool:
+        """Whether its law, which is known, has any polarization."""
+        return component_class(str(self.law)).polarized
+
     def check(self, law: str) -> None:
         """Raise ValueError for keys that do not go with a law."""
         if law == "cmb":

@@ -171,3 +171,31 @@ def test_the_cmb_is_described_in_its_table(tmp_path):
     refused(tmp_path, "sky.other.law: the CMB is described in", main='sky.other.law = "cmb"')
     words = "sky.cmb: the name 'cmb' has a meaning of its own"
     refused(tmp_path, words, main='sky.cmb.law = "dust"')
+
+
+def test_set_replaces_a_key_and_nothing_else(tmp_path):
+    path = tmp_path / "x.toml"
+    path.write_text(
+        "[truth]\n'dust.T_dust' = 20.0\n[sky]\nembedded = { nside = 16 }\n"
+        "[[bands]]\nname = 'a'\nfwhm = 30.0\nnoise = { level = 2.0 }\n"
+        "[free]\n'dust.beta_dust' = { start = 1.5, uniform = [1.0, 2.0] }\n"
+    )
+    changed = load(
+        path,
+        [
+            "truth = {}",
+            "bands.0.noise = { rms = 1.0 }",
+            "free.'dust.beta_dust'.start = 1.6",
+            "title = \N{GREEK SMALL LETTER BETA} \N{COMET} = 2",
+        ],
+    )
+    assert changed.truth == {}
+    (band,) = changed.bands
+    assert (band.fwhm, band.noise.rms, band.noise.level) == (30.0, 1.0, None)
+    assert changed.free["dust.beta_dust"].start == 1.6
+    assert changed.free["dust.beta_dust"].uniform == (1.0, 2.0)
+    assert changed.title == "\N{GREEK SMALL LETTER BETA} \N{COMET} = 2"
+    with pytest.raises(SettingsError, match=r"bands.1.fwhm=3: 1: is not among the 1 entries"):
+        load(path, ["bands.1.fwhm=3"])
+    with pytest.raises(SettingsError, match=r"bands.0.fwhm=3: 0: is not among the entries of \[\]"):
+        load(path, ["bands=[]", "bands.0.fwhm=3"])

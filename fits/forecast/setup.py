@@ -54,6 +54,10 @@ def build(settings: Experiment) -> Setup:
         templates do not resolve, and a mask that leaves nothing.
     """
     spec = settings.forecast
+    if not settings.cmb.include:
+        raise SettingsError("cmb.include: is false, but a forecast has a CMB.")
+    if settings.cmb.spectra is not None:
+        raise SettingsError("cmb.spectra: a forecast changes r, which takes spectra of CAMB.")
     templates, description = read_sky(settings, names=settings.modelled())
     if not templates:
         raise SettingsError("sky: has no components; a forecast takes some.")

@@ -32,7 +32,8 @@ def _settings(settings: Experiment, sources: Sources) -> Experiment:
     fit = (20, min(200, lmax - 10))
     spec = settings.forecast.model_copy(update={"bands": list(BANDS), "lmax": lmax, "fit": fit})
     bands = [BandTable.model_validate(band) for band in band_tables("core")]
-    changes = {"sky": sky, "bands": bands, "free": {}, "forecast": spec}
+    cmb = settings.cmb.model_copy(update={"include": True})
+    changes = {"sky": sky, "bands": bands, "cmb": cmb, "free": {}, "forecast": spec}
     return settings.model_copy(update=changes)
 
 

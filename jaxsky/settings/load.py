@@ -24,7 +24,8 @@ def _assigned(assignment: str) -> tuple[list[str], Any]:
         If it is none.
     """
     key, equals, value = assignment.partition("=")
-    for line in (assignment, f"{key} = {json.dumps(value.strip(), ensure_ascii=False)}") if equals else ():
+    text = f"{key} = {json.dumps(value.strip(), ensure_ascii=False)}"
+    for line in (assignment, text) if equals else ():
         try:
             found, place = tomllib.loads(line), tomllib.loads(f"{key} = 0")
         except (tomllib.TOMLDecodeError, RecursionError):

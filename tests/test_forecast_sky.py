@@ -303,7 +303,7 @@ def test_settings_that_come_along():
         ("level = 20.0", 'map = { file = "dust.fits" }, unit = "K_CMB"',
          "argument `unit` is K_CMB, but column Q_STOKES is in uK_RJ"),
         ("level = 20.0", "level = 0.0", "bands.0.noise: must be greater than 0"),
-        ('file = "dust.fits"\n', "", "fwhm and angles are of a map, but file is missing"),
+        ('file = "dust.fits"\n', "", "fwhm, angles and noise are of a map, but"),
         ('file = "dust.fits"\nnu_ref = 353.0\nfwhm = 60.0', "", "sky.dust: file is missing"),
         ('"half"', '"third"', "masks.npz: no mask 'third'"),
         ('"half"', '"odd"', "a mask has values 0 and 1, but 1536 of 3072 pixels have others"),

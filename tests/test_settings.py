@@ -199,3 +199,24 @@ def test_set_replaces_a_key_and_nothing_else(tmp_path):
         load(path, ["bands.1.fwhm=3"])
     with pytest.raises(SettingsError, match=r"bands.0.fwhm=3: 0: is not among the entries of \[\]"):
         load(path, ["bands=[]", "bands.0.fwhm=3"])
+
+
+@pytest.mark.parametrize(
+    ("assignment", "words"),
+    [
+        ("fixed = { 'dust.nu_ref' = 545.0 }", "fixed.dust.nu_ref: is that of the embedded map"),
+        ("sky.dust.parameters = { nu_ref = 545.0 }", "sky.dust: law and nu_ref are those of the"),
+        ("sky.dust.noise = { level = 3.0 }", "sky.dust: fwhm, angles and noise are of a map"),
+        (
+            "sky.dust.small_scales = { EE = [9, 3], BB = [3, 9] }",
+            "sky.dust.small_scales.EE: must increase, but is 9, 3",
+        ),
+        ("cmb.cosmology = { r = 0.1 }", "cmb.cosmology: 'r' is no parameter of the cosmology"),
+    ],
+)
+def test_keys_without_a_meaning_are_refused(tmp_path, assignment, words):
+    path = tmp_path / "x.toml"
+    path.write_text("[sky]\nembedded = { nside = 16 }\n")
+    with pytest.raises(SettingsError) as mistake:
+        load(path, [assignment])
+    assert words in str(mistake.value)

@@ -2,12 +2,16 @@
 
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from commands import jaxsky, one_sentence
 from fits.inputs import inputs_of
+from fits.resolution import prepare
+from fits.results import misfit
+from fits.spectral_index import _expected
 from jaxsky.experiment import build, cmb_spectra
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.io import write_maps
@@ -313,3 +317,18 @@ def test_a_folder_without_the_maps_is_named(folder, monkeypatch, capsys):
     assert jaxsky(monkeypatch, "fit", folder / "x.toml", *arguments) == 2
     assert "nothing/40.fits: no such file" in one_sentence(capsys)
     assert not (folder / "none").exists()
+
+
+def test_a_cmb_above_the_noise_is_no_misfit(folder):
+    prepared = prepare(inputs_of(load(folder / "x.toml", ['bands.0.channels = ["140"]'])), 16, 480)
+    used = np.arange(NPIX) % 2 == 0
+    expected = _expected(prepared, used, "U", ())
+    squares = []
+    for key in jax.random.split(jax.random.key(0), 50):
+        fluctuations = prepared.fluctuations
+        maps = fluctuations.noise_realisation(key) + fluctuations.cmb_realisation(key)
+        squares.append(np.mean((maps / prepared.sigma)[0, 1, used] ** 2))
+    assert expected > 10
+    np.testing.assert_allclose(expected, np.mean(squares), rtol=0.15)
+    assert misfit(50.0 * expected * 1000, 1000, expected) is None
+    assert misfit(150.0 * expected * 1000, 1000, expected) is not None

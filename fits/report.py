@@ -92,7 +92,7 @@ def result_table(fits: Sequence[Fit], truth: Mapping[str, float] | None = None) 
         box=box.SIMPLE,
         pad_edge=False,
         collapse_padding=True,
-        caption="best fit and central 68 % interval; chi2 is the sum over pixels",
+        caption="best fit and central 68 % interval; chi2 counts pixels with the noise alone",
     )
     for column in ("region", "", "method"):
         table.add_column(column)

@@ -18,14 +18,15 @@ ASTRONOMICAL, FEW = 100.0, 100
 LOST = 50.0
 
 
-def misfit(chi2: float, dof: int) -> str | None:
+def misfit(chi2: float, dof: int, expected: float = 1.0) -> str | None:
     """What to say of a chi^2 that no statistics, but only wrong inputs explain; None if it is not.
 
     Parameters
     ----------
     chi2, dof : of a fit
+    expected : chi2 per degree of freedom of the right model, if chi2 leaves out what is known
     """
-    if chi2 <= ASTRONOMICAL * max(dof, FEW):
+    if chi2 <= ASTRONOMICAL * expected * max(dof, FEW):
         return None
     return (
         f"chi2 is {chi2:.3g} for {dof} degrees of freedom, so the model does not describe the "
@@ -95,13 +96,16 @@ class FitResult(NamedTuple):
         i = self.free.index(name)
         return float(np.sqrt(self.covariance[i, i]))
 
-    def judged(self, chi2: float, dof: int, start: Mapping[str, Numeric]) -> "FitResult":
+    def judged(
+        self, chi2: float, dof: int, start: Mapping[str, Numeric], expected: float = 1.0
+    ) -> "FitResult":
         """Itself, not converged if parameters ran away, or chi^2 is that of no fit.
 
         Parameters
         ----------
         chi2, dof : of the data, or of what the likelihood compares
         start : start values by name
+        expected : see `misfit`
         """
         failures = [] if self.converged else [self.message]
         sigma = np.sqrt(np.diagonal(self.covariance))
@@ -112,7 +116,7 @@ class FitResult(NamedTuple):
                     f"The data do not constrain {name!r}: from {begun:g} it went to "
                     f"{value:.3g} +- {error:.2g}; {help_by_prior((name,))}."
                 )
-        if (wrong := misfit(chi2, dof)) and wrong not in self.message:
+        if (wrong := misfit(chi2, dof, expected)) and wrong not in self.message:
             failures.insert(0, wrong)
         if not failures:
             return self

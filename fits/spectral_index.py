@@ -124,7 +124,10 @@ def fit_pixels(
     values = {method: float(chi2(diagonal, r.best_fit)) for method, r in results.items()}
     number = len(prepared.bands) - len(nothing)
     dof = int(used.sum()) * number * len(stokes) - len(start)
-    results = {method: r.judged(values[method], dof, start) for method, r in results.items()}
+    expected = _expected(prepared, used, stokes, nothing)
+    results = {
+        method: r.judged(values[method], dof, start, expected) for method, r in results.items()
+    }
     lost = None
     variances = prepared.template_variances
     if any(bool(values.any()) for values in variances.values()) and prepared.sky is not None:
@@ -132,6 +135,20 @@ def fit_pixels(
         sky, sigma = prepared.sky, prepared.sigma
         lost = attenuation(like, result, sky, variances, sigma, used, stokes)
     return Fit(region, stokes, results, values, dof, dof_amplitudes, nothing, lost)
+
+
+def _expected(
+    prepared: Prepared, used: Bool[np.ndarray, " pix"], stokes: str, left_out: Sequence[str]
+) -> float:
+    """Mean square of noise and CMB in a pixel over that of the noise, which chi^2 counts alone."""
+    power = np.asarray(prepared.fluctuations.cmb_power()).sum(axis=1)
+    ell = np.arange(power.shape[-1])
+    # Q and U have half of E and B each.
+    variance = power @ (2 * ell + 1) / (8 * np.pi)
+    keep = np.array(["QU".index(s) for s in stokes])
+    ratio = variance[:, None, None] / np.asarray(prepared.sigma)[:, keep][..., used] ** 2
+    counted = [name not in left_out for name in prepared.bands]
+    return 1.0 + float(ratio[counted].mean())
 
 
 def weightless(

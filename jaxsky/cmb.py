@@ -27,7 +27,8 @@ PLANCK_2018 = {
     "ns": 0.9649,
 }
 
-
+#: What stands for H0 in a cosmology.
+EXPANSION = {"cosmomc_theta", "thetastar"}
 #: What this module gives to `camb.set_params` itself.
 OWN = ("r", "lmax", "max_l_tensor", "max_eta_k_tensor", "WantScalars", "WantTensors")
 #: Where the first pieces of spectra end. Each piece is a run of its own with the same settings
@@ -47,7 +48,7 @@ def camb_spectra(lmax: int, r: float = 0.0, **cosmology: float) -> Float[np.ndar
     ----------
     lmax : largest multipole
     r : tensor-to-scalar ratio at k = 0.05 / Mpc
-    **cosmology : of `camb.set_params`, instead of `PLANCK_2018`
+    **cosmology : of `camb.set_params`, in place of those in `PLANCK_2018`
 
     Raises
     ------
@@ -69,7 +70,7 @@ def tensor_spectra(lmax: int, **cosmology: float) -> Float[np.ndarray, "4 ell"]:
     Parameters
     ----------
     lmax : largest multipole
-    **cosmology : of `camb.set_params`, instead of `PLANCK_2018`
+    **cosmology : of `camb.set_params`, in place of those in `PLANCK_2018`
 
     Raises
     ------
@@ -88,9 +89,10 @@ def _joined(piece, end, lmax, cosmology):
             raise ValueError(f"{name!r} is no parameter of the cosmology.")
         if name in PLANCK_2018 and name != "omk" and not value >= 0:
             raise ValueError(f"Parameter {name!r} of the cosmology is {value}, which is negative.")
+    known = {n: v for n, v in PLANCK_2018.items() if n != "H0" or not EXPANSION & set(cosmology)}
     pieces, begin = [], 0
     while begin <= lmax:
-        pieces.append(piece(end, **(cosmology or PLANCK_2018))[:, begin : lmax + 1])
+        pieces.append(piece(end, **(known | cosmology))[:, begin : lmax + 1])
         begin, end = end + 1, 2 * end
     return np.concatenate(pieces, axis=1)
 

@@ -116,12 +116,12 @@ def build(
     stokes, precision = (spec.stokes, spec.precision) if written else ("QU", "double")
     target = None if spec.fwhm == "own" else spec.fwhm
     included = settings.included()
-    foregrounds = [name for name in settings.sky.components if name in included]
-    sky, description = read_sky(
-        settings, stokes, DTYPES[precision], names=foregrounds, galaxy=galaxy
-    )
+    tables = settings.sky.components
+    foregrounds = [name for name in tables if name in included]
+    seen_here = [name for name in foregrounds if written or tables[name].polarized]
+    sky, description = read_sky(settings, stokes, DTYPES[precision], names=seen_here, galaxy=galaxy)
     with at_key("truth"):
-        templates = set_parameters_of(sky, settings.truth)
+        templates = set_parameters_of(sky, settings.truth, tables)
     nside = map_nside(settings, templates)
     channels = {
         str(band.name): read_channel(settings, band, nside, stokes, "noise" in included)
@@ -167,7 +167,9 @@ def map_nside(settings: Experiment, templates: Mapping[str, Template]) -> int:
     if settings.simulate.nside is not None:
         return settings.simulate.nside
     if not templates and settings.sky.templates:  # nothing of the sky is simulated
-        templates, _ = read_sky(settings, names=settings.sky.templates)
+        tables = settings.sky.components
+        names = [name for name in settings.sky.templates if tables[name].polarized]
+        templates, _ = read_sky(settings, names=names)
     if not templates:
         raise SettingsError("simulate.nside: is missing; there is no map of the sky that has one.")
     return min(healpy.npix2nside(template.used.size) for template in templates.values())
@@ -370,7 +372,7 @@ def _leakage(
         return {}
     with at_key("simulate.leakage"):
         whole, _ = read_sky(settings, "IQU", names=names, galaxy=galaxy)
-        whole = set_parameters_of(whole, settings.truth)
+        whole = set_parameters_of(whole, settings.truth, settings.sky.components)
         sky = Sky({name: one.component for name, one in whole.items()})
         maps = {}
         for name, fraction in fractions.items():

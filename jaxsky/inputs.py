@@ -148,11 +148,9 @@ def read_sky(
         spec = tables[name]
         if spec.file is not None:
             known[name] = _read_template(folder, name, spec, known, stokes, dtype)
-    parts = {name: name.split(".")[0] for name in settings.fixed}
-    left_out = set(tables) - set(wanted)
-    fixed = {n: v for n, v in settings.fixed.items() if parts[n] not in left_out}
+    found = {name: known[name] for name in wanted}
     with at_key("fixed"):
-        return set_parameters_of({name: known[name] for name in wanted}, fixed), description
+        return set_parameters_of(found, settings.fixed, tables), description
 
 
 def embedded_galaxy(settings: Experiment) -> EmbeddedSky:
@@ -213,6 +211,11 @@ def _read_template(
     assert spec.law is not None  # as the settings see to
     found = read(folder, spec)
     law = component_class(spec.law)
+    if not law.polarized and stokes == "QU":
+        raise SettingsError(
+            f"sky.{name}: {law.__name__} is not polarized, and these are maps of Q and U; leave it "
+            'out of common.components, or of simulations unless simulate.stokes is "IQU".'
+        )
     padded = not law.polarized and stokes == "IQU"
     check_stokes(f"sky.{name}", found, "I" if spec.angles or padded else stokes)
     parameters, known = _parameters(folder, name, spec, found.nside)
@@ -235,9 +238,16 @@ def _read_template(
 
 
 def set_parameters_of(
-    templates: Mapping[str, Template], fixed: Mapping[str, float]
+    templates: Mapping[str, Template],
+    fixed: Mapping[str, float],
+    components: Collection[str] = (),
 ) -> dict[str, Template]:
     """Templates with some of their parameters set, by dotted name.
+
+    Parameters
+    ----------
+    templates, fixed : by name
+    components : names that there are; parameters of those without a template here are left out
 
     Raises
     ------
@@ -246,15 +256,17 @@ def set_parameters_of(
     """
     by_template: dict[str, dict[str, float]] = {}
     for name, value in fixed.items():
-        by_template.setdefault(name.split(".")[0], {})[name] = value
+        component = name.split(".")[0]
+        if component in templates or component not in components:
+            by_template.setdefault(component, {})[name] = value
     changed = dict(templates)
     for name, values in by_template.items():
         if name not in templates:
             raise ValueError(
                 f"there is no component {name!r}; components are {', '.join(templates)}"
             )
-        component = set_parameters(Sky({name: templates[name].component}), values)[name]
-        changed[name] = templates[name]._replace(component=component)
+        new = set_parameters(Sky({name: templates[name].component}), values)[name]
+        changed[name] = templates[name]._replace(component=new)
     return changed
 
 

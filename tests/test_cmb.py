@@ -98,6 +98,16 @@ def test_tensors_reach_any_multipole():
         np.testing.assert_allclose(found[1:3, ells], expected[1:3, ells], rtol=close)
 
 
+def test_what_a_cosmology_does_not_say_is_that_of_planck():
+    known = cmb.camb_spectra(60)
+    np.testing.assert_array_equal(cmb.camb_spectra(60, H0=cmb.PLANCK_2018["H0"]), known)
+    # Primordial power is linear in As, and what lensing adds to it is small.
+    brighter = cmb.camb_spectra(60, As=2 * cmb.PLANCK_2018["As"])
+    np.testing.assert_allclose(brighter[1, 2:], 2 * known[1, 2:], rtol=0.1)
+    # An angle in place of H0 is not one beside it.
+    assert np.isfinite(cmb.camb_spectra(60, cosmomc_theta=0.0104)).all()
+
+
 @pytest.mark.parametrize(
     ("cosmology", "words"),
     [

@@ -11,8 +11,8 @@ import pytest
 
 import commands
 from fits.commands.run import DEFAULTS
-from fits.paper import STEPS, Impossible, Item, Number, Sources, Step, run
-from fits.paper.experiment import _observation, _prepared
+from fits.paper import STEPS, Impossible, Item, Number, Sources, Step, experiment, run
+from fits.paper.experiment import _observation, _prepared, figure_patch
 from fits.paper.item import NUMBERS
 from fits.paper.run import labels_of
 from jaxsky.harmonics import gaussian_beam, power_spectrum
@@ -368,3 +368,16 @@ def test_settings_that_cannot_work(real):
     del raw["sky"]["sky_synchrotron"]
     with pytest.raises(Impossible, match="one template of the law 'synchrotron', but there are 0"):
         Sources(Experiment.model_validate(raw)).template("synchrotron")
+
+
+def test_the_cmb_of_figure_13_is_that_of_the_settings(real, monkeypatch):
+    settings, out, _ = real
+    spectra = experiment.cmb_spectra(settings, 100)
+    asked = []
+    monkeypatch.setattr(experiment, "_prepared", lambda *a: {})
+    monkeypatch.setattr(
+        experiment, "cmb_spectra", lambda s, lmax: asked.append(s) or spectra[:, :10]
+    )
+    with pytest.raises(ValueError, match=r"spectra of the CMB end at l = 9"):
+        figure_patch(settings, Sources(settings), out)
+    assert asked == [settings]

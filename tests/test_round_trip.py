@@ -2,12 +2,16 @@
 
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from commands import jaxsky, one_sentence
 from fits.inputs import inputs_of
+from fits.resolution import prepare
+from fits.results import misfit
+from fits.spectral_index import _expected
 from jaxsky.experiment import build, cmb_spectra
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.io import write_maps
@@ -270,8 +274,61 @@ def test_lensing_and_cosmology_are_those_of_the_settings(tmp_path):
     assert other[1, 5] > 1.5 * plain[1, 5]
 
 
+def test_truth_about_what_is_not_simulated_is_left_out(tmp_path):
+    path = settings_in(tmp_path)
+    for include in (["dust", "noise"], ["cmb"]):
+        setup = build(load(path, [f"simulate.include = {include}"]))
+        assert not any(name.startswith("synchrotron") for name in setup.truth)
+    with pytest.raises(SettingsError, match=r"truth: there is no component 'ame'"):
+        build(load(path, ['truth."ame.m60" = 1.0']))
+
+
+def test_only_is_of_what_is_included(tmp_path, monkeypatch, capsys):
+    path, out = settings_in(tmp_path), tmp_path / "sims"
+    include = ("--set", 'simulate.include = ["dust", "noise"]')
+    arguments = ("simulate", path, "--out", out, *include, "--only")
+    assert jaxsky(monkeypatch, *arguments, "signal") == 0
+    log = json.loads((out / "simulation.json").read_text())
+    assert log["settings"]["simulate"]["include"] == ["dust"]
+    capsys.readouterr()
+    assert jaxsky(monkeypatch, *arguments, "cmb") == 2
+    assert "--only cmb: nothing is left" in one_sentence(capsys)
+
+
+def test_intensity_alone_has_no_part_in_maps_of_q_and_u(tmp_path):
+    rng = np.random.default_rng(3)
+    write_maps(tmp_path / "ff.fits", rng.random((1, NPIX)), names=["I"], unit="uK_RJ")
+    path = settings_in(
+        tmp_path, SETTINGS + '[sky.ff]\nlaw = "free_free"\nfile = "ff.fits"\nnu_ref = 30.0\n'
+    )
+    fewer = 'common.components = ["dust", "synchrotron"]'
+    with pytest.raises(SettingsError, match=r"sky.ff: FreeFree is not polarized.*components"):
+        inputs_of(load(path))
+    own = inputs_of(load(path, [fewer]))
+    (tmp_path / "without").mkdir()
+    without = inputs_of(load(settings_in(tmp_path / "without")))
+    assert_same_bands(own.bands, without.bands)
+    with pytest.raises(SettingsError, match=r"sky.ff: FreeFree is not polarized.*simulate.stokes"):
+        build(load(path))
+
+
 def test_a_folder_without_the_maps_is_named(folder, monkeypatch, capsys):
     arguments = ("--maps", folder / "nothing", "--out", folder / "none")
     assert jaxsky(monkeypatch, "fit", folder / "x.toml", *arguments) == 2
     assert "nothing/40.fits: no such file" in one_sentence(capsys)
     assert not (folder / "none").exists()
+
+
+def test_a_cmb_above_the_noise_is_no_misfit(folder):
+    prepared = prepare(inputs_of(load(folder / "x.toml", ['bands.0.channels = ["140"]'])), 16, 480)
+    used = np.arange(NPIX) % 2 == 0
+    expected = _expected(prepared, used, "U", ())
+    squares = []
+    for key in jax.random.split(jax.random.key(0), 50):
+        fluctuations = prepared.fluctuations
+        maps = fluctuations.noise_realisation(key) + fluctuations.cmb_realisation(key)
+        squares.append(np.mean((maps / prepared.sigma)[0, 1, used] ** 2))
+    assert expected > 10
+    np.testing.assert_allclose(expected, np.mean(squares), rtol=0.15)
+    assert misfit(50.0 * expected * 1000, 1000, expected) is None
+    assert misfit(150.0 * expected * 1000, 1000, expected) is not None

@@ -171,3 +171,52 @@ def test_the_cmb_is_described_in_its_table(tmp_path):
     refused(tmp_path, "sky.other.law: the CMB is described in", main='sky.other.law = "cmb"')
     words = "sky.cmb: the name 'cmb' has a meaning of its own"
     refused(tmp_path, words, main='sky.cmb.law = "dust"')
+
+
+def test_set_replaces_a_key_and_nothing_else(tmp_path):
+    path = tmp_path / "x.toml"
+    path.write_text(
+        "[truth]\n'dust.T_dust' = 20.0\n[sky]\nembedded = { nside = 16 }\n"
+        "[[bands]]\nname = 'a'\nfwhm = 30.0\nnoise = { level = 2.0 }\n"
+        "[free]\n'dust.beta_dust' = { start = 1.5, uniform = [1.0, 2.0] }\n"
+    )
+    changed = load(
+        path,
+        [
+            "truth = {}",
+            "bands.0.noise = { rms = 1.0 }",
+            "free.'dust.beta_dust'.start = 1.6",
+            "title = \N{GREEK SMALL LETTER BETA} \N{COMET} = 2",
+        ],
+    )
+    assert changed.truth == {}
+    (band,) = changed.bands
+    assert (band.fwhm, band.noise.rms, band.noise.level) == (30.0, 1.0, None)
+    assert changed.free["dust.beta_dust"].start == 1.6
+    assert changed.free["dust.beta_dust"].uniform == (1.0, 2.0)
+    assert changed.title == "\N{GREEK SMALL LETTER BETA} \N{COMET} = 2"
+    with pytest.raises(SettingsError, match=r"bands.1.fwhm=3: 1: is not among the 1 entries"):
+        load(path, ["bands.1.fwhm=3"])
+    with pytest.raises(SettingsError, match=r"bands.0.fwhm=3: 0: is not among the entries of \[\]"):
+        load(path, ["bands=[]", "bands.0.fwhm=3"])
+
+
+@pytest.mark.parametrize(
+    ("assignment", "words"),
+    [
+        ("fixed = { 'dust.nu_ref' = 545.0 }", "fixed.dust.nu_ref: is that of the embedded map"),
+        ("sky.dust.parameters = { nu_ref = 545.0 }", "sky.dust: law and nu_ref are those of the"),
+        ("sky.dust.noise = { level = 3.0 }", "sky.dust: fwhm, angles and noise are of a map"),
+        (
+            "sky.dust.small_scales = { EE = [9, 3], BB = [3, 9] }",
+            "sky.dust.small_scales.EE: must increase, but is 9, 3",
+        ),
+        ("cmb.cosmology = { r = 0.1 }", "cmb.cosmology: 'r' is no parameter of the cosmology"),
+    ],
+)
+def test_keys_without_a_meaning_are_refused(tmp_path, assignment, words):
+    path = tmp_path / "x.toml"
+    path.write_text("[sky]\nembedded = { nside = 16 }\n")
+    with pytest.raises(SettingsError) as mistake:
+        load(path, [assignment])
+    assert words in str(mistake.value)

@@ -41,8 +41,12 @@ def simulate(
 
     def work(settings: Experiment, command: run.Run) -> run.Report:
         if only is not None:
-            include = {"include": ONLY[only](list(settings.sky.components))}
-            spec = settings.simulate.model_copy(update=include)
+            included = settings.included()
+            wanted = ONLY[only]([name for name in settings.sky.components if name in included])
+            include = [name for name in wanted if name in included]
+            if not include:
+                raise ValueError(f"--only {only}: nothing is left that simulate.include names.")
+            spec = settings.simulate.model_copy(update={"include": include})
             settings = settings.model_copy(update={"simulate": spec})
         return _work(settings, command, indices)
 

@@ -23,6 +23,7 @@ from jaxsky.cmb import camb_spectra, tensor_spectra
 from jaxsky.harmonics import beam_ratio, gaussian_beam
 from jaxsky.parameters import unknown_parameter
 from jaxsky.progress import QUIET, Progress
+from jaxsky.settings import SettingsError
 from jaxsky.settings.experiment import Experiment
 from jaxsky.settings.keys import at_key
 
@@ -155,6 +156,9 @@ def _errors(
     nuisance = foreground_names(model.sky, model.fields, spec.foregrounds)
     spectral = settings.free_in("forecast")
     widths = {n: one.gaussian[1] for n, one in spectral.items() if one.gaussian is not None}
+    for name in spec.priors:
+        if name in widths:
+            raise SettingsError(f"forecast.priors: the prior of {name!r} is in the table free.")
     with at_key("free"):
         for name in spectral:
             if name not in parameters:

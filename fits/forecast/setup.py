@@ -57,7 +57,7 @@ def build(settings: Experiment) -> Setup:
     if not settings.cmb.include:
         raise SettingsError("cmb.include: is false, but a forecast has a CMB.")
     if settings.cmb.spectra is not None:
-        raise SettingsError("cmb.spectra: a forecast has r and A_lens, and so spectra of CAMB.")
+        raise SettingsError("cmb.spectra: a forecast changes r, which takes spectra of CAMB.")
     templates, description = read_sky(settings, names=settings.modelled())
     if not templates:
         raise SettingsError("sky: has no components; a forecast takes some.")

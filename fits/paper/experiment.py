@@ -9,7 +9,7 @@ from fits.commands.page import Table
 from fits.paper.item import Item, Number, picture_of
 from fits.paper.patches import disc, draw_patches
 from fits.paper.sources import PAPER_FWHM, Sources
-from jaxsky.cmb import camb_spectra
+from jaxsky.experiment import cmb_spectra
 from jaxsky.instrument import load_instrument
 from jaxsky.interpolation import term_weights
 from jaxsky.observation import Observation, ObservedBand, Source
@@ -67,7 +67,7 @@ def figure_patch(settings: Experiment, sources: Sources, out: Path) -> Item:
     center, fwhm = settings.paper.center, settings.paper.fwhm
     observation = _observation(settings, sources)
     prepared = _prepared(sources, observation)
-    cmb = camb_spectra(observation.lmax, settings.cmb.r)
+    cmb = cmb_spectra(settings, observation.lmax)
     panels, rms = {}, {}
     finest = observation.names[-1]
     for name, maps in observe_bands(
@@ -85,6 +85,8 @@ def figure_patch(settings: Experiment, sources: Sources, out: Path) -> Item:
             to_cmb = float(channel.band.conversion("uK_RJ", "uK_CMB"))
             Q = seen["cmb"] * to_cmb
             panels = {f"CMB, {float(channel.beam):g}'": (Q, _limit(Q, center), "uK_CMB"), **panels}
+    spectra = settings.cmb.spectra
+    origin = f"r = {settings.cmb.r:g}" if spectra is None else f"spectra of {spectra}"
     picture = picture_of("Figure 13")
     draw_patches(out / picture, panels, center, SIZE)
     numbers = tuple(_brightest(name, values) for name, values in rms.items())
@@ -92,7 +94,7 @@ def figure_patch(settings: Experiment, sources: Sources, out: Path) -> Item:
         "Figure 13",
         "COrE",
         f"Stokes Q in a patch of {SIZE:g}° about (l, b) = ({center[0]:g}°, {center[1]:g}°): a CMB "
-        f"realisation (r = {settings.cmb.r:g}, thermodynamic units), and simulated observations "
+        f"realisation ({origin}, thermodynamic units), and simulated observations "
         "with COrE, noise included, in antenna temperature. Foregrounds have small scales.",
         f"{sources.sky_differs} The finest beam is {fwhm:g} arcmin, that of the small scales, "
         f"which the pixels resolve (nside {observation.nside}); the paper has {CMB_FWHM:g} arcmin "

@@ -2,7 +2,7 @@
 
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,8 @@ from jaxsky.settings.values import mistakes
 __all__ = ["load"]
 
 
-def _assigned(assignment: str) -> dict[str, Any]:
-    """The tables of `key=value`, where the value is TOML, or text as it is.
+def _assigned(assignment: str) -> tuple[list[str], Any]:
+    """The key and the value of `key=value`, where the value is TOML, or text as it is.
 
     Raises
     ------
@@ -24,31 +24,42 @@ def _assigned(assignment: str) -> dict[str, Any]:
         If it is none.
     """
     key, equals, value = assignment.partition("=")
-    for line in (assignment, f"{key} = {json.dumps(value.strip())}") if equals else ():
+    text = f"{key} = {json.dumps(value.strip(), ensure_ascii=False)}"
+    for line in (assignment, text) if equals else ():
         try:
-            return tomllib.loads(line)
+            found, place = tomllib.loads(line), tomllib.loads(f"{key} = 0")
         except (tomllib.TOMLDecodeError, RecursionError):
             continue
+        path: list[str] = []
+        while isinstance(place, dict) and len(found) == 1:
+            ((name, place),) = place.items()
+            path, found = [*path, name], found[name]
+            if place == 0:
+                return path, found
     raise SettingsError(
         f"--set {assignment}: must be KEY=VALUE, as in a settings file, with the table's name "
         f"before the key{'' if equals else '; there is no ='}."
     )
 
 
-def _merge(raw: Any, changes: Mapping[str, Any]) -> Any:
-    """Tables with changes in them; a number is the place in a list."""
+def _replaced(raw: Any, path: Sequence[str], value: Any) -> Any:
+    """Tables with one key replaced; a number is the place in a list.
+
+    Raises
+    ------
+    ValueError
+        If there is no such place.
+    """
+    if not path:
+        return value
+    key, *rest = path
     if isinstance(raw, list):
-        merged = list(raw)
-        for key, value in changes.items():
-            if not key.isdecimal() or int(key) >= len(raw):
-                raise ValueError(f"{key}: is not among the {len(raw)} entries, 0 to {len(raw) - 1}")
-            known = raw[int(key)]
-            merged[int(key)] = _merge(known, value) if isinstance(value, dict) else value
-        return merged
-    if not isinstance(raw, dict):
-        return changes
-    into = [k for k, v in changes.items() if isinstance(v, dict) and k in raw]
-    return {**raw, **changes, **{k: _merge(raw[k], changes[k]) for k in into}}
+        if not key.isdecimal() or int(key) >= len(raw):
+            there = f"the {len(raw)} entries, 0 to {len(raw) - 1}" if raw else "the entries of []"
+            raise ValueError(f"{key}: is not among {there}")
+        return [_replaced(one, rest, value) if i == int(key) else one for i, one in enumerate(raw)]
+    known = raw if isinstance(raw, dict) else {}
+    return {**known, key: _replaced(known.get(key), rest, value)}
 
 
 def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
@@ -58,7 +69,7 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
     ----------
     path : the file; relative paths in it are relative to its `data_dir`, and that to its folder
     assignments : `key=value` with a dotted key, such as "common.nside=32", "bands.0.fwhm=30" or
-        "free.'dust.beta_dust'.start=1.5"; they are merged into the file's tables
+        "free.'dust.beta_dust'.start=1.5", in place of what the file says; a table is replaced whole
 
     Returns
     -------
@@ -79,9 +90,9 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
         raise SettingsError(f"{path}: is nested too deeply.") from None
     options: dict[str, str] = {}
     for assignment in assignments:
-        changes = _assigned(assignment)
+        path_of_key, value = _assigned(assignment)
         try:
-            raw = _merge(raw, changes)
+            raw = _replaced(raw, path_of_key, value)
         except ValueError as error:
             raise SettingsError(f"{path}: --set {assignment}: {error}.") from None
         options[assignment.partition("=")[0].strip()] = " (given with --set)"

@@ -56,6 +56,14 @@ class SmallScalesTable(Table):
     modulation_fwhm: float = Field(180.0, gt=0)
     correlated_with: str | None = None
 
+    @model_validator(mode="after")
+    def _increase(self) -> "SmallScalesTable":
+        for key in ("EE", "BB"):
+            first, last = getattr(self, key)
+            if not first < last:
+                raise MistakeAt(key, f"must increase, but is {first}, {last}")
+        return self
+
 
 class ComponentTable(MapKeys):
     """A component: its law, parameters that are not default, and its map at `nu_ref` [GHz].
@@ -79,13 +87,18 @@ class ComponentTable(MapKeys):
             raise MistakeAt("noise.estimate_above", "is of bands")
         check_signs("parameters", self.parameters)
         if self.file is None:
-            if self.angles or self.fwhm:
-                raise ValueError("fwhm and angles are of a map, but file is missing")
+            if self.angles or self.fwhm or self.noise:
+                raise ValueError("fwhm, angles and noise are of a map, but file is missing")
             return self
         for key in ("law", "nu_ref"):
             if getattr(self, key) is None and not (key == "nu_ref" and key in self.parameters):
                 raise ValueError(f"{key} is missing")
         return self
+
+    @property
+    def polarized(self) -> bool:
+        """Whether its law, which is known, has any polarization."""
+        return component_class(str(self.law)).polarized
 
     def check(self, law: str) -> None:
         """Raise ValueError for keys that do not go with a law."""
@@ -134,7 +147,8 @@ class SkyTable(Table):
                     raise ValueError("law is missing")
                 one.check(one.law)
                 own = self.embedded is not None and one.file is None and EMBEDDED.get(name)
-                if own and (one.law != own or one.nu_ref is not None):
+                given = one.nu_ref is not None or "nu_ref" in one.parameters
+                if own and (one.law != own or given):
                     raise ValueError("law and nu_ref are those of the embedded map; give a file")
             except ValueError as error:
                 raise MistakeAt(name, error) from None
@@ -166,6 +180,8 @@ class CMBTable(Table):
     def _one_source(self) -> "CMBTable":
         if self.spectra is not None and (self.r or self.cosmology or self.A_lens != 1):
             raise ValueError("r, A_lens and cosmology are for CAMB; leave them out with spectra")
+        for name in {"r", "lmax"} & set(self.cosmology):
+            raise MistakeAt("cosmology", f"{name!r} is no parameter of the cosmology")
         if self.spectra is None and (self.format or self.unit):
             raise ValueError("format and unit are those of spectra, a file")
         return self

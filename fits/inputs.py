@@ -156,10 +156,7 @@ def _template_noise(
 def _simulated(
     settings: Experiment, setup: Setup, foregrounds: bool
 ) -> tuple[dict[str, Band], dict[str, Array] | None]:
-    """Bands as the first realisation of `jaxsky simulate` has them, and their foregrounds.
-
-    In double precision and Q, U; random numbers of others are different.
-    """
+    """Bands as the first realisation of `jaxsky simulate` has them, and their foregrounds."""
     observation, key = setup.observation, realisation_key(settings.seed)
     sky = prepare(setup.small_scales_key(key), setup.sources, observation)
     used = np.ones(healpy.nside2npix(observation.nside), bool)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxsky.harmonics import expand
+from jaxsky.keys import normal
 from jaxsky.noise import cholesky
 
 __all__ = ["realisation", "repair"]
@@ -86,5 +87,5 @@ def realisation(key: Array, spectra: Float[Array, "field field ell"]) -> Float[A
     """
     n, lmax = len(spectra), spectra.shape[-1] - 1
     lower = cholesky(spectra)
-    white = jax.random.normal(key, (n, (lmax + 1) ** 2), spectra.dtype)
+    white = normal(key, (n, (lmax + 1) ** 2), spectra.dtype)
     return jnp.stack([sum(expand(lower[i, j]) * white[j] for j in range(i + 1)) for i in range(n)])

@@ -1,13 +1,16 @@
 """Keys of random numbers: from the seed, the number of a realisation, a kind and a name."""
 
 import zlib
+from functools import partial
+from typing import Any
 
 import jax
-from jaxtyping import Array
+import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxsky.checks import check_seed
 
-__all__ = ["realisation_key", "stream"]
+__all__ = ["normal", "realisation_key", "stokes_noise", "stream"]
 
 
 def realisation_key(seed: int, index: int = 0) -> Array:
@@ -26,3 +29,14 @@ def realisation_key(seed: int, index: int = 0) -> Array:
 def stream(key: Array, kind: str, name: str = "") -> Array:
     """The key of one kind of random numbers: the same whatever else is drawn, and in any order."""
     return jax.random.fold_in(key, zlib.crc32(f"{kind} {name}".encode()))
+
+
+@partial(jax.jit, static_argnames=("shape", "dtype"))
+def normal(key: Array, shape: tuple[int, ...], dtype: Any) -> Float[Array, "..."]:
+    """Normal numbers, which are the same in any precision, but for rounding."""
+    return jax.random.normal(key, shape, jnp.result_type(float)).astype(dtype)
+
+
+def stokes_noise(key: Array, stokes: int, size: int, dtype: Any) -> Float[Array, "stokes size"]:
+    """White noise of I, or Q and U, or I, Q and U, of which Q and U are the same in both."""
+    return jnp.roll(normal(key, (stokes, size), dtype), int(stokes == 3), axis=0)

@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxsky.checks import as_array, check_finite, is_concrete
 from jaxsky.harmonics import alm_ell, analysis, children, expand
+from jaxsky.keys import stokes_noise
 from jaxsky.types import Numeric
 
 __all__ = [
@@ -65,15 +66,13 @@ def uniform_map(
     stokes : number of Stokes parameters, all with this noise
     """
     sigma = as_array("noise", noise) / float(healpy.nside2resol(nside, arcmin=True))
-    return sigma * jax.random.normal(key, (stokes, healpy.nside2npix(nside)), sigma.dtype)
+    return sigma * stokes_noise(key, stokes, healpy.nside2npix(nside), sigma.dtype)
 
 
 def uniform_alm(
     key: Array, noise: ArrayLike, lmax: int, stokes: int = 2
 ) -> Float[Array, "stokes alm"]:
     """Packed coefficients of white noise, N_l = noise^2 (in u rad) at all multipoles.
-
-    The harmonic counterpart of a draw from `uniform_covariance`, without pixels.
 
     Parameters
     ----------
@@ -97,7 +96,7 @@ def _uniform_alm(key, noise, lmax, stokes):
     spins = jnp.array({1: [0], 2: [2, 2], 3: [0, 2, 2]}[stokes])
     there = jnp.arange(lmax + 1) >= spins[:, None]
     levels = jnp.where(there, noise * (math.pi / 180 / 60), 0)
-    return jax.random.normal(key, (stokes, (lmax + 1) ** 2), noise.dtype) * expand(levels)
+    return stokes_noise(key, stokes, (lmax + 1) ** 2, noise.dtype) * expand(levels)
 
 
 def _diagonal(variance: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:
@@ -307,7 +306,8 @@ def draw(
     diagonal : independent draws with the diagonal of L as standard deviations, as in the paper
     """
     # Apart from the products: in one program XLA evaluates the normals anew in each of its rows.
-    white = jax.random.normal(key, covariance.shape[1:], covariance.dtype)
+    _, stokes, npix = covariance.shape
+    white = stokes_noise(key, stokes, npix, covariance.dtype)
     return _correlated(covariance, white, diagonal)
 
 

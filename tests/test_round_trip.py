@@ -62,9 +62,9 @@ def settings_in(folder, text=SETTINGS, **replaced):
     return folder / "x.toml"
 
 
-def written(path, out):
+def written(path, out, *values):
     """The maps of the first realisation that settings describe; their folder."""
-    settings = load(path)
+    settings = load(path, values)
     assert len(list(run(settings, build(settings), out, range(1)))) == len(settings.bands)
     return out / "sim_00000"
 
@@ -103,6 +103,17 @@ def test_simulated_maps_are_read_as_commands_simulate_them(folder):
     assert own.truth == read.truth
     assert own.truth["synchrotron.beta_syn"] == 3.05
     assert own.truth["r"] == 0.0
+
+
+@pytest.mark.parametrize("value", ["precision = 'single'", "stokes = 'IQU'", "unit = 'uK_CMB'"])
+def test_what_files_hold_does_not_change_the_sky(folder, value, tmp_path):
+    maps = written(folder / "x.toml", tmp_path, f"simulate.{value}")
+    own = inputs_of(load(folder / "x.toml")).bands
+    read = inputs_of(load(folder / "x.toml", [f'common.maps = "{maps}"'])).bands
+    for name, band in own.items():
+        # Single precision of maps, and of their transforms, is 1e-7 of the rms of the sky.
+        atol = 1e-5 * float(band.maps.std())
+        np.testing.assert_allclose(read[name].maps, band.maps, rtol=0, atol=atol)
 
 
 def near(value, truth, sigma):

@@ -124,6 +124,8 @@ def inputs_of(
     alone = None
     missing = [str(spec.name) for spec in settings.bands if str(spec.name) not in bands]
     if missing:
+        if "noise" not in settings.included():
+            raise SettingsError("simulate.include: leaves out the noise, which errors are made of.")
         setup = build(settings, missing, written=False, galaxy=galaxy)
         made, alone = _simulated(settings, setup, foregrounds and not bands)
         bands = {str(s.name): (bands | made)[str(s.name)] for s in settings.bands}

@@ -26,7 +26,7 @@ from jaxsky.preparation import Prepared, plan, prepare
 from jaxsky.settings.experiment import Experiment
 from jaxsky.simulate import observe_bands
 
-__all__ = ["LOG", "Written", "check_folder", "paths", "run"]
+__all__ = ["LOG", "Written", "changed_tables", "check_folder", "paths", "run"]
 
 LOG = "simulation.json"
 PACKAGES = ("jaxsky", "jax", "numpy", "healpy", "ducc0", "jaxbind", "camb")
@@ -100,6 +100,25 @@ def check_folder(
             f"{out}: holds maps of unknown settings, for {LOG} is missing; choose another --out, "
             "or start again with --overwrite."
         )
+
+
+def changed_tables(maps: Path, settings: Experiment) -> list[str]:
+    """Tables that say something else about a sky than those with which its maps were simulated.
+
+    Parameters
+    ----------
+    maps : folder of a realisation; without its log beside it nothing is known to be different
+    settings : of the experiment
+    """
+    try:
+        there = json.loads((maps.parent / LOG).read_text())["settings"]
+        was, now = there, _content(settings)
+        for key in ("stokes", "unit", "outputs", "precision"):  # of what is written only
+            was["simulate"].pop(key, None)
+            now["simulate"].pop(key, None)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return []
+    return [name for name in now if name != "seed" and was.get(name) != now[name]]
 
 
 def _maps(out: Path, indices: range | None = None) -> Iterator[Path]:

@@ -152,6 +152,16 @@ def test_commands_find_the_truth_in_simulated_maps(folder, command, monkeypatch)
         assert found["r"]["truth"] == 0.0
 
 
+def test_maps_of_other_settings_are_told(folder, monkeypatch, capsys):
+    maps = written(settings_in(folder), folder / "others")
+    arguments = ["fit", folder / "x.toml", "--maps", maps, "--overwrite", "--out", folder / "told"]
+    for value, words in [("seed=7", None), ("bands.0.fwhm=50", "bands"), ("cmb.r=0.1", "cmb")]:
+        assert jaxsky(monkeypatch, *arguments, "--set", value) == 0
+        said = " ".join(capsys.readouterr().err.split())
+        warned = f"were simulated with other settings in the tables {words};"
+        assert (warned in said) if words else ("other settings" not in said)
+
+
 def test_what_a_band_sees_does_not_depend_on_the_others(folder):
     settings = load(folder / "x.toml")
     alone = load(folder / "x.toml", ['bands.0.channels = ["140"]'])
@@ -292,6 +302,12 @@ def test_truth_about_what_is_not_simulated_is_left_out(tmp_path):
         assert not any(name.startswith("synchrotron") for name in setup.truth)
     with pytest.raises(SettingsError, match=r"truth: there is no component 'ame'"):
         build(load(path, ['truth."ame.m60" = 1.0']))
+
+
+def test_maps_without_noise_have_no_errors(folder):
+    settings = load(settings_in(folder), ["simulate.include=['dust', 'synchrotron']"])
+    with pytest.raises(SettingsError, match="simulate.include: leaves out the noise"):
+        inputs_of(settings)
 
 
 def test_only_is_of_what_is_included(tmp_path, monkeypatch, capsys):

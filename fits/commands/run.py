@@ -176,6 +176,7 @@ def run(
         mpl.use("Agg")  # pictures go to files
         command = Run(options, kind, folder, steps, part)
         report = work(settings, command)
+        report = report._replace(warnings=[*report.warnings, *_other_sky(settings)])
         if report.page:
             _show(out, settings.title, report, steps.seconds)
     if report.description:
@@ -238,6 +239,21 @@ def results_folder(
             if [path.name for path in out.glob("[!.]*")] == [LOG]:
                 (out / LOG).unlink()  # of nothing that would be in the folder
             raise
+
+
+def _other_sky(settings: Experiment) -> list[str]:
+    """A warning about maps that were simulated with other settings than these."""
+    if settings.common.maps is None:
+        return []
+    from jaxsky.montecarlo import changed_tables
+
+    maps = Path(settings.data_dir) / str(settings.common.maps)
+    if not (changed := changed_tables(maps, settings)):
+        return []
+    return [
+        f"The maps in {settings.common.maps} were simulated with other settings in the tables "
+        f"{', '.join(changed)}; bandpass, beam and noise are those of their files."
+    ]
 
 
 def _show(out: Path, title: str, report: Report, seconds: float) -> None:

@@ -306,7 +306,7 @@ def test_truth_about_what_is_not_simulated_is_left_out(tmp_path):
 
 def test_maps_without_noise_have_no_errors(folder):
     settings = load(settings_in(folder), ["simulate.include=['dust', 'synchrotron']"])
-    with pytest.raises(SettingsError, match="simulate.include: leaves out the noise"):
+    with pytest.raises(SettingsError, match=r"simulate.include: leaves out the noise"):
         inputs_of(settings)
 
 

@@ -110,12 +110,12 @@ class Fluctuations(eqx.Module):
         seen = self.cmb_factors[:, None] * self.cmb_windows
         return jnp.stack([synthesis(alm * expand(window), nside) for window in seen])
 
-    def cmb_power(self) -> Float[Array, "band 2 ell"]:
+    def cmb_power(self) -> Float[np.ndarray, "band 2 ell"]:
         """Mean spectra EE and BB of the CMB in the maps of each band [uK_RJ^2]."""
         if self.cmb_spectra is None or self.cmb_windows is None:
-            return jnp.zeros((len(self.preparations), 2, 1))
-        seen = self.cmb_factors[:, None] * self.cmb_windows
-        return seen[:, None] ** 2 * self.cmb_spectra
+            return np.zeros((len(self.preparations), 2, 1))
+        seen = np.asarray(self.cmb_factors)[:, None] * np.asarray(self.cmb_windows)
+        return seen[:, None] ** 2 * np.asarray(self.cmb_spectra)
 
     def sigma(self) -> Float[Array, "band stokes pix"]:
         """Standard deviation of the noise in each pixel of the prepared maps [uK_RJ].

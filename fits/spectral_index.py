@@ -141,7 +141,7 @@ def _expected(
     prepared: Prepared, used: Bool[np.ndarray, " pix"], stokes: str, left_out: Sequence[str]
 ) -> float:
     """Mean square of noise and CMB in a pixel over that of the noise, which chi^2 counts alone."""
-    power = np.asarray(prepared.fluctuations.cmb_power()).sum(axis=1)
+    power = prepared.fluctuations.cmb_power().sum(axis=1)
     ell = np.arange(power.shape[-1])
     # Q and U have half of E and B each.
     variance = power @ (2 * ell + 1) / (8 * np.pi)

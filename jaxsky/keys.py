@@ -37,6 +37,8 @@ def normal(key: Array, shape: tuple[int, ...], dtype: Any) -> Float[Array, "..."
     return jax.random.normal(key, shape, jnp.result_type(float)).astype(dtype)
 
 
+@partial(jax.jit, static_argnames=("stokes", "size", "dtype"))
 def stokes_noise(key: Array, stokes: int, size: int, dtype: Any) -> Float[Array, "stokes size"]:
     """White noise of I, or Q and U, or I, Q and U, of which Q and U are the same in both."""
-    return jnp.roll(normal(key, (stokes, size), dtype), int(stokes == 3), axis=0)
+    white = normal(key, (stokes, size), dtype)
+    return jnp.roll(white, 1, axis=0) if stokes == 3 else white

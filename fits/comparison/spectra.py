@@ -159,7 +159,7 @@ def compare_spectra(
     foregrounds = np.asarray(full_sky_spectra(model, lmax))
     noise = simulated.noise.mean(axis=0)
     cmb = np.zeros_like(noise)
-    theory = np.asarray(prepared.fluctuations.cmb_power())[..., : lmax + 1]
+    theory = prepared.fluctuations.cmb_power()[..., : lmax + 1]
     cmb[..., : theory.shape[-1]] = theory
     error = np.asarray(cosmic_error(jnp.asarray(cmb + noise)))
     results = []

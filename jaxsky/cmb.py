@@ -1,7 +1,5 @@
 """The CMB: power spectra from CAMB, and realisations of them."""
 
-import contextlib
-import hashlib
 from functools import cache, partial
 from importlib.metadata import version
 from typing import Any
@@ -127,28 +125,20 @@ def _tensors(end, **cosmology):
 
 def _spectra(which: str, end: int, **arguments: Any) -> Float[np.ndarray, "4 ell"]:
     """What CAMB computes up to l = end for arguments of `camb.set_params`, once and for all."""
-    from jaxsky.io.files import whole  # the border is slow to import, as CAMB is
-    from jaxsky.io.folders import cache_folder
+    from jaxsky.io.folders import kept  # the border is slow to import, as CAMB is
 
-    mark = repr((version("camb"), which, end, sorted(arguments.items())))
-    path = cache_folder() / "spectra" / f"{hashlib.sha256(mark.encode()).hexdigest()}.npy"
-    with contextlib.suppress(OSError, ValueError, EOFError):
-        found = np.load(path)
-        if found.shape == (4, end + 1):
-            return found
-    import camb
+    def computed() -> np.ndarray:
+        import camb
 
-    try:
-        results = camb.get_results(camb.set_params(**arguments))
-    except (camb.CAMBError, camb.CAMBFortranError, TypeError, ValueError) as error:
-        said = " ".join(str(error).split())
-        raise ValueError(f"CAMB does not take the cosmology: {said}") from None
-    spectra = np.asarray(getattr(results, which)(end, CMB_unit="muK", raw_cl=True).T)
-    with contextlib.suppress(OSError):  # it can be had again
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with whole(path) as beside, beside.open("wb") as file:
-            np.save(file, spectra)
-    return spectra
+        try:
+            results = camb.get_results(camb.set_params(**arguments))
+        except (camb.CAMBError, camb.CAMBFortranError, TypeError, ValueError) as error:
+            said = " ".join(str(error).split())
+            raise ValueError(f"CAMB does not take the cosmology: {said}") from None
+        return np.asarray(getattr(results, which)(end, CMB_unit="muK", raw_cl=True).T)
+
+    mark = (version("camb"), which, end, sorted(arguments.items()))
+    return kept("spectra", mark, (4, end + 1), computed)
 
 
 def realisation(

@@ -115,7 +115,6 @@ class EmbeddedSky(eqx.Module):
     dust, synchrotron : I, Q, U at their reference frequencies [uK_RJ], shape (3, pix)
     nu_dust, nu_synchrotron : reference frequencies [GHz]
     seed : of the turbulence
-    description : what the maps are, for headers and captions
     """
 
     dust: Float[Array, "3 pix"]
@@ -123,7 +122,15 @@ class EmbeddedSky(eqx.Module):
     nu_dust: float = eqx.field(static=True)
     nu_synchrotron: float = eqx.field(static=True)
     seed: int = eqx.field(static=True)
-    description: str = eqx.field(static=True)
+
+    @property
+    def description(self) -> str:
+        """What the maps are, for headers and captions."""
+        return (
+            "Model of the Galaxy (not data): line-of-sight integral through the spiral magnetic "
+            f"field of Page et al. (2007) with Gaussian turbulence, seed {self.seed}, scaled to "
+            "the polarized rms of the real sky."
+        )
 
     @property
     def nside(self) -> int:
@@ -353,9 +360,9 @@ def embedded_sky(
 ) -> EmbeddedSky:
     """A model of the polarized Galaxy: dust at 353 GHz and synchrotron at 30 GHz; not data.
 
-    Each component of `line_of_sight` times one number, by which the standard deviations of Q and
-    U at nside 64 add in quadrature to those of the real sky: (14.7, 6.8) uK_RJ for the dust and
-    (17.2, 9.1) for the synchrotron. That number is the same at all resolutions.
+    Each component of `line_of_sight` times a number, the same at all resolutions, by which the
+    standard deviations of Q and U at nside 64 add in quadrature to those of the real sky, uK_RJ:
+    (14.7, 6.8) for the dust, (17.2, 9.1) for the synchrotron.
 
     Parameters
     ----------
@@ -386,15 +393,10 @@ def embedded_sky(
     factors = jnp.array([DUST_RMS, SYNCHROTRON_RMS]) / spread
     if nside > NSIDE_SCALE:
         maps = line_of_sight(model, nside, seed, steps=steps)
-    elif nside == NSIDE_SCALE:
-        maps = calibrator
-    else:
+    elif nside < NSIDE_SCALE:
         cut = jnp.ones(3 * nside, calibrator.dtype)
         maps = jnp.stack([resample(component, cut, nside) for component in calibrator])
+    else:
+        maps = calibrator
     dust, synchrotron = factors[:, None, None] * maps
-    description = (
-        "Model of the Galaxy (not data): line-of-sight integral through the spiral magnetic field "
-        f"of Page et al. (2007) with Gaussian turbulence, seed {seed}, scaled to the polarized "
-        "rms of the real sky."
-    )
-    return EmbeddedSky(dust, synchrotron, NU_DUST, NU_SYNCHROTRON, seed, description)
+    return EmbeddedSky(dust, synchrotron, NU_DUST, NU_SYNCHROTRON, seed)

@@ -1,6 +1,8 @@
 """What settings name, read: maps, templates with their laws, bandpasses, noise."""
 
+import hashlib
 from collections.abc import Collection, Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,10 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from jaxsky import galaxy as model_galaxy
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import AME, Component, component_class
-from jaxsky.galaxy import EmbeddedSky, GalaxyModel, embedded_sky
+from jaxsky.galaxy import NU_DUST, NU_SYNCHROTRON, EmbeddedSky, GalaxyModel, embedded_sky
 from jaxsky.io import Maps, degrade_mask, read_bandpass, read_maps, unit_factor
+from jaxsky.io.folders import kept
 from jaxsky.lookup import find_file
 from jaxsky.parameter_maps import parameter_map
 from jaxsky.parameters import set_parameters
@@ -25,6 +29,7 @@ from jaxsky.sky import Sky
 __all__ = [
     "Template",
     "check_stokes",
+    "default_galaxy",
     "embedded_galaxy",
     "mask_at",
     "narrow",
@@ -38,6 +43,8 @@ __all__ = [
 
 #: Maps with at least so many pixels are kept in single precision, which is that of their files.
 LARGE = 12 * 512**2
+#: The embedded model is kept in the cache up to here: 38 MB of maps.
+KEPT_NSIDE = 256
 
 
 class Template(NamedTuple):
@@ -169,7 +176,23 @@ def embedded_galaxy(settings: Experiment) -> EmbeddedSky:
             raise SettingsError(f"sky.embedded.model: {name!r} is none of {', '.join(known)}.")
     numbers: dict[str, Any] = embedded.model
     with at_key("sky.embedded.model"):
-        return embedded_sky(embedded.nside, embedded.seed, GalaxyModel(**numbers))
+        model = GalaxyModel(**numbers)
+    if embedded.model or embedded.seed or embedded.nside > KEPT_NSIDE:
+        return embedded_sky(embedded.nside, embedded.seed, model)
+    return default_galaxy(embedded.nside)
+
+
+def default_galaxy(nside: int) -> EmbeddedSky:
+    """The embedded model with its default numbers, which is made once and kept in the cache."""
+
+    def computed() -> np.ndarray:
+        made = embedded_sky(nside)
+        return np.stack([made.dust, made.synchrotron])
+
+    source = hashlib.sha256(Path(model_galaxy.__file__).read_bytes()).hexdigest()
+    mark = (version("jaxsky"), version("jax"), source, nside, str(jnp.result_type(float)))
+    dust, synchrotron = kept("galaxy", mark, (2, 3, healpy.nside2npix(nside)), computed)
+    return EmbeddedSky(jnp.asarray(dust), jnp.asarray(synchrotron), NU_DUST, NU_SYNCHROTRON, 0)
 
 
 def _embedded(folder: Path, name: str, spec: ComponentTable, component: Component) -> Template:

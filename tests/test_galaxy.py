@@ -22,6 +22,7 @@ from jaxsky.galaxy import (
     magnetic_field,
 )
 from jaxsky.harmonics import alm_ell, analysis
+from jaxsky.inputs import default_galaxy
 
 NAMES = [field.name for field in dataclasses.fields(GalaxyModel)]
 
@@ -283,3 +284,19 @@ def test_resembles_the_real_sky(data_dir, galaxy, name, file, least_Q, least_U):
     # U of the dust is decided by a few bright pixels of the plane, where the turbulence is.
     assert correlate(2, abs(lat) > 20) > least_U
     assert correlate(1, abs(lat) > 20) > 0.3
+
+
+def test_the_default_model_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAXSKY_CACHE", str(tmp_path))
+    made, expected = default_galaxy(16), embedded_sky(16)
+    assert made.description == expected.description
+    (kept,) = (tmp_path / "galaxy").iterdir()
+    monkeypatch.setattr("jaxsky.inputs.embedded_sky", None)  # is not called again
+    for galaxy in (made, default_galaxy(16)):
+        np.testing.assert_array_equal(galaxy.dust, expected.dust)
+        np.testing.assert_array_equal(galaxy.synchrotron, expected.synchrotron)
+    monkeypatch.undo()
+    monkeypatch.setenv("JAXSKY_CACHE", str(tmp_path))
+    kept.write_bytes(kept.read_bytes()[:500])  # damaged
+    np.testing.assert_array_equal(default_galaxy(16).dust, expected.dust)
+    assert kept.stat().st_size > 500

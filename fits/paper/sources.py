@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 from fits.paper.indices import Index, drawn_index, held_index, read_index
 from fits.paper.item import Impossible
 from jaxsky import AME, Dust, Synchrotron
-from jaxsky.galaxy import EmbeddedSky, embedded_sky
-from jaxsky.inputs import Template, embedded_galaxy, read, read_sky, uK_RJ_per
+from jaxsky.galaxy import EmbeddedSky
+from jaxsky.inputs import Template, default_galaxy, embedded_galaxy, read, read_sky, uK_RJ_per
 from jaxsky.keys import realisation_key, stream
 from jaxsky.settings import SettingsError
 from jaxsky.settings.experiment import Experiment, IndexFile
@@ -151,7 +151,7 @@ class Sources:
         """The embedded model; where templates come from files, at low resolution."""
         if self.settings.sky.embedded is not None:
             return self.once("galaxy", lambda: embedded_galaxy(self.settings))
-        return self.once("galaxy", lambda: embedded_sky(NSIDE))
+        return self.once("galaxy", lambda: default_galaxy(NSIDE))
 
     def _spec(self, law: str) -> tuple[str, ComponentTable]:
         found = [(n, spec) for n, spec in self.settings.sky.components.items() if spec.law == law]

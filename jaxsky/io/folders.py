@@ -1,22 +1,24 @@
 """Folders of results: one process works in one, or several, each on a part of its own."""
 
 import errno
+import hashlib
 import os
 import socket
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
 import filelock
+import numpy as np
 import platformdirs
 
-from jaxsky.io.files import PARTIAL, guards
+from jaxsky.io.files import PARTIAL, guards, whole
 
-__all__ = ["ALL", "Folder", "alone", "cache_folder", "occupied"]
+__all__ = ["ALL", "Folder", "alone", "cache_folder", "kept", "occupied"]
 
 #: Locked for moments only, while it is seen who works in a folder.
 GATE = ".lock"
@@ -32,6 +34,32 @@ def cache_folder() -> Path:
     """What can be had again is kept here: $JAXSKY_CACHE, or the platform's folder for caches."""
     given = os.environ.get("JAXSKY_CACHE")
     return Path(given or platformdirs.user_cache_path("jaxsky")).expanduser().absolute()
+
+
+def kept(
+    kind: str, mark: object, shape: tuple[int, ...], make: Callable[[], np.ndarray]
+) -> np.ndarray:
+    """An array that takes long to make, from the cache folder if it was made before.
+
+    Parameters
+    ----------
+    kind : of the array, a folder in the cache
+    mark : all that it depends on
+    shape : that it has
+    make : called if it is not there, or is damaged
+    """
+    name = hashlib.sha256(repr(mark).encode()).hexdigest()
+    path = cache_folder() / kind / f"{name}.npy"
+    with suppress(OSError, ValueError, EOFError):
+        found = np.load(path)
+        if found.shape == shape:
+            return found
+    made = make()
+    with suppress(OSError):  # it can be had again
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole(path) as beside, beside.open("wb") as file:
+            np.save(file, made)
+    return made
 
 
 class Owner(NamedTuple):

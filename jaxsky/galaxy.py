@@ -128,8 +128,8 @@ class EmbeddedSky(eqx.Module):
         """What the maps are, for headers and captions."""
         return (
             "Model of the Galaxy (not data): line-of-sight integral through the spiral magnetic "
-            f"field of Page et al. (2007) with Gaussian turbulence, seed {self.seed}, scaled to "
-            "the polarized rms of the real sky."
+            "field of Page et al. (2007) with Gaussian turbulence, "
+            f"seed {self.seed}, scaled to the polarized rms of the real sky."
         )
 
     @property
@@ -355,6 +355,13 @@ def line_of_sight(
     return _integrate(model, jax.random.key(seed), _geometry(nside), steps)
 
 
+@jax.jit
+def _scaled(maps, calibrator):
+    """Maps of both components times a number each, by which the calibrator is as the real sky."""
+    spread = jnp.sqrt(jnp.var(calibrator[:, 1:], axis=-1).sum(axis=-1))
+    return (jnp.array([DUST_RMS, SYNCHROTRON_RMS]) / spread)[:, None, None] * maps
+
+
 def embedded_sky(
     nside: int, seed: int = 0, model: GalaxyModel | None = None, *, steps: int = STEPS
 ) -> EmbeddedSky:
@@ -380,23 +387,17 @@ def embedded_sky(
 
     Examples
     --------
-    >>> galaxy = embedded_sky(16, seed=1)
-    >>> galaxy.description[:32]
-    'Model of the Galaxy (not data): '
-    >>> galaxy.sky().shape
+    >>> embedded_sky(16, seed=1).sky().shape
     (2, 3072)
     """
     _check(nside, seed, steps)
     model = GalaxyModel() if model is None else model
     calibrator = line_of_sight(model, NSIDE_SCALE, seed, steps=steps)
-    spread = jnp.sqrt(jnp.var(calibrator[:, 1:], axis=-1).sum(axis=-1))
-    factors = jnp.array([DUST_RMS, SYNCHROTRON_RMS]) / spread
+    maps = calibrator
     if nside > NSIDE_SCALE:
         maps = line_of_sight(model, nside, seed, steps=steps)
     elif nside < NSIDE_SCALE:
         cut = jnp.ones(3 * nside, calibrator.dtype)
         maps = jnp.stack([resample(component, cut, nside) for component in calibrator])
-    else:
-        maps = calibrator
-    dust, synchrotron = factors[:, None, None] * maps
+    dust, synchrotron = _scaled(maps, calibrator)
     return EmbeddedSky(dust, synchrotron, NU_DUST, NU_SYNCHROTRON, seed)

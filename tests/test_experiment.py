@@ -16,6 +16,7 @@ from commands import jaxsky, one_sentence
 from fits.commands.run import DEFAULTS
 from jaxsky import experiment, inputs, montecarlo
 from jaxsky.experiment import build
+from jaxsky.galaxy import GalaxyModel
 from jaxsky.harmonics import alm_ell, expand, gaussian_beam, synthesis
 from jaxsky.io import read_maps, write_maps
 from jaxsky.io.folders import occupied
@@ -527,6 +528,7 @@ def test_keys_of_instruments_and_of_the_embedded_sky(folder, monkeypatch):
         return galaxy
 
     monkeypatch.setattr(inputs, "embedded_sky", recorded)
+    monkeypatch.setattr(inputs, "default_galaxy", lambda nside: recorded(nside, 0, GalaxyModel()))
     monkeypatch.setattr(experiment, "camb_spectra", lambda lmax, r: np.zeros((4, lmax + 1)))
 
     def made(*changes):

@@ -33,8 +33,8 @@ from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum, uniform_cov
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import Observation, ObservedBand
 from jaxsky.preparation import prepare
-from jaxsky.settings import SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import SettingsError
 from jaxsky.settings.keys import at_key
 from jaxsky.settings.tables import BandTable
 from jaxsky.simulate import observe_bands
@@ -214,11 +214,8 @@ def _from_file(settings: Experiment, spec: BandTable) -> tuple[Band, Mapping[str
     folder, where = Path(settings.data_dir), f"bands.{spec.name}"
     if spec.file is not None:
         observed = read_observed(find_file(folder, spec.files[0]))
-        if observed is not None and spec.fwhm not in (None, observed.beam):
-            raise SettingsError(
-                f"{where}.fwhm: {spec.fwhm:g} arcmin, but the map {spec.label} says that its beam "
-                f"is {'a table' if np.ndim(observed.beam) else f'{observed.beam:g} arcmin'}."
-            )
+        if observed is not None:
+            _check_beam(folder, spec, observed, where)
         return read_band(folder, spec, observed), None if observed is None else observed.truth
     name = f"{settings.common.maps}/{spec.name}.fits"
     try:
@@ -230,6 +227,26 @@ def _from_file(settings: Experiment, spec: BandTable) -> tuple[Band, Mapping[str
     # What the file says is true of its map: it may have another beam than the band.
     plain = BandTable(name=spec.name, file=name, fields=["Q", "U"])
     return read_band(folder, plain, observed), observed.truth
+
+
+def _check_beam(folder: Path, spec: BandTable, observed: Observed, where: str) -> None:
+    """Refuse a beam that is not that of the simulated map."""
+    own = np.asarray(observed.beam)
+    if spec.beam is not None:
+        said, same = f"beam: {spec.beam}", False
+        if own.ndim:
+            with at_key(f"{where}.beam"):
+                given = read_beam(find_file(folder, spec.beam), own.size - 1)
+            same = np.allclose(given, own, rtol=0, atol=1e-6)
+    elif spec.fwhm is not None:
+        said, same = f"fwhm: {spec.fwhm:g} arcmin", not own.ndim and spec.fwhm == float(own)
+    else:
+        return
+    if not same:
+        raise SettingsError(
+            f"{where}.{said}, but the map {spec.label} says that its beam is "
+            f"{'another table' if own.ndim else f'{own:g} arcmin'}."
+        )
 
 
 def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -> Band:

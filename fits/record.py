@@ -14,8 +14,8 @@ import numpy as np
 
 from jaxsky.io import write_text
 from jaxsky.lookup import found_files
-from jaxsky.settings import SettingsFile
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import SettingsFile
 from jaxsky.settings.planck_names import leak
 
 __all__ = ["fingerprint", "leaks", "probability", "with_error", "write_json", "write_log"]

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from jaxsky.inputs import mask_at
 from jaxsky.io import degrade_mask, read_mask
 from jaxsky.lookup import find_file
-from jaxsky.settings import MaskFile
 from jaxsky.settings.experiment import Experiment, parse_region
+from jaxsky.settings.files import MaskFile
 
 __all__ = ["apodize", "region_mask", "region_masks", "region_words"]
 

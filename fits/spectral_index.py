@@ -24,8 +24,8 @@ from fits.sample import sample
 from fits.template_noise import Attenuation, attenuation
 from jaxsky import observe_components, parameter_names, set_parameters
 from jaxsky.progress import QUIET, Progress
-from jaxsky.settings import SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import SettingsError
 from jaxsky.settings.keys import at_key
 
 __all__ = ["Fit", "all_free", "run"]

@@ -20,8 +20,8 @@ from jaxsky.lookup import find_file
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import DTYPES, Observation, ObservedBand, Source
 from jaxsky.parameters import get_parameters, parameter_names
-from jaxsky.settings import SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import SettingsError
 from jaxsky.settings.keys import at_key
 from jaxsky.settings.tables import BandTable
 from jaxsky.sky import Sky, observe_band

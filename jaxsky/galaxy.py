@@ -30,8 +30,6 @@ from jaxsky.trigonometry import sine_and_cosine
 
 __all__ = ["EmbeddedSky", "GalaxyModel", "embedded_sky", "line_of_sight", "magnetic_field"]
 
-#: Reference frequencies of the maps [GHz].
-NU_DUST, NU_SYNCHROTRON = 353.0, 30.0
 #: Standard deviations of Q and U over the real sky at nside 64 [uK_RJ], added in quadrature.
 DUST_RMS, SYNCHROTRON_RMS = np.hypot(14.7, 6.8), np.hypot(17.2, 9.1)
 #: Resolution at which the maps are scaled and up to which the turbulence is normalised.
@@ -113,15 +111,14 @@ class EmbeddedSky(eqx.Module):
     Parameters
     ----------
     dust, synchrotron : I, Q, U at their reference frequencies [uK_RJ], shape (3, pix)
-    nu_dust, nu_synchrotron : reference frequencies [GHz]
     seed : of the turbulence
     """
 
     dust: Float[Array, "3 pix"]
     synchrotron: Float[Array, "3 pix"]
-    nu_dust: float = eqx.field(static=True)
-    nu_synchrotron: float = eqx.field(static=True)
     seed: int = eqx.field(static=True)
+
+    nu_dust, nu_synchrotron = 353.0, 30.0  #: reference frequencies [GHz]
 
     @property
     def description(self) -> str:
@@ -400,4 +397,4 @@ def embedded_sky(
         cut = jnp.ones(3 * nside, calibrator.dtype)
         maps = jnp.stack([resample(component, cut, nside) for component in calibrator])
     dust, synchrotron = _scaled(maps, calibrator)
-    return EmbeddedSky(dust, synchrotron, NU_DUST, NU_SYNCHROTRON, seed)
+    return EmbeddedSky(dust, synchrotron, seed)

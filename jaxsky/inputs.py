@@ -14,14 +14,14 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from jaxsky import galaxy as model_galaxy
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import AME, Component, component_class
-from jaxsky.galaxy import NU_DUST, NU_SYNCHROTRON, EmbeddedSky, GalaxyModel, embedded_sky
+from jaxsky.galaxy import EmbeddedSky, GalaxyModel, embedded_sky
 from jaxsky.io import Maps, degrade_mask, read_bandpass, read_maps, unit_factor
 from jaxsky.io.folders import kept
 from jaxsky.lookup import find_file
 from jaxsky.parameter_maps import parameter_map
 from jaxsky.parameters import set_parameters
-from jaxsky.settings import BandpassSpec, MapFile, MapKeys, SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import BandpassSpec, MapFile, MapKeys, SettingsError
 from jaxsky.settings.keys import at_key
 from jaxsky.settings.tables import ComponentTable
 from jaxsky.sky import Sky
@@ -192,7 +192,7 @@ def default_galaxy(nside: int) -> EmbeddedSky:
     source = hashlib.sha256(Path(model_galaxy.__file__).read_bytes()).hexdigest()
     mark = (version("jaxsky"), version("jax"), source, nside, str(jnp.result_type(float)))
     dust, synchrotron = kept("galaxy", mark, (2, 3, healpy.nside2npix(nside)), computed)
-    return EmbeddedSky(jnp.asarray(dust), jnp.asarray(synchrotron), NU_DUST, NU_SYNCHROTRON, 0)
+    return EmbeddedSky(jnp.asarray(dust), jnp.asarray(synchrotron), 0)
 
 
 def _embedded(folder: Path, name: str, spec: ComponentTable, component: Component) -> Template:

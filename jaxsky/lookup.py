@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from jaxsky.io import InputError, MissingFileError, check_file
 from jaxsky.io.folders import cache_folder
-from jaxsky.settings import NamedFile, SettingsFile, expand
+from jaxsky.settings.files import NamedFile, SettingsFile, expand
 
 __all__ = ["find_file", "found_files", "named_files"]
 

@@ -18,7 +18,7 @@ from jaxsky.noise import (
     uniform_covariance,
     weights_covariance,
 )
-from jaxsky.settings import Hits, MapFile, MapKeys, NoiseColumns, NoiseTable, SettingsError
+from jaxsky.settings.files import Hits, MapFile, MapKeys, NoiseColumns, NoiseTable, SettingsError
 from jaxsky.settings.keys import at_key
 
 __all__ = ["read_noise"]

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float
 from jaxsky.components import parameter_declaration
 from jaxsky.io import Maps, unit_factor
 from jaxsky.io.missing import sentinels
-from jaxsky.settings import SettingsError
+from jaxsky.settings.files import SettingsError
 from jaxsky.settings.values import check_sign
 
 __all__ = ["one_column", "parameter_map", "parameter_unit"]

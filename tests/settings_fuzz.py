@@ -16,8 +16,8 @@ from fits.regions import region_masks
 from fits.resolution import prepare
 from jaxsky import experiment
 from jaxsky.io import InputError
-from jaxsky.settings import SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import SettingsError
 from jaxsky.settings.keys import at_key, of_file
 from jaxsky.settings.load import load
 

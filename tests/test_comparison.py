@@ -20,8 +20,8 @@ from fits.inputs import inputs_of
 from fits.regions import region_masks
 from fits.resolution import prepare
 from jaxsky.io import InputError
-from jaxsky.settings import SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import SettingsError
 from jaxsky.settings.load import load
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "wmap7_vw.toml"

@@ -15,8 +15,8 @@ from jaxsky.inputs import (
 )
 from jaxsky.io import InputError
 from jaxsky.noise_inputs import read_noise
-from jaxsky.settings import BandpassSpec, MapFile, NoiseTable, SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import BandpassSpec, MapFile, NoiseTable, SettingsError
 from jaxsky.settings.load import load
 
 NSIDE = 4

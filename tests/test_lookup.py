@@ -16,8 +16,8 @@ from jaxsky.archive import cache_folder
 from jaxsky.experiment import build as build_experiment
 from jaxsky.io import InputError, write_maps
 from jaxsky.lookup import find_file, found_files
-from jaxsky.settings import MapFile, SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import MapFile, SettingsError
 from jaxsky.settings.load import load
 
 KNOWN = "LFI_RIMO_R3.31.fits"

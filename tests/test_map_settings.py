@@ -13,8 +13,8 @@ from fits.regions import region_masks
 from fits.separate.setup import build
 from jaxsky.inputs import read, read_sky
 from jaxsky.io import InputError
-from jaxsky.settings import MapFile, SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import MapFile, SettingsError
 from jaxsky.settings.load import load
 from jaxsky.settings.tables import BandTable
 

@@ -16,7 +16,7 @@ from jaxsky.experiment import build, cmb_spectra
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.io import write_maps
 from jaxsky.montecarlo import run
-from jaxsky.settings import SettingsError
+from jaxsky.settings.files import SettingsError
 from jaxsky.settings.load import load
 
 NSIDE, NPIX = 16, 12 * 16**2
@@ -226,6 +226,15 @@ def test_a_band_may_be_a_simulated_file(files, tmp_path):
     assert inputs.truth["dust.beta_dust"] == 1.53
     with pytest.raises(SettingsError, match=r"bands.x.fwhm: 60 arcmin, but .*330 arcmin"):
         inputs_of(load(settings_in(tmp_path, text), ["bands.0.fwhm = 60.0"]))
+    with pytest.raises(SettingsError, match=r"bands.x.beam: beam.txt, but .*330 arcmin"):
+        inputs_of(load(settings_in(tmp_path, text), ["bands.0.beam = 'beam.txt'"]))
+    table = settings_in(tmp_path, text.replace("own.fits", "70.fits"))
+    np.testing.assert_array_equal(
+        inputs_of(load(table, ["bands.0.beam = 'beam.txt'"])).bands["x"].beam,
+        inputs_of(load(table)).bands["x"].beam,
+    )
+    with pytest.raises(SettingsError, match=r"bands.x.fwhm: 60 arcmin, but .*another table"):
+        inputs_of(load(table, ["bands.0.fwhm = 60.0"]))
 
 
 def test_smoothed_noise_of_pixels_is_not_guessed(files, tmp_path):

@@ -23,8 +23,8 @@ from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis
 from jaxsky.io import InputError
 from jaxsky.progress import Progress
-from jaxsky.settings import SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import SettingsError
 from jaxsky.settings.load import load
 
 NSIDE, FWHM = 16, 360.0

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxsky.settings import SettingsError
+from jaxsky.settings.files import SettingsError
 from jaxsky.settings.load import load
 
 #: The least that a file has to say of a band and of a component.

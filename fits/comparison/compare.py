@@ -15,8 +15,8 @@ from fits.pseudo_cl import bin_edges
 from fits.record import fingerprint
 from fits.resolution import Prepared
 from jaxsky.progress import QUIET
-from jaxsky.settings import SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import SettingsError
 
 __all__ = ["Comparison", "check_comparison", "compare"]
 

@@ -14,8 +14,8 @@ from jaxsky.harmonics import gaussian_beam
 from jaxsky.inputs import Template, read_sky
 from jaxsky.io import degrade_mask
 from jaxsky.observation import ObservedBand
-from jaxsky.settings import SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import SettingsError
 
 __all__ = ["Setup", "build"]
 

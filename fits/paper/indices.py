@@ -16,8 +16,8 @@ from jaxsky.io import InputError
 from jaxsky.lookup import find_file
 from jaxsky.parameter_maps import parameter_map
 from jaxsky.presets import from_pysm_beta
-from jaxsky.settings import SettingsError
 from jaxsky.settings.experiment import IndexFile
+from jaxsky.settings.files import SettingsError
 from jaxsky.templates import dust_index, steepening
 
 __all__ = ["STEEPENING", "SYMBOLS", "Index", "drawn_index", "held_index", "read_index"]

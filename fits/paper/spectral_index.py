@@ -10,8 +10,8 @@ from fits.regions import region_masks, region_words
 from fits.report import known_truth, with_errors
 from fits.resolution import prepare
 from fits.spectral_index import run
-from jaxsky.settings import SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import SettingsError
 
 __all__ = ["figure_probability"]
 

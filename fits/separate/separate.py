@@ -28,8 +28,8 @@ from jaxsky.cmb import tensor_spectra
 from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.progress import QUIET, Progress
-from jaxsky.settings import SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import SettingsError
 from jaxsky.settings.keys import at_key
 
 __all__ = ["SAMPLED", "Separation", "separate"]

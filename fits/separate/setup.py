@@ -22,8 +22,8 @@ from jaxsky import Component, Sky, set_parameters
 from jaxsky.components import component_class
 from jaxsky.inputs import read, read_parameter
 from jaxsky.parameter_maps import one_column
-from jaxsky.settings import MapFile, SettingsError
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import MapFile, SettingsError
 from jaxsky.settings.keys import at_key
 from jaxsky.settings.tables import Regions
 

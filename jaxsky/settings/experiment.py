@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
 from jaxsky.instrument import band_tables
-from jaxsky.settings import FileName, MapFile, MaskFile, SettingsError, SettingsFile, Table
+from jaxsky.settings.files import FileName, MapFile, MaskFile, SettingsError, SettingsFile, Table
 from jaxsky.settings.tables import (
     BandTable,
     CMBTable,

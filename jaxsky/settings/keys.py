@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from jaxsky.io import InputError
-from jaxsky.settings import SettingsError
+from jaxsky.settings.files import SettingsError
 
 __all__ = ["at_key", "of_file"]
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from jaxsky.settings import SettingsError, expand
 from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import SettingsError, expand
 from jaxsky.settings.values import mistakes
 
 __all__ = ["load"]

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from jaxsky.components import AME, component_class
-from jaxsky.settings import BandpassSpec, FileName, MapFile, MapKeys, NoiseTable, Table
+from jaxsky.settings.files import BandpassSpec, FileName, MapFile, MapKeys, NoiseTable, Table
 from jaxsky.settings.planck_names import check_release
 from jaxsky.settings.types import (
     BandName,

@@ -12,8 +12,6 @@ from benchmarks.timing import interleave, page_faults, seconds
 from jaxsky import Bandpass, Dust, Sky, observe
 from jaxsky.sky import interpolation_nodes
 
-__all__ = ["beta_and_T_maps", "beta_map", "compilation", "growth", "samples"]
-
 NU_REF, T_DUST = 353.0, 20.0
 #: Ranges of the maps of PySM's model d1; how values are spread in between does not matter.
 BETA_RANGE, T_RANGE = (1.25, 1.80), (14.0, 31.0)

@@ -12,8 +12,6 @@ from benchmarks.table import Row, time_text
 from benchmarks.timing import usage
 from fits.commands.run import DEFAULTS
 
-__all__ = ["fit", "planck"]
-
 #: The sample sky, and next to it what makes files in the structure of Planck's.
 DATA = Path(os.environ.get("JAXSKY_DATA", Path(__file__).parents[2] / "shared" / "data"))
 MAKER = DATA.parent / "official" / "make_files.py"

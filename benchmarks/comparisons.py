@@ -18,8 +18,6 @@ from fits.pseudo_cl import coupling_matrices, pure_coupling_matrices
 from jaxsky.galaxy import embedded_sky
 from jaxsky.harmonics import gaussian_beam, smooth
 
-__all__ = ["commands", "coupling", "patches"]
-
 
 def coupling(quick: bool) -> list[Row]:
     """Mode coupling of spin 2, EE and BB, against the largest multipole."""

@@ -21,8 +21,6 @@ from furax.obs.operators import MixingMatrixOperator, NoiseDiagonalOperator
 from furax.obs.stokes import StokesQU
 from furax.tree import dot
 
-__all__ = ["Furax"]
-
 #: T_CMB of its operators [K], of astropy's Planck15.
 T_CMB = 2.7255
 #: References [GHz] of dust and synchrotron: those of its benchmarks, and those for which

@@ -21,8 +21,6 @@ from fits.sample import sample
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.constants import H_OVER_K
 
-__all__ = ["chain", "grid"]
-
 NU_DUST, NU_SYNCHROTRON, T_DUST = 353.0, 30.0, 21.0
 START = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1}
 PRIORS = {"dust.beta_dust": Uniform(1.2, 1.9), "synchrotron.beta_syn": Uniform(2.7, 3.5)}

@@ -34,8 +34,6 @@ from fits.separation import SpectralLikelihood, sample_spectra, spectral_likelih
 from jaxsky import Bandpass, observe
 from jaxsky.sed import cmb_derivative
 
-__all__ = ["pixel_noise", "regions", "samples", "simulations", "uniform_noise", "whole_fit"]
-
 #: Points at which the codes are compared; they are timed at the first.
 POINTS = np.array([[20.0, 1.54, 3.0], [21.0, 1.5, 3.1], [18.5, 1.6, 2.95]])
 #: Noise of a pixel and band is that of the instrument times a number between these.

@@ -21,17 +21,6 @@ from fits.separation import fit_spectra, spectral_likelihood, superpixels
 from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe, observe_components
 from jaxsky.instrument import load_instrument
 
-__all__ = [
-    "NAMES",
-    "START",
-    "TEMPLATES",
-    "TRUTH",
-    "Experiment",
-    "litebird",
-    "maps_in_memory",
-    "white_sky",
-]
-
 NAMES = ("dust.T_dust", "dust.beta_dust", "synchrotron.beta_syn")
 TRUTH = dict(zip(NAMES, (20.0, 1.54, 3.0), strict=True))
 START = dict(zip(NAMES, (19.0, 1.6, 3.1), strict=True))

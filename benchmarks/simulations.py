@@ -32,17 +32,6 @@ from jaxsky.harmonics import (
 from jaxsky.instrument import load_instrument
 from jaxsky.io import read_maps, write_maps
 
-__all__ = [
-    "beta_maps",
-    "constant",
-    "correlated_alm",
-    "growth",
-    "monte_carlo",
-    "nside_2048",
-    "smoothing",
-    "transform",
-]
-
 JAXSKY = str(Path(sys.executable).with_name("jaxsky"))
 #: Multipoles whose power of CMB and noise is compared, in a map of 1 degree.
 POWER_RANGE = slice(100, 250)

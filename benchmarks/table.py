@@ -9,8 +9,6 @@ from typing import NamedTuple
 
 from rich.table import Table
 
-__all__ = ["Row", "conditions", "markdown", "rich_table", "time_text"]
-
 HEADER = ("work", "measured", "target", "", "remarks")
 PACKAGES = ("jaxsky", "jax", "numpy", "pysm3", "numba", "emcee", "h5py")
 

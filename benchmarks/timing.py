@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 
 import jax
 
-__all__ = ["Times", "Usage", "interleave", "page_faults", "seconds", "usage"]
-
 # The memory of a process that starts another counts as the other's until it runs its own
 # program, so a small interpreter stands between this process and the command.
 _BETWEEN = """

@@ -15,8 +15,6 @@ from fits.commands.interrupt import prompt
 from jaxsky.io.folders import cache_folder
 from jaxsky.programs import keep_programs
 
-__all__ = ["app", "main"]
-
 #: Parameters of glibc's mallopt: M_ARENA_MAX, M_MMAP_THRESHOLD.
 MALLOC = {-8: 1, -3: 8 * 2**20}
 

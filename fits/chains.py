@@ -13,8 +13,6 @@ import numpy as np
 from fits.realisations import SAVED_EVERY
 from jaxsky.io import InputError, whole
 
-__all__ = ["ChainFile", "kept_chain"]
-
 #: Entries of numpy's random state, each an attribute of a chain in its file.
 RANDOM_STATE = 5
 
@@ -111,11 +109,6 @@ def kept_chain(path: Path, name: str, size: tuple[int, int], mark: str) -> Chain
     path, name : file, and name of the chain in it
     size : number of walkers and of parameters
     mark : of all that the chain depends on
-
-    Raises
-    ------
-    jaxsky.io.InputError
-        If the file is damaged, or holds a chain with another mark or size.
     """
     backend, mark = ChainFile(path, name), f"{mark} {size}"
     held = _held(path, name)

@@ -12,8 +12,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["gram", "square_root"]
-
 #: Pixels per pass; small enough that the weighted copies stay in cache.
 CHUNK = 1 << 14
 

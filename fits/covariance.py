@@ -21,8 +21,6 @@ from jaxsky.harmonics import adjoint_synthesis, alm_ell, expand, synthesis
 from jaxsky.keys import stream
 from jaxsky.noise import draw, uniform_alm
 
-__all__ = ["Fluctuations", "uniform_level"]
-
 #: Pixels whose products are added up at once; few enough to stay in cache.
 CHUNK = 1 << 16
 

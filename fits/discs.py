@@ -15,18 +15,6 @@ from jaxtyping import Float, Int
 
 from jaxsky.harmonics import alm_to_healpy, gaussian_beam, lmax_of, smooth
 
-__all__ = [
-    "BICEP2",
-    "Patch",
-    "bicep2_mask",
-    "disc_centers",
-    "disc_mask",
-    "paper_patches",
-    "ring_functions",
-    "zonal",
-    "zonal_products",
-]
-
 #: Radius of the paper's discs: 400 square degrees.
 RADIUS = 11.3
 #: FWHM of the Gaussian with which masks are smoothed [deg].
@@ -91,12 +79,6 @@ def disc_mask(
     lon, lat : Galactic coordinates of its middle [deg]
     radius : of the disc [deg]
     fwhm : of the Gaussian [deg]; what it leaves below 1e-5 is zero
-
-    Raises
-    ------
-    ValueError
-        If the Gaussian is wider than the disc, either is not positive, or lon and lat are no
-        direction.
     """
     if not (np.isfinite(lon) and -90 <= lat <= 90):
         raise ValueError(

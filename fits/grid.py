@@ -12,8 +12,6 @@ from fits.priors import Prior, bounds, check_priors, log_prior
 from fits.results import FitResult
 from jaxsky.types import Numeric
 
-__all__ = ["grid_fit", "grid_is_possible"]
-
 #: The grid is narrowed to where the posterior exceeds exp(-NARROW/2) of its maximum (6 sigma).
 NARROW = 36.0
 #: A posterior that changes by less over the whole prior, in its logarithm, is flat.

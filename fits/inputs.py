@@ -39,8 +39,6 @@ from jaxsky.settings.keys import at_key
 from jaxsky.settings.tables import BandTable
 from jaxsky.simulate import observe_bands
 
-__all__ = ["Band", "Inputs", "Leakage", "inputs_of", "read_band"]
-
 
 class Leakage(NamedTuple):
     """Intensity leaked into Q and U of a band [uK_RJ], at the resolution of its own map."""
@@ -100,11 +98,6 @@ def inputs_of(
     templates : read those of the components that are modelled
     foregrounds : give the foregrounds alone as well, where all bands are simulated
     galaxy : the embedded model, if it is made already
-
-    Raises
-    ------
-    jaxsky.io.InputError, SettingsError
-        For files that cannot be read as what they should be, and bands that say too little.
     """
     folder = Path(settings.data_dir)
     if not settings.bands:
@@ -257,11 +250,6 @@ def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -
     folder : of the files
     spec : what the settings say
     observed : how a simulated map was observed, for what they do not say
-
-    Raises
-    ------
-    jaxsky.io.InputError, SettingsError
-        For files that cannot be read as what they should be.
     """
     where, found = f"bands.{spec.name}", read(folder, spec)
     check_stokes(where, found, "QU")

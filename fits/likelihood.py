@@ -35,8 +35,6 @@ from jaxsky.parameters import OFFSET, unknown_parameter
 from jaxsky.sky import interpolation_nodes
 from jaxsky.types import Numeric
 
-__all__ = ["Likelihood", "PixelLikelihood", "TemplateLikelihood", "chi2", "likelihood"]
-
 #: Covariance of the inner products <rows, data>: (band, row, stokes, pix) -> square matrix over
 #: (band, row) flattened. `fits.covariance.Fluctuations.covariance` is one.
 CovarianceOf = Callable[[Float[Array, "band row stokes pix"]], Float[np.ndarray, "row row"]]
@@ -345,13 +343,7 @@ def _covariance(
 
 
 def _whitening(covariance: Float[np.ndarray, "row row"]) -> Float[Array, "row row"]:
-    """W with W^T W the inverse of a covariance.
-
-    Raises
-    ------
-    ValueError
-        If the covariance is not positive definite: two templates are the same up to a factor.
-    """
+    """W with W^T W the inverse of a covariance."""
     scale = np.sqrt(np.diagonal(covariance))
     usable = np.all(scale > 0)
     if usable:

@@ -23,8 +23,6 @@ from fits.priors import (
 from fits.results import FitResult, help_by_prior
 from jaxsky.types import Numeric
 
-__all__ = ["MAX_STEPS", "Solver", "best_fit", "search"]
-
 #: What finds an optimum: by residuals, or by a function alone.
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 #: Steps of a search, by default.

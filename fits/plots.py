@@ -14,8 +14,6 @@ from fits.spectral_index import Fit, all_free
 from jaxsky.components import parameter_declaration
 from jaxsky.plots import STYLE, draw_title, in_formula, plain, save
 
-__all__ = ["label", "plot_chains", "plot_grids", "plot_marginals", "plot_posterior"]
-
 chains.print_load_details = False  # getdist otherwise prints about burn-in
 
 #: Okabe & Ito's colours, which the colour-blind can tell apart.

@@ -21,8 +21,6 @@ from jaxsky.harmonics import (
     synthesis,
 )
 
-__all__ = ["Preparation", "prepare_component"]
-
 #: Up to this fraction of nside the quadrature of an analysis is good without steps or margin: what
 #: a multipole adds to another, up to three times as high, is some 1e-6 of it at nside 128, and the
 #: less, the finer the pixels are. Variances, whose spectra are steep, take a larger fraction.
@@ -55,24 +53,13 @@ class Preparation(eqx.Module):
         """Smooth from an own beam to one of fwhm [arcmin], by sqrt(fwhm^2 - own^2).
 
         `own` is the FWHM of a Gaussian [arcmin], or a table b_l.
-
-        Raises
-        ------
-        ValueError
-            If the target is finer than `what` is, in beam or pixels.
         """
         _check_nside(nside_in, nside, what)
         return cls(beam_ratio(fwhm, own, lmax, what), nside_in, nside)
 
     @classmethod
     def averaging(cls, nside_in: int, nside: int, what: str = "map") -> "Preparation":
-        """Average over pixels.
-
-        Raises
-        ------
-        ValueError
-            If the target has smaller pixels than `what` has.
-        """
+        """Average over pixels."""
         _check_nside(nside_in, nside, what)
         return cls(None, nside_in, nside)
 

@@ -10,20 +10,6 @@ from jaxtyping import Array, Bool, Float
 from jaxsky.settings.experiment import Experiment
 from jaxsky.types import Numeric
 
-__all__ = [
-    "Gaussian",
-    "Prior",
-    "Uniform",
-    "at_edge",
-    "bounds",
-    "check_priors",
-    "from_unbounded",
-    "log_prior",
-    "prior_residuals",
-    "priors_of",
-    "to_unbounded",
-]
-
 #: A value this close to the edge of a uniform prior, in units of its width, is at the edge.
 EDGE = 1e-4
 
@@ -107,13 +93,7 @@ def priors_of(settings: Experiment, command: str) -> dict[str, Prior]:
 
 
 def check_priors(priors: Mapping[str, Prior] | None, free: Iterable[str]) -> dict[str, Prior]:
-    """The priors, once each is known to belong to a free parameter.
-
-    Raises
-    ------
-    KeyError
-        If one does not.
-    """
+    """The priors, once each is known to belong to a free parameter."""
     free = list(free)
     for name in priors or {}:
         if name not in free:
@@ -126,13 +106,7 @@ def check_priors(priors: Mapping[str, Prior] | None, free: Iterable[str]) -> dic
 def prior_residuals(
     params: Mapping[str, Numeric], priors: Mapping[str, Prior]
 ) -> Float[Array, " gaussian"]:
-    """(value - mean)/sigma of the Gaussian priors: their sum of squares is -2 log_prior.
-
-    Raises
-    ------
-    TypeError
-        If a prior is neither uniform nor Gaussian.
-    """
+    """(value - mean)/sigma of the Gaussian priors: their sum of squares is -2 log_prior."""
     rows = []
     for name, p in priors.items():
         if isinstance(p, Gaussian):
@@ -174,13 +148,7 @@ def from_unbounded(
 
 
 def to_unbounded(params: Mapping[str, Numeric], priors: Mapping[str, Prior]) -> dict[str, Numeric]:
-    """The inverse of `from_unbounded`.
-
-    Raises
-    ------
-    ValueError
-        If a parameter is not inside its uniform prior.
-    """
+    """The inverse of `from_unbounded`."""
     result = dict(params)
     for name, p in priors.items():
         if isinstance(p, Uniform) and name in result:

@@ -24,18 +24,6 @@ from jaxsky.checks import check_finite, is_concrete
 from jaxsky.correlated import realisation
 from jaxsky.harmonics import analysis, expand, lmax_of, power_spectrum, synthesis
 
-__all__ = [
-    "MaskedSpectra",
-    "band_covariance",
-    "band_powers",
-    "bin_edges",
-    "coupling_matrices",
-    "covariance_terms",
-    "masked_spectra",
-    "pure_coupling_matrices",
-    "sky_fraction",
-]
-
 #: Fewest modes of a field in a bin that a mean power can be taken of.
 LEAST_MODES = 4.0
 
@@ -331,11 +319,6 @@ def band_covariance(
     simulations : number of Gaussian skies from which the standard deviations are taken, while the
         correlations stay; 200 measure them to 5 %. By default none
     key : of jax.random, for the simulations
-
-    Raises
-    ------
-    ValueError
-        For one simulation, or without a key for them.
     """
     covariance = 2 * covariance_terms(spectra, np.stack([EE, BB])[None])[0, 0]
     if not simulations:

@@ -17,8 +17,6 @@ from jaxsky.io import InputError, whole
 from jaxsky.keys import realisation_key, stream
 from jaxsky.progress import QUIET
 
-__all__ = ["realisations"]
-
 #: They are written to their file after so many seconds, and when they are stopped.
 SAVED_EVERY = 10.0
 #: What a damaged archive raises besides: RuntimeError for one that seems encrypted or packed in
@@ -45,11 +43,6 @@ def realisations(
     path : file that keeps what is done; what it holds already is not made again
     mark : of all that the results depend on; a file with another one is refused
     report : called with the number of realisations done, and that of all
-
-    Raises
-    ------
-    jaxsky.io.InputError
-        If the file is damaged, or holds realisations of other data or settings.
     """
     check_seed("seed", seed)
     done = [] if path is None else _load(path, mark, names)

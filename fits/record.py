@@ -18,8 +18,6 @@ from jaxsky.settings.experiment import Experiment
 from jaxsky.settings.files import SettingsFile
 from jaxsky.settings.planck_names import leak
 
-__all__ = ["fingerprint", "leaks", "probability", "with_error", "write_json", "write_log"]
-
 PACKAGES = (
     "jaxsky",
     "jax",
@@ -41,13 +39,7 @@ def leaks(settings: Experiment) -> list[str]:
 
 
 def fingerprint(tree: Any) -> str:
-    """A hash of all arrays of a tree; functions, which work with them, are left out.
-
-    Raises
-    ------
-    TypeError
-        If something else is in it, whose hash would be another one in each process.
-    """
+    """A hash of all arrays of a tree; functions, which work with them, are left out."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(tree):
         array = np.ascontiguousarray(leaf)

@@ -14,8 +14,6 @@ from jaxsky.lookup import find_file
 from jaxsky.settings.experiment import Experiment, parse_region
 from jaxsky.settings.files import MaskFile
 
-__all__ = ["apodize", "region_mask", "region_masks", "region_words"]
-
 COMPARISONS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 
 
@@ -35,11 +33,6 @@ def region_mask(
     name : of one of them
     nside : resolution
     coarser : take a coarser mask for all pixels inside of its own, instead of refusing it
-
-    Raises
-    ------
-    SettingsError, jaxsky.io.InputError
-        For a mask that cannot be read, or is coarser.
     """
     region, inside = settings.regions[name], np.ones(healpy.nside2npix(nside), bool)
     masks = {"common.mask": settings.common.mask}

@@ -15,8 +15,6 @@ from fits.spectral_index import Fit, all_free
 from fits.template_noise import unknown_noise
 from jaxsky.settings.experiment import Experiment
 
-__all__ = ["known_truth", "result_table", "warnings", "write_report"]
-
 #: A fit with a smaller probability to exceed its chi^2 is pointed out.
 UNLIKELY = 0.01
 

@@ -18,8 +18,6 @@ from jaxsky import Bandpass, Sky, observe
 from jaxsky.harmonics import beam_ratio, gaussian_beam, pixel_window
 from jaxsky.types import Numeric
 
-__all__ = ["Prepared", "prepare"]
-
 #: A pixel is used if no more than this fraction of what was smoothed or averaged was missing.
 MISSING = 0.01
 
@@ -65,11 +63,6 @@ class Prepared(NamedTuple):
         stokes : "Q", "U" or "QU"
         region : pixels to use, of those that can be; default all
         kind : "exact", or "diagonal" for the paper's sum over pixels
-
-        Raises
-        ------
-        KeyError, ValueError
-            For unknown parameters, a region without pixels or an unknown kind.
         """
         if kind not in ("exact", "diagonal"):
             raise ValueError(f"Argument `kind` must be 'exact' or 'diagonal', not {kind!r}.")
@@ -96,11 +89,6 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
     ----------
     inputs : templates and maps
     nside, fwhm : common resolution; fwhm in arcmin
-
-    Raises
-    ------
-    ValueError
-        If a map is coarser than the common resolution.
     """
     maps: dict[str, tuple[Bool[np.ndarray, " pix"], Any]] = {
         f"template {name!r}": (t.used, t.fwhm) for name, t in inputs.templates.items()

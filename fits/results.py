@@ -8,8 +8,6 @@ from jaxtyping import Bool, Float
 
 from jaxsky.types import Numeric
 
-__all__ = ["FitError", "FitResult", "astray", "help_by_prior", "misfit"]
-
 #: A chi^2 above so many times the degrees of freedom, taken as `FEW` if they are fewer, is that of
 #: no fit. Real skies, with laws that vary, errors that are too small and bright planes, have
 #: some ten for each; a few missing values read as data have hundreds and more.
@@ -123,13 +121,7 @@ class FitResult(NamedTuple):
         return self._replace(converged=False, message=" ".join(failures))
 
     def checked(self, throw: bool) -> "FitResult":
-        """Itself, if it converged or need not have.
-
-        Raises
-        ------
-        FitError
-            If it did not converge and `throw` is true.
-        """
+        """Itself, if it converged or need not have."""
         if throw and not self.converged:
             raise FitError(self.message, self)
         return self

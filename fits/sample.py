@@ -18,8 +18,6 @@ from fits.results import FitResult
 from jaxsky.checks import check_seed
 from jaxsky.types import Numeric
 
-__all__ = ["ensemble", "ensemble_summary", "sample", "summary"]
-
 #: A chain shorter than this many autocorrelation times is reported as too short.
 ENOUGH = 50
 
@@ -78,11 +76,6 @@ def ensemble(
     initial : start positions (walker, par) from a generator of random numbers
     size : number of parameters
     nwalkers, nsteps, seed, backend, progress : see `sample`
-
-    Raises
-    ------
-    ValueError
-        For fewer than twice as many walkers as parameters, or no step.
     """
     check_seed("seed", seed)
     if nwalkers < 2 * size or nsteps < 1:

@@ -28,8 +28,6 @@ from jaxsky.settings.experiment import Experiment
 from jaxsky.settings.files import SettingsError
 from jaxsky.settings.keys import at_key
 
-__all__ = ["Fit", "all_free", "run"]
-
 #: A band in which each template has less than this part of its weight has none.
 WEIGHTLESS = 1e-6
 
@@ -191,11 +189,6 @@ def run(
     regions : pixels of each region by name
     chains : file of the chains; steps that it already holds are not made again
     progress : told of each step of the work
-
-    Raises
-    ------
-    KeyError, ValueError
-        For parameters that do not exist, regions without pixels, or what a method cannot do.
     """
     if not settings.free_in("fit"):
         raise SettingsError("free: name at least one parameter to fit.")

@@ -27,15 +27,6 @@ from jaxsky.settings.files import SettingsError
 from jaxsky.settings.tables import ComponentTable
 from jaxsky.units import conversion
 
-__all__ = [
-    "Attenuation",
-    "TemplateNoise",
-    "attenuation",
-    "prepared_variance",
-    "read_template_noise",
-    "unknown_noise",
-]
-
 
 class TemplateNoise(NamedTuple):
     """Noise of Q and U of a template; without both it has none.
@@ -62,13 +53,7 @@ class Attenuation(NamedTuple):
 def read_template_noise(
     folder: Path, name: str, spec: ComponentTable, template: Template
 ) -> TemplateNoise:
-    """The noise that the settings state of a template.
-
-    Raises
-    ------
-    jaxsky.io.InputError, SettingsError
-        For files that cannot be read as what they should be, and noise that cannot be right.
-    """
+    """The noise that the settings state of a template."""
     noise, where = spec.noise, f"sky.{name}.noise"
     assert noise is not None  # as called
     if noise.rms == 0 or noise.level == 0:

@@ -1,6 +1,6 @@
 """jaxsky: a JAX-differentiable model of the polarized microwave sky."""
 
-import jaxsky.bare  # noqa: F401  (before all else: it guards what is imported after it)
+import jaxsky.bare
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import AME, CMB, Component, Dust, Synchrotron
 from jaxsky.parameters import get_parameters, parameter_names, set_parameters

@@ -15,8 +15,6 @@ from jaxsky.sed import cmb_derivative
 from jaxsky.types import Numeric
 from jaxsky.units import band_conversion, parse_unit
 
-__all__ = ["CONVENTIONS", "Bandpass", "Samples", "average", "stack_bands"]
-
 #: convention -> factor that turns its weights into weights on antenna temperature
 CONVENTIONS: dict[str, Callable[[Array], Array]] = {
     "RJ": jnp.ones_like,

@@ -1,7 +1,7 @@
 """Public functions take bare numbers: what carries a unit is refused by the argument's name.
 
 JAX and numpy drop the unit of an astropy quantity without a word. Importing this module, as the
-two packages do before all else, has every function and method that a module names in `__all__`
+two packages do before all else, has every function and method whose name has no underscore
 checked, in the manner of beartype and jaxtyping; so none can be forgotten.
 """
 
@@ -15,8 +15,6 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
-
-__all__ = ["refuse_unit", "takes_quantities"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -86,10 +84,9 @@ def _guard_class(cls: type) -> None:
 
 
 def _guard(module: ModuleType) -> None:
-    """Guard what a module names in `__all__` and defines itself."""
-    for name in getattr(module, "__all__", ()):
-        value = getattr(module, name)
-        if getattr(value, "__module__", None) != module.__name__:
+    """Guard what a module defines itself under a name without an underscore."""
+    for name, value in list(vars(module).items()):
+        if name.startswith("_") or getattr(value, "__module__", None) != module.__name__:
             continue
         if inspect.isclass(value):
             # Settings, of pydantic, have types of their own.

@@ -4,8 +4,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-__all__ = ["coefficients", "evaluate", "nodes", "polynomials"]
-
 
 def nodes(n: int) -> Float[np.ndarray, " n"]:
     """The n Chebyshev points of the first kind in (-1, 1)."""

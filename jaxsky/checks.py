@@ -7,15 +7,6 @@ from jaxtyping import Array
 
 from jaxsky.bare import refuse_unit, takes_quantities
 
-__all__ = [
-    "as_array",
-    "check_double",
-    "check_finite",
-    "check_positive",
-    "check_seed",
-    "is_concrete",
-]
-
 
 def is_concrete(x: object) -> bool:
     """True if the values of `x` can be looked at now (it is not being traced)."""
@@ -24,13 +15,7 @@ def is_concrete(x: object) -> bool:
 
 @takes_quantities
 def as_array(name: str, value: object) -> Array:
-    """`value` as a floating-point JAX array in native byte order.
-
-    Raises
-    ------
-    TypeError
-        If it carries a unit (JAX would drop it silently) or is not numeric.
-    """
+    """`value` as a floating-point JAX array in native byte order."""
     refuse_unit(name, value)
     if isinstance(value, np.ndarray) and not value.dtype.isnative:
         value = value.astype(value.dtype.newbyteorder("="))

@@ -11,8 +11,6 @@ from jaxtyping import Array, Float
 
 from jaxsky import correlated
 
-__all__ = ["PLANCK_2018", "camb_spectra", "realisation", "tensor_spectra"]
-
 #: Planck 2018 results VI, TT,TE,EE+lowE+lensing; arguments of `camb.set_params`.
 PLANCK_2018 = {
     "H0": 67.36,
@@ -69,11 +67,6 @@ def tensor_spectra(lmax: int, **cosmology: float) -> Float[np.ndarray, "4 ell"]:
     ----------
     lmax : largest multipole
     **cosmology : of `camb.set_params`, in place of those in `PLANCK_2018`
-
-    Raises
-    ------
-    ValueError
-        If lmax is negative, or CAMB does not take the cosmology.
     """
     return _joined(_tensors, TENSORS_END, lmax, cosmology)
 
@@ -151,11 +144,6 @@ def realisation(
     key : of jax.random
     spectra : C_l of TT, EE, BB, TE, in any unit squared
     stokes : "QU" or "IQU"
-
-    Raises
-    ------
-    ValueError
-        If `stokes` is neither.
     """
     if stokes not in ("QU", "IQU"):
         raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")

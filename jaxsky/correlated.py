@@ -8,8 +8,6 @@ from jaxsky.harmonics import expand
 from jaxsky.keys import normal
 from jaxsky.noise import cholesky
 
-__all__ = ["realisation", "repair"]
-
 #: Smallest eigenvalue that a repaired matrix of correlations keeps.
 LEAST = 1e-10
 

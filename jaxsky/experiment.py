@@ -27,8 +27,6 @@ from jaxsky.settings.tables import BandTable
 from jaxsky.sky import Sky, observe_band
 from jaxsky.small_scales import SmallScales
 
-__all__ = ["Setup", "build", "cmb_spectra", "leak", "map_nside", "read_channel"]
-
 #: A map resolves beams of so many pixels: there b_l is down to 0.43 at l = 2 nside.
 PIXELS = 1.5
 #: A beam below this lets nothing through that would be seen.
@@ -104,13 +102,6 @@ def build(
     written : for files, in Stokes parameters and precision of the settings, and in pixels that
         resolve all beams; else Q and U in double precision, to be smoothed
     galaxy : the embedded model, if it is made already
-
-    Raises
-    ------
-    jaxsky.io.InputError, SettingsError, KeyError
-        For files that are not what they should be, names that do not exist, pixels too wide for
-        a beam, a beam finer than a template without small scales, or one that is finer than the
-        beam of a band.
     """
     spec = settings.simulate
     stokes, precision = (spec.stokes, spec.precision) if written else ("QU", "double")
@@ -157,13 +148,7 @@ def build(
 
 
 def map_nside(settings: Experiment, templates: Mapping[str, Template]) -> int:
-    """Resolution of simulated maps: what the settings say, or that of the coarsest template.
-
-    Raises
-    ------
-    SettingsError
-        If neither is there.
-    """
+    """Resolution of simulated maps: what the settings say, or that of the coarsest template."""
     if settings.simulate.nside is not None:
         return settings.simulate.nside
     if not templates and settings.sky.templates:  # nothing of the sky is simulated
@@ -274,11 +259,6 @@ def read_channel(
     spec : one of its bands
     nside, stokes : of the maps
     noisy : with the noise [uK_RJ]
-
-    Raises
-    ------
-    jaxsky.io.InputError, SettingsError
-        For files that cannot be read as what they should be, and a table that says too little.
     """
     folder, where = Path(settings.data_dir), f"bands.{spec.name}"
     if spec.bandpass is None:
@@ -339,11 +319,6 @@ def cmb_spectra(settings: Experiment, lmax: int, r: float | None = None) -> np.n
     settings : of the experiment, with its r
     lmax : largest multipole
     r : in place of that; only for spectra that CAMB makes
-
-    Raises
-    ------
-    jaxsky.io.InputError, SettingsError
-        For a file that cannot be read or ends before lmax, and a cosmology that cannot be.
     """
     spec = settings.cmb
     if spec.spectra is None:

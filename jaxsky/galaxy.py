@@ -28,8 +28,6 @@ from jaxsky.harmonics import alm_ell, resample, synthesis
 from jaxsky.sky import Sky
 from jaxsky.trigonometry import sine_and_cosine
 
-__all__ = ["EmbeddedSky", "GalaxyModel", "embedded_sky", "line_of_sight", "magnetic_field"]
-
 #: Standard deviations of Q and U over the real sky at nside 64 [uK_RJ], added in quadrature.
 DUST_RMS, SYNCHROTRON_RMS = np.hypot(14.7, 6.8), np.hypot(17.2, 9.1)
 #: Resolution at which the maps are scaled and up to which the turbulence is normalised.
@@ -78,11 +76,6 @@ class GalaxyModel(eqx.Module):
         stretch as long as its distance s is the mean of about s / coherence cells, so the rms
         there is turbulence / sqrt(1 + s / coherence).
     slope : exponent of its power spectrum, C_l ~ l^slope for l >= 2
-
-    Raises
-    ------
-    TypeError, ValueError
-        For units, values that are not finite numbers, lengths or p0 that are not positive.
 
     Examples
     --------
@@ -140,11 +133,6 @@ class EmbeddedSky(eqx.Module):
         Parameters
         ----------
         stokes : "QU" or "IQU"
-
-        Raises
-        ------
-        ValueError
-            If `stokes` is neither.
         """
         if stokes not in ("QU", "IQU"):
             raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")
@@ -342,11 +330,6 @@ def line_of_sight(
     Returns
     -------
     Maps [kpc], shape (2, 3, pix): dust and synchrotron, I, Q, U.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If nside is not a power of two, or the seed or the steps are not suitable integers.
     """
     _check(nside, seed, steps)
     return _integrate(model, jax.random.key(seed), _geometry(nside), steps)

@@ -26,21 +26,6 @@ from jaxsky.settings.keys import at_key
 from jaxsky.settings.tables import ComponentTable
 from jaxsky.sky import Sky
 
-__all__ = [
-    "Template",
-    "check_stokes",
-    "default_galaxy",
-    "embedded_galaxy",
-    "mask_at",
-    "narrow",
-    "read",
-    "read_bandpass_spec",
-    "read_parameter",
-    "read_sky",
-    "set_parameters_of",
-    "uK_RJ_per",
-]
-
 #: Maps with at least so many pixels are kept in single precision, which is that of their files.
 LARGE = 12 * 512**2
 #: The embedded model is kept in the cache up to here: 38 MB of maps.
@@ -95,13 +80,7 @@ def read_parameter(
     where: str,
     of: str = "that of the template",
 ) -> tuple[Float[np.ndarray, " pix"], Bool[np.ndarray, " pix"]]:
-    """The map of a spectral parameter and where it is known; see `jaxsky.parameter_maps`.
-
-    Raises
-    ------
-    jaxsky.io.InputError, SettingsError
-        For files that cannot be read as what they should be.
-    """
+    """The map of a spectral parameter and where it is known; see `jaxsky.parameter_maps`."""
     found = read(folder, spec, stokes="", zeros_are_data=True)
     return parameter_map(found, name, nside, where, of=of, stated=spec.missing is not None)
 
@@ -130,12 +109,6 @@ def read_sky(
     dtype : of the templates from files; parameters that are maps are always in double precision
     names : of components, by default all
     galaxy : the embedded model, if it is made already
-
-    Raises
-    ------
-    jaxsky.io.InputError, SettingsError
-        For files that cannot be read as what they should be, a component without a map, and
-        parameters that do not exist.
     """
     tables, folder = settings.sky.components, Path(settings.data_dir)
     wanted = [name for name in tables if names is None or name in names]
@@ -161,13 +134,7 @@ def read_sky(
 
 
 def embedded_galaxy(settings: Experiment) -> EmbeddedSky:
-    """The embedded model of the Galaxy that the settings describe.
-
-    Raises
-    ------
-    SettingsError
-        For a number of the model that does not exist, or cannot be.
-    """
+    """The embedded model of the Galaxy that the settings describe."""
     embedded = settings.sky.embedded
     assert embedded is not None  # as called
     known = GalaxyModel.__dataclass_fields__
@@ -271,11 +238,6 @@ def set_parameters_of(
     ----------
     templates, fixed : by name
     components : names that there are; parameters of those without a template here are left out
-
-    Raises
-    ------
-    KeyError, ValueError
-        For a template or a parameter that does not exist.
     """
     by_template: dict[str, dict[str, float]] = {}
     for name, value in fixed.items():
@@ -294,25 +256,13 @@ def set_parameters_of(
 
 
 def mask_at(mask: Bool[np.ndarray, " pix"], nside: int, where: str) -> Bool[np.ndarray, " pix"]:
-    """A mask at the resolution at which it is used; see `jaxsky.io.degrade_mask`.
-
-    Raises
-    ------
-    SettingsError
-        If it is coarser, or has an nside that is no power of two; `where` is its key.
-    """
+    """A mask at the resolution at which it is used; see `jaxsky.io.degrade_mask`."""
     with at_key(where):
         return np.asarray(degrade_mask(mask, nside))
 
 
 def uK_RJ_per(unit: str, at: Bandpass | float, where: str) -> float:
-    """What a map is multiplied by to be in uK_RJ, at a frequency [GHz] or over a band.
-
-    Raises
-    ------
-    SettingsError
-        If the unit is none of a brightness; `where` is the table of the map in the settings.
-    """
+    """What a map is multiplied by to be in uK_RJ, at a frequency [GHz] or over a band."""
     with at_key(f"{where}.unit"):
         return float(unit_factor(unit, "uK_RJ", at))
 

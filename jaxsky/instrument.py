@@ -16,8 +16,6 @@ from jaxsky.checks import as_array, check_positive, is_concrete
 from jaxsky.observation import ObservedBand
 from jaxsky.units import parse_unit
 
-__all__ = ["Channel", "Instrument", "band_tables", "instrument_names", "load_instrument"]
-
 
 class Channel(eqx.Module):
     """One channel: a top-hat band, a Gaussian beam and white noise.
@@ -29,14 +27,6 @@ class Channel(eqx.Module):
     fwhm : full width at half maximum of the beam [arcmin]
     noise : noise of Q and of U [noise_unit arcmin]
     noise_unit : unit of temperature of the noise, "uK_CMB" or another name of `jaxsky.units`
-
-    Raises
-    ------
-    TypeError
-        If a number carries a unit or is none.
-    ValueError
-        For numbers that are not scalar and positive, a band that reaches down to 0 GHz, or an
-        unknown unit.
     """
 
     name: str = eqx.field(static=True)
@@ -224,13 +214,6 @@ def band_tables(
     ----------
     name : one of `instrument_names()`, or a file with a list `bands`, relative to `folder`
     channels : names of the bands wanted, by default all
-
-    Raises
-    ------
-    KeyError
-        For an unknown instrument or channel; lists the known ones.
-    ValueError
-        For a file that is no instrument.
     """
     path = folder / name
     if name in _presets():

@@ -22,17 +22,6 @@ from jaxsky.bandpass import Bandpass, Samples, average, stack_bands
 from jaxsky.checks import is_concrete
 from jaxsky.components import Component
 
-__all__ = [
-    "Nodes",
-    "Terms",
-    "band_sed",
-    "band_seds",
-    "choose_nodes",
-    "choose_terms",
-    "term",
-    "term_weights",
-]
-
 
 class NodeCounts(NamedTuple):
     """Counts, one for each parameter of a component that is a map, and the error to check.

@@ -10,17 +10,9 @@ from jaxtyping import Array, Float
 
 from jaxsky.checks import check_seed
 
-__all__ = ["normal", "realisation_key", "stokes_noise", "stream"]
-
 
 def realisation_key(seed: int, index: int = 0) -> Array:
-    """The key of a sky, from nothing but the seed and its number; number 0 is what is observed.
-
-    Raises
-    ------
-    TypeError, ValueError
-        For a seed or a number that is none, or is below 0 or above 2^32 - 1.
-    """
+    """The key of a sky, from nothing but the seed and its number; number 0 is what is observed."""
     check_seed("seed", seed)
     check_seed("index", index)
     return jax.random.fold_in(jax.random.key(seed), index)

@@ -11,8 +11,6 @@ from jaxsky.io import InputError, MissingFileError, check_file
 from jaxsky.io.folders import cache_folder
 from jaxsky.settings.files import NamedFile, SettingsFile, expand
 
-__all__ = ["find_file", "found_files", "named_files"]
-
 
 def find_file(folder: Path, name: str) -> Path:
     """Find a file that settings name.
@@ -25,12 +23,6 @@ def find_file(folder: Path, name: str) -> Path:
     ----------
     folder : the settings' `data_dir`
     name : as in the settings
-
-    Raises
-    ------
-    jaxsky.io.InputError
-        If it is not there or no file that can be read; says how to fetch it if it is an official
-        product.
     """
     if not os.path.lexists(folder / name):
         try:

@@ -26,8 +26,6 @@ from jaxsky.preparation import Prepared, plan, prepare
 from jaxsky.settings.experiment import Experiment
 from jaxsky.simulate import observe_bands
 
-__all__ = ["LOG", "Written", "changed_tables", "check_folder", "paths", "run"]
-
 LOG = "simulation.json"
 PACKAGES = ("jaxsky", "jax", "numpy", "healpy", "ducc0", "jaxbind", "camb")
 #: Settings that do not change what a realisation is.
@@ -70,12 +68,6 @@ def check_folder(
     out, settings : the folder, and what is simulated
     resume, overwrite : keep or replace what is there
     indices : numbers of the realisations; by default all
-
-    Raises
-    ------
-    ValueError
-        If there are results already and they are neither to be resumed nor replaced, or it is
-        not known that those that are there are of the same settings.
     """
     log = out / LOG
     if overwrite:

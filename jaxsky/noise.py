@@ -15,22 +15,6 @@ from jaxsky.harmonics import alm_ell, analysis, children, expand
 from jaxsky.keys import stokes_noise
 from jaxsky.types import Numeric
 
-__all__ = [
-    "check_covariance",
-    "cholesky",
-    "covariance_from_columns",
-    "draw",
-    "estimate_variance",
-    "fit_knee",
-    "hits_covariance",
-    "knee_spectrum",
-    "rms_covariance",
-    "uniform_alm",
-    "uniform_covariance",
-    "uniform_map",
-    "weights_covariance",
-]
-
 #: Pixels that are checked at once.
 _PIECE = 1 << 20
 #: Columns of a covariance by their number, in the order of Planck's maps.
@@ -80,11 +64,6 @@ def uniform_alm(
     noise : noise [u arcmin], u being the unit of the maps
     lmax : largest multipole
     stokes : rows: 1 for I, 2 for E, B, 3 for I, E, B; E and B have no modes at l < 2
-
-    Raises
-    ------
-    ValueError
-        If `stokes` is none of these.
     """
     if stokes not in (1, 2, 3):
         raise ValueError(f"Argument `stokes` must be 1, 2 or 3, not {stokes!r}.")
@@ -109,13 +88,6 @@ def rms_covariance(rms: Float[Array, "stokes pix"]) -> Float[Array, "stokes stok
     Parameters
     ----------
     rms : standard deviation of each Stokes parameter in each pixel, shape (stokes, pix)
-
-    Raises
-    ------
-    TypeError
-        If the maps carry a unit.
-    ValueError
-        For a wrong shape, and values that are not finite or negative.
     """
     rms = as_array("rms", rms)
     if rms.ndim != 2:
@@ -139,13 +111,6 @@ def hits_covariance(
         polarization differ a little from those of its intensity
     hits : number of observations of each pixel
     stokes : number of Stokes parameters
-
-    Raises
-    ------
-    TypeError
-        If an argument carries a unit.
-    ValueError
-        For wrong shapes, values that are not finite, and pixels without hits.
     """
     sigma0, hits = as_array("sigma0", sigma0), as_array("hits", hits)
     if sigma0.shape not in ((), (stokes,)):
@@ -174,13 +139,6 @@ def weights_covariance(
     ----------
     sigma0 : noise of one observation of Q or U, a number or one for each
     weights : elements QQ, QU, UU; a pixel whose weights have no inverse gets no finite covariance
-
-    Raises
-    ------
-    TypeError
-        If an argument carries a unit.
-    ValueError
-        For wrong shapes.
     """
     sigma0, weights = as_array("sigma0", sigma0), as_array("weights", weights)
     if sigma0.shape not in ((), (2,)):
@@ -206,13 +164,6 @@ def covariance_from_columns(
     columns : three maps for Q, U or six for I, Q, U
     names : what they are, "QQ_COV" or "QQ" and so on, I or T; by default in Planck's order, QQ,
         QU, UU or II, IQ, IU, QQ, QU, UU
-
-    Raises
-    ------
-    TypeError
-        If the maps carry a unit.
-    ValueError
-        For another number of columns, or names that are not these.
     """
     columns = as_array("columns", columns)
     if columns.ndim != 2 or len(columns) not in _COLUMNS:
@@ -322,11 +273,6 @@ def estimate_variance(
     ----------
     maps : maps with white noise, RING
     used : pixels to use; groups of which all four are used count
-
-    Raises
-    ------
-    ValueError
-        If no complete group is left, or values in one are not finite or UNSEEN.
     """
     nside = healpy.npix2nside(maps.shape[-1])
     whole = children(used, nside // 2).all(axis=-1)
@@ -371,11 +317,6 @@ def fit_knee(
     maps : Q and U, RING
     used : pixels to use; the fewer, the coarser the estimate
     lmax : largest multipole to use
-
-    Raises
-    ------
-    ValueError
-        If no pixel is left, or the fit does not converge.
     """
     fraction = float(np.mean(used))
     if not fraction:

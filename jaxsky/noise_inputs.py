@@ -21,8 +21,6 @@ from jaxsky.noise import (
 from jaxsky.settings.files import Hits, MapFile, MapKeys, NoiseColumns, NoiseTable, SettingsError
 from jaxsky.settings.keys import at_key
 
-__all__ = ["read_noise"]
-
 #: Noise outside of this range, relative to the rms of its map, is a mistake unless it is meant.
 PLAUSIBLE = (1e-6, 10.0)
 
@@ -53,12 +51,6 @@ def read_noise(
     unit : unit of the map, and so of level, rms and sigma0 unless the noise has its own
     own : the map that has the noise, if its columns are in the same file
     maps, used : the map that has the noise [uK_RJ] and its pixels, against whose rms it is checked
-
-    Raises
-    ------
-    jaxsky.io.InputError, SettingsError
-        For files that cannot be read as what they should be, another nside, noise that is not
-        positive definite, and noise far from the rms of the map.
     """
     unit = noise.unit or unit
     with at_key(where):

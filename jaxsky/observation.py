@@ -10,8 +10,6 @@ from jaxsky.bandpass import Bandpass
 from jaxsky.components import Component
 from jaxsky.small_scales import SmallScales
 
-__all__ = ["DTYPES", "Observation", "ObservedBand", "Source"]
-
 #: Types of numbers by the name of their precision.
 DTYPES: dict[str, type[np.floating]] = {"double": np.float64, "single": np.float32}
 

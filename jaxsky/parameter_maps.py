@@ -9,8 +9,6 @@ from jaxsky.io.missing import sentinels
 from jaxsky.settings.files import SettingsError
 from jaxsky.settings.values import check_sign
 
-__all__ = ["one_column", "parameter_map", "parameter_unit"]
-
 
 def parameter_unit(name: str) -> str:
     """Unit of a spectral parameter by its name, dotted or not; "" for a pure number."""
@@ -41,12 +39,6 @@ def parameter_map(
     -------
     Values in the parameter's unit, in pixels without one the median of the others, and a mask,
     True where they are known; both of shape (pix,).
-
-    Raises
-    ------
-    SettingsError
-        For several columns, another unit or nside, the sign of another convention, and zeros that
-        seem to mark missing pixels.
     """
     values, used = one_column(found, nside, where, of), np.asarray(found.mask)
     unit = parameter_unit(name)
@@ -75,13 +67,7 @@ def parameter_map(
 
 
 def one_column(found: Maps, nside: int, where: str, of: str) -> Float[np.ndarray, " pix"]:
-    """The one column that was read, of the resolution that it must have.
-
-    Raises
-    ------
-    SettingsError
-        For several, or another nside.
-    """
+    """The one column that was read, of the resolution that it must have."""
     if len(found.maps) != 1:
         raise SettingsError(f"{where}: fields must name one column, not {', '.join(found.names)}.")
     if found.nside != nside:

@@ -14,8 +14,6 @@ from jaxsky.checks import as_array
 from jaxsky.components import check_value
 from jaxsky.sky import Sky
 
-__all__ = ["OFFSET", "get_parameters", "parameter_names", "set_parameters"]
-
 OFFSET = ".offset"
 
 

@@ -18,19 +18,6 @@ from matplotlib.axes import Axes
 from jaxsky.harmonics import analysis, power_spectrum
 from jaxsky.io import whole
 
-__all__ = [
-    "COLORS",
-    "STYLE",
-    "contact_sheet",
-    "draw_map",
-    "draw_patch",
-    "draw_spectra",
-    "draw_title",
-    "in_formula",
-    "plain",
-    "save",
-]
-
 STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 9,

@@ -7,8 +7,6 @@ from jaxtyping import Array, Float
 
 from jaxsky.checks import check_positive
 
-__all__ = ["PowerLaw", "fit_power_law"]
-
 
 class PowerLaw(NamedTuple):
     """C_l = exp(log_amplitude) (l / pivot)^slope, with the covariance of the two numbers."""
@@ -34,12 +32,6 @@ def fit_power_law(spectrum: Float[Array, " ell"], lmin: int, lmax: int) -> Power
     ----------
     spectrum : C_l, l = 0 ...
     lmin, lmax : range of the fit, both included; lmax is the pivot of the result
-
-    Raises
-    ------
-    ValueError
-        If the range has fewer than four multipoles, is not within 2 ... of the spectrum, or the
-        spectrum is not positive there.
     """
     if not 2 <= lmin <= lmax - 3 or lmax >= len(spectrum):
         raise ValueError(

@@ -31,8 +31,6 @@ from jaxsky.keys import stream
 from jaxsky.observation import Observation, Source
 from jaxsky.small_scales import continue_templates
 
-__all__ = ["Prepared", "plan", "prepare"]
-
 #: Error of the varying laws, relative to the maps of a band.
 TOLERANCE = 1e-7
 #: Most Jacobi steps of an analysis; below nside 128, where the quadrature is worse, one more.
@@ -183,11 +181,6 @@ def prepare(
     terms : from `plan`, by default made here; None for a source averages its bands one by one,
         as is necessary where its parameters that are maps are being traced
     release : take each source out of `sources`, a dict, when it has served, to free its memory
-
-    Raises
-    ------
-    ValueError
-        If a range of a fit of small scales does not lie within a template's multipoles.
     """
     _check_sources(sources, observation)
     terms = plan(sources, observation) if terms is None else terms

@@ -16,8 +16,6 @@ from jaxsky.checks import as_array
 from jaxsky.components import Component, component_class
 from jaxsky.sky import Sky
 
-__all__ = ["baseline", "from_pysm_beta", "preset", "preset_names"]
-
 
 @cache
 def _presets() -> dict[str, dict[str, Any]]:
@@ -58,15 +56,6 @@ def preset(name: str, amplitude: ArrayLike, **maps: ArrayLike) -> Component:
     **maps : the parameters that are maps in this preset, shape (pix,) or numbers: `beta_dust`
         and `T_dust` [K] of d1, `beta_syn` of s1 and s3 (PySM's BETA_S has the other sign:
         `from_pysm_beta`)
-
-    Raises
-    ------
-    KeyError
-        If the name is unknown; lists the known ones.
-    TypeError
-        If a map is missing, or one is given that the preset does not take.
-    ValueError
-        If the component refuses the arrays, as it does a `beta_syn` of the other sign.
 
     Examples
     --------

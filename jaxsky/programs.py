@@ -14,8 +14,6 @@ import jax
 import jaxlib
 from jax._src import compilation_cache, lru_cache
 
-__all__ = ["keep_programs", "program_folder"]
-
 #: Most that is kept [bytes], and how many kinds of processor and versions of JAX it is kept for.
 LARGEST, KINDS = 2**30, 4
 

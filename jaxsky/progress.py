@@ -1,7 +1,5 @@
 """What long work says about itself while it is done."""
 
-__all__ = ["QUIET", "Progress"]
-
 
 class Progress:
     """Told what is being done and how far it is; this one keeps it to itself."""

@@ -13,24 +13,15 @@ from jaxtyping import Array, Float
 from jaxsky.constants import H_OVER_K, T_CMB
 from jaxsky.types import Numeric
 
-__all__ = [
-    "ame_log_parabola",
-    "cmb_derivative",
-    "curved_power_law",
-    "modified_blackbodies",
-    "modified_blackbody",
-    "power_law",
-]
 
-
-def log_planck_excess(x: Numeric) -> Numeric:
+def _log_planck_excess(x: Numeric) -> Numeric:
     """ln(e^x - 1) for x > 0, finite where e^x overflows."""
     return x + jnp.log(-jnp.expm1(-x))
 
 
 def _log_body(nu, beta_dust, T_dust, nu_pivot):
     """ln of (nu/nu_pivot)^(beta+1) / (e^{h nu / k T} - 1)."""
-    return (beta_dust + 1) * jnp.log(nu / nu_pivot) - log_planck_excess(H_OVER_K * nu / T_dust)
+    return (beta_dust + 1) * jnp.log(nu / nu_pivot) - _log_planck_excess(H_OVER_K * nu / T_dust)
 
 
 @jax.jit

@@ -22,8 +22,6 @@ from jaxsky.noise import draw, uniform_alm, uniform_map
 from jaxsky.observation import Observation, ObservedBand, Source
 from jaxsky.preparation import Prepared, prepare
 
-__all__ = ["observe_bands", "simulate"]
-
 
 class _Part(NamedTuple):
     """What one component adds to a band: coefficients, their weights, and a window for all."""
@@ -89,13 +87,6 @@ def observe_bands(
     Returns
     -------
     Name of the channel, and maps [uK_RJ] by name, shape (stokes, pix); each in turn.
-
-    Raises
-    ------
-    ValueError
-        If a component is called "cmb", "noise" or "total", the beam of a channel is finer than
-        that of a component, the CMB's spectra end below 2 nside, or there is nothing to observe
-        in a channel.
     """
     nside, lmax, stokes = observation.nside, observation.lmax, observation.stokes
     if taken := {"cmb", "noise", "total"} & set(prepared):

@@ -12,8 +12,6 @@ from jaxsky.bandpass import Bandpass
 from jaxsky.components import Component
 from jaxsky.interpolation import Nodes, band_sed, choose_nodes
 
-__all__ = ["Sky", "interpolation_nodes", "observe", "observe_band", "observe_components"]
-
 
 class Sky(eqx.Module):
     """A sum of named components on the same pixels.

@@ -35,17 +35,6 @@ from jaxsky.harmonics import (
 from jaxsky.harmonics.beams import NEGLIGIBLE
 from jaxsky.power_law import PowerLaw, fit_power_law
 
-__all__ = [
-    "DUST",
-    "SYNCHROTRON",
-    "Extrapolation",
-    "SmallScales",
-    "add_small_scales",
-    "continue_templates",
-    "extrapolate",
-    "modulation",
-]
-
 
 def _numbers(name: str, value: ArrayLike, count: int = 1) -> Array:
     """A finite number, or `count` of them."""
@@ -141,11 +130,6 @@ def extrapolate(
     own : beam of the template [arcmin]
     small : how it is continued
     lmax : largest multipole of the small scales
-
-    Raises
-    ------
-    ValueError
-        If a range does not lie within the template's multipoles.
     """
     known = lmax_of(alm)
     beam = gaussian_beam(own, known)
@@ -301,12 +285,6 @@ def continue_templates(
     small : how each is continued
     nside : resolution at which the small scales are modulated
     lmax : largest multipole of the result, by default 2 nside
-
-    Raises
-    ------
-    ValueError
-        If maps are not Q, U, a range of a fit does not lie within a template's multipoles, or
-        ranges of correlated templates do not overlap.
     """
     for each in maps:
         if jnp.ndim(each) != 2 or len(each) != 2:
@@ -367,12 +345,6 @@ def add_small_scales(
     own, fwhm : beam of the template, and of the result [arcmin]
     nside : resolution of the result
     small : how the template is continued
-
-    Raises
-    ------
-    ValueError
-        If the maps are not Q, U, or a range of a fit does not lie within the template's
-        multipoles.
     """
     (alm,) = continue_templates(key, [maps], [own], [small], nside).alms
     return synthesis(alm * expand(gaussian_beam(fwhm, lmax_of(alm))), nside)

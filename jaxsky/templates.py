@@ -23,16 +23,6 @@ from jaxsky.harmonics import analysis, beam_ratio, expand, needed_lmax, resize, 
 from jaxsky.harmonics.resolution import MARGIN
 from jaxsky.types import Numeric
 
-__all__ = [
-    "Correlation",
-    "coarse_pixels",
-    "correlation",
-    "dust_index",
-    "polarization_template",
-    "steepening",
-    "synchrotron_index",
-]
-
 #: First and last frequency of an interval [GHz].
 Interval: TypeAlias = tuple[ArrayLike, ArrayLike] | Float[Array, "2"]
 #: Intervals of the paper's steepening [GHz]: that of Giardino's map, and that of the model.
@@ -95,11 +85,6 @@ def polarization_template(
     own_fwhm, fwhm : beam of the maps and of the result, full width at half maximum [arcmin];
         where they are equal only the pixels change
     nside : resolution of the result; below that of the maps, multipoles above 2 nside are cut
-
-    Raises
-    ------
-    ValueError
-        For a wrong shape or nside, values that are not finite, or a target finer than the maps.
     """
     maps, nside_in = _healpix("maps", maps, rows=(2, 3))
     check_finite("maps", maps)
@@ -126,12 +111,6 @@ def dust_index(
     own_fwhm, fwhm : resolution of the map and of the result [arcmin]
     nside : resolution of the result
     mask : True in used pixels, shape (pix,), by default all; what is in the others is ignored
-
-    Raises
-    ------
-    ValueError
-        For a wrong shape or nside, values in used pixels that are not finite, a target finer
-        than the map, or pixels of the result without used ones under the beam.
     """
     beta, nside_in = _healpix("beta", beta)
     _check_nside(nside)
@@ -173,12 +152,6 @@ def steepening(
     nu : frequencies [GHz], shape (sample,), strictly increasing
     temperature : antenna temperature of the spectrum in any unit, shape (sample,)
     low, high : the two intervals, first and last frequency [GHz]; high minus low is returned
-
-    Raises
-    ------
-    ValueError
-        For shapes that do not match, values that are not positive, frequencies that do not
-        increase, or an interval that the spectrum does not cover.
 
     Examples
     --------
@@ -237,11 +210,6 @@ def synchrotron_index(
     ----------
     beta : index at radio frequencies, T ~ nu^-beta and so positive, shape (pix,)
     nu, temperature, low, high : see `steepening`
-
-    Raises
-    ------
-    ValueError
-        If the index is not positive, and for what `steepening` refuses.
     """
     beta = as_array("beta", beta)
     check_positive("beta", beta)
@@ -259,11 +227,6 @@ def coarse_pixels(nside: int, nside_coarse: int) -> Int[np.ndarray, " pix"]:
     """Number of the pixel of a coarser grid that each pixel lies in (both RING).
 
     Blocks for a jackknife over the sky.
-
-    Raises
-    ------
-    ValueError
-        If nside_coarse is not a power of 2 up to nside.
     """
     if not healpy.isnsideok(nside_coarse, nest=True) or nside_coarse > nside:
         raise ValueError(
@@ -285,12 +248,6 @@ def correlation(x: ArrayLike, y: ArrayLike, blocks: ArrayLike | None = None) -> 
     blocks : label of the block of each pixel, shape (pix,); by default each pixel is one. That
         takes neighbours as independent, which they are not on a smooth sky: blocks wider than
         its structures (`coarse_pixels`) give the honest, larger error.
-
-    Raises
-    ------
-    ValueError
-        For shapes that do not match, values that are not finite, less than two blocks, or maps
-        that vary in one of the blocks only, or not at all.
 
     Examples
     --------

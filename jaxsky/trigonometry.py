@@ -4,8 +4,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-__all__ = ["sine_and_cosine"]
-
 
 def sine_and_cosine(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Sine and cosine to some roundings, in a tenth of the time of XLA's, which do one at a time.

@@ -15,8 +15,6 @@ from jaxsky.constants import MJYSR_PER_K_RJ_AT_1GHZ
 from jaxsky.sed import cmb_derivative
 from jaxsky.types import Numeric
 
-__all__ = ["band_conversion", "conversion", "parse_unit"]
-
 _PREFIXES = {"": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9}
 #: name -> (size in the unit of its kind, kind)
 UNITS: dict[str, tuple[float, str]] = {
@@ -28,11 +26,6 @@ UNITS: dict[str, tuple[float, str]] = {
 
 def parse_unit(unit: str) -> tuple[float, str]:
     """Size and kind ("K_RJ", "K_CMB" or "MJy/sr") of a unit's name.
-
-    Raises
-    ------
-    ValueError
-        If the name is unknown.
 
     Examples
     --------
@@ -60,11 +53,6 @@ def conversion(source: str, target: str, nu: Numeric) -> Float[Array, "..."]:
     ----------
     source, target : names of units
     nu : frequency [GHz], any shape
-
-    Raises
-    ------
-    ValueError
-        If a unit is unknown.
 
     Examples
     --------
@@ -101,11 +89,6 @@ def band_conversion(
     nu : frequencies [GHz]
     weights : weights on antenna temperature, summing to 1 (`Bandpass.quadrature`)
     nu_ref : frequency at which a brightness in MJy/sr is quoted [GHz]
-
-    Raises
-    ------
-    ValueError
-        If a unit is unknown.
     """
 
     def K_RJ_per(kind: str) -> Numeric:

@@ -36,7 +36,7 @@ def test_any_name_is_drawn(tmp_path, name):
     axes.set_xlabel(f"${in_formula(name)}$")
     axes.set_ylabel(f"${label(f'calibration.{name}')}$, ${label(f'{name}.beta_dust')}$")
     axes.plot([0, 1], label=plain(name))
-    axes.legend()
+    axes.legend(handles=axes.lines)
     save(figure, tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 5000
 

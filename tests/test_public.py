@@ -41,14 +41,14 @@ def modules():
 
 
 def public():
-    """Functions, constructors and methods that `__all__` names, by name.
+    """Functions, constructors and methods without an underscore, by name.
 
     Named tuples keep what they are given, unit included; settings have types (tested below).
     """
     for module in modules():
-        for name in getattr(module, "__all__", ()):
-            value = getattr(module, name)
-            if getattr(value, "__module__", None) != module.__name__ or not callable(value):
+        for name, value in vars(module).items():
+            own = getattr(value, "__module__", None) == module.__name__ and callable(value)
+            if name.startswith("_") or not own:
                 continue
             where = f"{module.__name__}.{name}"
             if not inspect.isclass(value):

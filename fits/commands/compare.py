@@ -8,8 +8,6 @@ import typer
 from fits.commands import run
 from jaxsky.settings.keys import at_key
 
-__all__ = ["compare"]
-
 KIND = run.Kind(
     "compare",
     (

@@ -15,8 +15,6 @@ from rich.text import Text
 
 from jaxsky import progress
 
-__all__ = ["Steps", "console", "print_tables", "print_written", "replace_unprintable", "warn"]
-
 #: Everything is printed as it is: names, titles and paths may have brackets and colons.
 PLAIN: dict[str, Any] = {"markup": False, "emoji": False, "highlight": False}
 console = Console(stderr=True, **PLAIN)

@@ -10,8 +10,6 @@ from rich.text import Text
 
 from fits.commands.console import console, print_tables
 
-__all__ = ["data"]
-
 data = typer.Typer(
     help="Official data products: what there is, download, and checks.", no_args_is_help=True
 )

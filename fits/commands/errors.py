@@ -10,8 +10,6 @@ from pathlib import Path
 import jaxsky
 from fits.commands.console import console
 
-__all__ = ["logged", "print_error"]
-
 #: Where the traceback of an error is written, in the folder of the results.
 LOG = "error.log"
 #: Longest message of a library that is repeated.

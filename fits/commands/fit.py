@@ -8,8 +8,6 @@ import typer
 from fits.commands import run
 from jaxsky.settings.keys import at_key
 
-__all__ = ["fit"]
-
 KIND = run.Kind(
     "fit", ("result.json", "log.json", "grid.png", "marginals.png", "posterior.png", "chain.h5")
 )

@@ -7,8 +7,6 @@ import typer
 
 from fits.commands import run
 
-__all__ = ["forecast"]
-
 KIND = run.Kind("forecast", ("forecast.json", "log.json", "bb.png", "fisher.png"), resumable=False)
 
 

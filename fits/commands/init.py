@@ -8,8 +8,6 @@ import typer
 from fits.commands.console import print_written
 from fits.commands.run import DEFAULTS
 
-__all__ = ["init"]
-
 #: All that an experiment file can say, with comments.
 TEMPLATE = "experiment"
 

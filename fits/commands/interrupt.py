@@ -12,8 +12,6 @@ from contextlib import contextmanager
 
 from fits.commands.console import console
 
-__all__ = ["interruptible", "prompt"]
-
 #: Ctrl-C is repeated after this time [s], in case a callback has swallowed it; and after so many
 #: repetitions the process ends where it is.
 PATIENCE, REPETITIONS = 1.0, 3

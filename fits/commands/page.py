@@ -10,8 +10,6 @@ from rich.table import Table as TerminalTable
 import jaxsky
 from jaxsky.io import write_text
 
-__all__ = ["Section", "Table", "table_of", "write_page"]
-
 STYLE = """
 body { font: 17px/1.5 Georgia, "Times New Roman", serif; color: #222; background: #fff;
   max-width: 56rem; margin: 2rem auto 4rem; padding: 0 1rem; }

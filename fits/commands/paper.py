@@ -8,8 +8,6 @@ import typer
 from fits.commands import run
 from jaxsky.settings.experiment import Experiment
 
-__all__ = ["paper"]
-
 
 def paper(
     settings_file: run.SettingsPath = None,

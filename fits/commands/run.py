@@ -22,20 +22,6 @@ from jaxsky.settings.experiment import Experiment
 from jaxsky.settings.keys import of_file
 from jaxsky.settings.load import load
 
-__all__ = [
-    "Kind",
-    "Maps",
-    "Options",
-    "Overwrite",
-    "Report",
-    "Resume",
-    "Run",
-    "SettingsPath",
-    "Values",
-    "results_folder",
-    "run",
-]
-
 #: Steps and their times, and the page that shows the results, in every folder.
 LOG, PAGE = "log.txt", "index.html"
 #: Steps of a process that makes a part of the results, from its first one.
@@ -148,12 +134,6 @@ def run(
     work : from settings to what was found; calls `Run.begin` before it writes
     options : of the command line
     part : of the results that is made, see `jaxsky.io.folders.occupied`
-
-    Raises
-    ------
-    ValueError
-        For settings that cannot work, and for a folder with results that are neither to be kept
-        nor replaced, or in which another command works.
     """
     path, out = options.settings_file or DEFAULTS / f"{kind.name}.toml", options.out
     values = list(options.values or ())
@@ -208,12 +188,6 @@ def results_folder(
     resume, overwrite : results that are there are kept or replaced, and refused if neither is
         set. `resume` is None for commands that cannot be resumed.
     part : what of the results is made, see `jaxsky.io.folders.occupied`
-
-    Raises
-    ------
-    ValueError
-        If another command works in the folder, or there are results that are not to be kept or
-        replaced.
     """
     if resume and overwrite:
         raise ValueError("--resume and --overwrite exclude each other.")

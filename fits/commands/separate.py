@@ -7,8 +7,6 @@ import typer
 
 from fits.commands import run
 
-__all__ = ["separate"]
-
 KIND = run.Kind(
     "separate",
     (

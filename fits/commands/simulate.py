@@ -11,8 +11,6 @@ from fits.commands import run
 from jaxsky.io.folders import ALL
 from jaxsky.settings.experiment import Experiment
 
-__all__ = ["simulate"]
-
 #: What is simulated with --only: from the names of the foregrounds.
 ONLY: dict[str, Callable[[list[str]], list[str]]] = {
     "noise": lambda foregrounds: ["noise"],

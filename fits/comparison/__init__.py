@@ -2,5 +2,3 @@
 
 from fits.comparison.compare import Comparison, check_comparison, compare
 from fits.comparison.patches import PatchComparison, compare_patches
-
-__all__ = ["Comparison", "PatchComparison", "check_comparison", "compare", "compare_patches"]

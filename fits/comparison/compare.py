@@ -18,8 +18,6 @@ from jaxsky.progress import QUIET
 from jaxsky.settings.experiment import Experiment
 from jaxsky.settings.files import SettingsError
 
-__all__ = ["Comparison", "check_comparison", "compare"]
-
 #: A slope and a correlation take a few pixels.
 LEAST_PIXELS = 10
 
@@ -51,14 +49,7 @@ class Comparison(NamedTuple):
 def check_comparison(
     settings: Experiment, prepared: Prepared, regions: Mapping[str, Bool[np.ndarray, " pix"]]
 ) -> None:
-    """Refuse at once what `compare` and `compare_patches` would find out late.
-
-    Raises
-    ------
-    SettingsError
-        For a region without pixels, multipoles that the maps do not have, more bins than
-        realisations can test, and patches finer than the maps.
-    """
+    """Refuse at once what `compare` and `compare_patches` would find out late."""
     how = settings.compare
     for name, inside in regions.items():
         if (inside & prepared.used).sum() < LEAST_PIXELS:

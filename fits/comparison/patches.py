@@ -15,8 +15,6 @@ from jaxsky.harmonics import average_pixels, beam_ratio, gaussian_beam, pixel_wi
 from jaxsky.keys import realisation_key, stream
 from jaxsky.settings.experiment import Experiment
 
-__all__ = ["PatchComparison", "compare_patches", "template_patches"]
-
 
 class PatchComparison(NamedTuple):
     """A and alpha of the patches in one band.
@@ -119,11 +117,6 @@ def compare_patches(settings: Experiment, inputs: Inputs) -> PatchComparison:
     ----------
     settings : `compare.patches` is the band
     inputs : templates and maps
-
-    Raises
-    ------
-    ValueError
-        If the maps do not have the multipoles.
     """
     name, nside = str(settings.compare.patches), settings.compare.patches_nside
     fwhm = settings.common.fwhm

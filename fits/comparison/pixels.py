@@ -13,8 +13,6 @@ from fits.comparison.simulations import Simulated, sums_of_squares
 from fits.record import probability
 from fits.resolution import Prepared
 
-__all__ = ["STOKES", "Scatter", "compare_pixels"]
-
 STOKES = ("Q", "U", "QU")
 
 

@@ -18,15 +18,6 @@ from fits.record import probability, with_error
 from jaxsky.harmonics import average_pixels
 from jaxsky.plots import COLORS, STYLE, UNITS, draw_map, draw_title, plain, save
 
-__all__ = [
-    "plot_leakage",
-    "plot_maps",
-    "plot_patches",
-    "plot_scatter",
-    "plot_spectra",
-    "plot_template_patches",
-]
-
 OBSERVED, MODEL, FOREGROUNDS, NOISE = COLORS[1], COLORS[2], COLORS[0], "0.55"
 UNIT = UNITS["uK_RJ"]
 POWER = rf"$D_\ell$ [{UNIT}$^2$]"

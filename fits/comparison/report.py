@@ -13,8 +13,6 @@ from fits.inputs import Inputs
 from fits.record import leaks, probability, with_error, write_json, write_log
 from jaxsky.settings.experiment import Experiment
 
-__all__ = ["comparison_json", "comparison_table", "warnings", "write_report"]
-
 #: A comparison with a smaller probability is pointed out.
 UNLIKELY = 0.01
 

@@ -15,8 +15,6 @@ from jaxsky.checks import check_seed
 from jaxsky.harmonics import analysis, lmax_of, power_spectrum
 from jaxsky.progress import QUIET
 
-__all__ = ["Simulated", "full_sky_spectra", "simulate", "sums_of_squares"]
-
 
 class Simulated(NamedTuple):
     """Of each realisation, what is compared with the data.

@@ -13,8 +13,6 @@ from fits.pseudo_cl import bin_edges
 from fits.resolution import Prepared
 from jaxsky.types import Numeric
 
-__all__ = ["LMIN", "BandSpectra", "compare_spectra", "cosmic_error", "hotelling"]
-
 #: Polarization has no multipoles below.
 LMIN = 2
 
@@ -100,11 +98,6 @@ def hotelling(
     ----------
     observed : the measurement
     simulated : independent simulations of it
-
-    Raises
-    ------
-    ValueError
-        If there are not more simulations than bins.
     """
     n, p = simulated.shape
     if n <= p:
@@ -142,11 +135,6 @@ def compare_spectra(
     model : foregrounds of each band [uK_RJ]
     simulated : realisations
     width : multipoles in a bin
-
-    Raises
-    ------
-    ValueError
-        If pixels are missing.
     """
     if missing := int(np.sum(~prepared.used)):
         raise ValueError(

@@ -12,19 +12,6 @@ from jaxsky import Bandpass, Sky, observe_band
 from jaxsky.harmonics import beam_ratio
 from jaxsky.observation import ObservedBand
 
-__all__ = [
-    "PIVOT",
-    "REIONISATION",
-    "BandLaw",
-    "correlation",
-    "equal_r",
-    "fit_law",
-    "foreground_powers",
-    "noise_level",
-    "noise_spectrum",
-    "to_D",
-]
-
 #: Multipole at which amplitudes are given: where primordial B modes of recombination peak.
 PIVOT = 80
 #: Bins whose middle is up to this multipole are taken for the bump of reionisation.
@@ -104,11 +91,6 @@ def fit_law(
     powers : D_b
     fit : first and last multipole of the bins that are fitted
     what : name of the powers, for messages
-
-    Raises
-    ------
-    ValueError
-        If less than three bins are in the range, or powers there are not positive.
     """
     inside = _inside(spectra, fit, what)
     D, ell = powers[inside], spectra.centers[inside]

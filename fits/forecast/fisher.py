@@ -34,16 +34,6 @@ from jaxsky.bandpass import Samples, average, stack_bands
 from jaxsky.checks import check_double
 from jaxsky.parameters import unknown_parameter
 
-__all__ = [
-    "Errors",
-    "Model",
-    "covariance",
-    "fiducial",
-    "fisher_errors",
-    "foreground_names",
-    "unit_sky",
-]
-
 #: Combinations of parameters that change the data by less than this, relative to each parameter
 #: by itself, are not told apart.
 LEAST_CHANGE = 1e-9
@@ -170,11 +160,6 @@ def fiducial(
     correlations : of each field and pair of components, in the order of the sky
     r : tensor-to-scalar ratio
     A_lens : fraction of the lensing BB that is left
-
-    Raises
-    ------
-    ValueError
-        If the correlation coefficients of a field are those of no fields.
     """
     _check_correlations(list(sky), correlations)
     names = [name for name in parameter_names(sky) if not name.endswith(".amplitude")]

@@ -27,8 +27,6 @@ from jaxsky.settings.experiment import Experiment
 from jaxsky.settings.files import SettingsError
 from jaxsky.settings.keys import at_key
 
-__all__ = ["FIELDS", "Forecast", "forecast"]
-
 FIELDS = ("EE", "BB")
 
 

@@ -14,8 +14,6 @@ from fits.plots import label
 from jaxsky.plots import COLORS, STYLE, UNITS, plain, save
 from jaxsky.settings.experiment import Experiment
 
-__all__ = ["plot_b_modes", "plot_errors"]
-
 #: Primordial spectra, from the largest r on.
 DASHES = ("-", "--", "-.", ":")
 LENSING = "#888888"

@@ -14,8 +14,6 @@ from fits.record import write_json, write_log
 from jaxsky.components import declared
 from jaxsky.settings.experiment import Experiment
 
-__all__ = ["forecast_json", "tables", "warnings", "write_report"]
-
 
 def forecast_json(found: Forecast, settings: Experiment) -> dict[str, Any]:
     """All numbers, D_l in uK_CMB^2 unless their key says otherwise."""

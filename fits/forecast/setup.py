@@ -17,8 +17,6 @@ from jaxsky.observation import ObservedBand
 from jaxsky.settings.experiment import Experiment
 from jaxsky.settings.files import SettingsError
 
-__all__ = ["Setup", "build"]
-
 #: Spectra are corrected for beams down to this window.
 LEAST_WINDOW = 0.05
 
@@ -45,14 +43,7 @@ class Setup(NamedTuple):
 
 
 def build(settings: Experiment) -> Setup:
-    """Read what the settings name, and check that it can work.
-
-    Raises
-    ------
-    jaxsky.io.InputError, SettingsError, KeyError, ValueError
-        For files that are not what they should be, names that do not exist, multipoles that
-        templates do not resolve, and a mask that leaves nothing.
-    """
+    """Read what the settings name, and check that it can work."""
     spec = settings.forecast
     if not settings.cmb.include:
         raise SettingsError("cmb.include: is false, but a forecast has a CMB.")

@@ -4,14 +4,3 @@ from fits.commands.page import Table
 from fits.paper.item import Impossible, Item, Number
 from fits.paper.run import STEPS, Step, run
 from fits.paper.sources import Sources
-
-__all__ = [
-    "STEPS",
-    "Impossible",
-    "Item",
-    "Number",
-    "Sources",
-    "Step",
-    "Table",
-    "run",
-]

@@ -16,16 +16,6 @@ from fits.regions import region_masks, region_words
 from fits.resolution import prepare
 from jaxsky.settings.experiment import Experiment
 
-__all__ = [
-    "figure_leakage",
-    "figure_maps",
-    "figure_patches",
-    "figure_planck",
-    "figure_scatter",
-    "figure_wmap",
-    "shared_inputs",
-]
-
 PLANCK, WMAP = ("30", "44", "70", "353"), ("K", "Ka", "Q", "V", "W")
 #: Bands of the paper's figures 5 and 6.
 SHOWN = ("30", "44", "70", "353", "K", "W")

@@ -17,8 +17,6 @@ from jaxsky.preparation import Prepared, plan, prepare
 from jaxsky.settings.experiment import Experiment
 from jaxsky.simulate import observe_bands
 
-__all__ = ["figure_patch", "table_core"]
-
 BANDS = ("45", "105", "315")
 #: The paper's resolution of the CMB [arcmin], and what dominates each band there.
 CMB_FWHM, DOMINANT = 4.0, {"45": "synchrotron", "105": "CMB", "315": "dust"}

@@ -14,8 +14,6 @@ from jaxsky.io import InputError
 from jaxsky.settings.experiment import Experiment
 from jaxsky.settings.tables import BandTable
 
-__all__ = ["figure_b_modes"]
-
 #: The paper's bands of COrE [GHz].
 BANDS = ("45", "105", "315")
 #: Resolution of the embedded model here, and the largest multipole.

@@ -20,8 +20,6 @@ from jaxsky.settings.experiment import IndexFile
 from jaxsky.settings.files import SettingsError
 from jaxsky.templates import dust_index, steepening
 
-__all__ = ["STEEPENING", "SYMBOLS", "Index", "drawn_index", "held_index", "read_index"]
-
 #: Resolution of the paper's maps [arcmin], and by how much its synchrotron is made steeper.
 FWHM = {"beta_dust": 180.0, "beta_syn": 600.0}
 STEEPENING = 0.13
@@ -73,13 +71,7 @@ def held_index(name: str, values: Float[Array, " pix"]) -> Index:
 
 
 def read_index(folder: Path, name: str, spec: IndexFile) -> Index:
-    """The index of a file, smoothed; that of the synchrotron made steeper, if so wished.
-
-    Raises
-    ------
-    SettingsError, jaxsky.io.InputError
-        For files that cannot be read as what they should be.
-    """
+    """The index of a file, smoothed; that of the synchrotron made steeper, if so wished."""
     pure = spec if spec.unit is not None else spec.model_copy(update={"unit": ""})
     where, found = f"paper.{name}", read(folder, pure, stokes="", zeros_are_data=True)
     origin, fwhm, by = f"{SYMBOLS[name]} is that of {spec.label}", max(FWHM[name], spec.fwhm), 0.0

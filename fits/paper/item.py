@@ -5,8 +5,6 @@ from typing import NamedTuple
 
 from fits.commands.page import Table
 
-__all__ = ["NUMBERS", "Impossible", "Item", "Number", "picture_of"]
-
 #: Label of the table that is collected from all items.
 NUMBERS = "Numbers of the text"
 

@@ -10,8 +10,6 @@ from jaxtyping import Float
 
 from jaxsky.plots import STYLE, UNITS, draw_patch, save
 
-__all__ = ["disc", "draw_patches"]
-
 
 def disc(
     values: Float[np.ndarray, " pix"], center: tuple[float, float], size: float

@@ -24,8 +24,6 @@ from fits.record import write_log
 from jaxsky.progress import QUIET, Progress
 from jaxsky.settings.experiment import Experiment
 
-__all__ = ["LOG", "STEPS", "Step", "labels_of", "run"]
-
 LOG = "log.json"
 PAPER = (
     "Hervías-Caimapo, Bonaldi & Brown (2016), “A new model of the microwave polarized sky for CMB "
@@ -70,11 +68,6 @@ STEPS: list[Step] = [
 
 def labels_of(words: Iterable[str], steps: Iterable[Step] = STEPS) -> list[str]:
     """Labels of items by number or label; all without any.
-
-    Raises
-    ------
-    ValueError
-        For a word that is none of them; lists the known ones.
 
     Examples
     --------
@@ -141,13 +134,6 @@ def run(
     Returns
     -------
     The items of the page, those that were there already among them.
-
-    Raises
-    ------
-    ValueError
-        For unknown figures, and a folder with results that are neither to be kept nor replaced.
-    jaxsky.io.InputError, SettingsError
-        For files that cannot be read as what they should be.
     """
     started = time.perf_counter()
     steps = list(STEPS if steps is None else steps)

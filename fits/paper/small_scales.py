@@ -26,8 +26,6 @@ from jaxsky.settings.experiment import Experiment
 from jaxsky.small_scales import DUST, SYNCHROTRON, SmallScales, continue_templates
 from jaxsky.templates import polarization_template
 
-__all__ = ["figure_randomised", "figure_spectra"]
-
 NAMES = ("synchrotron", "dust")
 #: The paper's ranges and the slopes it finds, EE and BB.
 RANGES = {"synchrotron": SYNCHROTRON, "dust": DUST}

@@ -22,8 +22,6 @@ from jaxsky.settings.tables import ComponentTable, SmallScalesTable
 from jaxsky.small_scales import Continued, SmallScales, continue_templates
 from jaxsky.templates import dust_index, polarization_template
 
-__all__ = ["NSIDE", "PAPER_FWHM", "Ame", "Layer", "Sources", "listed"]
-
 #: Beams of the paper's templates [arcmin].
 PAPER_FWHM = {"dust": 10.0, "synchrotron": 60.0}
 #: Reference frequency of the AME [GHz], its resolution [arcmin] and nside, and those of its

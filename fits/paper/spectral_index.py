@@ -13,8 +13,6 @@ from fits.spectral_index import run
 from jaxsky.settings.experiment import Experiment
 from jaxsky.settings.files import SettingsError
 
-__all__ = ["figure_probability"]
-
 #: The bands that the paper fits.
 BANDS = ("44", "70")
 #: What it finds, by region and parameter.

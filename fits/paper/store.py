@@ -10,8 +10,6 @@ from fits.paper.item import Item, Number
 from fits.record import write_json
 from jaxsky.settings.experiment import Experiment
 
-__all__ = ["FILE", "Store"]
-
 FILE = "items.json"
 
 
@@ -40,12 +38,6 @@ class Store:
     resume : go on with those that are there
     overwrite : those that are there may be replaced; of other settings, they are discarded when
         the first new one is there
-
-    Raises
-    ------
-    ValueError
-        If there are items and they are neither to be kept nor replaced, are to be kept but are
-        of other settings, or cannot be read.
     """
 
     def __init__(

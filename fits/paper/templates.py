@@ -17,8 +17,6 @@ from jaxsky.presets import preset
 from jaxsky.settings.experiment import Experiment
 from jaxsky.templates import coarse_pixels, correlation, polarization_template, steepening
 
-__all__ = ["COLUMN", "figure_ame", "figure_indices", "figure_templates", "limit"]
-
 #: Width of a column [in].
 COLUMN = 3.5
 #: The paper's correlations of dust and AME.

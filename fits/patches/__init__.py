@@ -2,5 +2,3 @@
 
 from fits.patches.fit import PatchFits, fit_patches
 from fits.patches.prepare import EDGES, PreparedPatches, prepare_patches
-
-__all__ = ["EDGES", "PatchFits", "PreparedPatches", "fit_patches", "prepare_patches"]

@@ -14,8 +14,6 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Float
 
-__all__ = ["Bands", "decorrelate", "law", "minimise", "sandwich", "variances"]
-
 PIVOT = 80.0
 #: The root of the variance of a power never falls below this part of what it is expected to be:
 #: where a law predicts nothing in a band, that band alone would decide.

@@ -20,8 +20,6 @@ from fits.patches.prepare import PreparedPatches
 from fits.pseudo_cl import band_powers, covariance_terms
 from jaxsky.harmonics import analysis, power_spectrum
 
-__all__ = ["PatchFits", "fit_patches", "fit_powers"]
-
 #: Mean and standard deviation of the Gaussian prior of alpha. Dust has -2.4 (Planck intermediate
 #: results 30, 2016).
 SLOPE = (-2.4, 3.0)

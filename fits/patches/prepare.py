@@ -9,8 +9,6 @@ from jaxtyping import Float
 from fits.discs import Patch
 from fits.pseudo_cl import MaskedSpectra, masked_spectra
 
-__all__ = ["EDGES", "PreparedPatches", "prepare_patches"]
-
 #: The paper's multipoles, 40 to 100, in four bins.
 EDGES = (40, 55, 70, 85, 101)
 #: Matrices of coupling that agree to this belong to the same mask, turned.

@@ -30,8 +30,6 @@ from jaxsky.harmonics import analysis, expand, gaussian_beam, lmax_of, synthesis
 from jaxsky.keys import stream
 from jaxsky.noise import draw, uniform_alm
 
-__all__ = ["Domain", "HarmonicDomain", "PixelDomain"]
-
 
 class PixelDomain(NamedTuple):
     """Pixel by pixel, all maps at one resolution.

@@ -13,8 +13,6 @@ from fits.record import with_error
 from fits.separate.separate import Separation
 from jaxsky.plots import COLORS, STYLE, UNITS, draw_map, draw_title, plain, save
 
-__all__ = ["plot_components", "plot_parameters", "plot_ratio", "plot_residuals", "plot_spectra"]
-
 #: Width of a column of a paper [inch].
 COLUMN = 3.5
 #: Bands whose residuals are drawn.

@@ -15,8 +15,6 @@ from jaxsky.io import write_maps
 from jaxsky.parameter_maps import parameter_unit
 from jaxsky.settings.experiment import Experiment
 
-__all__ = ["result_json", "tables", "warnings", "write_report"]
-
 #: Probabilities below this are worth a word.
 UNLIKELY = 1e-3
 #: As is E in B above this fraction of a power's standard deviation.

@@ -32,8 +32,6 @@ from jaxsky.settings.experiment import Experiment
 from jaxsky.settings.files import SettingsError
 from jaxsky.settings.keys import at_key
 
-__all__ = ["SAMPLED", "Separation", "separate"]
-
 #: Walkers of emcee, if they are enough.
 WALKERS = 32
 #: The posterior of more parameters is not sampled.
@@ -105,15 +103,6 @@ def separate(
     setup : what is separated, from `fits.separate.setup.build`
     out : folder that keeps simulations and chains; what it holds is not made again
     progress : told of each step of the work
-
-    Raises
-    ------
-    RuntimeError
-        Without double precision.
-    fits.results.FitError
-        If the data do not determine the parameters.
-    KeyError, ValueError
-        For parameters that do not exist and settings that cannot work.
     """
     check_double("A separation")
     spec, domain, priors = settings.separate, setup.domain, priors_of(settings, "separate")

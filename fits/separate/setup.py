@@ -27,8 +27,6 @@ from jaxsky.settings.files import MapFile, SettingsError
 from jaxsky.settings.keys import at_key
 from jaxsky.settings.tables import Regions
 
-__all__ = ["Setup", "build"]
-
 #: Noise that varies by less than this fraction from pixel to pixel is uniform: smoothed maps of
 #: variances ring by 1e-7.
 UNIFORM = 1e-6
@@ -56,14 +54,7 @@ class Setup(NamedTuple):
 
 
 def build(settings: Experiment) -> Setup:
-    """Read or simulate what the settings name, and check that it can work.
-
-    Raises
-    ------
-    jaxsky.io.InputError, SettingsError, KeyError, ValueError
-        For files that are not what they should be, names that do not exist, maps that are coarser
-        than the common resolution, and a mask that leaves nothing.
-    """
+    """Read or simulate what the settings name, and check that it can work."""
     spec, common = settings.separate, settings.common
     if not settings.cmb.include:
         raise SettingsError("cmb.include: is false, but a separation has a CMB.")

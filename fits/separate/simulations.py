@@ -24,8 +24,6 @@ from jaxsky.cmb import realisation
 from jaxsky.harmonics import analysis, expand, power_spectrum, synthesis
 from jaxsky.keys import stream
 
-__all__ = ["Realisation", "Simulated"]
-
 
 class Simulated(NamedTuple):
     """Of each simulation; band powers are D_b of BB [uK_CMB^2].

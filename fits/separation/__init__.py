@@ -19,27 +19,3 @@ from fits.separation.noise import Noise, as_noise
 from fits.separation.regions import clusters, latitude_bands, superpixels
 from fits.separation.results import SpectralFit
 from fits.separation.sample import sample_spectra
-
-__all__ = [
-    "ComponentMaps",
-    "HarmonicMaps",
-    "Noise",
-    "SpectralFit",
-    "SpectralLikelihood",
-    "as_noise",
-    "clusters",
-    "component_maps",
-    "fisher",
-    "fit_spectra",
-    "harmonic_coefficients",
-    "harmonic_component_maps",
-    "harmonic_likelihood",
-    "hessian",
-    "latitude_bands",
-    "noise_degradation",
-    "residual_maps",
-    "sample_spectra",
-    "spectral_likelihood",
-    "superpixels",
-    "white_spectrum",
-]

@@ -6,8 +6,6 @@ import scipy.special
 import scipy.stats
 from jaxtyping import Float
 
-__all__ = ["agreement"]
-
 
 def _normal(values: np.ndarray) -> np.ndarray:
     """Values (step, chain, par) as quantiles of the normal distribution, by their ranks."""

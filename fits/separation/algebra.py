@@ -8,8 +8,6 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Float
 
-__all__ = ["Factor", "assembled", "degenerate", "variances"]
-
 #: Matrices up to this size are treated as dense ones.
 DENSE = 1500
 #: Columns solved for at a time, and the most of them for variances of a sparse matrix.

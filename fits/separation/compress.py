@@ -18,8 +18,6 @@ from fits.separation.noise import Noise, chunks
 from fits.separation.regions import Cells
 from jaxsky.checks import UNSEEN
 
-__all__ = ["Layout", "band_covariance", "compressed", "gathered", "layouts", "used_pixels"]
-
 #: Pixels in a block of the likelihood: few enough for the cache, enough for its loops.
 BLOCK = 4096
 
@@ -62,13 +60,7 @@ def layouts(stokes: int, joint: bool) -> tuple[Layout, ...]:
 
 
 def used_pixels(noise: Noise, npix: int, components: int) -> np.ndarray:
-    """Pixels that are not masked.
-
-    Raises
-    ------
-    ValueError
-        If none is left, or one is seen in fewer bands than there are components.
-    """
+    """Pixels that are not masked."""
     used = np.zeros(npix, bool)
     few = 0
     for part in chunks(npix):

@@ -30,8 +30,6 @@ from fits.separation.problem import (
 from fits.separation.results import SpectralFit
 from jaxsky.types import Numeric
 
-__all__ = ["fisher", "fit_spectra", "hessian", "start_vector"]
-
 #: The optimum is reached this close to it, in standard deviations of a parameter.
 REACHED = 1e-3
 #: Newton steps, by default.
@@ -65,13 +63,7 @@ def _dense(which, like, params):
 def start_vector(
     like: SpectralLikelihood, start: Mapping[str, Numeric] | None, priors: Mapping[str, Prior]
 ) -> Float[np.ndarray, " par"]:
-    """The vector to start from.
-
-    Raises
-    ------
-    KeyError, ValueError
-        For unknown parameters, or start values outside their prior.
-    """
+    """The vector to start from."""
     params = like.check(like.start if start is None else start)
     to_unbounded(params, priors)
     return np.array(like.flat(params))

@@ -16,17 +16,6 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-__all__ = [
-    "Derivatives",
-    "Pixels",
-    "chi2",
-    "derivatives",
-    "explained",
-    "inverse_gram",
-    "residuals",
-    "solve",
-]
-
 
 class Pixels(NamedTuple):
     """Data in pixels that are treated in the same way.

@@ -33,8 +33,6 @@ from jaxsky.parameters import check_parameter, unknown_parameter
 from jaxsky.types import Numeric
 from jaxsky.units import parse_unit
 
-__all__ = ["SpectralLikelihood", "spectral_likelihood"]
-
 #: Pixels that are treated at once.
 PASS = 4096
 

@@ -17,8 +17,6 @@ from fits.separation.likelihood import SpectralLikelihood
 from fits.separation.noise import Noise, as_noise, bare, chunks
 from jaxsky.types import Numeric
 
-__all__ = ["ComponentMaps", "component_maps", "noise_degradation", "residual_maps"]
-
 
 class ComponentMaps(NamedTuple):
     """Maps of the components; NaN in masked pixels.
@@ -246,11 +244,6 @@ def noise_degradation(
     Returns
     -------
     Ratio of standard deviations; a single pixel if it is the same in all.
-
-    Raises
-    ------
-    KeyError
-        If there is no such component.
     """
     names = tuple(like.sky)
     if component not in names:

@@ -23,8 +23,6 @@ from jaxsky.sed import cmb_derivative
 from jaxsky.types import Numeric
 from jaxsky.units import parse_unit
 
-__all__ = ["Mixing", "SpectralBands", "spectral_names"]
-
 #: parameter of a band -> its value if not given
 NOMINAL = {"shift": 0.0, "width": 1.0, "gain": 1.0, "angle": 0.0}
 #: Fields that act on amplitudes, which are free in every pixel anyway.

@@ -10,8 +10,6 @@ from jaxtyping import Float
 from fits.separation.algebra import Factor
 from fits.separation.problem import Matrix, Problem
 
-__all__ = ["CLOSE", "minimise"]
-
 #: A step this small, in standard deviations, is the last one.
 CLOSE = 1e-5
 

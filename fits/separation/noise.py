@@ -9,8 +9,6 @@ from jaxtyping import Bool, Float
 from jaxsky.bare import refuse_unit, takes_quantities
 from jaxsky.types import Numeric
 
-__all__ = ["Noise", "as_noise", "bare", "chunks"]
-
 #: Pixels per pass.
 CHUNK = 1 << 15
 #: Ratios of sigma between bands that are constant to this accuracy make noise separable.
@@ -27,13 +25,7 @@ def chunks(npix: int, size: int = CHUNK) -> Iterator[slice]:
 
 @takes_quantities
 def bare(name: str, value: object) -> np.ndarray:
-    """A numeric array without a copy, in whatever precision it has.
-
-    Raises
-    ------
-    TypeError
-        If it carries a unit, or is not an array of real numbers.
-    """
+    """A numeric array without a copy, in whatever precision it has."""
     refuse_unit(name, value)
     array = np.asarray(value)
     if array.dtype.kind not in "fiu":
@@ -137,14 +129,6 @@ def as_noise(
     -------
     The noise. Standard deviations whose ratios between bands and Stokes parameters are the same
     in all pixels are recognised as such: it makes the likelihood independent of the pixels.
-
-    Raises
-    ------
-    TypeError
-        If an argument carries a unit or is not numeric.
-    ValueError
-        For other shapes, standard deviations that are not positive, and covariances that are not
-        positive definite.
     """
     if isinstance(noise, Noise):
         return noise

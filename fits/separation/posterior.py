@@ -20,8 +20,6 @@ from fits.separation.algebra import degenerate
 from fits.separation.likelihood import SpectralLikelihood
 from fits.separation.problem import Problem, prior_terms
 
-__all__ = ["Posterior", "scaled_posterior"]
-
 #: Samples for each parameter, from which on they tell more than the curvature at the best fit.
 ENOUGH = 30
 

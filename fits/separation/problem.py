@@ -18,14 +18,6 @@ from fits.separation.algebra import assembled
 from fits.separation.kernel import Derivatives
 from fits.separation.likelihood import SpectralLikelihood
 
-__all__ = [
-    "Matrix",
-    "Problem",
-    "cell_derivatives",
-    "prior_terms",
-    "value_and_gradient",
-]
-
 #: Dense, or sparse for many parameters.
 Matrix: TypeAlias = np.ndarray | scipy.sparse.csc_matrix
 

@@ -11,8 +11,6 @@ from jaxtyping import Int
 from jaxsky.checks import check_seed
 from jaxsky.types import Numeric
 
-__all__ = ["Cells", "check_labels", "clusters", "intersections", "latitude_bands", "superpixels"]
-
 
 def superpixels(nside_map: int, nside: int) -> Int[np.ndarray, " pix"]:
     """Labels of a map's pixels (RING): the RING pixels of a coarser resolution they lie in.
@@ -99,15 +97,7 @@ def clusters(
 
 
 def check_labels(name: str, labels: object, npix: int, used: np.ndarray) -> np.ndarray:
-    """Labels as integers of shape (pix,), 0 where a pixel is not used.
-
-    Raises
-    ------
-    TypeError
-        If they are not integers.
-    ValueError
-        For another shape, or negative labels of pixels that are used.
-    """
+    """Labels as integers of shape (pix,), 0 where a pixel is not used."""
     array = np.asarray(labels)
     if array.dtype.kind not in "iu":
         raise TypeError(f"Labels of {name!r} must be integers, but are {array.dtype}.")

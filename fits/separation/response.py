@@ -13,8 +13,6 @@ from fits.separation.likelihood import SpectralLikelihood
 from fits.separation.problem import Problem, value_and_gradient
 from jaxsky.types import Numeric
 
-__all__ = ["Response", "widened"]
-
 
 class Response:
     """-H^-1 of a fit, with H the curvature of -log posterior.

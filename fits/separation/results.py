@@ -7,8 +7,6 @@ from jaxtyping import Float
 
 from fits.results import FitError
 
-__all__ = ["SpectralFit"]
-
 
 class SpectralFit(NamedTuple):
     """Spectral parameters, numbers or arrays with a value for each region.
@@ -53,13 +51,7 @@ class SpectralFit(NamedTuple):
         return float(self.covariance[i, j] / scale)
 
     def checked(self, throw: bool) -> "SpectralFit":
-        """Itself, if it converged or need not have.
-
-        Raises
-        ------
-        FitError
-            If it did not converge and `throw` is true.
-        """
+        """Itself, if it converged or need not have."""
         if throw and not self.converged:
             raise FitError(self.message, self)  # type: ignore[arg-type]
         return self

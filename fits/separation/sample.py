@@ -28,8 +28,6 @@ from fits.separation.problem import Problem, value_and_gradient
 from jaxsky.checks import check_seed
 from jaxsky.types import Numeric
 
-__all__ = ["sample_spectra"]
-
 #: What each sampler takes, with the values if they are not given.
 OPTIONS: dict[str, dict[str, Any]] = {
     "nuts": {"nsteps": 1000, "nwarmup": 300, "nchains": 4},
@@ -192,13 +190,7 @@ def _undetermined(method: str, labels: tuple[str, ...], unknown: list[str], chi2
 
 
 def _options(sampler: str, given: dict[str, Any]) -> dict[str, Any]:
-    """What the sampler is called with.
-
-    Raises
-    ------
-    ValueError
-        For another sampler, and what this one does not take.
-    """
+    """What the sampler is called with."""
     if sampler not in OPTIONS:
         names = " or ".join(map(repr, OPTIONS))
         raise ValueError(f"Argument `sampler` must be {names}, not {sampler!r}.")

@@ -15,8 +15,6 @@ from jaxtyping import Float
 
 from fits.pseudo_cl import MaskedSpectra, covariance_terms
 
-__all__ = ["PowerModel", "TensorFit", "fit_tensors", "power_model"]
-
 #: Steps of the search, and the change in standard deviations at which it ends.
 STEPS, CLOSE = 50, 1e-6
 #: The posterior is tabulated up to so many standard deviations above the larger of r and 0.
@@ -108,11 +106,6 @@ def power_model(
     simulated : band powers of simulations with r = 0. The standard deviations of the analytic
         covariance are scaled to theirs: it is exact for masks that do not depend on longitude
         and for uniform noise only
-
-    Raises
-    ------
-    ValueError
-        If a spectrum ends too early, or there are fewer than two simulations.
     """
     lmax, bins = spectra.lmax, len(spectra.edges) - 1
     for name, rows in (("lensed", lensed), ("tensors", tensors)):
@@ -165,11 +158,6 @@ def fit_tensors(model: PowerModel, powers: Float[np.ndarray, " bin"]) -> TensorF
     ----------
     model : from `power_model`
     powers : band powers D_b of BB, noise and residuals in them [uK_CMB^2]
-
-    Raises
-    ------
-    ValueError
-        For another number of powers, or powers that are not finite.
     """
     powers = np.asarray(powers, float)
     if powers.shape != model.tensors.shape or not np.isfinite(powers).all():

@@ -5,16 +5,3 @@ from jaxsky.archive.checking import verify
 from jaxsky.archive.download import fetch
 from jaxsky.archive.products import Product, ProductSet, catalogue, find, product_sets, total_size
 from jaxsky.io.folders import cache_folder
-
-__all__ = [
-    "DownloadError",
-    "Product",
-    "ProductSet",
-    "cache_folder",
-    "catalogue",
-    "fetch",
-    "find",
-    "product_sets",
-    "total_size",
-    "verify",
-]

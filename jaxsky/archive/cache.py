@@ -15,17 +15,6 @@ from jaxsky.archive.products import Product
 from jaxsky.io import InputError
 from jaxsky.io.folders import NO_LOCKS
 
-__all__ = [
-    "CHECKSUMS",
-    "DownloadError",
-    "alone",
-    "checksums",
-    "file_hash",
-    "known_hash",
-    "remember",
-    "writing",
-]
-
 #: Hashes of files that the catalogue has none of, as they were when they were fetched.
 CHECKSUMS = "checksums.json"
 _HASH = re.compile(r"(sha256|md5):[0-9a-f]+")

@@ -10,8 +10,6 @@ from jaxsky.io import InputError, read_spectra
 from jaxsky.io.quantities import unit_name
 from jaxsky.io.tables import HealpixTable, open_fits
 
-__all__ = ["check_size", "check_structure", "verify"]
-
 
 def verify(product: Product, folder: Path) -> str:
     """Check a product's file; returns in words what was checked.
@@ -20,12 +18,6 @@ def verify(product: Product, folder: Path) -> str:
     ----------
     product : from the catalogue
     folder : where the file is
-
-    Raises
-    ------
-    InputError
-        If the file is missing, has another size or hash, is cut, or is not what the catalogue
-        says: its columns, units and resolution; and if the record of hashes is damaged.
     """
     path = folder / product.name
     if not path.is_file():
@@ -50,12 +42,6 @@ def check_structure(product: Product, path: Path) -> list[str]:
     """Check that a file is complete and what the catalogue says; returns what was checked.
 
     Reads headers and ends of tables only, whatever the size.
-
-    Raises
-    ------
-    InputError
-        If a FITS file does not open, is cut, or has other columns, units or resolution; if a text
-        file is not the table of spectra that it should be.
     """
     with path.open("rb") as file:
         start = file.read(512)

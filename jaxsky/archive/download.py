@@ -22,8 +22,6 @@ from jaxsky.archive.products import Product
 from jaxsky.io import InputError
 from jaxsky.io.folders import cache_folder
 
-__all__ = ["fetch"]
-
 
 def fetch(
     product: Product,

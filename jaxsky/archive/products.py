@@ -6,16 +6,6 @@ from functools import cache
 from importlib.resources import files
 from typing import Any, NamedTuple
 
-__all__ = [
-    "Product",
-    "ProductSet",
-    "catalogue",
-    "find",
-    "in_words",
-    "product_sets",
-    "total_size",
-]
-
 
 class Product(NamedTuple):
     """A file of an archive.
@@ -102,13 +92,7 @@ def catalogue() -> dict[str, Product]:
 
 
 def find(words: Sequence[str] = ()) -> list[Product]:
-    """Products by name, group, or a part of either, or by the name of a set; all without any.
-
-    Raises
-    ------
-    ValueError
-        If nothing is found for a word.
-    """
+    """Products by name, group, or a part of either, or by the name of a set; all without any."""
     products = list(catalogue().values())
     if not words:
         return products

@@ -14,8 +14,6 @@ import urllib3
 from jaxsky.archive.cache import DownloadError
 from jaxsky.archive.products import in_words
 
-__all__ = ["CutError", "RefusedError", "discard", "reason", "source", "transfer"]
-
 #: Seconds to wait for a connection, and for more bytes.
 TIMEOUT = (10.0, 60.0)
 CHUNK = 2**20
@@ -85,15 +83,6 @@ def transfer(address: str, part: Path, report: Report, size: int | None = None) 
     part : the partial file
     report : called with the bytes that are there, and all bytes or None
     size : bytes that the file has, None if not known
-
-    Raises
-    ------
-    CutError
-        If the transfer ends early; what came is kept.
-    RefusedError, requests.RequestException
-        If the answer is not the file.
-    DownloadError
-        If there is no room for it.
     """
     state = _state(part)
     if state is not None and state.address != address:

@@ -24,22 +24,6 @@ from jaxsky.components.cmb import CMB
 from jaxsky.components.dust import Dust
 from jaxsky.components.synchrotron import Synchrotron
 
-__all__ = [
-    "AME",
-    "CMB",
-    "Component",
-    "Dust",
-    "Synchrotron",
-    "check_value",
-    "component_class",
-    "declared",
-    "parameter",
-    "parameter_declaration",
-    "reference",
-    "template",
-]
-
 for _module in pkgutil.iter_modules(__path__):
     _found = importlib.import_module(f"{__name__}.{_module.name}")
-    globals().update({name: getattr(_found, name) for name in _found.__all__})
-    __all__ += [name for name in _found.__all__ if name not in __all__]
+    globals().update({name: value for name, value in vars(_found).items() if name[0] != "_"})

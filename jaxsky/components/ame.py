@@ -10,8 +10,6 @@ from jaxsky.checks import as_array, is_concrete
 from jaxsky.components.base import Component, parameter, reference, template
 from jaxsky.types import Parameter
 
-__all__ = ["AME"]
-
 
 class AME(Component, law="ame"):
     """Anomalous microwave emission with the log-parabola law (`sed.ame_log_parabola`).

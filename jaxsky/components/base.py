@@ -13,17 +13,6 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.checks import as_array, check_finite, check_positive, is_concrete
 
-__all__ = [
-    "Component",
-    "check_value",
-    "component_class",
-    "declared",
-    "parameter",
-    "parameter_declaration",
-    "reference",
-    "template",
-]
-
 #: Components by the name of their law, or module and class, from the moment a class is defined.
 _LAWS: dict[str, type["Component"]] = {}
 
@@ -219,11 +208,6 @@ def component_class(law: str) -> type[Component]:
     """The component with a law, by its name or as "module:Class" from a package of one's own.
 
     Such a module is looked for where Python does, and in the current folder.
-
-    Raises
-    ------
-    ValueError
-        If there is no such law, module or class.
     """
     if ":" not in law:
         if law not in _LAWS:

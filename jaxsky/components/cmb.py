@@ -9,8 +9,6 @@ from jaxsky.components.base import Component, parameter, template
 from jaxsky.constants import T_CMB
 from jaxsky.types import Parameter
 
-__all__ = ["CMB"]
-
 
 class CMB(Component, law="cmb"):
     """The CMB anisotropies: the derivative of a black body (`sed.cmb_derivative`).

@@ -6,8 +6,6 @@ from jaxsky import sed
 from jaxsky.components.base import Component, parameter, reference, template
 from jaxsky.types import Parameter
 
-__all__ = ["Dust"]
-
 
 class Dust(Component, law="dust"):
     """Thermal dust: one modified black body, or a sum of them given as tuples.

@@ -9,8 +9,6 @@ from jaxtyping import Array, Float
 from jaxsky.components.base import Component, parameter, reference, template
 from jaxsky.types import Numeric, Parameter
 
-__all__ = ["FreeFree", "amplitude_from_emission_measure"]
-
 
 def _emissivity(nu: Numeric, T_e: Numeric) -> Float[Array, "..."]:
     """nu^-2 T_e^-1/2 times the Gaunt factor of Draine (2011), eq. 10.9, with nu in units of GHz."""

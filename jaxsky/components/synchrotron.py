@@ -6,8 +6,6 @@ from jaxsky import sed
 from jaxsky.components.base import Component, parameter, reference, template
 from jaxsky.types import Parameter
 
-__all__ = ["Synchrotron"]
-
 
 class Synchrotron(Component, law="synchrotron"):
     """Synchrotron: a power law, or one with curvature (`sed.curved_power_law`).

@@ -25,27 +25,3 @@ from jaxsky.harmonics.resolution import (
     smooth,
 )
 from jaxsky.harmonics.transforms import ENGINES, adjoint_synthesis, analysis, rotate, synthesis
-
-__all__ = [
-    "ENGINES",
-    "adjoint_synthesis",
-    "alm_ell",
-    "alm_from_healpy",
-    "alm_to_healpy",
-    "analysis",
-    "average_pixels",
-    "beam_ratio",
-    "children",
-    "expand",
-    "gaussian_beam",
-    "lmax_of",
-    "low_multipoles",
-    "needed_lmax",
-    "pixel_window",
-    "power_spectrum",
-    "resample",
-    "resize",
-    "rotate",
-    "smooth",
-    "synthesis",
-]

@@ -11,8 +11,6 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.checks import is_concrete
 
-__all__ = ["beam_ratio", "gaussian_beam", "needed_lmax", "pixel_window"]
-
 #: A window below this is nothing: what it lets through is lost in rounding.
 NEGLIGIBLE = 1e-12
 #: By this much a tabulated target may exceed a map's own window, as measured tables do.
@@ -53,11 +51,6 @@ def beam_ratio(
     target, own : full width at half maximum of a Gaussian [arcmin], or a table b_l, l = 0 ...
     lmax : largest multipole
     what : what has its own beam, for the message
-
-    Raises
-    ------
-    ValueError
-        If the target is finer than the map's own beam, or a table ends below lmax.
     """
     target, own = jnp.asarray(target, float), jnp.asarray(own, float)
     if not target.ndim and not own.ndim:

@@ -12,8 +12,6 @@ from pathlib import Path
 import jax
 import numpy as np
 
-__all__ = ["finish_at_exit"]
-
 #: What Linux says of each thread of this process; elsewhere, threads are not unwound.
 THREADS = Path("/proc/self/task")
 

@@ -13,16 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-__all__ = [
-    "alm_ell",
-    "alm_from_healpy",
-    "alm_to_healpy",
-    "expand",
-    "lmax_of",
-    "power_spectrum",
-    "resize",
-]
-
 
 def alm_ell(lmax: int) -> np.ndarray:
     """Multipole l of each packed coefficient, shape (alm,)."""

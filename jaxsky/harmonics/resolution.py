@@ -12,8 +12,6 @@ from jaxsky.harmonics.beams import beam_ratio, needed_lmax
 from jaxsky.harmonics.packing import expand, resize
 from jaxsky.harmonics.transforms import analysis, synthesis
 
-__all__ = ["average_pixels", "children", "low_multipoles", "resample", "smooth"]
-
 #: Multipoles analysed by `low_multipoles`, in units of those kept, as far as the map resolves them.
 MARGIN = 3
 

@@ -19,8 +19,6 @@ from jaxsky.checks import check_double
 from jaxsky.harmonics.ending import finish_at_exit
 from jaxsky.harmonics.packing import alm_from_healpy, alm_to_healpy, lmax_of
 
-__all__ = ["ENGINES", "adjoint_synthesis", "analysis", "rotate", "synthesis"]
-
 #: Who computes the transforms: ducc0, inside jit and with gradients, or healpy, the reference.
 ENGINES = ("ducc", "healpy")
 #: Coordinates between which coefficients are rotated.
@@ -92,11 +90,6 @@ def synthesis(
     nside : resolution of the maps; lmax may exceed 3 nside - 1, the maps are then samples
     engine : "ducc", or "healpy", which has no gradients
     spin : of the last two rows, if there are two; 2 for polarization
-
-    Raises
-    ------
-    ValueError
-        If `engine` is neither.
     """
     _check_engine(engine)
     lmax = lmax_of(alm)
@@ -164,11 +157,6 @@ def analysis(
         below nside 128, where the quadrature is worse
     engine : "ducc", or "healpy", which has no gradients and no other spin
     spin : of the last two rows, if there are two; 2 for polarization
-
-    Raises
-    ------
-    ValueError
-        If `engine` is neither.
     """
     _check_engine(engine)
     nside = healpy.npix2nside(maps.shape[-1])
@@ -213,11 +201,6 @@ def rotate(
     alm : packed coefficients, shape (stokes, (lmax+1)^2)
     source, target : "G" Galactic, "E" ecliptic or "C" celestial (equatorial), both J2000
     engine : "ducc", or "healpy", which has no gradients
-
-    Raises
-    ------
-    ValueError
-        If `source`, `target` or `engine` is unknown.
     """
     _check_engine(engine)
     for name, value in {"source": source, "target": target}.items():

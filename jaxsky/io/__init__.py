@@ -13,22 +13,3 @@ from jaxsky.io.maps import Maps, read_maps, write_maps
 from jaxsky.io.masks import degrade_mask, read_mask
 from jaxsky.io.quantities import from_quantity, unit_factor, unit_name
 from jaxsky.io.spectra import read_spectra
-
-__all__ = [
-    "InputError",
-    "Maps",
-    "MissingFileError",
-    "check_file",
-    "degrade_mask",
-    "from_quantity",
-    "read_bandpass",
-    "read_beam",
-    "read_maps",
-    "read_mask",
-    "read_spectra",
-    "unit_factor",
-    "unit_name",
-    "whole",
-    "write_maps",
-    "write_text",
-]

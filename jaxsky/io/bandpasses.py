@@ -15,8 +15,6 @@ from jaxsky.io.spectra import is_fits
 from jaxsky.io.tables import InputError, open_fits, select_hdu
 from jaxsky.io.text import TextTable, number, read_text
 
-__all__ = ["read_bandpass"]
-
 #: Frequencies [GHz] and weights of a table.
 Samples: TypeAlias = tuple[np.ndarray, np.ndarray]
 

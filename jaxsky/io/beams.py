@@ -10,8 +10,6 @@ from jaxsky.io.spectra import fits_table, is_fits, multipole_range
 from jaxsky.io.tables import InputError, open_fits
 from jaxsky.io.text import text_table
 
-__all__ = ["read_beam"]
-
 #: Columns that hold b_l: HEALPix, Planck's T E B windows, HFI's and LFI's instrument models.
 _COLUMNS = ("TEMPERATURE", "INTENSITY", "T", "NOMINAL", "BL")
 

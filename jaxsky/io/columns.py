@@ -10,8 +10,6 @@ from itertools import product
 
 from jaxsky.io.tables import PIXELS, InputError
 
-__all__ = ["choose", "parse_stokes", "stokes"]
-
 _LETTERS = {"I": "I", "T": "I", "Q": "Q", "U": "U"}
 _RUNS = ("FULL", "HM1", "HM2", "HR1", "HR2", "YR1", "YR2", "Y1", "Y2")
 _OF_ONE = (
@@ -92,11 +90,6 @@ def parse_stokes(given: str | Sequence[str]) -> list[str]:
     ----------
     given : a letter per column ("IQU"), or words: a sequence, or text with blanks or commas
         ("QQ QU UU"); an entry "" is a column without a Stokes parameter
-
-    Raises
-    ------
-    InputError
-        For what is neither I, Q, U nor a pair of them.
 
     Examples
     --------

@@ -4,8 +4,6 @@ import os
 import stat
 from pathlib import Path
 
-__all__ = ["InputError", "MissingFileError", "check_file"]
-
 
 class InputError(ValueError):
     """A file that cannot be used, as it is or as it was asked for; one sentence with the names."""

@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["PARTIAL", "check_guards", "guards", "whole", "write_text"]
-
 #: How names of files begin that are not complete; the number of their process follows.
 PARTIAL = ".partial-"
 #: Called before anything is written; an exception of theirs keeps it from being written.
@@ -25,11 +23,6 @@ def whole(path: Path) -> Iterator[Path]:
 
     What is there survives a process that is killed and a full disk. Data are on the disk before
     they get their name, as some file systems tell only then that there was no room.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written, with the file and the reason in one sentence.
     """
     beside = path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
     check_guards()

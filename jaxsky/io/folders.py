@@ -18,8 +18,6 @@ import platformdirs
 
 from jaxsky.io.files import PARTIAL, guards, whole
 
-__all__ = ["ALL", "Folder", "alone", "cache_folder", "kept", "occupied"]
-
 #: Locked for moments only, while it is seen who works in a folder.
 GATE = ".lock"
 #: How the name of a file begins that a process keeps locked as long as it works in a folder.
@@ -213,13 +211,6 @@ def occupied(out: Path, part: range = ALL) -> Iterator[Folder]:
     ----------
     out : the folder
     part : what of the results is made; processes share a folder only if their parts differ
-
-    Raises
-    ------
-    ValueError
-        If another process works on the same part, with its number and when it started.
-    OSError
-        If the folder cannot be made, or was removed meanwhile.
     """
     missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:

@@ -10,8 +10,6 @@ from jaxtyping import Float
 from jaxsky.io.tables import InputError
 from jaxsky.io.text import TextTable
 
-__all__ = ["check_plausible", "frequency_unit", "to_GHz"]
-
 #: astropy's name of a unit -> how it is spelt; wavenumbers and wavelengths are converted.
 _UNITS = {
     **{f"{prefix}Hz": re.compile(f"{prefix}hz", re.I) for prefix in ("", "k", "M", "G", "T")},
@@ -52,11 +50,6 @@ def frequency_unit(path: Path, table: TextTable, column: int, given: str | None)
 
     Of a text table the line above the rows counts first; what is said above that is overruled by
     the argument. Lengths are units of wavelengths only where these are spoken of.
-
-    Raises
-    ------
-    InputError
-        If the header names another unit than the argument, several, or wavelengths without one.
     """
     last = _units(table.header[-1]) if table.header else []
     if table.bars:
@@ -84,13 +77,7 @@ def frequency_unit(path: Path, table: TextTable, column: int, given: str | None)
 def to_GHz(
     path: Path, samples: Float[np.ndarray, "2 sample"], unit: str
 ) -> Float[np.ndarray, "2 sample"]:
-    """Frequencies, wavenumbers or wavelengths with their weights, as frequencies in GHz.
-
-    Raises
-    ------
-    InputError
-        If the unit is none of these.
-    """
+    """Frequencies, wavenumbers or wavelengths with their weights, as frequencies in GHz."""
     known = _known(unit)
     if known not in _UNITS:
         raise InputError(

@@ -23,8 +23,6 @@ from jaxsky.io.tables import InputError, equals
 from jaxsky.types import Numeric
 from jaxsky.units import UNITS
 
-__all__ = ["Maps", "read_maps", "write_maps"]
-
 
 @dataclass(frozen=True, eq=False)
 class Maps:

@@ -11,8 +11,6 @@ from jaxsky.io.errors import check_file
 from jaxsky.io.sources import default_fields
 from jaxsky.io.tables import COORDINATES, ORDERINGS, HealpixTable, InputError, equals, open_fits
 
-__all__ = ["degrade_mask", "read_mask"]
-
 
 def _choose(path: Path, key: str | None, known: list[str]) -> str:
     if key is None and len(known) == 1:
@@ -136,11 +134,6 @@ def degrade_mask(
     mask : True in used pixels, RING, shape (pix,)
     nside : resolution of the result
     threshold : smallest used fraction of a pixel, 0 < threshold <= 1
-
-    Raises
-    ------
-    ValueError
-        If nside is not a power of 2 up to that of the mask, or the threshold is outside (0, 1].
     """
     found = healpy.npix2nside(np.size(mask))
     if not healpy.isnsideok(found, nest=True):

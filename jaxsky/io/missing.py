@@ -10,8 +10,6 @@ from jaxtyping import Float
 
 from jaxsky.io.tables import InputError
 
-__all__ = ["parse_missing", "sentinels", "zeros"]
-
 #: Numbers that are written in place of a value that is missing, of either sign.
 USUAL = (999.0, 9999.0, 99999.0, 999999.0, 32767.0, 32768.0, 2147483647.0, 2147483648.0)
 #: Beyond any value of a sky map in any unit, unless its others are as large.
@@ -23,13 +21,7 @@ ZEROS = 0.3
 
 
 def parse_missing(given: Any) -> list[float]:
-    """The numbers that an argument says to mark missing pixels.
-
-    Raises
-    ------
-    InputError
-        For what is not a number or several.
-    """
+    """The numbers that an argument says to mark missing pixels."""
     several: list = [given] if isinstance(given, numbers.Real | str) else list(given)
     if any(isinstance(x, bool) or not isinstance(x, numbers.Real) for x in several):
         raise InputError(f"Argument `missing` must be a number or a list of them, not {given!r}.")

@@ -13,8 +13,6 @@ from jaxsky.bandpass import Bandpass
 from jaxsky.io.errors import InputError
 from jaxsky.io.tables import open_fits
 
-__all__ = ["Observed", "observed_tables", "read_observed"]
-
 #: Whose maps have these tables.
 CREATOR = "jaxsky"
 NOISE = ("QQ", "QU", "UU")
@@ -80,13 +78,7 @@ def observed_tables(observed: Observed) -> list[pyfits.BinTableHDU]:
 
 
 def read_observed(path: Path) -> Observed | None:
-    """How the map in a file was observed; None if `observed_tables` did not write it.
-
-    Raises
-    ------
-    InputError
-        If tables are missing or damaged.
-    """
+    """How the map in a file was observed; None if `observed_tables` did not write it."""
     with open_fits(path) as hdus:
         tables = {hdu.name: hdu for hdu in hdus[1:]}
         if "BANDPASS" not in tables or tables["BANDPASS"].header.get("CREATOR") != CREATOR:

@@ -11,8 +11,6 @@ from jaxsky.bare import takes_quantities
 from jaxsky.types import Numeric
 from jaxsky.units import UNITS, conversion, parse_unit
 
-__all__ = ["from_quantity", "is_ambiguous", "unit_factor", "unit_name"]
-
 _DIMENSIONLESS = {"", "1", "none", "n/a", "na", "unitless", "dimensionless", "index", "ratio"}
 _DIMENSIONLESS |= {"count", "counts", "ct", "hit", "hits", "n_obs", "samples", "number"}
 _SQUARE = r"(?P<square>(?:\^|\*\*)?2)?"
@@ -38,11 +36,6 @@ def unit_name(text: str) -> str:
     -------
     A name of `jaxsky.units`, with "^2" for a square; "" for a pure number; "K", "mK", "uK" or
     "nK" where the text does not say whether antenna or thermodynamic; else astropy's name.
-
-    Raises
-    ------
-    ValueError
-        If the text names no unit.
 
     Examples
     --------

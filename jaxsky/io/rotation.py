@@ -8,8 +8,6 @@ from jaxtyping import Bool, Float
 
 from jaxsky.io.tables import InputError
 
-__all__ = ["blocks", "to_galactic"]
-
 
 def blocks(where: str, names: Sequence[str], kinds: Sequence[str | None]) -> list[list[int]]:
     """Rows that turn together when the coordinates change: (Q, U) pairs, and single scalars.
@@ -19,11 +17,6 @@ def blocks(where: str, names: Sequence[str], kinds: Sequence[str | None]) -> lis
     where : file, for the message
     names : of the columns
     kinds : their Stokes parameters, "" for other scalars
-
-    Raises
-    ------
-    InputError
-        For Q without U, and for covariances, which cannot be turned.
     """
     found: list[list[int]] = []
     row = 0

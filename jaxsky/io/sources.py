@@ -21,8 +21,6 @@ from jaxsky.io.tables import (
     open_fits,
 )
 
-__all__ = ["Columns", "Source", "check_alike", "default_fields", "read_columns", "sources"]
-
 POLARIZATIONS = {"COSMO": "COSMO", "IAU": "IAU"}
 
 
@@ -138,13 +136,7 @@ def read_columns(
     coordinates: str | None,
     polarization: str | None,
 ) -> Columns:
-    """The columns of one table; arguments as those of `read_maps`.
-
-    Raises
-    ------
-    InputError
-        See `read_maps`.
-    """
+    """The columns of one table; arguments as those of `read_maps`."""
     with open_fits(source.path) as hdus:
         table = HealpixTable(source.path, hdus, source.hdu)
         if source.fields is None:

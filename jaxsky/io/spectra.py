@@ -13,8 +13,6 @@ from jaxsky.io.quantities import unit_factor, unit_name
 from jaxsky.io.tables import InputError, open_fits
 from jaxsky.io.text import text_table
 
-__all__ = ["fits_table", "is_fits", "multipole_range", "read_spectra"]
-
 SPECTRA = ("TT", "EE", "BB", "TE")
 #: First columns of text files, by format.
 _ORDERS = {"planck": ("L", "TT", "TE", "EE", "BB"), "camb": ("L", "TT", "EE", "BB", "TE")}
@@ -64,13 +62,6 @@ def multipole_range(
     ell : multipole of each row
     lmax : multipole that has to be reached
     start : largest multipole with which the table may begin
-
-    Raises
-    ------
-    InputError
-        If the rows are no complete sequence of multipoles from `start` to `lmax`.
-    ValueError
-        If lmax is negative.
     """
     if lmax < 0:
         raise ValueError(f"Argument `lmax` must not be negative, but is {lmax}.")

@@ -16,17 +16,6 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsky.io.errors import InputError, check_file
 
-__all__ = [
-    "COORDINATES",
-    "ORDERINGS",
-    "PIXELS",
-    "HealpixTable",
-    "InputError",
-    "equals",
-    "open_fits",
-    "select_hdu",
-]
-
 #: Spellings in headers and arguments, upper case -> the package's.
 ORDERINGS = {"RING": "RING", "NESTED": "NESTED", "NEST": "NESTED"}
 COORDINATES = {
@@ -149,12 +138,6 @@ class HealpixTable:
     path : the file, for the messages
     hdus : the open file
     hdu : number or name of the table
-
-    Raises
-    ------
-    InputError
-        If it is no HEALPix map: no binary table, another PIXTYPE, NSIDE or number of rows, pixel
-        numbers that are none or are there twice.
     """
 
     def __init__(self, path: Path, hdus: pyfits.HDUList, hdu: int | str) -> None:
@@ -369,11 +352,6 @@ class HealpixTable:
         keywords : header keywords that say the same
         spellings : upper-case spelling -> the package's
         default : value if neither says anything; None to make that an error
-
-        Raises
-        ------
-        InputError
-            If nothing is said, one of the two is no known value, or they contradict.
         """
         choices = ", ".join(dict.fromkeys(spellings.values()))
         if given is not None:

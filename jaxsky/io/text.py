@@ -10,8 +10,6 @@ from jaxtyping import Float
 
 from jaxsky.io.tables import InputError
 
-__all__ = ["Row", "TextTable", "read_text", "text_table"]
-
 COMMENTS = ("#", ";", "%", "!", "\\", "|", "//", "*")
 _TRAILING = re.compile(r"\s(?:[#!%\\]|//).*")
 _NUMBER = re.compile(
@@ -66,13 +64,7 @@ def _lines(path: Path) -> list[str]:
 
 
 def _cells(path: Path, line: int, text: str) -> list[str]:
-    """Fields between semicolons, commas or blanks; a comma may be decimal in the first case only.
-
-    Raises
-    ------
-    InputError
-        If commas stand inside of numbers that blanks separate.
-    """
+    """Fields between semicolons, commas or blanks; a comma may be decimal in the first."""
     if ";" in text:
         return [cell.strip().replace(",", ".") for cell in text.strip(" ;").split(";")]
     words = [word.strip(",") for word in text.split()]
@@ -91,11 +83,6 @@ def read_text(path: Path) -> TextTable:
     Comments start with # ; % ! \ | // or *. Columns are separated by blanks, commas or semicolons.
     A line before the first row is a header if none of its fields is a number, and they do not all
     begin with a digit.
-
-    Raises
-    ------
-    InputError
-        If the file is no text, has no rows, or commas that separate columns or decimals.
     """
     table = TextTable([], [], [])
     for line, whole in enumerate(_lines(path), start=1):
@@ -136,13 +123,7 @@ def _check_commas(path: Path, rows: list[Row]) -> None:
 
 
 def text_table(path: Path) -> tuple[list[list[str]], Float[np.ndarray, "row column"]]:
-    """Lines before the numbers of a text table, split into words, and the numbers.
-
-    Raises
-    ------
-    InputError
-        If the file is no text, or a row is not of numbers, as many as in those above.
-    """
+    """Lines before the numbers of a text table, split into words, and the numbers."""
     found = read_text(path)
     width = len(found.rows[0].cells)
     table = []

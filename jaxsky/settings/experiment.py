@@ -29,18 +29,6 @@ from jaxsky.settings.types import (
 from jaxsky.settings.values import MistakeAt, check_reference, check_signs
 from jaxsky.small_scales import DUST, SYNCHROTRON
 
-__all__ = [
-    "Common",
-    "Compare",
-    "Experiment",
-    "Fit",
-    "Forecast",
-    "Paper",
-    "Separate",
-    "Simulate",
-    "parse_region",
-]
-
 Positive = Annotated[float, Field(gt=0)]
 Multipole = Annotated[int, Field(ge=2)]
 
@@ -56,11 +44,6 @@ WORDS = {
 
 def parse_region(text: str) -> tuple[str, float] | None:
     """The comparison and the latitude [deg] of "|b| > 20" and its like; None for the full sky.
-
-    Raises
-    ------
-    ValueError
-        For other words.
 
     Examples
     --------
@@ -369,13 +352,7 @@ class Experiment(SettingsFile):
         return [f"{w.format(command)}: {', '.join(names)}." for w, names in parts.items() if names]
 
     def start(self, command: str) -> dict[str, float]:
-        """Start values of the free parameters of a command.
-
-        Raises
-        ------
-        SettingsError
-            For one without a start and a prior.
-        """
+        """Start values of the free parameters of a command."""
         values = {}
         for name, one in self.free_in(command).items():
             if (value := one.first()) is None:

@@ -25,24 +25,6 @@ from jaxsky.settings.values import (
 )
 from jaxsky.units import UNITS
 
-__all__ = [
-    "BandpassSpec",
-    "CovarianceColumns",
-    "FileName",
-    "Hits",
-    "MapFile",
-    "MapKeys",
-    "MaskFile",
-    "NamedFile",
-    "NoiseColumns",
-    "NoiseTable",
-    "SettingsError",
-    "SettingsFile",
-    "Table",
-    "Weights",
-    "expand",
-]
-
 
 class SettingsError(ValueError):
     """Settings that cannot work, as one sentence that names the file and the key."""
@@ -260,13 +242,7 @@ class SettingsFile(Table):
 
 
 def expand(text: str) -> str:
-    """Expand `~` and environment variables, $NAME or ${NAME:-default}, in a path.
-
-    Raises
-    ------
-    ValueError
-        If a variable is not set and has no default.
-    """
+    """Expand `~` and environment variables, $NAME or ${NAME:-default}, in a path."""
 
     def value(match: re.Match[str]) -> str:
         name, default = match["braced"] or match["plain"], match["default"]

@@ -8,18 +8,10 @@ from pathlib import Path
 from jaxsky.io import InputError
 from jaxsky.settings.files import SettingsError
 
-__all__ = ["at_key", "of_file"]
-
 
 @contextmanager
 def at_key(name: str) -> Iterator[None]:
-    """Have an error of the numerics name the key of the value that led to it.
-
-    Raises
-    ------
-    SettingsError
-        For what is raised in here, unless it names its place already.
-    """
+    """Have an error of the numerics name the key of the value that led to it."""
     try:
         yield
     except (InputError, SettingsError):
@@ -33,13 +25,7 @@ def at_key(name: str) -> Iterator[None]:
 
 @contextmanager
 def of_file(path: Path) -> Iterator[None]:
-    """Have errors about settings name their file.
-
-    Raises
-    ------
-    SettingsError
-        For one that is raised in here, with the file.
-    """
+    """Have errors about settings name their file."""
     try:
         yield
     except SettingsError as error:

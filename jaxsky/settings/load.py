@@ -12,17 +12,9 @@ from jaxsky.settings.experiment import Experiment
 from jaxsky.settings.files import SettingsError, expand
 from jaxsky.settings.values import mistakes
 
-__all__ = ["load"]
-
 
 def _assigned(assignment: str) -> tuple[list[str], Any]:
-    """The key and the value of `key=value`, where the value is TOML, or text as it is.
-
-    Raises
-    ------
-    SettingsError
-        If it is none.
-    """
+    """The key and the value of `key=value`, where the value is TOML, or text as it is."""
     key, equals, value = assignment.partition("=")
     text = f"{key} = {json.dumps(value.strip(), ensure_ascii=False)}"
     for line in (assignment, text) if equals else ():
@@ -43,13 +35,7 @@ def _assigned(assignment: str) -> tuple[list[str], Any]:
 
 
 def _replaced(raw: Any, path: Sequence[str], value: Any) -> Any:
-    """Tables with one key replaced; a number is the place in a list.
-
-    Raises
-    ------
-    ValueError
-        If there is no such place.
-    """
+    """Tables with one key replaced; a number is the place in a list."""
     if not path:
         return value
     key, *rest = path
@@ -74,11 +60,6 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
     Returns
     -------
     The settings, with `data_dir` as an absolute path.
-
-    Raises
-    ------
-    SettingsError
-        If the file is absent, is not TOML, or has a mistake; the message names file and key.
     """
     try:
         raw = tomllib.loads(path.read_text())

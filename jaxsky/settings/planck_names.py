@@ -4,8 +4,6 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-__all__ = ["check_release", "leak"]
-
 #: Release and correction in the names of Planck's files.
 _RELEASE = re.compile(r"_R(\d)\.\d\d")
 #: Maps of LFI's second and third release, and of HFI's second, that are as they were observed: of

@@ -21,18 +21,6 @@ from jaxsky.settings.types import (
 )
 from jaxsky.settings.values import MistakeAt, check_reference, check_signs, mistakes
 
-__all__ = [
-    "BandTable",
-    "CMBTable",
-    "ComponentTable",
-    "Embedded",
-    "FreeParameter",
-    "Leakage",
-    "Regions",
-    "SkyTable",
-    "SmallScalesTable",
-]
-
 #: Laws of the components of the embedded model.
 EMBEDDED = {"dust": "dust", "synchrotron": "synchrotron"}
 

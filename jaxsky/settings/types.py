@@ -9,21 +9,6 @@ from pydantic import AfterValidator, Field, Strict
 from jaxsky.components import component_class
 from jaxsky.settings.values import MistakeAt
 
-__all__ = [
-    "BandName",
-    "Distinct",
-    "Law",
-    "Nside",
-    "Pair",
-    "RegionName",
-    "Seed",
-    "Several",
-    "TensorRatio",
-    "Word",
-    "check_component_names",
-    "check_names",
-]
-
 T = TypeVar("T")
 
 #: Names are parts of file names and of columns in FITS files.

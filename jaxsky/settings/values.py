@@ -9,18 +9,6 @@ from pydantic import ValidationError
 
 from jaxsky.components import component_class, declared
 
-__all__ = [
-    "MistakeAt",
-    "check_reference",
-    "check_sign",
-    "check_signs",
-    "file_names",
-    "hdu_numbers",
-    "missing_numbers",
-    "mistakes",
-    "stokes_words",
-]
-
 
 class MistakeAt(ValueError):
     """A mistake at a key inside of the table that is checked."""

@@ -14,11 +14,3 @@ the angle of a band turns E + iB in the same way.
 from fits.separation.harmonic.likelihood import harmonic_likelihood
 from fits.separation.harmonic.maps import HarmonicMaps, harmonic_component_maps
 from fits.separation.harmonic.multipoles import harmonic_coefficients, white_spectrum
-
-__all__ = [
-    "HarmonicMaps",
-    "harmonic_coefficients",
-    "harmonic_component_maps",
-    "harmonic_likelihood",
-    "white_spectrum",
-]

@@ -13,8 +13,6 @@ from fits.separation.mixing import spectral_names
 from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.types import Numeric
 
-__all__ = ["harmonic_likelihood"]
-
 
 def _refuse_maps(sky: Sky, start: Mapping[str, Numeric]) -> None:
     names = [name for name in spectral_names(sky) if name not in start]

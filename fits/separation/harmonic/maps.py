@@ -19,8 +19,6 @@ from jaxsky.checks import as_array, check_finite
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
 from jaxsky.types import Numeric
 
-__all__ = ["HarmonicMaps", "harmonic_component_maps"]
-
 
 class HarmonicMaps(NamedTuple):
     """Coefficients of the components, without any beam.
@@ -60,11 +58,6 @@ class HarmonicMaps(NamedTuple):
         ----------
         nside : resolution; multipoles above 2 nside are cut
         beam : of the maps: full width at half maximum [arcmin], or a table b_l from l = 0
-
-        Raises
-        ------
-        ValueError
-            If nside is none, or the beam is not finite, negative, above one, or ends too early.
         """
         if not healpy.isnsideok(nside, nest=True):
             raise ValueError(f"Argument `nside` must be a power of 2, but is {nside}.")
@@ -130,11 +123,6 @@ def harmonic_component_maps(
     params : spectral parameters, such as `SpectralFit.best_fit`
     alm, noise, beams, lmin, lmax : as for `harmonic_likelihood`; the multipoles need not be those
         that were fitted
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        For unknown parameters, a likelihood with regions, and what `harmonic_likelihood` refuses.
     """
     if len(like.index) != 1:
         raise ValueError(

@@ -15,27 +15,12 @@ from jaxsky.checks import UNSEEN, check_double, check_finite
 from jaxsky.harmonics import gaussian_beam, lmax_of, low_multipoles
 from jaxsky.types import Numeric
 
-__all__ = [
-    "Multipoles",
-    "check_alm",
-    "compressed",
-    "harmonic_coefficients",
-    "multipoles_of",
-    "positions",
-    "white_spectrum",
-]
-
 #: A band is left out where its beam is below this: its weight would be lost in rounding.
 BEAM = 1e-5
 
 
 def white_spectrum(level: Numeric) -> Float[np.ndarray, "..."]:
     """N_l [u^2 sr] of white noise of a level [u arcmin], u being the unit of the maps.
-
-    Raises
-    ------
-    TypeError, ValueError
-        For levels that carry a unit, or are not positive.
 
     Examples
     --------
@@ -153,13 +138,7 @@ def positions(ell: int, lmax: int) -> np.ndarray:
 
 
 def check_alm(alm: Numeric, bands: int) -> np.ndarray:
-    """Packed coefficients (band, stokes, alm), as they are.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If they carry a unit, or have another shape.
-    """
+    """Packed coefficients (band, stokes, alm), as they are."""
     array = bare("alm", alm)
     shape = array.shape
     known = array.ndim == 3 and shape[0] == bands and shape[1] in (2, 3)

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fits.likelihood import Likelihood, PixelLikelihood, chi2
 from fits.priors import Prior, bounds, check_priors, log_prior
 from fits.results import FitResult
+from fits.template_likelihood import Likelihood, PixelLikelihood, chi2
 from jaxsky.types import Numeric
 
 #: The grid is narrowed to where the posterior exceeds exp(-NARROW/2) of its maximum (6 sigma).
@@ -91,7 +91,7 @@ def grid_fit(
 
     Parameters
     ----------
-    like : from `fits.likelihood`
+    like : from `fits.template_likelihood`
     start : the free parameters by name (the values do not matter); one or two
     priors : a uniform prior for each of them
     points : points an axis

@@ -9,7 +9,6 @@ import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 
-from fits.likelihood import Likelihood, chi2
 from fits.priors import (
     Prior,
     at_edge,
@@ -21,6 +20,7 @@ from fits.priors import (
     to_unbounded,
 )
 from fits.results import FitResult, help_by_prior
+from fits.template_likelihood import Likelihood, chi2
 from jaxsky.types import Numeric
 
 #: What finds an optimum: by residuals, or by a function alone.
@@ -116,7 +116,7 @@ def best_fit(
 
     Parameters
     ----------
-    like : from `fits.likelihood`
+    like : from `fits.template_likelihood`
     start : start values of the free parameters by name
     priors : priors by name; uniform ones bound the search
     solver : of optimistix, default `LevenbergMarquardt`

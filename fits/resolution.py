@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float
 
 from fits.covariance import Fluctuations, uniform_level
 from fits.inputs import Inputs
-from fits.likelihood import CovarianceOf, Likelihood, likelihood
 from fits.preparation import Preparation, prepare_component
 from fits.record import fingerprint
+from fits.template_likelihood import CovarianceOf, Likelihood, likelihood
 from fits.template_noise import prepared_variance
 from jaxsky import Bandpass, Sky, observe
 from jaxsky.harmonics import beam_ratio, gaussian_beam, pixel_window
@@ -55,7 +55,7 @@ class Prepared(NamedTuple):
         region: Bool[np.ndarray, " pix"] | None = None,
         kind: str = "exact",
     ) -> Likelihood:
-        """The likelihood of the parameters in `start`; see `fits.likelihood.likelihood`.
+        """The likelihood of the parameters in `start`; see `fits.template_likelihood.likelihood`.
 
         Parameters
         ----------

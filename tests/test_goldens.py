@@ -14,10 +14,10 @@ import pytest
 
 import systems
 from fits.covariance import Fluctuations
-from fits.likelihood import chi2, likelihood
 from fits.preparation import Preparation
 from fits.pseudo_cl import masked_spectra
 from fits.separation import harmonic_likelihood, hessian, spectral_likelihood
+from fits.template_likelihood import chi2, likelihood
 from jaxsky import Bandpass, Sky, get_parameters, observe, parameter_names, set_parameters
 from jaxsky.cmb import realisation
 from jaxsky.components import FreeFree

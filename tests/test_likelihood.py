@@ -14,9 +14,9 @@ from jax.test_util import check_grads
 import systems
 from fits.compress import gram, square_root
 from fits.covariance import Fluctuations
-from fits.likelihood import chi2, likelihood
 from fits.optimize import best_fit
 from fits.preparation import Preparation
+from fits.template_likelihood import chi2, likelihood
 from jaxsky import AME, Bandpass, Dust, Sky, Synchrotron, observe, parameter_names, set_parameters
 from jaxsky.cmb import camb_spectra
 from jaxsky.harmonics import adjoint_synthesis, alm_ell, gaussian_beam
@@ -392,7 +392,10 @@ def test_bad_input_is_refused(changes, error, words):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        ("from fits.likelihood import likelihood; likelihood(None, [], 0, 0, {})", "fits needs"),
+        (
+            "from fits.template_likelihood import likelihood; likelihood(None, [], 0, 0, {})",
+            "fits needs",
+        ),
         (
             "import jax; from jaxsky import harmonics as h; h.synthesis(jax.numpy.ones((2, 9)), 2)",
             "A spherical harmonic transform needs",

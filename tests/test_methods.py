@@ -8,11 +8,11 @@ import pytest
 
 from fits.chains import ChainFile
 from fits.grid import grid_fit
-from fits.likelihood import likelihood
 from fits.optimize import best_fit
 from fits.priors import Gaussian, Uniform, from_unbounded, log_prior, to_unbounded
 from fits.results import FitError, FitResult, misfit
-from fits.sample import sample
+from fits.sampling import sample
+from fits.template_likelihood import likelihood
 from jaxsky import Dust, Sky, observe, set_parameters
 from test_likelihood import BANDS, START, fluctuations, problem
 

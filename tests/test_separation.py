@@ -8,7 +8,6 @@ import pytest
 import scipy.optimize
 
 from fits.grid import grid_fit
-from fits.likelihood import chi2
 from fits.optimize import best_fit
 from fits.priors import Gaussian, Uniform
 from fits.results import FitError
@@ -22,6 +21,7 @@ from fits.separation import (
     residual_maps,
     spectral_likelihood,
 )
+from fits.template_likelihood import chi2
 from jaxsky import AME, CMB, Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.constants import H_OVER_K, T_CMB
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from fits.likelihood import chi2
 from fits.priors import Gaussian
 from fits.separation import (
     fisher,
@@ -20,6 +19,7 @@ from fits.separation import (
     spectral_likelihood,
     white_spectrum,
 )
+from fits.template_likelihood import chi2
 from jaxsky import Dust
 from jaxsky.harmonics import (
     alm_ell,

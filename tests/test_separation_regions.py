@@ -5,7 +5,6 @@ import jax
 import numpy as np
 import pytest
 
-from fits.likelihood import chi2
 from fits.priors import Gaussian
 from fits.results import FitError
 from fits.separation import (
@@ -20,6 +19,7 @@ from fits.separation import (
     spectral_likelihood,
     superpixels,
 )
+from fits.template_likelihood import chi2
 from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe
 from test_separation import BANDS, NPIX, START, TRUTH, problem, random_sky
 

@@ -11,12 +11,12 @@ import scipy.special
 import scipy.stats
 
 from fits.chains import ChainFile
+from fits.posterior import Problem, value_and_gradient
 from fits.priors import Gaussian, Uniform
 from fits.results import FitError
 from fits.separation import fit_spectra, sample_spectra, spectral_likelihood
 from fits.separation.agreement import agreement
-from fits.separation.posterior import scaled_posterior
-from fits.separation.problem import Problem, value_and_gradient
+from fits.unbounded import scaled_posterior
 from test_separation import BANDS, START, problem, random_sky
 from test_separation_solvers import constant, regions
 

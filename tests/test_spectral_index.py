@@ -9,12 +9,12 @@ import pytest
 from fits.commands.run import DEFAULTS
 from fits.covariance import Fluctuations, uniform_level
 from fits.inputs import Band, Inputs, inputs_of
-from fits.likelihood import likelihood
 from fits.optimize import best_fit
 from fits.preparation import Preparation, prepare_component
 from fits.regions import region_masks
 from fits.resolution import prepare
 from fits.spectral_index import run
+from fits.template_likelihood import likelihood
 from jaxsky import Bandpass, Dust, Sky, observe
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.galaxy import embedded_sky

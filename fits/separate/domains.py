@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fits.covariance import Fluctuations
+from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.separation.harmonic import (
     HarmonicMaps,
     harmonic_component_maps,
     harmonic_likelihood,
 )
-from fits.separation.likelihood import SpectralLikelihood, spectral_likelihood
 from fits.separation.maps import (
     ComponentMaps,
     component_maps,

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from fits.chains import kept_chain
 from fits.priors import priors_of
+from fits.profile_likelihood import SpectralLikelihood
 from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra
 from fits.realisations import realisations
 from fits.record import fingerprint
@@ -18,7 +19,6 @@ from fits.separate.domains import PixelDomain
 from fits.separate.setup import Setup
 from fits.separate.simulations import Realisation, Simulated
 from fits.separation.fit import fit_spectra
-from fits.separation.likelihood import SpectralLikelihood
 from fits.separation.response import Response, widened
 from fits.separation.results import SpectralFit
 from fits.separation.sample import sample_spectra

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fits.profile_likelihood import SpectralLikelihood
 from fits.pseudo_cl import MaskedSpectra, band_powers
 from fits.separate.domains import Domain
-from fits.separation.likelihood import SpectralLikelihood
 from fits.separation.response import Response
 from jaxsky.cmb import realisation
 from jaxsky.harmonics import analysis, expand, power_spectrum, synthesis

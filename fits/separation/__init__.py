@@ -1,5 +1,6 @@
 """Component separation with parametric laws: spectra first, then maps of the components."""
 
+from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.separation.fit import fisher, fit_spectra, hessian
 from fits.separation.harmonic import (
     HarmonicMaps,
@@ -8,7 +9,6 @@ from fits.separation.harmonic import (
     harmonic_likelihood,
     white_spectrum,
 )
-from fits.separation.likelihood import SpectralLikelihood, spectral_likelihood
 from fits.separation.maps import (
     ComponentMaps,
     component_maps,

@@ -16,17 +16,17 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Bool, Float
 
+from fits import newton
 from fits.optimize import MAX_STEPS, Solver, search
-from fits.priors import Prior, check_priors, prior_residuals, to_unbounded
-from fits.results import astray, help_by_prior, misfit
-from fits.separation import newton
-from fits.separation.algebra import Factor, assembled, degenerate, variances
-from fits.separation.likelihood import SpectralLikelihood
-from fits.separation.problem import (
+from fits.posterior import (
     Problem,
     cell_derivatives,
     prior_terms,
 )
+from fits.priors import Prior, check_priors, prior_residuals, to_unbounded
+from fits.profile_likelihood import SpectralLikelihood
+from fits.results import astray, help_by_prior, misfit
+from fits.separation.algebra import Factor, assembled, degenerate, variances
 from fits.separation.results import SpectralFit
 from jaxsky.types import Numeric
 

@@ -10,10 +10,10 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Float
 
+from fits.profile_likelihood import SpectralLikelihood
 from fits.separation import kernel
 from fits.separation.compress import Layout, used_pixels
 from fits.separation.kernel import Pixels
-from fits.separation.likelihood import SpectralLikelihood
 from fits.separation.noise import Noise, as_noise, bare, chunks
 from jaxsky.types import Numeric
 

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from fits.likelihood import Bands
+from fits.template_likelihood import Bands
 from jaxsky import Sky, parameter_names, set_parameters
 from jaxsky.bandpass import Samples, average
 from jaxsky.interpolation import band_seds, choose_nodes

@@ -6,11 +6,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from fits.posterior import Problem, value_and_gradient
 from fits.priors import Gaussian, Prior
+from fits.profile_likelihood import SpectralLikelihood
 from fits.results import FitResult
 from fits.separation.algebra import Factor
-from fits.separation.likelihood import SpectralLikelihood
-from fits.separation.problem import Problem, value_and_gradient
 from jaxsky.types import Numeric
 
 

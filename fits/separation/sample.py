@@ -2,7 +2,7 @@
 
 The no-U-turn sampler (Hoffman & Gelman 2014, JMLR 15, 1593) follows the gradient, so it takes a
 few evaluations for a sample that does not depend on the last one, however many parameters there
-are. It moves in the numbers of `fits.separation.posterior`.
+are. It moves in the numbers of `fits.unbounded`.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,14 +17,14 @@ from blackjax.adaptation.step_size import dual_averaging_adaptation
 from tqdm import tqdm
 
 from fits.chains import ChainFile
+from fits.posterior import Problem, value_and_gradient
 from fits.priors import Prior, check_priors
+from fits.profile_likelihood import SpectralLikelihood
 from fits.results import FitResult
-from fits.sample import ensemble, ensemble_summary, summary
+from fits.sampling import ensemble, ensemble_summary, summary
 from fits.separation.agreement import agreement
 from fits.separation.fit import fit_spectra, start_vector
-from fits.separation.likelihood import SpectralLikelihood
-from fits.separation.posterior import scaled_posterior
-from fits.separation.problem import Problem, value_and_gradient
+from fits.unbounded import scaled_posterior
 from jaxsky.checks import check_seed
 from jaxsky.types import Numeric
 
@@ -244,7 +244,7 @@ def sample_spectra(
     nchains : "nuts": number of chains (4)
     nwalkers : "emcee": size of the ensemble (32)
     seed : of the start positions and the moves
-    backend : "emcee": file of the chain, as for `fits.sample.sample`
+    backend : "emcee": file of the chain, as for `fits.sampling.sample`
     progress : show a progress bar, or call a function with the steps done and those in all
     throw : raise if the chains are too short or do not agree
 
@@ -254,7 +254,7 @@ def sample_spectra(
     covariance of the samples. Its parameters are called as in `SpectralFit.labels`
     ("dust.beta_dust[3]"); those of regions without a pixel are left out. `details` holds "chain"
     (step, chain or walker, par), "log_prob", "tau" by name, "acceptance", "discard" and "thin" as
-    for `fits.sample.sample`; of "nuts" also "divergences", their number, "rhat" and "ess", the
+    for `fits.sampling.sample`; of "nuts" also "divergences", their number, "rhat" and "ess", the
     number of effective samples, by name, "gradients", their mean number for a step, and
     "step_size".
 

@@ -11,10 +11,10 @@ import numpy as np
 import scipy.special
 from jaxtyping import ArrayLike, Float
 
+from fits.profile_likelihood import SpectralLikelihood
 from fits.separation import kernel
 from fits.separation.compress import Layout
 from fits.separation.harmonic.multipoles import check_alm, compressed, multipoles_of, positions
-from fits.separation.likelihood import SpectralLikelihood
 from jaxsky.checks import as_array, check_finite
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
 from jaxsky.types import Numeric

@@ -15,10 +15,10 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Bool, Float, Int
 
+from fits.posterior import Problem, prior_terms
 from fits.priors import Prior
+from fits.profile_likelihood import SpectralLikelihood
 from fits.separation.algebra import degenerate
-from fits.separation.likelihood import SpectralLikelihood
-from fits.separation.problem import Problem, prior_terms
 
 #: Samples for each parameter, from which on they tell more than the curvature at the best fit.
 ENOUGH = 30

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from fits.chains import ChainFile
-from fits.likelihood import Likelihood, chi2
 from fits.optimize import best_fit
 from fits.priors import Prior, bounds, check_priors, log_prior
 from fits.results import FitResult
+from fits.template_likelihood import Likelihood, chi2
 from jaxsky.checks import check_seed
 from jaxsky.types import Numeric
 
@@ -126,7 +126,7 @@ def sample(
 
     Parameters
     ----------
-    like : from `fits.likelihood`
+    like : from `fits.template_likelihood`
     start : start values of the free parameters by name; the walkers start around the best fit
     priors : priors by name
     nwalkers, nsteps : size of the ensemble, and its steps in all

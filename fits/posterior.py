@@ -14,9 +14,9 @@ import scipy.sparse
 from jaxtyping import Bool, Float
 
 from fits.priors import Gaussian, Prior, Uniform, at_edge, bounds
+from fits.profile_likelihood import SpectralLikelihood
 from fits.separation.algebra import assembled
 from fits.separation.kernel import Derivatives
-from fits.separation.likelihood import SpectralLikelihood
 
 #: Dense, or sparse for many parameters.
 Matrix: TypeAlias = np.ndarray | scipy.sparse.csc_matrix

@@ -19,13 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from fits.likelihood import Likelihood, named_bands
 from fits.separation import kernel
 from fits.separation.compress import Layout, compressed, gathered, layouts, used_pixels
 from fits.separation.kernel import Pixels
 from fits.separation.mixing import Mixing, SpectralBands, spectral_names
 from fits.separation.noise import Noise, as_noise, bare
 from fits.separation.regions import Cells, check_labels, intersections
+from fits.template_likelihood import Likelihood, named_bands
 from jaxsky import Bandpass, Component, Sky, get_parameters, set_parameters
 from jaxsky.bandpass import Samples, stack_bands
 from jaxsky.checks import as_array, check_double, check_finite
@@ -38,7 +38,7 @@ PASS = 4096
 
 
 class SpectralLikelihood(Likelihood):
-    """See `spectral_likelihood`; also a `fits.likelihood.Likelihood`, for grids and chains.
+    """See `spectral_likelihood`; for grids and chains like any `Likelihood`.
 
     Parameters
     ----------

@@ -1,21 +1,34 @@
 """Component separation with parametric laws: spectra first, then maps of the components."""
 
-from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
-from fits.separation.fit import fisher, fit_spectra, hessian
-from fits.separation.harmonic import (
-    HarmonicMaps,
-    harmonic_coefficients,
-    harmonic_component_maps,
-    harmonic_likelihood,
-    white_spectrum,
-)
-from fits.separation.maps import (
-    ComponentMaps,
-    component_maps,
-    noise_degradation,
-    residual_maps,
-)
-from fits.separation.noise import Noise, as_noise
-from fits.separation.regions import clusters, latitude_bands, superpixels
-from fits.separation.results import SpectralFit
-from fits.separation.sample import sample_spectra
+from importlib import import_module
+from typing import Any
+
+#: name -> module that has it; imported when it is asked for
+_WHERE = {
+    "fits.separation.fit": ("fisher", "fit_spectra", "hessian"),
+    "fits.separation.harmonic": (
+        "HarmonicMaps",
+        "harmonic_coefficients",
+        "harmonic_component_maps",
+        "harmonic_likelihood",
+        "white_spectrum",
+    ),
+    "fits.profile_likelihood": ("SpectralLikelihood", "spectral_likelihood"),
+    "fits.separation.maps": (
+        "ComponentMaps",
+        "component_maps",
+        "noise_degradation",
+        "residual_maps",
+    ),
+    "fits.separation.noise": ("Noise", "as_noise"),
+    "fits.separation.regions": ("clusters", "latitude_bands", "superpixels"),
+    "fits.separation.results": ("SpectralFit",),
+    "fits.separation.sample": ("sample_spectra",),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _WHERE.items():
+        if name in names:
+            return getattr(import_module(module), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

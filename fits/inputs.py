@@ -28,15 +28,11 @@ from jaxsky.inputs import (
 from jaxsky.io import MissingFileError, read_beam
 from jaxsky.io.observations import Observed, read_observed
 from jaxsky.keys import realisation_key
-from jaxsky.lookup import find_file
 from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum, uniform_covariance
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import Observation, ObservedBand
 from jaxsky.preparation import prepare
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.keys import at_key
-from jaxsky.settings.tables import BandTable
+from jaxsky.settings import BandTable, Experiment, SettingsError, at_key, find_file
 from jaxsky.simulate import observe_bands
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 from jaxsky.types import Numeric
 
 #: A value this close to the edge of a uniform prior, in units of its width, is at the edge.

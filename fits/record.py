@@ -13,10 +13,7 @@ import jax
 import numpy as np
 
 from jaxsky.io import write_text
-from jaxsky.lookup import found_files
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import SettingsFile
-from jaxsky.settings.planck_names import leak
+from jaxsky.settings import Experiment, SettingsFile, found_files, leakage_warning
 
 PACKAGES = (
     "jaxsky",
@@ -35,7 +32,7 @@ PACKAGES = (
 def leaks(settings: Experiment) -> list[str]:
     """Warnings about maps that are known to hold leakage which is not subtracted."""
     bands = [band for band in settings.bands if band.leakage is None]
-    return list(filter(None, (leak(str(band.name), band.files) for band in bands)))
+    return list(filter(None, (leakage_warning(str(band.name), band.files) for band in bands)))
 
 
 def fingerprint(tree: Any) -> str:

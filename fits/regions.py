@@ -10,9 +10,7 @@ from jaxtyping import Bool, Float
 
 from jaxsky.inputs import mask_at
 from jaxsky.io import degrade_mask, read_mask
-from jaxsky.lookup import find_file
-from jaxsky.settings.experiment import Experiment, parse_region
-from jaxsky.settings.files import MaskFile
+from jaxsky.settings import Experiment, MaskFile, find_file, parse_region
 
 COMPARISONS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 

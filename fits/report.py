@@ -13,7 +13,7 @@ from fits.inputs import Inputs
 from fits.record import leaks, write_json, write_log
 from fits.spectral_index import Fit, all_free
 from fits.template_noise import unknown_noise
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 
 #: A fit with a smaller probability to exceed its chi^2 is pointed out.
 UNLIKELY = 0.01

@@ -24,9 +24,7 @@ from fits.template_likelihood import chi2
 from fits.template_noise import Attenuation, attenuation
 from jaxsky import observe_components, parameter_names, set_parameters
 from jaxsky.progress import QUIET, Progress
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.keys import at_key
+from jaxsky.settings import Experiment, SettingsError, at_key
 
 #: A band in which each template has less than this part of its weight has none.
 WEIGHTLESS = 1e-6

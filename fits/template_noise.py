@@ -23,8 +23,7 @@ from jaxsky import Sky
 from jaxsky.harmonics import gaussian_beam, pixel_window
 from jaxsky.inputs import Template
 from jaxsky.noise_inputs import read_noise
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.tables import ComponentTable
+from jaxsky.settings import ComponentTable, SettingsError
 from jaxsky.units import conversion
 
 

@@ -16,14 +16,10 @@ from jaxsky.inputs import Template, read_bandpass_spec, read_sky, set_parameters
 from jaxsky.io import read_beam, read_spectra
 from jaxsky.io.observations import Observed
 from jaxsky.keys import realisation_key
-from jaxsky.lookup import find_file
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import DTYPES, Observation, ObservedBand, Source
 from jaxsky.parameters import get_parameters, parameter_names
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.keys import at_key
-from jaxsky.settings.tables import BandTable
+from jaxsky.settings import BandTable, Experiment, SettingsError, at_key, find_file
 from jaxsky.sky import Sky, observe_band
 from jaxsky.small_scales import SmallScales
 

@@ -1,4 +1,4 @@
-"""What settings name, read: maps, templates with their laws, bandpasses, noise."""
+"""What settings name, read: maps, templates with their laws, maps of parameters, bandpasses."""
 
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
@@ -13,18 +13,90 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxsky import galaxy as model_galaxy
 from jaxsky.bandpass import Bandpass
-from jaxsky.components import AME, Component, component_class
+from jaxsky.components import AME, Component, component_class, parameter_declaration
 from jaxsky.galaxy import EmbeddedSky, GalaxyModel, embedded_sky
 from jaxsky.io import Maps, degrade_mask, read_bandpass, read_maps, unit_factor
+from jaxsky.io.columns import sentinels
 from jaxsky.io.folders import kept
-from jaxsky.lookup import find_file
-from jaxsky.parameter_maps import parameter_map
 from jaxsky.parameters import set_parameters
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import BandpassSpec, MapFile, MapKeys, SettingsError
-from jaxsky.settings.keys import at_key
-from jaxsky.settings.tables import ComponentTable
+from jaxsky.settings import (
+    BandpassSpec,
+    ComponentTable,
+    Experiment,
+    MapFile,
+    MapKeys,
+    SettingsError,
+    at_key,
+    check_sign,
+    find_file,
+)
 from jaxsky.sky import Sky
+
+
+def parameter_unit(name: str) -> str:
+    """Unit of a spectral parameter by its name, dotted or not; "" for a pure number."""
+    return parameter_declaration(name.split(".")[-1]).get("unit", "")
+
+
+def parameter_map(
+    found: Maps,
+    name: str,
+    nside: int,
+    where: str,
+    *,
+    of: str = "that of the template",
+    stated: bool = False,
+) -> tuple[Float[np.ndarray, " pix"], Bool[np.ndarray, " pix"]]:
+    """The map of a spectral parameter, and where it is known.
+
+    Parameters
+    ----------
+    found : what was read
+    name : of the parameter
+    nside : resolution that it must have
+    where : key in the settings, for the messages
+    of : whose nside that is
+    stated : the settings say which values are missing, so zeros are data
+
+    Returns
+    -------
+    Values in the parameter's unit, in pixels without one the median of the others, and a mask,
+    True where they are known; both of shape (pix,).
+    """
+    values, used = one_column(found, nside, where, of), np.asarray(found.mask)
+    unit = parameter_unit(name)
+    if found.unit != unit:
+        try:
+            values = values * float(unit_factor(found.unit, unit))
+        except ValueError:
+            raise SettingsError(
+                f"{where}: {name} is {f'in {unit}' if unit else 'a pure number'}, but column "
+                f"{found.names[0]} is in {found.unit or 'no unit'}."
+            ) from None
+    known = values[used]
+    zero = parameter_declaration(name).get("zero", True)
+    marks = [] if stated or zero else sentinels(known, zero=True)
+    if marks:
+        raise SettingsError(
+            f"{where}: column {found.names[0]} is {marks[0][0]:g} in {marks[0][1]} pixels, far "
+            "from its other values; give `missing`, the numbers that mark pixels without a value, "
+            "or `missing = []` if all are data."
+        )
+    try:
+        check_sign(name, float(np.median(known)))
+    except ValueError as error:
+        raise SettingsError(f"{where}: {error}.") from None
+    return np.where(used, values, np.median(known)), used
+
+
+def one_column(found: Maps, nside: int, where: str, of: str) -> Float[np.ndarray, " pix"]:
+    """The one column that was read, of the resolution that it must have."""
+    if len(found.maps) != 1:
+        raise SettingsError(f"{where}: fields must name one column, not {', '.join(found.names)}.")
+    if found.nside != nside:
+        raise SettingsError(f"{where}: nside is {found.nside}, but {of} is {nside}.")
+    return np.asarray(found.maps[0])
+
 
 #: Maps with at least so many pixels are kept in single precision, which is that of their files.
 LARGE = 12 * 512**2
@@ -80,7 +152,7 @@ def read_parameter(
     where: str,
     of: str = "that of the template",
 ) -> tuple[Float[np.ndarray, " pix"], Bool[np.ndarray, " pix"]]:
-    """The map of a spectral parameter and where it is known; see `jaxsky.parameter_maps`."""
+    """The map of a spectral parameter and where it is known; see `jaxsky.inputs`."""
     found = read(folder, spec, stokes="", zeros_are_data=True)
     return parameter_map(found, name, nside, where, of=of, stated=spec.missing is not None)
 

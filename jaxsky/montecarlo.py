@@ -21,9 +21,8 @@ from jaxsky.io.files import check_guards
 from jaxsky.io.folders import alone
 from jaxsky.io.observations import observed_tables
 from jaxsky.keys import realisation_key
-from jaxsky.lookup import found_files
 from jaxsky.preparation import Prepared, plan, prepare
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment, found_files
 from jaxsky.simulate import observe_bands
 
 LOG = "simulation.json"

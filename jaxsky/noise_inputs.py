@@ -18,8 +18,7 @@ from jaxsky.noise import (
     uniform_covariance,
     weights_covariance,
 )
-from jaxsky.settings.files import Hits, MapFile, MapKeys, NoiseColumns, NoiseTable, SettingsError
-from jaxsky.settings.keys import at_key
+from jaxsky.settings import Hits, MapFile, MapKeys, NoiseColumns, NoiseTable, SettingsError, at_key
 
 #: Noise outside of this range, relative to the rms of its map, is a mistake unless it is meant.
 PLAUSIBLE = (1e-6, 10.0)

@@ -16,10 +16,7 @@ from fits.regions import region_masks
 from fits.resolution import prepare
 from jaxsky import experiment
 from jaxsky.io import InputError
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.keys import at_key, of_file
-from jaxsky.settings.load import load
+from jaxsky.settings import Experiment, SettingsError, at_key, load, of_file
 
 VALUES = (-1, 0, 1.5, 1e30, -1e300, 2**40, True, "", "unknown", "[/] $x_$", [], [1], [-1, "a"], {},
           {"unknown": 1})  # fmt: skip

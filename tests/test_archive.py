@@ -16,8 +16,7 @@ from jaxsky.archive import (
     verify,
 )
 from jaxsky.io import InputError
-from jaxsky.lookup import named_files
-from jaxsky.settings.load import load
+from jaxsky.settings import load, named_files
 from jaxsky.units import parse_unit
 from misbehaving import CONTENT, NAME, SHA, Handler, fits_bytes, product, serving
 

@@ -22,8 +22,7 @@ from fits.inputs import inputs_of
 from fits.separate.setup import build as build_separation
 from jaxsky import Bandpass, Dust, Synchrotron
 from jaxsky.io import read_bandpass, read_beam, read_maps, read_mask, read_spectra, unit_factor
-from jaxsky.settings.keys import of_file
-from jaxsky.settings.load import load
+from jaxsky.settings import load, of_file
 from settings_fuzz import changed, written
 
 NSIDE = 4

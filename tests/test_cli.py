@@ -14,7 +14,7 @@ from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.harmonics import alm_ell, gaussian_beam, synthesis
 from jaxsky.io import write_maps
 from jaxsky.noise import draw, uniform_covariance
-from jaxsky.settings.load import load
+from jaxsky.settings import load
 
 NSIDE = 16
 TRUTH = {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}

@@ -15,8 +15,7 @@ from rich.table import Table
 from fits.commands import console as terminal
 from fits.commands.page import Section, key_of, table_of, write_page
 from fits.commands.run import DEFAULTS
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.load import load
+from jaxsky.settings import SettingsError, load
 
 SETTINGS = """
 [common]

@@ -20,9 +20,7 @@ from fits.inputs import inputs_of
 from fits.regions import region_masks
 from fits.resolution import prepare
 from jaxsky.io import InputError
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.load import load
+from jaxsky.settings import Experiment, SettingsError, load
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "wmap7_vw.toml"
 SETTINGS = """

@@ -16,7 +16,7 @@ from fits.patches import fit_patches, prepare_patches
 from fits.pseudo_cl import band_powers
 from fits.resolution import prepare
 from jaxsky.harmonics import gaussian_beam
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 
 NSIDE = 64
 

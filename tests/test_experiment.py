@@ -21,7 +21,7 @@ from jaxsky.harmonics import alm_ell, expand, gaussian_beam, synthesis
 from jaxsky.io import read_maps, write_maps
 from jaxsky.io.folders import occupied
 from jaxsky.keys import realisation_key
-from jaxsky.settings.load import load
+from jaxsky.settings import load
 from jaxsky.simulate import simulate
 
 TEMPLATE = DEFAULTS / "experiment.toml"

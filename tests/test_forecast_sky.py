@@ -18,7 +18,7 @@ from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe_band
 from jaxsky.harmonics import alm_ell, gaussian_beam, power_spectrum, synthesis
 from jaxsky.instrument import load_instrument
 from jaxsky.io import write_maps
-from jaxsky.settings.load import load
+from jaxsky.settings import load
 
 NSIDE, LMAX = 32, 64
 #: D_l at l = 80 and slope of C_l, of EE and BB [uK_RJ^2].

@@ -14,8 +14,7 @@ from commands import jaxsky, one_sentence
 from jaxsky import Bandpass, Component, Sky, observe, set_parameters
 from jaxsky.components import FreeFree, amplitude_from_emission_measure
 from jaxsky.io import read_maps, write_maps
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import SettingsError
+from jaxsky.settings import Experiment, SettingsError
 
 NSIDE = 8
 NPIX = 12 * NSIDE**2

@@ -15,9 +15,7 @@ from jaxsky.inputs import (
 )
 from jaxsky.io import InputError
 from jaxsky.noise_inputs import read_noise
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import BandpassSpec, MapFile, NoiseTable, SettingsError
-from jaxsky.settings.load import load
+from jaxsky.settings import BandpassSpec, Experiment, MapFile, NoiseTable, SettingsError, load
 
 NSIDE = 4
 NPIX = 12 * NSIDE**2

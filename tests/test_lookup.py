@@ -15,10 +15,7 @@ from fits.separate.setup import build as build_separation
 from jaxsky.archive import cache_folder
 from jaxsky.experiment import build as build_experiment
 from jaxsky.io import InputError, write_maps
-from jaxsky.lookup import find_file, found_files
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import MapFile, SettingsError
-from jaxsky.settings.load import load
+from jaxsky.settings import Experiment, MapFile, SettingsError, find_file, found_files, load
 
 KNOWN = "LFI_RIMO_R3.31.fits"
 MASK = "wmap_polarization_analysis_mask_r9_9yr_v5.fits"

@@ -13,10 +13,7 @@ from fits.regions import region_masks
 from fits.separate.setup import build
 from jaxsky.inputs import read, read_sky
 from jaxsky.io import InputError
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import MapFile, SettingsError
-from jaxsky.settings.load import load
-from jaxsky.settings.tables import BandTable
+from jaxsky.settings import BandTable, Experiment, MapFile, SettingsError, load
 
 NSIDE = 8
 NPIX = 12 * NSIDE**2

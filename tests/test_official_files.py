@@ -13,8 +13,7 @@ from jaxsky.harmonics import gaussian_beam, resample, synthesis
 from jaxsky.inputs import read
 from jaxsky.io import InputError
 from jaxsky.noise import weights_covariance
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import MapFile, SettingsError
+from jaxsky.settings import Experiment, MapFile, SettingsError
 
 NSIDE = 8
 NPIX = 12 * NSIDE**2

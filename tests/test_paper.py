@@ -20,8 +20,7 @@ from jaxsky.io import read_maps
 from jaxsky.observation import Source
 from jaxsky.power_law import fit_power_law
 from jaxsky.preparation import prepare
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.load import load
+from jaxsky.settings import Experiment, load
 
 LABELS = [*(f"Figure {n}" for n in (1, 2, 3, 4, 13)), "Table 1", "Figure 14"]
 REAL = """

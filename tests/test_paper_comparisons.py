@@ -14,8 +14,7 @@ from fits.paper.sources import Sources
 from fits.record import with_error
 from fits.regions import region_masks
 from fits.resolution import prepare
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.load import load
+from jaxsky.settings import Experiment, load
 
 LABELS = [f"Figure {n}" for n in range(5, 13)]
 EXAMPLE = Path(__file__).parents[1] / "examples" / "paper_real_sky.toml"

@@ -22,10 +22,7 @@ from jaxsky.harmonics import alm_ell, gaussian_beam, resample, synthesis
 from jaxsky.inputs import Template
 from jaxsky.io import write_maps
 from jaxsky.noise import draw, uniform_covariance
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.load import load
-from jaxsky.settings.tables import BandTable
+from jaxsky.settings import BandTable, Experiment, SettingsError, load
 
 NSIDE = 8
 NPIX = healpy.nside2npix(NSIDE)

@@ -22,7 +22,7 @@ from jaxsky.harmonics import smooth
 from jaxsky.io import Maps, unit_factor
 from jaxsky.keys import realisation_key
 from jaxsky.noise import estimate_variance
-from jaxsky.settings.experiment import Common
+from jaxsky.settings import Common
 
 #: Annotations of arguments that may be numbers, or hold some.
 NUMERIC = re.compile(

@@ -10,8 +10,7 @@ from fits.inputs import inputs_of
 from fits.regions import region_masks
 from fits.resolution import prepare
 from fits.spectral_index import run
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.load import load
+from jaxsky.settings import Experiment, load
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "wmap7_vw.toml"
 

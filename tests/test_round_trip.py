@@ -16,8 +16,7 @@ from jaxsky.experiment import build, cmb_spectra
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.io import write_maps
 from jaxsky.montecarlo import run
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.load import load
+from jaxsky.settings import SettingsError, load
 
 NSIDE, NPIX = 16, 12 * 16**2
 SETTINGS = """

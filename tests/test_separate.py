@@ -23,9 +23,7 @@ from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis
 from jaxsky.io import InputError
 from jaxsky.progress import Progress
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.load import load
+from jaxsky.settings import Experiment, SettingsError, load
 
 NSIDE, FWHM = 16, 360.0
 CHANNELS = ["40", "68", "100", "140", "195", "280", "402"]

@@ -2,8 +2,7 @@
 
 import pytest
 
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.load import load
+from jaxsky.settings import SettingsError, load
 
 #: The least that a file has to say of a band and of a component.
 BAND = '[[bands]]\nname = "{band}"\n'

@@ -3,9 +3,7 @@
 import pytest
 
 from jaxsky.io import InputError
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.keys import at_key, of_file
-from jaxsky.settings.load import load
+from jaxsky.settings import SettingsError, at_key, load, of_file
 from settings_fuzz import KINDS, changed, fault, faults, small, written
 
 

@@ -29,8 +29,7 @@ from jaxsky.harmonics import (
 from jaxsky.inputs import Template
 from jaxsky.instrument import load_instrument
 from jaxsky.noise import draw, fit_knee, knee_spectrum, uniform_covariance
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.load import load
+from jaxsky.settings import SettingsError, load
 
 QUICK = ["common.nside=16", "common.fwhm=300.0", "seed=3", "sky.embedded.nside=32"]
 

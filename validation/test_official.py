@@ -15,7 +15,7 @@ from fits.inputs import inputs_of
 from fits.optimize import best_fit
 from fits.regions import region_masks
 from fits.resolution import prepare
-from jaxsky.settings.load import load
+from jaxsky.settings import load
 
 TRUTH = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1}
 SEEDS = range(1, 51)

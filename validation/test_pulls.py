@@ -8,7 +8,7 @@ from fits.inputs import inputs_of
 from fits.optimize import best_fit
 from fits.resolution import prepare
 from jaxsky.galaxy import embedded_sky
-from jaxsky.settings.load import load
+from jaxsky.settings import load
 
 SKIES = 200
 

@@ -11,7 +11,7 @@ from fits.separation import fit_spectra
 from fits.separation.tensor_ratio import fit_tensors
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.harmonics import expand, gaussian_beam, synthesis
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 
 NSIDE, FWHM, R, SKIES = 32, 180.0, 0.01, 100
 SETTINGS = {

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fits.commands import run
-from jaxsky.settings.keys import at_key
+from jaxsky.settings import at_key
 
 KIND = run.Kind(
     "fit", ("result.json", "log.json", "grid.png", "marginals.png", "posterior.png", "chain.h5")

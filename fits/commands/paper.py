@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fits.commands import run
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 
 
 def paper(

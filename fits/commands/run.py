@@ -18,9 +18,7 @@ from fits.commands.errors import logged
 from fits.commands.interrupt import interruptible
 from fits.commands.page import Section, table_of, write_page
 from jaxsky.io.folders import ALL, Folder, occupied
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.keys import of_file
-from jaxsky.settings.load import load
+from jaxsky.settings import Experiment, load, of_file
 
 #: Steps and their times, and the page that shows the results, in every folder.
 LOG, PAGE = "log.txt", "index.html"

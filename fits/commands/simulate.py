@@ -9,7 +9,7 @@ import typer
 
 from fits.commands import run
 from jaxsky.io.folders import ALL
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 
 #: What is simulated with --only: from the names of the foregrounds.
 ONLY: dict[str, Callable[[list[str]], list[str]]] = {

@@ -15,8 +15,7 @@ from fits.pseudo_cl import bin_edges
 from fits.record import fingerprint
 from fits.resolution import Prepared
 from jaxsky.progress import QUIET
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import SettingsError
+from jaxsky.settings import Experiment, SettingsError
 
 #: A slope and a correlation take a few pixels.
 LEAST_PIXELS = 10

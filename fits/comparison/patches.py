@@ -13,7 +13,7 @@ from fits.patches import PatchFits, PreparedPatches, fit_patches, prepare_patche
 from fits.resolution import Prepared, prepare
 from jaxsky.harmonics import average_pixels, beam_ratio, gaussian_beam, pixel_window
 from jaxsky.keys import realisation_key, stream
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 
 
 class PatchComparison(NamedTuple):

@@ -11,7 +11,7 @@ from fits.comparison.compare import Comparison
 from fits.comparison.patches import PatchComparison
 from fits.inputs import Inputs
 from fits.record import leaks, probability, with_error, write_json, write_log
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 
 #: A comparison with a smaller probability is pointed out.
 UNLIKELY = 0.01

@@ -23,9 +23,7 @@ from jaxsky.cmb import camb_spectra, tensor_spectra
 from jaxsky.harmonics import beam_ratio, gaussian_beam
 from jaxsky.parameters import unknown_parameter
 from jaxsky.progress import QUIET, Progress
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.keys import at_key
+from jaxsky.settings import Experiment, SettingsError, at_key
 
 FIELDS = ("EE", "BB")
 

@@ -12,7 +12,7 @@ from fits.forecast.fisher import Errors
 from fits.forecast.forecast import Forecast
 from fits.plots import label
 from jaxsky.plots import COLORS, STYLE, UNITS, plain, save
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 
 #: Primordial spectra, from the largest r on.
 DASHES = ("-", "--", "-.", ":")

@@ -12,7 +12,7 @@ from fits.forecast.forecast import Forecast
 from fits.pseudo_cl import sky_fraction
 from fits.record import write_json, write_log
 from jaxsky.components import declared
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 
 
 def forecast_json(found: Forecast, settings: Experiment) -> dict[str, Any]:

@@ -14,8 +14,7 @@ from jaxsky.harmonics import gaussian_beam
 from jaxsky.inputs import Template, read_sky
 from jaxsky.io import degrade_mask
 from jaxsky.observation import ObservedBand
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import SettingsError
+from jaxsky.settings import Experiment, SettingsError
 
 #: Spectra are corrected for beams down to this window.
 LEAST_WINDOW = 0.05

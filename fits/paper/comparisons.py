@@ -14,7 +14,7 @@ from fits.paper.sources import Sources, listed
 from fits.record import probability, with_error
 from fits.regions import region_masks, region_words
 from fits.resolution import prepare
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 
 PLANCK, WMAP = ("30", "44", "70", "353"), ("K", "Ka", "Q", "V", "W")
 #: Bands of the paper's figures 5 and 6.

@@ -14,7 +14,7 @@ from jaxsky.instrument import load_instrument
 from jaxsky.interpolation import term_weights
 from jaxsky.observation import Observation, ObservedBand, Source
 from jaxsky.preparation import Prepared, plan, prepare
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 from jaxsky.simulate import observe_bands
 
 BANDS = ("45", "105", "315")

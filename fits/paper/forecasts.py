@@ -11,8 +11,7 @@ from fits.pseudo_cl import sky_fraction
 from fits.regions import region_words
 from jaxsky.instrument import band_tables
 from jaxsky.io import InputError
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.tables import BandTable
+from jaxsky.settings import BandTable, Experiment
 
 #: The paper's bands of COrE [GHz].
 BANDS = ("45", "105", "315")

@@ -11,13 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsky.harmonics import expand, gaussian_beam, synthesis
-from jaxsky.inputs import read
+from jaxsky.inputs import parameter_map, read
 from jaxsky.io import InputError
-from jaxsky.lookup import find_file
-from jaxsky.parameter_maps import parameter_map
 from jaxsky.presets import from_pysm_beta
-from jaxsky.settings.experiment import IndexFile
-from jaxsky.settings.files import SettingsError
+from jaxsky.settings import IndexFile, SettingsError, find_file
 from jaxsky.templates import dust_index, steepening
 
 #: Resolution of the paper's maps [arcmin], and by how much its synchrotron is made steeper.

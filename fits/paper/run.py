@@ -22,7 +22,7 @@ from fits.paper.sources import Sources
 from fits.paper.store import Store
 from fits.record import write_log
 from jaxsky.progress import QUIET, Progress
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 
 LOG = "log.json"
 PAPER = (

@@ -22,7 +22,7 @@ from jaxsky.harmonics import (
 )
 from jaxsky.keys import stream
 from jaxsky.plots import COLORS, STYLE, draw_spectra, save
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 from jaxsky.small_scales import DUST, SYNCHROTRON, SmallScales, continue_templates
 from jaxsky.templates import polarization_template
 

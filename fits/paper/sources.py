@@ -16,9 +16,7 @@ from jaxsky import AME, Dust, Synchrotron
 from jaxsky.galaxy import EmbeddedSky
 from jaxsky.inputs import Template, default_galaxy, embedded_galaxy, read, read_sky, uK_RJ_per
 from jaxsky.keys import realisation_key, stream
-from jaxsky.settings.experiment import Experiment, IndexFile
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.tables import ComponentTable, SmallScalesTable
+from jaxsky.settings import ComponentTable, Experiment, IndexFile, SettingsError, SmallScalesTable
 from jaxsky.small_scales import Continued, SmallScales, continue_templates
 from jaxsky.templates import dust_index, polarization_template
 

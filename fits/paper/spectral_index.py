@@ -10,8 +10,7 @@ from fits.regions import region_masks, region_words
 from fits.report import known_truth, with_errors
 from fits.resolution import prepare
 from fits.spectral_index import run
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import SettingsError
+from jaxsky.settings import Experiment, SettingsError
 
 #: The bands that the paper fits.
 BANDS = ("44", "70")

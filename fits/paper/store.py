@@ -8,7 +8,7 @@ from typing import Any
 from fits.commands.page import Table
 from fits.paper.item import Item, Number
 from fits.record import write_json
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 
 FILE = "items.json"
 

@@ -14,7 +14,7 @@ from fits.paper.sources import NSIDE, Sources
 from fits.record import with_error
 from jaxsky.plots import STYLE, UNITS, draw_map, save
 from jaxsky.presets import preset
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 from jaxsky.templates import coarse_pixels, correlation, polarization_template, steepening
 
 #: Width of a column [in].

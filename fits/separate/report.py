@@ -11,9 +11,9 @@ from fits.record import leaks, probability, with_error, write_json, write_log
 from fits.separate import plots
 from fits.separate.separate import SAMPLED, Separation
 from fits.separation.maps import ComponentMaps
+from jaxsky.inputs import parameter_unit
 from jaxsky.io import write_maps
-from jaxsky.parameter_maps import parameter_unit
-from jaxsky.settings.experiment import Experiment
+from jaxsky.settings import Experiment
 
 #: Probabilities below this are worth a word.
 UNLIKELY = 1e-3

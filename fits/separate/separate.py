@@ -28,9 +28,7 @@ from jaxsky.cmb import tensor_spectra
 from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.progress import QUIET, Progress
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import SettingsError
-from jaxsky.settings.keys import at_key
+from jaxsky.settings import Experiment, SettingsError, at_key
 
 #: Walkers of emcee, if they are enough.
 WALKERS = 32

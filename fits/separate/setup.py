@@ -20,12 +20,8 @@ from fits.separation.noise import Noise, as_noise
 from fits.separation.regions import clusters, latitude_bands, superpixels
 from jaxsky import Component, Sky, set_parameters
 from jaxsky.components import component_class
-from jaxsky.inputs import read, read_parameter
-from jaxsky.parameter_maps import one_column
-from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import MapFile, SettingsError
-from jaxsky.settings.keys import at_key
-from jaxsky.settings.tables import Regions
+from jaxsky.inputs import one_column, read, read_parameter
+from jaxsky.settings import Experiment, MapFile, Regions, SettingsError, at_key
 
 #: Noise that varies by less than this fraction from pixel to pixel is uniform: smoothed maps of
 #: variances ring by 1e-7.

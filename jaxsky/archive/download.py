@@ -1,26 +1,236 @@
 """Download of products into a cache: resumed, checked, whole or not at all."""
 
 import contextlib
+import json
 import os
+import re
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import urljoin, urlsplit
 
 import requests
 import urllib3
 
-from jaxsky.archive import transfer
-from jaxsky.archive.cache import (
+from jaxsky.archive.products import (
     DownloadError,
+    Product,
     alone,
+    check_size,
+    check_structure,
     checksums,
     file_hash,
+    in_words,
     remember,
     writing,
 )
-from jaxsky.archive.checking import check_size, check_structure
-from jaxsky.archive.products import Product
 from jaxsky.io import InputError
 from jaxsky.io.folders import cache_folder
+
+#: Seconds to wait for a connection, and for more bytes.
+TIMEOUT = (10.0, 60.0)
+CHUNK = 2**20
+_RANGE = re.compile(r"bytes (\d+)-(\d+)/(\d+|\*)")
+
+#: What may be done about a file of another size or hash.
+ANEW = "; if the archive has issued the file anew, --accept takes it"
+
+Report = Callable[[int, int | None], None]
+
+
+class CutError(Exception):
+    """A transfer that ended early, after so many bytes."""
+
+
+class RefusedError(Exception):
+    """An answer that is not the file; what it is."""
+
+
+class _State(NamedTuple):
+    """What a partial file is of, kept next to it.
+
+    Parameters
+    ----------
+    address : where it comes from
+    version : the server's strong ETag or date of the file
+    total : bytes of the whole file, None if the server did not say
+    """
+
+    address: str
+    version: str
+    total: int | None
+
+
+def _beside(part: Path) -> Path:
+    return part.with_name(f"{part.name}.json")
+
+
+def _state(part: Path) -> _State | None:
+    """What is known of a partial file; None if it has to be begun anew."""
+    try:
+        state = _State(**json.loads(_beside(part).read_text()))
+        have = part.stat().st_size
+    except (OSError, ValueError, TypeError):
+        return None
+    return None if not have or (state.total is not None and have > state.total) else state
+
+
+def source(part: Path) -> str | None:
+    """Address of which a partial file is, None if there is none that can be resumed."""
+    state = _state(part)
+    return state and state.address
+
+
+def discard(part: Path) -> None:
+    """Remove a partial file and what is known of it, in an order that allows to be interrupted."""
+    _beside(part).unlink(missing_ok=True)
+    part.unlink(missing_ok=True)
+
+
+def _transfer(address: str, part: Path, report: Report, size: int | None = None) -> None:
+    """Bring a file, or what is missing of it.
+
+    Parameters
+    ----------
+    address : http or https
+    part : the partial file
+    report : called with the bytes that are there, and all bytes or None
+    size : bytes that the file has, None if not known
+    """
+    state = _state(part)
+    if state is not None and state.address != address:
+        state = None
+    if state is not None and part.stat().st_size == state.total:
+        return
+    if state is not None and _resume(address, part, state, report, size):
+        return
+    with _get(address, {}) as answer:
+        answer.raise_for_status()
+        if answer.status_code != requests.codes.ok:
+            raise RefusedError(f"answers {answer.status_code}")
+        total = _length(answer)
+        _check(answer, part, total, total, size)
+        discard(part)
+        if version := _version(answer):
+            state = _State(address, version, total)
+            _beside(part).write_text(json.dumps(state._asdict()))
+        _receive(answer, part, 0, total, report)
+
+
+def _resume(address: str, part: Path, state: _State, report: Report, size: int | None) -> bool:
+    """Bring what is missing; False if the server has no such rest of this version of the file."""
+    have = part.stat().st_size
+    with _get(address, {"Range": f"bytes={have}-", "If-Range": state.version}) as answer:
+        if answer.status_code in (requests.codes.ok, requests.codes.range_not_satisfiable):
+            return False
+        answer.raise_for_status()
+        found = _RANGE.fullmatch(answer.headers.get("Content-Range", ""))
+        if answer.status_code != requests.codes.partial_content or found is None:
+            return False
+        total = state.total if found[3] == "*" else int(found[3])
+        dated = not state.version.startswith('"')  # a date need not be said again, a tag must
+        if (
+            int(found[1]) != have
+            or _version(answer) not in (None if dated else state.version, state.version)
+            or state.total not in (None, total)
+        ):
+            return False
+        _check(answer, part, total, total and total - have, size)
+        _receive(answer, part, have, total, report)
+    return True
+
+
+def _get(address: str, headers: dict[str, str]) -> requests.Response:
+    # Compressed transfers would have other lengths than the file.
+    headers = {"Accept-Encoding": "identity", **headers}
+    try:
+        return requests.get(
+            address, headers=headers, stream=True, timeout=TIMEOUT, hooks={"response": _stay_safe}
+        )
+    except requests.RequestException:
+        raise
+    except ValueError:  # of an address that cannot be taken apart
+        raise RefusedError("sends on to no address") from None
+
+
+def _stay_safe(answer: requests.Response, **_: object) -> None:
+    """Refuse to be sent from https to an address that is not."""
+    if answer.is_redirect and urlsplit(answer.url).scheme == "https":
+        there = urljoin(answer.url, answer.headers["Location"])
+        if urlsplit(there).scheme != "https":
+            raise RefusedError(f"sends on to {there}, which is not https")
+
+
+def _version(answer: requests.Response) -> str | None:
+    """What tells this version of the file from others; weak tags do not."""
+    tag = answer.headers.get("ETag", "")
+    return tag if tag.startswith('"') else answer.headers.get("Last-Modified")
+
+
+def _length(answer: requests.Response) -> int | None:
+    text = answer.headers.get("Content-Length", "")
+    return int(text) if text.isdecimal() and "Transfer-Encoding" not in answer.headers else None
+
+
+def _check(
+    answer: requests.Response, part: Path, total: int | None, rest: int | None, size: int | None
+) -> None:
+    """Refuse what need not be transferred to know that it is wrong, or has no room."""
+    encoding = answer.headers.get("Content-Encoding", "identity")
+    if encoding not in ("", "identity"):
+        raise RefusedError(f"sends the file compressed ({encoding}), unasked")
+    if size is not None and total not in (None, size):
+        raise RefusedError(f"has {total} bytes, but should have {size}{ANEW}")
+    free = shutil.disk_usage(part.parent).free
+    if rest is not None and rest > free:
+        raise DownloadError(
+            f"{part.parent}: {in_words(free)} are free, but {part.stem} takes {in_words(rest)} "
+            "more; make room, or give another --dir."
+        )
+
+
+def _receive(
+    answer: requests.Response, part: Path, have: int, total: int | None, report: Report
+) -> None:
+    report(have, total)
+    # What has come counts, also before a break.
+    answer.raw.enforce_content_length = False
+    with part.open("ab" if have else "wb") as file:
+        while chunk := _read(answer, have):
+            file.write(chunk)
+            file.flush()
+            have += len(chunk)
+            report(have, total)
+    if total is not None and have != total:
+        raise CutError(have)
+
+
+def _read(answer: requests.Response, have: int) -> bytes:
+    try:
+        return answer.raw.read1(CHUNK, decode_content=False)
+    except (urllib3.exceptions.HTTPError, OSError):
+        raise CutError(have) from None
+
+
+def _reason(error: requests.RequestException) -> str:
+    """What is wrong with an address, to follow it in a sentence."""
+    if isinstance(error, requests.HTTPError) and error.response is not None:
+        later = error.response.headers.get("Retry-After")
+        said = f"answers {error.response.status_code}"
+        wait = f"{later} s" if later and later.isdecimal() else f"until {later}"
+        return f"{said}, and asks to wait {wait}" if later else said
+    for kind, words in {
+        requests.Timeout: "does not answer in time",
+        requests.exceptions.SSLError: "has a certificate that cannot be checked",
+        requests.TooManyRedirects: "sends on and on",
+        requests.exceptions.InvalidSchema: "is, or sends on to, no http or https address",
+        requests.exceptions.InvalidURL: "is no address",
+        requests.exceptions.MissingSchema: "is no address",
+    }.items():
+        if isinstance(error, kind):
+            return words
+    return "cannot be reached"
 
 
 def fetch(
@@ -29,7 +239,7 @@ def fetch(
     *,
     mirror: str | None = None,
     accept: bool = False,
-    report: transfer.Report = lambda have, total: None,
+    report: Report = lambda have, total: None,
     waiting: Callable[[], None] = lambda: None,
 ) -> Path:
     """A product's file, downloaded unless it is there; of either, size and structure are checked.
@@ -102,7 +312,7 @@ def _kept(product: Product, path: Path, part: Path) -> Path:
 
 def _tidy(part: Path) -> None:
     """Remove what a download needs beside its file; processes that wait look for that first."""
-    transfer.discard(part)
+    discard(part)
     part.with_name(f".{part.stem}.lock").unlink(missing_ok=True)
 
 
@@ -111,23 +321,23 @@ def _download(
     addresses: Sequence[str],
     part: Path,
     accept: bool,
-    report: transfer.Report,
+    report: Report,
 ) -> str:
     """Bring the file from the first address that has it; returns its hash."""
     failures = []
-    begun = transfer.source(part)
+    begun = source(part)
     for address in sorted(addresses, key=lambda a: a != begun):
         try:
-            transfer.transfer(address, part, report, None if accept else product.size)
+            _transfer(address, part, report, None if accept else product.size)
             return _checked(product, part, accept)
-        except transfer.CutError as cut:
+        except CutError as cut:
             raise DownloadError(
                 f"{product.name}: the transfer from {address} ended early, after {cut} bytes; "
                 "fetch it again to resume."
             ) from None
         except requests.RequestException as error:
-            failures.append(f"{address} {transfer.reason(error)}")
-        except (transfer.RefusedError, urllib3.exceptions.HTTPError) as error:
+            failures.append(f"{address} {_reason(error)}")
+        except (RefusedError, urllib3.exceptions.HTTPError) as error:
             failures.append(f"{address} {error}")
     raise DownloadError(
         f"{product.name}: {'; '.join(failures)}. Try again later, give another --mirror, or put "
@@ -141,11 +351,11 @@ def _checked(product: Product, part: Path, accept: bool) -> str:
         check_structure(product, part)
         size, found = part.stat().st_size, file_hash(part, product.hash or "sha256:")
         if not accept and product.size not in (None, size):
-            raise InputError(f"has {size} bytes, but should have {product.size}{transfer.ANEW}.")
+            raise InputError(f"has {size} bytes, but should have {product.size}{ANEW}.")
         if not accept and product.hash not in (None, found):
-            raise InputError(f"has {found}, but should have {product.hash}{transfer.ANEW}.")
+            raise InputError(f"has {found}, but should have {product.hash}{ANEW}.")
     except InputError as error:
-        transfer.discard(part)
+        discard(part)
         said = str(error).replace(str(part), product.name).rstrip(".")
-        raise transfer.RefusedError(f"sent another file ({said})") from None
+        raise RefusedError(f"sent another file ({said})") from None
     return found

@@ -1,10 +1,25 @@
-"""What the archives hold, from `products.toml`."""
+"""What the archives hold, from `products.toml`; what of it is kept here, and checks of that."""
 
+import errno
+import json
+import os
+import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any, NamedTuple
+
+import filelock
+import pooch
+from astropy.io import fits as pyfits
+
+from jaxsky.io import InputError, read_spectra
+from jaxsky.io.folders import NO_LOCKS
+from jaxsky.io.quantities import unit_name
+from jaxsky.io.tables import HealpixTable, open_fits
 
 
 class Product(NamedTuple):
@@ -139,3 +154,179 @@ def total_size(products: Sequence[Product]) -> str:
     if None in sizes:
         return f"more than {size}" if known else "of unknown size"
     return size if all(p.size is not None for p in products) else f"about {size}"
+
+
+#: Hashes of files that the catalogue has none of, as they were when they were fetched.
+CHECKSUMS = "checksums.json"
+_HASH = re.compile(r"(sha256|md5):[0-9a-f]+")
+_MOVE = "move it away to go on without the hashes in it."
+_FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used up"}
+
+
+class DownloadError(ValueError):
+    """A file that could not be had; one sentence."""
+
+
+def checksums(folder: Path) -> dict[str, str]:
+    """Hashes by name, as they were recorded; raises InputError if the record is damaged."""
+    path = folder / CHECKSUMS
+    try:
+        known = json.loads(path.read_text())
+    except (FileNotFoundError, NotADirectoryError):
+        return {}
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); {_MOVE}") from None
+    if not isinstance(known, dict) or not all(_HASH.fullmatch(str(h)) for h in known.values()):
+        raise InputError(f"{path}: is damaged, it holds other things than hashes; {_MOVE}")
+    return known
+
+
+def known_hash(product: Product, folder: Path) -> str | None:
+    """The hash that a file should have: its own when it was fetched, or the catalogue's."""
+    return checksums(folder).get(product.name, product.hash)
+
+
+def file_hash(path: Path, like: str = "sha256:") -> str:
+    """The hash of a file by the algorithm of another hash."""
+    algorithm = like.partition(":")[0]
+    return f"{algorithm}:{pooch.file_hash(str(path), alg=algorithm)}"
+
+
+def remember(product: Product, folder: Path, value: str) -> None:
+    """Record the hash of a product's file."""
+    with alone(folder / f".{CHECKSUMS}.lock"):
+        known = checksums(folder) | {product.name: value}
+        new = folder / f".{CHECKSUMS}.new"
+        new.write_text(json.dumps(known, indent=2, sort_keys=True) + "\n")
+        os.replace(new, folder / CHECKSUMS)
+
+
+@contextmanager
+def alone(path: Path, waiting: Callable[[], None] = lambda: None) -> Iterator[None]:
+    """Hold a lock, which ends with the process; without one where a file system has none.
+
+    Parameters
+    ----------
+    path : of the lock
+    waiting : called if another process has it
+    """
+    lock = filelock.FileLock(path, fallback_to_soft=False)
+    try:
+        lock.acquire(blocking=False)
+    except filelock.Timeout:
+        waiting()
+        lock.acquire()
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """What is wrong with a disk while it is written to, as a DownloadError."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _FULL:
+            raise DownloadError(
+                f"{folder}: {_FULL[error.errno]}; make room and fetch it again to resume."
+            ) from None
+        where = error.filename or folder
+        raise DownloadError(
+            f"{where}: cannot be written ({error.strerror or error}); give another --dir."
+        ) from None
+
+
+def verify(product: Product, folder: Path) -> str:
+    """Check a product's file; returns in words what was checked.
+
+    Parameters
+    ----------
+    product : from the catalogue
+    folder : where the file is
+    """
+    path = folder / product.name
+    if not path.is_file():
+        raise InputError(f"{path}: is not there; fetch it with `jaxsky data fetch`.")
+    check_size(product, folder)
+    known = known_hash(product, folder)
+    if known is not None and (found := file_hash(path, known)) != known:
+        raise InputError(f"{path}: has the hash {found}, but should have {known}; fetch it anew.")
+    return ", ".join([*(["hash"] if known else []), *check_structure(product, path)])
+
+
+def check_size(product: Product, folder: Path) -> None:
+    """Raise InputError if a product's file has another size than the catalogue says."""
+    path = folder / product.name
+    size = path.stat().st_size
+    # The hash of a file that was accepted as it came stands in for the catalogue's size.
+    if product.size not in (None, size) and known_hash(product, folder) == product.hash:
+        raise InputError(f"{path}: has {size} bytes, but should have {product.size}.")
+
+
+def check_structure(product: Product, path: Path) -> list[str]:
+    """Check that a file is complete and what the catalogue says; returns what was checked.
+
+    Reads headers and ends of tables only, whatever the size.
+    """
+    with path.open("rb") as file:
+        start = file.read(512)
+    shown = " ".join(start[:60].decode("ascii", "replace").split())
+    if not start:
+        raise InputError(f"{path}: is empty.")
+    if product.name.endswith(".fits"):
+        if not start.startswith((b"SIMPLE", b"\x1f\x8b")):
+            raise InputError(f"{path}: is no FITS file, it begins with {shown!r}.")
+        with open_fits(path) as hdus:
+            _check_whole(hdus)
+            if product.nside is not None:
+                _check_maps(HealpixTable(path, hdus, 1), product)
+        return ["complete"] if product.nside is None else ["columns", "complete"]
+    if start.lstrip().startswith(b"<"):
+        raise InputError(f"{path}: is no table, it begins with {shown!r}.")
+    if product.lmax is not None:
+        _check_text(path, product.lmax)
+    return ["complete"]
+
+
+def _check_text(path: Path, lmax: int) -> None:
+    read_spectra(path, lmax)
+    with path.open("rb") as file:
+        file.seek(-1, 2)
+        if file.read() != b"\n":
+            raise InputError(f"{path}: ends in the middle of a line.")
+
+
+def _check_whole(hdus: pyfits.HDUList) -> None:
+    """Read the last byte of each table or image, at which astropy notices a cut."""
+    for hdu in hdus:
+        if isinstance(hdu, pyfits.BinTableHDU):
+            if len(hdu.columns):
+                hdu.data[-1:]
+        elif hdu.is_image and hdu.shape:
+            hdu.section[-1:]
+
+
+def _check_maps(table: HealpixTable, product: Product) -> None:
+    if table.nside != product.nside:
+        raise InputError(f"{table.where}: nside is {table.nside}, but {product.nside} is expected.")
+    for name in product.columns:
+        index = table.index(name)
+        # Hits and covariances have units of their own.
+        if product.unit is None or name.upper() in ("N_OBS", "HITS") or name.endswith("_COV"):
+            continue
+        text = table.unit(index)
+        if text is None:
+            continue
+        try:
+            unit = unit_name(text)
+        except ValueError:
+            unit = text
+        if unit not in (product.unit, product.unit.replace("_CMB", "").replace("_RJ", "")):
+            raise InputError(
+                f"{table.where}: column {name} is in {text}, but {product.unit} is expected."
+            )

@@ -6,10 +6,8 @@ Everything else is converted and checked here, once. A file that cannot be used 
 """
 
 from jaxsky.io.bandpasses import read_bandpass
-from jaxsky.io.beams import read_beam
-from jaxsky.io.errors import InputError, MissingFileError, check_file
-from jaxsky.io.files import whole, write_text
+from jaxsky.io.files import InputError, MissingFileError, check_file, whole, write_text
 from jaxsky.io.maps import Maps, read_maps, write_maps
 from jaxsky.io.masks import degrade_mask, read_mask
 from jaxsky.io.quantities import from_quantity, unit_factor, unit_name
-from jaxsky.io.spectra import read_spectra
+from jaxsky.io.spectra import read_beam, read_spectra

@@ -1,14 +1,29 @@
-"""Columns of HEALPix files: what their names say for certain, and what an argument says.
+"""Columns of HEALPix tables: what names, headers, values and arguments say of them.
 
-Only names on this list say which Stokes parameter a column holds. They are those of Planck, WMAP,
+Only names on a list say which Stokes parameter a column holds. They are those of Planck, WMAP,
 healpy, the HEALPix libraries, PySM and this package; where a column stands says nothing.
 """
 
+import numbers
 import re
 from collections.abc import Sequence
-from itertools import product
+from dataclasses import dataclass
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any, NamedTuple
 
-from jaxsky.io.tables import PIXELS, InputError
+import numpy as np
+from jaxtyping import Float
+
+from jaxsky.io.quantities import is_ambiguous, unit_name
+from jaxsky.io.tables import (
+    COORDINATES,
+    ORDERINGS,
+    PIXELS,
+    HealpixTable,
+    InputError,
+    open_fits,
+)
 
 _LETTERS = {"I": "I", "T": "I", "Q": "Q", "U": "U"}
 _RUNS = ("FULL", "HM1", "HM2", "HR1", "HR2", "YR1", "YR2", "Y1", "Y2")
@@ -112,3 +127,246 @@ def parse_stokes(given: str | Sequence[str]) -> list[str]:
             )
         found.append(kind)
     return found
+
+
+#: Numbers that are written in place of a value that is missing, of either sign.
+USUAL = (999.0, 9999.0, 99999.0, 999999.0, 32767.0, 32768.0, 2147483647.0, 2147483648.0)
+#: Beyond any value of a sky map in any unit, unless its others are as large.
+HUGE = 1e15
+#: A sentinel is repeated so often, and so much more often than its neighbour among the values.
+REPEATED, MORE_OFTEN = 4, 3
+#: A map that is exactly 0 in more of its pixels than this fraction is taken to have a footprint.
+ZEROS = 0.3
+
+
+def parse_missing(given: Any) -> list[float]:
+    """The numbers that an argument says to mark missing pixels."""
+    several: list = [given] if isinstance(given, numbers.Real | str) else list(given)
+    if any(isinstance(x, bool) or not isinstance(x, numbers.Real) for x in several):
+        raise InputError(f"Argument `missing` must be a number or a list of them, not {given!r}.")
+    return [float(x) for x in several]
+
+
+def sentinels(
+    values: Float[np.ndarray, " pix"], lowest: float | None = None, *, zero: bool = False
+) -> list[tuple[float, int]]:
+    """Values that look like marks of missing pixels, with the number of their pixels.
+
+    A mark is an extreme far from the rest, further out than the rest is from its median, and
+    repeated, or huge; the usual numbers (-999, -32768, ...) count also where they are nearer.
+
+    Parameters
+    ----------
+    values : of a column, NaN where they are known to be missing
+    lowest : what the lowest stored integer of the column stands for; None for other types
+    zero : zero is a usual number, too, rather than none
+    """
+    known = np.isfinite(values)
+    rest = values if known.all() else values[known]
+    usual = {sign * number for number in USUAL for sign in (1.0, -1.0)} | {lowest}
+    usual |= {0.0} if zero else set()
+    found: list[tuple[float, int]] = []
+    while rest.size:
+        for extreme in (float(rest.min()), float(rest.max())):
+            count = int(np.count_nonzero(rest == extreme))
+            others = _marks(rest, extreme, count, extreme in usual) if zero or extreme else None
+            if others is not None:
+                found.append((extreme, count))
+                rest = others
+                break
+        else:
+            break
+    return found
+
+
+def _marks(rest: np.ndarray, extreme: float, count: int, usual: bool) -> np.ndarray | None:
+    """The other values if an extreme marks missing pixels, else None."""
+    if count < 2 and not usual and abs(extreme) < HUGE:
+        return None
+    others = rest[rest != extreme]
+    if not others.size:
+        return None
+    near = others.min() if extreme < others.min() else others.max()
+    far = abs(near - extreme) > abs(np.median(others) - near)
+    often = max(REPEATED, 1 + MORE_OFTEN * int(np.count_nonzero(others == near)))
+    is_mark = far and (usual or abs(extreme) >= HUGE or (count >= often and _is_continuous(others)))
+    if usual and count > 1 and not is_mark:
+        is_mark = not np.array_equal(others, np.round(others))
+    return others if is_mark else None
+
+
+def _is_continuous(values: np.ndarray) -> bool:
+    """True if most values are there once, unlike labels, steps and rings."""
+    some = values[:: max(1, values.size // 1000)]
+    return np.unique(some).size > some.size / 2
+
+
+def zeros(columns: Sequence[Float[np.ndarray, " pix"]]) -> float:
+    """Fraction of the pixels with values in which all columns are exactly 0."""
+    known = np.isfinite(columns[0])
+    empty = columns[0] == 0
+    for _, values in pairwise(columns):
+        known &= np.isfinite(values)
+        empty &= values == 0
+    return float(np.count_nonzero(empty & known)) / max(float(np.count_nonzero(known)), 1.0)
+
+
+POLARIZATIONS = {"COSMO": "COSMO", "IAU": "IAU"}
+
+
+class Source(NamedTuple):
+    """A table, and the columns that are read of it; None for those that their names tell."""
+
+    path: Path
+    hdu: int | str
+    fields: list[int | str] | None
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns of one table: values in RING order, NaN where missing, and what is said of them."""
+
+    where: str
+    names: list[str]
+    values: list[Float[np.ndarray, " pix"]]
+    lowest: list[float | None]
+    alone: bool
+    nside: int
+    unit: str
+    coordinates: str
+    polarization: str
+
+
+def default_fields(table: HealpixTable, argument: str = "fields") -> list[int]:
+    """The first I, Q and U columns that are there, by their names; else a column that is alone."""
+    if found := choose(table.names):
+        return found
+    columns = [i for i, name in enumerate(table.names) if name.upper() not in PIXELS]
+    if len(columns) == 1:
+        return columns
+    raise InputError(
+        f"{table.where}: no column is named as I, Q or U; give `{argument}` out of "
+        f"{', '.join(table.names)}."
+    )
+
+
+def _units_agree(given: str, found: str) -> bool:
+    """True if a unit from an argument is the header's, or makes its bare kelvins definite."""
+    return given == found or (is_ambiguous(found) and re.sub("_(CMB|RJ)", "", given) == found)
+
+
+def _unit(table: HealpixTable, columns: list[int], given: str | None) -> str:
+    """The one unit of some columns, from the header and the argument."""
+    units = []
+    for column in columns:
+        text, name = table.unit(column), table.names[column]
+        try:
+            found = None if text is None else unit_name(text)
+        except ValueError:
+            found = None
+        if given is None and (found is None or is_ambiguous(found)):
+            says = (
+                f"has the unit {text!r}, which leaves open what is meant" if text else "has no unit"
+            )
+            raise InputError(
+                f'{table.where}: column {name} {says}; give `unit`, such as "uK_CMB", "K_RJ", '
+                '"MJy/sr", "K" for a temperature of matter or "" for a pure number.'
+            )
+        if given is not None and found is not None and not _units_agree(given, found):
+            raise InputError(
+                f"{table.where}: argument `unit` is {given or 'that of a pure number'}, but column "
+                f"{name} is {f'in {found}' if found else 'a pure number'}."
+            )
+        units.append(found if given is None else given)
+    if len(set(units)) > 1:
+        listed = ", ".join(f"{table.names[c]} [{v}]" for c, v in zip(columns, units, strict=True))
+        raise InputError(
+            f"{table.where}: columns have different units, read each by itself: {listed}."
+        )
+    return str(units[0])
+
+
+def _several(value: Any, scalar: type | tuple[type, ...]) -> list[Any]:
+    return [value] if isinstance(value, scalar) else list(value)
+
+
+def sources(path: Any, hdu: Any, fields: Any) -> list[Source]:
+    """File, HDU and columns of each table, from arguments that may be lists."""
+    paths, hdus = _several(path, (str, Path)), _several(hdu, (str, numbers.Integral))
+    number = max(len(paths), len(hdus))
+    for name, given in {"path": paths, "hdu": hdus}.items():
+        if len(given) not in (1, number) or not given:
+            raise InputError(
+                f"Argument `{name}` must be one, or as many as the other names, {number}, "
+                f"but is {len(given)}."
+            )
+    wanted = None if fields is None else _several(fields, (str, numbers.Integral))
+    if wanted is not None and not wanted:
+        raise InputError(f"{paths[0]}: argument `fields` is empty.")
+    if number == 1:
+        return [Source(Path(paths[0]), hdus[0], wanted)]
+    if wanted is not None and len(wanted) not in (1, number):
+        raise InputError(
+            f"Argument `fields` must name one column of all {number} tables, or one of each, "
+            f"not {len(wanted)}."
+        )
+    columns = [None] * number if wanted is None else wanted * (number // len(wanted))
+    return [
+        Source(Path(p), h, None if c is None else [c])
+        for p, h, c in zip(
+            paths * (number // len(paths)), hdus * (number // len(hdus)), columns, strict=True
+        )
+    ]
+
+
+def read_columns(
+    source: Source,
+    unit: str | None,
+    ordering: str | None,
+    coordinates: str | None,
+    polarization: str | None,
+) -> Columns:
+    """The columns of one table; arguments as those of `read_maps`."""
+    with open_fits(source.path) as hdus:
+        table = HealpixTable(source.path, hdus, source.hdu)
+        if source.fields is None:
+            wanted = default_fields(table)
+        else:
+            wanted = [table.index(field) for field in source.fields]
+            if len(set(wanted)) < len(wanted):
+                raise InputError(f"{table.where}: `fields` names a column twice: {source.fields}.")
+        unit = _unit(table, wanted, unit)
+        order = table.state("ordering", ordering, ("ORDERING",), ORDERINGS)
+        return Columns(
+            where=table.where,
+            names=[table.names[i] for i in wanted],
+            values=[table.values(i, order) for i in wanted],
+            lowest=[table.lowest(i) for i in wanted],
+            alone=sum(name.upper() not in PIXELS for name in table.names) == 1,
+            nside=table.nside,
+            unit=unit,
+            coordinates=table.state(
+                "coordinates", coordinates, ("COORDSYS", "SKYCOORD"), COORDINATES
+            ),
+            polarization=table.state(
+                "polarization", polarization, ("POLCCONV",), POLARIZATIONS, default="COSMO"
+            ),
+        )
+
+
+def check_alike(tables: Sequence[Columns]) -> None:
+    """Refuse tables that differ in what one field has in common."""
+    hints = {
+        "nside": "one field has one nside",
+        "unit": "read each by itself",
+        "coordinates": "one field has one system of coordinates",
+        "polarization": "give `polarization` if one of them does not say it",
+    }
+    first = tables[0]
+    for name, hint in hints.items():
+        for other in tables[1:]:
+            one, two = getattr(first, name), getattr(other, name)
+            if one != two:
+                raise InputError(
+                    f"{other.where}: {name} is {two}, but that of {first.where} is {one}; {hint}."
+                )

@@ -12,13 +12,21 @@ from jaxtyping import Bool, Float
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.bare import takes_quantities
-from jaxsky.io.columns import parse_stokes
+from jaxsky.io.columns import (
+    ZEROS,
+    Columns,
+    check_alike,
+    parse_missing,
+    parse_stokes,
+    read_columns,
+    sentinels,
+    sources,
+    zeros,
+)
 from jaxsky.io.columns import stokes as stokes_of
 from jaxsky.io.files import whole
-from jaxsky.io.missing import ZEROS, parse_missing, sentinels, zeros
 from jaxsky.io.quantities import unit_factor, unit_name
 from jaxsky.io.rotation import blocks, to_galactic
-from jaxsky.io.sources import Columns, check_alike, read_columns, sources
 from jaxsky.io.tables import InputError, equals
 from jaxsky.types import Numeric
 from jaxsky.units import UNITS

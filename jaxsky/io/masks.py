@@ -7,8 +7,8 @@ import healpy
 import numpy as np
 from jaxtyping import Bool
 
-from jaxsky.io.errors import check_file
-from jaxsky.io.sources import default_fields
+from jaxsky.io.columns import default_fields
+from jaxsky.io.files import check_file
 from jaxsky.io.tables import COORDINATES, ORDERINGS, HealpixTable, InputError, equals, open_fits
 
 

@@ -10,7 +10,7 @@ from astropy.io import fits as pyfits
 from jaxtyping import Array, Float
 
 from jaxsky.bandpass import Bandpass
-from jaxsky.io.errors import InputError
+from jaxsky.io.files import InputError
 from jaxsky.io.tables import open_fits
 
 #: Whose maps have these tables.

@@ -14,7 +14,7 @@ from astropy.io import fits as pyfits
 from astropy.utils.exceptions import AstropyUserWarning
 from jaxtyping import Bool, Float, Int
 
-from jaxsky.io.errors import InputError, check_file
+from jaxsky.io.files import InputError, check_file
 
 #: Spellings in headers and arguments, upper case -> the package's.
 ORDERINGS = {"RING": "RING", "NESTED": "NESTED", "NEST": "NESTED"}

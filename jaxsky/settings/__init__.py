@@ -1,1 +1,23 @@
-"""Experiment files: what they can say, with a sentence for each mistake."""
+"""The experiment file: its tables, a sentence for each mistake, and the files that it names."""
+
+from jaxsky.settings.experiment import Common, Experiment, IndexFile, parse_region
+from jaxsky.settings.files import (
+    BandpassSpec,
+    Hits,
+    MapFile,
+    MapKeys,
+    MaskFile,
+    NoiseColumns,
+    NoiseTable,
+    SettingsError,
+    SettingsFile,
+)
+from jaxsky.settings.tables import (
+    BandTable,
+    ComponentTable,
+    Regions,
+    SmallScalesTable,
+    leakage_warning,
+)
+from jaxsky.settings.toml import at_key, find_file, found_files, load, named_files, of_file
+from jaxsky.settings.types import check_sign

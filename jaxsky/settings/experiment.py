@@ -18,6 +18,7 @@ from jaxsky.settings.tables import (
 )
 from jaxsky.settings.types import (
     Distinct,
+    MistakeAt,
     Nside,
     Pair,
     RegionName,
@@ -25,8 +26,9 @@ from jaxsky.settings.types import (
     Several,
     Word,
     check_names,
+    check_reference,
+    check_signs,
 )
-from jaxsky.settings.values import MistakeAt, check_reference, check_signs
 from jaxsky.small_scales import DUST, SYNCHROTRON
 
 Positive = Annotated[float, Field(gt=0)]

@@ -16,8 +16,9 @@ from pydantic import (
     model_validator,
 )
 
-from jaxsky.settings.types import Several, Word
-from jaxsky.settings.values import (
+from jaxsky.settings.types import (
+    Several,
+    Word,
     file_names,
     hdu_numbers,
     missing_numbers,
@@ -47,7 +48,7 @@ class Table(BaseModel):
 
 
 class NamedFile(str):
-    """The name of a file, told from other text; see `jaxsky.lookup.find_file`."""
+    """The name of a file, told from other text; see `jaxsky.settings.toml.find_file`."""
 
     __slots__ = ()
 

@@ -1,13 +1,154 @@
-"""Types of values in settings: numbers within their bounds, names, and lists of them."""
+"""Types of values in settings, and checks of values; ValueError with the words after the key."""
 
 import re
-from collections.abc import Collection, Iterable
-from typing import Annotated, TypeVar
+import reprlib
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, Field, Strict
+from pydantic import AfterValidator, Field, Strict, ValidationError
 
-from jaxsky.components import component_class
-from jaxsky.settings.values import MistakeAt
+from jaxsky.components import component_class, declared
+
+
+class MistakeAt(ValueError):
+    """A mistake at a key inside of the table that is checked."""
+
+    def __init__(self, key: str, mistake: str | ValueError) -> None:
+        self.key, self.words = key, str(mistake)
+        if isinstance(mistake, MistakeAt):
+            self.key, self.words = f"{key}.{mistake.key}", mistake.words
+        super().__init__(f"{self.key}: {self.words}")
+
+
+def _key(raw: Any, place: Sequence[str | int], missing: bool) -> str:
+    """The dotted key of a mistake; its place also names types, which are no keys."""
+    keys = []
+    for i, step in enumerate(place):
+        if isinstance(raw, dict) and step in raw:
+            keys.append(str(step))
+            raw = raw[step]
+        elif isinstance(raw, list) and isinstance(step, int):
+            keys.append(str(step))
+            raw = raw[step] if step < len(raw) else None
+        elif missing and i == len(place) - 1:
+            keys.append(str(step))
+    return ".".join(keys)
+
+
+def mistakes(
+    raw: Any, error: ValidationError, options: Mapping[str, str] = MappingProxyType({})
+) -> str:
+    """A sentence about what is wrong with tables, with the keys; options add to those of a key."""
+    wrong: dict[str, list[str]] = {}
+    types: dict[str, str] = {}
+    for item in error.errors():
+        what = item["msg"].removeprefix("Value error, ").rstrip(".")
+        where = _key(raw, item["loc"], item["type"] == "missing")
+        mistake = item.get("ctx", {}).get("error")
+        if isinstance(mistake, MistakeAt):
+            where = f"{where}.{mistake.key}" if where else mistake.key
+            what = mistake.words.rstrip(".")
+        elif item["type"] == "extra_forbidden":
+            what = "unknown key"
+        elif item["type"] == "missing":
+            what = "is missing"
+        elif item["type"].endswith(("_type", "literal_error")):
+            wanted = what.removeprefix("Input should be ").partition(" or instance")[0]
+            wanted = wanted.replace("dictionary", "table")
+            known = types.get(where, "input should be ").partition(", not ")[0]
+            joined = known + ("" if known.endswith("be ") else " or ") + wanted
+            types[where] = f"{joined}, not {reprlib.repr(item['input'])}"
+            continue
+        elif item["msg"] == what:
+            value = "" if ", not " in what else f", not {reprlib.repr(item['input'])}"
+            what = f"{what[0].lower()}{what[1:]}{value}"
+        wrong.setdefault(where, []).append(what)
+    # Of a value that may be of several types, those that it is not matter only if it is none.
+    places = [*wrong, *types]
+    for where, what in types.items():
+        if where not in wrong and not any(place.startswith(f"{where}.") for place in places):
+            wrong[where] = [what]
+    sentences = [
+        ": ".join(filter(None, (k, " or ".join(w)))) + options.get(k, "") for k, w in wrong.items()
+    ]
+    return "; ".join(sentences)
+
+
+def check_reference(law: str, nu_ref: float | None, parameters: Mapping[str, Any]) -> None:
+    """Raise ValueError for a reference frequency that is given twice, or not in GHz."""
+    if nu_ref is not None and "nu_ref" in parameters:
+        raise ValueError(
+            f"nu_ref is given twice, {nu_ref:g} and in parameters; leave one of them out"
+        )
+    given = parameters.get("nu_ref", nu_ref)
+    known = declared(component_class(law), "nu_ref")
+    if given is not None and not known:
+        raise ValueError(f"the law {law!r} has no nu_ref: its maps are in uK_CMB")
+    if not isinstance(given, int | float) or known["within"] is None:
+        return
+    least, most = known["within"]
+    if not least <= given <= most:
+        raise ValueError(
+            f"nu_ref is in GHz, for the law {law!r} from {least:g} to {most:g}, not {given:g}"
+        )
+
+
+def check_sign(name: str, *values: float) -> None:
+    """Raise ValueError for an index beta_syn in the sign of T ~ nu^beta, by its dotted name."""
+    negative = [value for value in values if value <= 0]
+    if name.split(".")[-1] == "beta_syn" and negative:
+        raise MistakeAt(
+            name,
+            "beta_syn is the index in T ~ nu^-beta_syn, positive and about 3, not "
+            f"{negative[0]:g}; that of T ~ nu^beta has the other sign",
+        )
+
+
+def check_signs(table: str, values: Mapping[str, Any]) -> None:
+    """`check_sign` of the numbers in a table of settings."""
+    for name, value in values.items():
+        numbers = value if isinstance(value, list) else [value]
+        try:
+            check_sign(name, *(x for x in numbers if isinstance(x, int | float)))
+        except ValueError as error:
+            raise MistakeAt(table, error) from None
+
+
+def file_names(value: Any) -> Any:
+    """The name of a file, or several."""
+    names = value if isinstance(value, list | tuple) else [value]
+    if not names or not all(isinstance(name, str) and name for name in names):
+        raise ValueError(f"must be the name of a file, or a list of them, not {value!r}")
+    return value
+
+
+def hdu_numbers(value: Any) -> Any:
+    """The number of an HDU, or several."""
+    numbers = value if isinstance(value, list | tuple) else [value]
+    whole = all(isinstance(n, int) and not isinstance(n, bool) and n >= 1 for n in numbers)
+    if not numbers or not whole:
+        raise ValueError(
+            f"must be the number of an HDU, 1 or more, or a list of them, not {value!r}"
+        )
+    return value
+
+
+def stokes_words(value: Any) -> Any:
+    """What `jaxsky.io.read_maps` takes as `stokes`."""
+    from jaxsky.io.columns import parse_stokes  # reading is slow to import
+
+    parse_stokes(value if isinstance(value, str | list | tuple) else [value])
+    return value
+
+
+def missing_numbers(value: Any) -> Any:
+    """What `jaxsky.io.read_maps` takes as `missing`."""
+    from jaxsky.io.columns import parse_missing
+
+    parse_missing([value] if not isinstance(value, list | tuple) else value)
+    return value
+
 
 T = TypeVar("T")
 

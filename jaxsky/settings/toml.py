@@ -1,0 +1,189 @@
+"""Settings from TOML files and the command line, and the files that they name."""
+
+import json
+import os
+import re
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from jaxsky.io import InputError, MissingFileError, check_file
+from jaxsky.io.folders import cache_folder
+from jaxsky.settings.experiment import Experiment
+from jaxsky.settings.files import NamedFile, SettingsError, SettingsFile, expand
+from jaxsky.settings.types import mistakes
+
+
+@contextmanager
+def at_key(name: str) -> Iterator[None]:
+    """Have an error of the numerics name the key of the value that led to it."""
+    try:
+        yield
+    except (InputError, SettingsError):
+        raise
+    except (ValueError, TypeError, KeyError, ArithmeticError) as error:
+        message = str(error.args[0] if isinstance(error, KeyError) else error)
+        if (unknown := re.search(r"unexpected keyword argument ('\w+')", message)) is not None:
+            message = f"there is no parameter {unknown[1]}"
+        raise SettingsError(f"{name}: {message.rstrip('.')}.") from error
+
+
+@contextmanager
+def of_file(path: Path) -> Iterator[None]:
+    """Have errors about settings name their file."""
+    try:
+        yield
+    except SettingsError as error:
+        if str(error).startswith(f"{path}: "):
+            raise
+        raise SettingsError(f"{path}: {error}") from error
+
+
+def _assigned(assignment: str) -> tuple[list[str], Any]:
+    """The key and the value of `key=value`, where the value is TOML, or text as it is."""
+    key, equals, value = assignment.partition("=")
+    text = f"{key} = {json.dumps(value.strip(), ensure_ascii=False)}"
+    for line in (assignment, text) if equals else ():
+        try:
+            found, place = tomllib.loads(line), tomllib.loads(f"{key} = 0")
+        except (tomllib.TOMLDecodeError, RecursionError):
+            continue
+        path: list[str] = []
+        while isinstance(place, dict) and len(found) == 1:
+            ((name, place),) = place.items()
+            path, found = [*path, name], found[name]
+            if place == 0:
+                return path, found
+    raise SettingsError(
+        f"--set {assignment}: must be KEY=VALUE, as in a settings file, with the table's name "
+        f"before the key{'' if equals else '; there is no ='}."
+    )
+
+
+def _replaced(raw: Any, path: Sequence[str], value: Any) -> Any:
+    """Tables with one key replaced; a number is the place in a list."""
+    if not path:
+        return value
+    key, *rest = path
+    if isinstance(raw, list):
+        if not key.isdecimal() or int(key) >= len(raw):
+            there = f"the {len(raw)} entries, 0 to {len(raw) - 1}" if raw else "the entries of []"
+            raise ValueError(f"{key}: is not among {there}")
+        return [_replaced(one, rest, value) if i == int(key) else one for i, one in enumerate(raw)]
+    known = raw if isinstance(raw, dict) else {}
+    return {**known, key: _replaced(known.get(key), rest, value)}
+
+
+def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
+    """An experiment from a TOML file.
+
+    Parameters
+    ----------
+    path : the file; relative paths in it are relative to its `data_dir`, and that to its folder
+    assignments : `key=value` with a dotted key, such as "common.nside=32", "bands.0.fwhm=30" or
+        "free.'dust.beta_dust'.start=1.5", in place of what the file says; a table is replaced whole
+
+    Returns
+    -------
+    The settings, with `data_dir` as an absolute path.
+    """
+    try:
+        raw = tomllib.loads(path.read_text())
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read ({error.strerror}).") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: is not valid TOML ({error}).") from None
+    except RecursionError:
+        raise SettingsError(f"{path}: is nested too deeply.") from None
+    options: dict[str, str] = {}
+    for assignment in assignments:
+        path_of_key, value = _assigned(assignment)
+        try:
+            raw = _replaced(raw, path_of_key, value)
+        except ValueError as error:
+            raise SettingsError(f"{path}: --set {assignment}: {error}.") from None
+        options[assignment.partition("=")[0].strip()] = " (given with --set)"
+    named = raw.get("data_dir", ".")
+    try:
+        name = expand(named) if isinstance(named, str) else "."
+        folder = (path.absolute().parent / name).resolve()
+        if folder.exists() and not folder.is_dir():
+            raise ValueError(f"{folder} is not a folder")
+        settings = Experiment.model_validate(raw, context={"folder": folder})
+    except ValidationError as error:
+        raise SettingsError(f"{path}: {mistakes(raw, error, options)}.") from None
+    except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: links in a circle
+        raise SettingsError(f"{path}: data_dir: {error}.") from None
+    return settings.model_copy(update={"data_dir": str(folder)})
+
+
+def find_file(folder: Path, name: str) -> Path:
+    """Find a file that settings name.
+
+    A name without a folder is looked for in `folder`, then in the cache of `jaxsky data fetch`;
+    with one, it is relative to `folder`. `~`, `$NAME` and `${NAME:-default}` are expanded, unless
+    a file has that very name.
+
+    Parameters
+    ----------
+    folder : the settings' `data_dir`
+    name : as in the settings
+    """
+    if not os.path.lexists(folder / name):
+        try:
+            name = expand(name)
+        except ValueError as error:
+            raise InputError(f"{name}: {error}.") from None
+    path, cache = folder / name, None
+    if not os.path.dirname(name) and not os.path.lexists(path):
+        cache = cache_folder()
+        if os.path.lexists(cache / name):
+            path = cache / name
+    try:
+        check_file(path)
+    except MissingFileError:
+        raise MissingFileError(f"{path}: {_missing(path, cache)}.") from None
+    return path
+
+
+def _missing(path: Path, cache: Path | None) -> str:
+    """Why a file is not there, and how it comes."""
+    from jaxsky.archive import catalogue, product_sets  # slow to import, and seldom needed
+
+    said = "no such file" if path.parent.is_dir() else "no such file, nor folder"
+    if cache is not None:
+        said += f", and none in the cache {cache}"
+    if path.name in catalogue():
+        said += f"; fetch it with `jaxsky data fetch {path.name}`"
+        if cache is None:
+            said += f" into {cache_folder()}, and name it without a folder"
+    if sets := [name for name, found in product_sets().items() if path.name in found.files]:
+        said += f" (all files of such an analysis: `jaxsky data fetch {sets[0]}`)"
+    return said
+
+
+def found_files(settings: SettingsFile) -> dict[str, str]:
+    """The files that settings name and that are there: name -> path."""
+    found = {}
+    for name in named_files(settings):
+        try:
+            found[str(name)] = str(find_file(Path(settings.data_dir), name))
+        except InputError:
+            continue  # not needed, or a folder of maps
+    return found
+
+
+def named_files(value: Any) -> Iterator[str]:
+    """All names of files among the values of settings."""
+    if isinstance(value, NamedFile):
+        yield value
+    elif isinstance(value, BaseModel | dict):
+        for _, entry in value if isinstance(value, BaseModel) else value.items():
+            yield from named_files(entry)
+    elif isinstance(value, list | tuple):
+        for entry in value:
+            yield from named_files(entry)

@@ -17,7 +17,8 @@ import numpy as np
 from astropy.io import fits as pyfits
 
 from benchmarks.timing import seconds
-from fits.separation import fit_spectra, spectral_likelihood, superpixels
+from fits.regions import superpixels
+from fits.separation import fit_spectra, spectral_likelihood
 from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe, observe_components
 from jaxsky.instrument import load_instrument
 

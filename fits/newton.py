@@ -8,7 +8,7 @@ import scipy.sparse
 from jaxtyping import Float
 
 from fits.posterior import Matrix, Problem
-from fits.separation.algebra import Factor
+from fits.systems import Factor
 
 #: A step this small, in standard deviations, is the last one.
 CLOSE = 1e-5

@@ -13,10 +13,10 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float
 
+from fits.amplitudes import Derivatives
 from fits.priors import Gaussian, Prior, Uniform, at_edge, bounds
 from fits.profile_likelihood import SpectralLikelihood
-from fits.separation.algebra import assembled
-from fits.separation.kernel import Derivatives
+from fits.systems import assembled
 
 #: Dense, or sparse for many parameters.
 Matrix: TypeAlias = np.ndarray | scipy.sparse.csc_matrix

@@ -7,7 +7,7 @@ With A (band, component) the band-averaged laws and any amplitudes in each pixel
 
 Parameters are numbers, or arrays with a value for each region of a map of labels; a cell is an
 intersection of regions. Where noise is separable and cells are large, a few vectors take the
-place of the pixels (`fits.separation.compress`) and nothing depends on nside.
+place of the pixels (`fits.compress`) and nothing depends on nside.
 """
 
 import dataclasses
@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from fits.separation import kernel
-from fits.separation.compress import Layout, compressed, gathered, layouts, used_pixels
-from fits.separation.kernel import Pixels
-from fits.separation.mixing import Mixing, SpectralBands, spectral_names
-from fits.separation.noise import Noise, as_noise, bare
-from fits.separation.regions import Cells, check_labels, intersections
+from fits import amplitudes
+from fits.amplitudes import Pixels
+from fits.compress import Layout, compressed, gathered, layouts, used_pixels
+from fits.mixing import Mixing, SpectralBands, spectral_names
+from fits.noise import Noise, as_noise, bare
+from fits.regions import Cells, check_labels, intersections
 from fits.template_likelihood import Likelihood, named_bands
 from jaxsky import Bandpass, Component, Sky, get_parameters, set_parameters
 from jaxsky.bandpass import Samples, stack_bands
@@ -155,10 +155,10 @@ class SpectralLikelihood(Likelihood):
 
     def total(self, local: Float[Array, "cell free"]) -> Float[Array, ""]:
         """-2 ln L for parameters of each cell."""
-        parts = self._mapped(kernel.chi2, self.matrices(local))
+        parts = self._mapped(amplitudes.chi2, self.matrices(local))
         return sum((jnp.sum(part) for part in parts), jnp.zeros(()))
 
-    def derivatives(self, local: Float[Array, "cell free"]) -> kernel.Derivatives:
+    def derivatives(self, local: Float[Array, "cell free"]) -> amplitudes.Derivatives:
         """-ln L of each cell, and its derivatives in the parameters of the cell."""
         units = jnp.eye(local.shape[1])
 
@@ -173,7 +173,7 @@ class SpectralLikelihood(Likelihood):
 
         one, two = jax.vmap(lambda unit: slope(first, unit), out_axes=(None, 1))(units)
         every = tuple(zip(self.matrices(local), one, two, strict=True))
-        parts = self._mapped(lambda m, own: kernel.derivatives(m[0], m[1], m[2], own), every)
+        parts = self._mapped(lambda m, own: amplitudes.derivatives(m[0], m[1], m[2], own), every)
         summed = []
         for part in parts:
             cells = self._cell_of_block(len(part.value))
@@ -183,7 +183,7 @@ class SpectralLikelihood(Likelihood):
         return jax.tree.map(lambda *rows: sum(rows), *summed)
 
     def residuals(self, params):
-        parts = self._mapped(kernel.residuals, self.matrices(self.flat(params)[self.index]))
+        parts = self._mapped(amplitudes.residuals, self.matrices(self.flat(params)[self.index]))
         return jnp.concatenate([part.ravel() for part in parts])
 
 
@@ -263,7 +263,7 @@ def spectral_likelihood(
         `fits.separation.as_noise`
     start : start values of the free parameters by name: of the laws ("dust.beta_dust"), or of
         bands ("shift.<band>", "width.<band>", "gain.<band>", "angle.<band>"; see
-        `fits.separation.mixing`)
+        `fits.mixing`)
     labels : maps of region numbers from 0 for parameters that vary, by name; start values are
         then arrays with one value for each region, or a number for all
     unit : of the data, "uK_RJ", "K_CMB" or the like; amplitudes are uK in any case (CMB: uK_CMB)

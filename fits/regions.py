@@ -1,16 +1,23 @@
-"""Parts of the sky by name: latitudes, or masks in files; and masks with smooth edges."""
+"""Parts of the sky by name, masks with smooth edges, and regions of constant parameters.
+
+Regions are maps of labels 0, 1, ..., one for each parameter; cells are their intersections.
+"""
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import healpy
 import numpy as np
-from jaxtyping import Bool, Float
+import scipy.cluster.vq
+from jaxtyping import Bool, Float, Int
 
+from jaxsky.checks import check_seed
 from jaxsky.inputs import mask_at
 from jaxsky.io import degrade_mask, read_mask
 from jaxsky.settings import Experiment, MaskFile, find_file, parse_region
+from jaxsky.types import Numeric
 
 COMPARISONS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 
@@ -74,3 +81,133 @@ def apodize(used: Bool[np.ndarray, " pix"], width: float) -> Float[np.ndarray, "
     distance = healpy.dist2holes(~used)  # 0 where not used
     x = np.minimum(np.sin(distance / 2) / np.sin(np.radians(width) / 2), 1.0)
     return np.where(distance > np.radians(width), 1.0, x - np.sin(2 * np.pi * x) / (2 * np.pi))
+
+
+def superpixels(nside_map: int, nside: int) -> Int[np.ndarray, " pix"]:
+    """Labels of a map's pixels (RING): the RING pixels of a coarser resolution they lie in.
+
+    Parameters
+    ----------
+    nside_map, nside : of the map, and of the labels
+
+    Raises
+    ------
+    ValueError
+        If one is not a power of 2, or the labels are finer than the map.
+
+    Examples
+    --------
+    >>> np.bincount(superpixels(4, 1))
+    array([16, 16, 16, 16, 16, 16, 16, 16, 16, 16, 16, 16])
+    """
+    for name, value in (("nside_map", nside_map), ("nside", nside)):
+        if not healpy.isnsideok(value, nest=True):
+            raise ValueError(f"Argument `{name}` must be a power of 2, but is {value}.")
+    if nside > nside_map:
+        raise ValueError(
+            f"Argument `nside` must be at most that of the map, {nside_map}, but is {nside}."
+        )
+    nested = healpy.ring2nest(nside_map, np.arange(healpy.nside2npix(nside_map)))
+    return healpy.nest2ring(nside, nested // (nside_map // nside) ** 2)
+
+
+def latitude_bands(nside_map: int, edges: Sequence[float]) -> Int[np.ndarray, " pix"]:
+    """Labels by absolute Galactic latitude: 0 below the first edge [deg], 1 below the second, ...
+
+    Raises
+    ------
+    ValueError
+        If the edges do not increase between 0 and 90 degrees.
+
+    Examples
+    --------
+    >>> np.bincount(latitude_bands(1, [30.0]))
+    array([4, 8])
+    """
+    limits = np.asarray(edges, float)
+    if limits.ndim != 1 or not np.all(np.diff([0.0, *limits, 90.0]) > 0):
+        raise ValueError(f"Argument `edges` must increase between 0 and 90, but is {edges}.")
+    npix = healpy.nside2npix(nside_map)
+    latitude = healpy.pix2ang(nside_map, np.arange(npix), lonlat=True)[1]
+    return np.digitize(np.abs(latitude), limits)
+
+
+def clusters(
+    maps: Numeric, count: int, *, seed: int = 0, iterations: int = 30
+) -> Int[np.ndarray, " pix"]:
+    """Labels of pixels that are alike in some maps, by k-means.
+
+    Parameters
+    ----------
+    maps : what pixels are compared by, shape (map, pix), each map scaled to its scatter; NaN or
+        infinite where masked: such pixels get the label of the mean
+    count : number of clusters
+    seed, iterations : of k-means; clusters that remain empty are left out
+
+    Raises
+    ------
+    ValueError
+        For a wrong shape, or fewer pixels than clusters.
+    """
+    check_seed("seed", seed)
+    values = np.atleast_2d(np.asarray(maps, float))
+    good = np.isfinite(values).all(axis=0)
+    if values.ndim != 2 or not 1 <= count <= good.sum():
+        raise ValueError(
+            f"Argument `maps` must have shape (map, pix) with at least {count} usable pixels, "
+            f"but has shape {values.shape}, {int(good.sum())} of them usable."
+        )
+    middle = values[:, good].mean(axis=1, keepdims=True)
+    spread = values[:, good].std(axis=1, keepdims=True)
+    points = np.where(good, (values - middle) / np.where(spread > 0, spread, 1), 0).T
+    _, found = scipy.cluster.vq.kmeans2(
+        points[good], count, iter=iterations, minit="++", seed=np.random.default_rng(seed)
+    )
+    centers = np.stack([points[good][found == k].mean(axis=0) for k in np.unique(found)])
+    return scipy.cluster.vq.vq(points, centers)[0]
+
+
+def check_labels(name: str, labels: object, npix: int, used: np.ndarray) -> np.ndarray:
+    """Labels as integers of shape (pix,), 0 where a pixel is not used."""
+    array = np.asarray(labels)
+    if array.dtype.kind not in "iu":
+        raise TypeError(f"Labels of {name!r} must be integers, but are {array.dtype}.")
+    if array.shape != (npix,):
+        raise ValueError(
+            f"Labels of {name!r} must have shape ({npix},) like a map, but have {array.shape}."
+        )
+    if bad := int(np.sum(array[used] < 0)):
+        raise ValueError(f"Labels of {name!r} are negative in {bad} pixels that are used.")
+    return np.where(used, array, 0)
+
+
+class Cells(NamedTuple):
+    """Intersections of regions: sets of pixels in which all parameters are constant.
+
+    Parameters
+    ----------
+    of_pixel : cell of each pixel; None if there is a single one. Pixels that are not used have -1.
+    labels : label of each parameter in each cell, by name
+    number : of cells
+    """
+
+    of_pixel: Int[np.ndarray, " pix"] | None
+    labels: dict[str, Int[np.ndarray, " cell"]]
+    number: int
+
+
+def intersections(labels: Mapping[str, Int[np.ndarray, " pix"]], used: np.ndarray) -> Cells:
+    """The intersections of the regions of several parameters, among used pixels."""
+    if not labels:
+        return Cells(None, {}, 1)
+    key = np.zeros(int(used.sum()), np.int64)
+    for array in labels.values():
+        _, key = np.unique(key * (int(array.max()) + 1) + array[used], return_inverse=True)
+    _, first, cell = np.unique(key, return_index=True, return_inverse=True)
+    where = np.flatnonzero(used)[first]
+    of_pixel = np.full(used.shape, -1, np.int32)
+    of_pixel[used] = cell
+    found = {name: array[where] for name, array in labels.items()}
+    if len(first) == 1:
+        return Cells(None, found, 1)
+    return Cells(of_pixel, found, len(first))

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from fits.posterior import Problem, prior_terms
 from fits.priors import Prior
 from fits.profile_likelihood import SpectralLikelihood
-from fits.separation.algebra import degenerate
+from fits.systems import degenerate
 
 #: Samples for each parameter, from which on they tell more than the curvature at the best fit.
 ENOUGH = 30

@@ -16,7 +16,8 @@ import systems
 from fits.covariance import Fluctuations
 from fits.preparation import Preparation
 from fits.pseudo_cl import masked_spectra
-from fits.separation import harmonic_likelihood, hessian, spectral_likelihood
+from fits.separation import hessian, spectral_likelihood
+from fits.separation.harmonic import harmonic_likelihood
 from fits.template_likelihood import chi2, likelihood
 from jaxsky import Bandpass, Sky, get_parameters, observe, parameter_names, set_parameters
 from jaxsky.cmb import realisation

@@ -18,7 +18,7 @@ from fits.separate.separate import separate
 from fits.separate.setup import build
 from fits.separation import fit_spectra
 from fits.separation.response import Response, widened
-from fits.separation.tensor_ratio import fit_tensors
+from fits.tensor_ratio import fit_tensors
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis
 from jaxsky.io import InputError

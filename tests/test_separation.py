@@ -8,19 +8,12 @@ import pytest
 import scipy.optimize
 
 from fits.grid import grid_fit
+from fits.noise import as_noise
 from fits.optimize import best_fit
 from fits.priors import Gaussian, Uniform
 from fits.results import FitError
-from fits.separation import (
-    as_noise,
-    component_maps,
-    fisher,
-    fit_spectra,
-    hessian,
-    noise_degradation,
-    residual_maps,
-    spectral_likelihood,
-)
+from fits.separated_maps import component_maps, noise_degradation, residual_maps
+from fits.separation import fisher, fit_spectra, hessian, spectral_likelihood
 from fits.template_likelihood import chi2
 from jaxsky import AME, CMB, Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.constants import H_OVER_K, T_CMB

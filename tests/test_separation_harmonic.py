@@ -9,14 +9,11 @@ import pytest
 import scipy.stats
 
 from fits.priors import Gaussian
-from fits.separation import (
-    fisher,
-    fit_spectra,
+from fits.separation import fisher, fit_spectra, hessian, spectral_likelihood
+from fits.separation.harmonic import (
     harmonic_coefficients,
     harmonic_component_maps,
     harmonic_likelihood,
-    hessian,
-    spectral_likelihood,
     white_spectrum,
 )
 from fits.template_likelihood import chi2

@@ -8,17 +8,13 @@ import healpy
 import numpy as np
 import pytest
 
+from fits.noise import as_noise
 from fits.priors import Gaussian
 from fits.pseudo_cl import band_powers, bin_edges, masked_spectra
-from fits.regions import apodize
-from fits.separation import (
-    as_noise,
-    component_maps,
-    fit_spectra,
-    spectral_likelihood,
-    superpixels,
-)
-from fits.separation.tensor_ratio import fit_tensors, power_model
+from fits.regions import apodize, superpixels
+from fits.separated_maps import component_maps
+from fits.separation import fit_spectra, spectral_likelihood
+from fits.tensor_ratio import fit_tensors, power_model
 from jaxsky import CMB, Dust, Sky, Synchrotron, observe
 from jaxsky.cmb import camb_spectra, tensor_spectra
 from jaxsky.instrument import load_instrument

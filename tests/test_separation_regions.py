@@ -5,20 +5,13 @@ import jax
 import numpy as np
 import pytest
 
+from fits import mixing, systems
+from fits.noise import as_noise
 from fits.priors import Gaussian
+from fits.regions import clusters, latitude_bands, superpixels
 from fits.results import FitError
-from fits.separation import (
-    algebra,
-    as_noise,
-    clusters,
-    component_maps,
-    fit_spectra,
-    latitude_bands,
-    mixing,
-    sample_spectra,
-    spectral_likelihood,
-    superpixels,
-)
+from fits.separated_maps import component_maps
+from fits.separation import fit_spectra, sample_spectra, spectral_likelihood
 from fits.template_likelihood import chi2
 from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe
 from test_separation import BANDS, NPIX, START, TRUTH, problem, random_sky
@@ -89,7 +82,7 @@ def test_intersections_of_regions_compressed_pixel_by_pixel_and_sparse(monkeypat
         )
         for compress in (True, False)
     ]
-    monkeypatch.setattr(algebra, "DENSE", 0)
+    monkeypatch.setattr(systems, "DENSE", 0)
     like = spectral_likelihood(random_sky(), BANDS, data, given, START, labels=labels)
     fits.append(fit_spectra(like, priors={"dust.beta_dust": Gaussian(1.5, 0.1)}))
     for name in START:
@@ -111,7 +104,7 @@ def test_each_pixel_its_own_region(monkeypatch):
     like = spectral_likelihood(random_sky(), BANDS, data, given, start, labels=labels)
     assert like.pixels[0].data.shape == (NPIX, 2, 8, 1)
     dense = fit_spectra(like, priors=priors)
-    monkeypatch.setattr(algebra, "DENSE", 0)
+    monkeypatch.setattr(systems, "DENSE", 0)
     sparse = fit_spectra(like, priors=priors)
     for name in start:
         np.testing.assert_allclose(sparse.best_fit[name], dense.best_fit[name], rtol=1e-7)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fits.pseudo_cl import band_powers, masked_spectra
-from fits.separation.tensor_ratio import PowerModel, fit_tensors, power_model
+from fits.tensor_ratio import PowerModel, fit_tensors, power_model
 from jaxsky.cmb import camb_spectra, realisation, tensor_spectra
 from jaxsky.harmonics import expand, gaussian_beam, synthesis
 

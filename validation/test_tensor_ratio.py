@@ -8,7 +8,7 @@ from fits.pseudo_cl import band_powers
 from fits.separate.separate import separate
 from fits.separate.setup import build
 from fits.separation import fit_spectra
-from fits.separation.tensor_ratio import fit_tensors
+from fits.tensor_ratio import fit_tensors
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.harmonics import expand, gaussian_beam, synthesis
 from jaxsky.settings import Experiment

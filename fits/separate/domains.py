@@ -12,19 +12,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fits.covariance import Fluctuations
+from fits.noise import Noise
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
-from fits.separation.harmonic import (
-    HarmonicMaps,
-    harmonic_component_maps,
-    harmonic_likelihood,
-)
-from fits.separation.maps import (
+from fits.separated_maps import (
     ComponentMaps,
     component_maps,
     noise_degradation,
     residual_maps,
 )
-from fits.separation.noise import Noise
+from fits.separation.harmonic import (
+    HarmonicMaps,
+    harmonic_component_maps,
+    harmonic_likelihood,
+)
 from jaxsky import Bandpass, Sky
 from jaxsky.harmonics import analysis, expand, gaussian_beam, lmax_of, synthesis
 from jaxsky.keys import stream

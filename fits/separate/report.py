@@ -10,7 +10,7 @@ from fits.plots import plot_chains
 from fits.record import leaks, probability, with_error, write_json, write_log
 from fits.separate import plots
 from fits.separate.separate import SAMPLED, Separation
-from fits.separation.maps import ComponentMaps
+from fits.separated_maps import ComponentMaps
 from jaxsky.inputs import parameter_unit
 from jaxsky.io import write_maps
 from jaxsky.settings import Experiment

@@ -22,7 +22,7 @@ from fits.separation.fit import fit_spectra
 from fits.separation.response import Response, widened
 from fits.separation.results import SpectralFit
 from fits.separation.sample import sample_spectra
-from fits.separation.tensor_ratio import TensorFit, fit_tensors, power_model
+from fits.tensor_ratio import TensorFit, fit_tensors, power_model
 from jaxsky.checks import check_double
 from jaxsky.cmb import tensor_spectra
 from jaxsky.experiment import cmb_spectra

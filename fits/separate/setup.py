@@ -10,14 +10,13 @@ from jaxtyping import Array, Bool, Float
 
 from fits.covariance import uniform_level
 from fits.inputs import Band, Inputs, inputs_of
+from fits.mixing import NOMINAL
+from fits.noise import Noise, as_noise
 from fits.preparation import Preparation
-from fits.regions import apodize, region_mask
+from fits.regions import apodize, clusters, latitude_bands, region_mask, superpixels
 from fits.resolution import prepare
 from fits.separate.domains import Domain, HarmonicDomain, PixelDomain
 from fits.separation.harmonic import harmonic_coefficients
-from fits.separation.mixing import NOMINAL
-from fits.separation.noise import Noise, as_noise
-from fits.separation.regions import clusters, latitude_bands, superpixels
 from jaxsky import Component, Sky, set_parameters
 from jaxsky.components import component_class
 from jaxsky.inputs import one_column, read, read_parameter

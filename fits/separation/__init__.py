@@ -14,14 +14,14 @@ _WHERE = {
         "white_spectrum",
     ),
     "fits.profile_likelihood": ("SpectralLikelihood", "spectral_likelihood"),
-    "fits.separation.maps": (
+    "fits.separated_maps": (
         "ComponentMaps",
         "component_maps",
         "noise_degradation",
         "residual_maps",
     ),
-    "fits.separation.noise": ("Noise", "as_noise"),
-    "fits.separation.regions": ("clusters", "latitude_bands", "superpixels"),
+    "fits.noise": ("Noise", "as_noise"),
+    "fits.regions": ("clusters", "latitude_bands", "superpixels"),
     "fits.separation.results": ("SpectralFit",),
     "fits.separation.sample": ("sample_spectra",),
 }

@@ -26,8 +26,8 @@ from fits.posterior import (
 from fits.priors import Prior, check_priors, prior_residuals, to_unbounded
 from fits.profile_likelihood import SpectralLikelihood
 from fits.results import astray, help_by_prior, misfit
-from fits.separation.algebra import Factor, assembled, degenerate, variances
 from fits.separation.results import SpectralFit
+from fits.systems import Factor, assembled, degenerate, variances
 from jaxsky.types import Numeric
 
 #: The optimum is reached this close to it, in standard deviations of a parameter.

@@ -10,7 +10,7 @@ from fits.posterior import Problem, value_and_gradient
 from fits.priors import Gaussian, Prior
 from fits.profile_likelihood import SpectralLikelihood
 from fits.results import FitResult
-from fits.separation.algebra import Factor
+from fits.systems import Factor
 from jaxsky.types import Numeric
 
 

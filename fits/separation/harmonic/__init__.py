@@ -11,6 +11,6 @@ exactly. Nothing is smoothed, so each band keeps the resolution it has. A rotati
 the angle of a band turns E + iB in the same way.
 """
 
+from fits.multipoles import harmonic_coefficients, white_spectrum
 from fits.separation.harmonic.likelihood import harmonic_likelihood
 from fits.separation.harmonic.maps import HarmonicMaps, harmonic_component_maps
-from fits.separation.harmonic.multipoles import harmonic_coefficients, white_spectrum

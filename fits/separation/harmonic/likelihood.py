@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 import jax.numpy as jnp
 import numpy as np
 
+from fits.mixing import spectral_names
+from fits.multipoles import check_alm, compressed, multipoles_of
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
-from fits.separation.harmonic.multipoles import check_alm, compressed, multipoles_of
-from fits.separation.mixing import spectral_names
 from fits.template_likelihood import named_bands
 from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.types import Numeric

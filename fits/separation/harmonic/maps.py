@@ -11,10 +11,10 @@ import numpy as np
 import scipy.special
 from jaxtyping import ArrayLike, Float
 
+from fits import amplitudes
+from fits.compress import Layout
+from fits.multipoles import check_alm, compressed, multipoles_of, positions
 from fits.profile_likelihood import SpectralLikelihood
-from fits.separation import kernel
-from fits.separation.compress import Layout
-from fits.separation.harmonic.multipoles import check_alm, compressed, multipoles_of, positions
 from jaxsky.checks import as_array, check_finite
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
 from jaxsky.types import Numeric
@@ -77,9 +77,9 @@ def _filters(like, params, parts):
         unit = jnp.broadcast_to(jnp.eye(rows), (groups, rows, rows))
 
         def each(here):
-            filters = kernel.solve(matrix, here._replace(data=unit))
-            covariance = kernel.inverse_gram(matrix, here)[..., 0]
-            return filters, covariance, kernel.chi2(matrix, here)
+            filters = amplitudes.solve(matrix, here._replace(data=unit))
+            covariance = amplitudes.inverse_gram(matrix, here)[..., 0]
+            return filters, covariance, amplitudes.chi2(matrix, here)
 
         return jax.vmap(each)(pixels)
 

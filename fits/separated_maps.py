@@ -10,11 +10,11 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Float
 
+from fits import amplitudes
+from fits.amplitudes import Pixels
+from fits.compress import Layout, used_pixels
+from fits.noise import Noise, as_noise, bare, chunks
 from fits.profile_likelihood import SpectralLikelihood
-from fits.separation import kernel
-from fits.separation.compress import Layout, used_pixels
-from fits.separation.kernel import Pixels
-from fits.separation.noise import Noise, as_noise, bare, chunks
 from jaxsky.types import Numeric
 
 
@@ -77,12 +77,12 @@ def _by_pixel(function, matrix, pixels):
 
 @jax.jit
 def _explained(matrix, pixels):
-    return _by_pixel(kernel.explained, matrix, pixels)
+    return _by_pixel(amplitudes.explained, matrix, pixels)
 
 
 @jax.jit
 def _inverse(matrix, pixels):
-    return _by_pixel(kernel.inverse_gram, matrix, pixels)
+    return _by_pixel(amplitudes.inverse_gram, matrix, pixels)
 
 
 @partial(jax.jit, static_argnames="unknowns")
@@ -90,7 +90,7 @@ def _alone(matrix, pixels, unknowns):
     """Variance of one component if there were no other."""
 
     def variances(m, p):
-        single = [kernel.inverse_gram(m[:, u : u + 1], p)[:, 0, 0] for u in unknowns]
+        single = [amplitudes.inverse_gram(m[:, u : u + 1], p)[:, 0, 0] for u in unknowns]
         return jnp.stack(single, axis=1)
 
     return _by_pixel(variances, matrix, pixels)

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.separation.compress import Layout
-from fits.separation.kernel import Pixels
-from fits.separation.noise import bare
+from fits.amplitudes import Pixels
+from fits.compress import Layout
+from fits.noise import bare
 from jaxsky.checks import UNSEEN, check_double, check_finite
 from jaxsky.harmonics import gaussian_beam, lmax_of, low_multipoles
 from jaxsky.types import Numeric

@@ -1,25 +1,40 @@
-"""Pictures of fits: the grid, the marginal distributions, the posterior of the chains."""
+"""What all pictures share: style, panels, titles, symbols, maps and spectra."""
 
 import re
-from collections.abc import Mapping, Sequence
+import textwrap
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import healpy
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-from getdist import MCSamples, chains, plots
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 
-from fits.results import FitResult
-from fits.spectral_index import Fit, all_free
 from jaxsky.components import parameter_declaration
-from jaxsky.plots import STYLE, draw_title, in_formula, plain, save
+from jaxsky.io import whole
 
-chains.print_load_details = False  # getdist otherwise prints about burn-in
-
+STYLE: Any = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.labelsize": 10,
+    "legend.fontsize": 8,
+    "figure.dpi": 150,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
 #: Okabe & Ito's colours, which the colour-blind can tell apart.
-COLORS = {"Q": "#0072B2", "U": "#D55E00", "QU": "#222222"}
-REGION_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
-TRUTH = {"color": "#CC79A7", "linewidth": 1.6}
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222")
+#: Width of a column of a paper [inch].
+COLUMN = 3.5
+#: Height of a map in it, with its title [inch].
+MAP_HEIGHT = 1.85
+UNITS = {"uK_RJ": r"$\mu{\rm K}_{\rm RJ}$", "uK_CMB": r"$\mu{\rm K}_{\rm CMB}$"}
 #: What parameters of bands are called, and their unit.
 BAND_SYMBOLS = {
     "calibration": ("g", ""),
@@ -28,6 +43,20 @@ BAND_SYMBOLS = {
     "width": ("w", ""),
     "angle": (r"\psi", r"\ [^\circ]"),
 }
+
+
+def plain(text: str) -> str:
+    """Text that is drawn as it is: between its dollar signs there is no formula.
+
+    Behind a thin space, as labels that begin with an underscore are left out of legends.
+    """
+    return ("\N{THIN SPACE}" if text.startswith("_") else "") + text.replace("$", r"\$")
+
+
+def in_formula(text: str) -> str:
+    """A name as upright letters of a formula, drawn as it is."""
+    escaped = re.sub(r"([$%#&_{} ])", r"\\\1", re.sub(r"[\\^~]", "?", text))
+    return rf"{{\rm {escaped}}}"
 
 
 def label(name: str) -> str:
@@ -47,204 +76,208 @@ def label(name: str) -> str:
     return shift + (known.get("symbol") or in_formula(parts[1])) + number + unit
 
 
-def _tex(name: str) -> str:
-    return f"${label(name)}$"
+def draw_title(figure: plt.Figure, title: str, **options: Any) -> None:
+    """Write a title above a figure as it is; what is longer than three lines is cut."""
+    lines = [textwrap.fill(line, 110, max_lines=3) for line in title.splitlines()]
+    figure.suptitle(plain("\n".join(lines)), **options)
 
 
-def _levels(log_posterior: np.ndarray) -> list[float]:
-    """Heights of the contours that hold 95.45 % and 68.27 % of the probability."""
-    density = np.sort(np.exp(log_posterior).ravel())[::-1]
-    held = np.cumsum(density) / density.sum()
-    return [float(np.log(density[np.searchsorted(held, p)])) for p in (0.9545, 0.6827)]
+def save(figure: plt.Figure, path: Path) -> None:
+    """Write a figure as PNG, whole, and close it."""
+    # A constrained layout fits already; cropping would draw it once more.
+    box = None if figure.get_layout_engine() is not None else "tight"
+    with (
+        whole(path) as beside,
+        plt.rc_context({"savefig.bbox": box}),
+        warnings.catch_warnings(action="ignore", category=UserWarning),  # glyphs a font lacks
+    ):
+        figure.savefig(beside, format="png")
+    plt.close(figure)
 
 
-def _by_region(fits: Sequence[Fit]) -> dict[str, list[Fit]]:
-    regions: dict[str, list[Fit]] = {}
-    for fit in fits:
-        regions.setdefault(fit.region, []).append(fit)
-    return regions
+@contextmanager
+def draw_panels(
+    path: Path,
+    title: str,
+    size: tuple[float, float],
+    rows: int = 1,
+    columns: int = 1,
+    fontsize: float = 9,
+    **options: Any,
+) -> Iterator[np.ndarray]:
+    """Panels to draw on, an array (rows, columns) of axes; at the end they are written to a file.
 
-
-def plot_grids(
-    path: Path, fits: Sequence[Fit], truth: Mapping[str, float] | None, title: str
-) -> bool:
-    """The probability on the grid, Q beside U, a row for each region: the paper's figure.
-
-    Returns False, without a picture, if no fit has a grid of two parameters.
+    Parameters
+    ----------
+    path : picture to write
+    title : above all panels; may be empty
+    size : width and height [inch]
+    rows, columns : of the panels
+    fontsize : of the title
+    options : of `matplotlib.pyplot.subplots`
     """
-    with_grid = [f for f in fits if "grid" in f.results and len(f.results["grid"].free) == 2]
-    if not with_grid:
-        return False
-    regions = _by_region(with_grid)
-    x, y = with_grid[0].results["grid"].free
-    columns = max(len(r) for r in regions.values())
-    with mpl.rc_context(STYLE):
-        figure, axes = plt.subplots(
-            len(regions),
-            columns,
-            figsize=(1.2 + 2.6 * columns, 0.8 + 2.4 * len(regions)),
-            squeeze=False,
-            layout="constrained",
+    with plt.rc_context(STYLE):
+        figure, panels = plt.subplots(
+            rows, columns, figsize=size, squeeze=False, layout="constrained", **options
         )
-        x, y = with_grid[0].results["grid"].free
-        for row, (region, members) in zip(axes, regions.items(), strict=True):
-            for axis in row[len(members) :]:
-                axis.set_visible(False)
-            for axis, fit in zip(row, members, strict=False):
-                _grid_panel(axis, fit.results["grid"], truth)
-                alike = [f for f in with_grid if f.stokes == fit.stokes]
-                axis.set(xlim=_limits(alike, x), ylim=_limits(alike, y))
-                axis.set_title(plain(f"{region}, {' + '.join(fit.stokes)}"))
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-        draw_title(figure, title, fontsize=9)
+        yield panels
+        if title:
+            draw_title(figure, title, fontsize=fontsize)
         save(figure, path)
-    return True
 
 
-def _drawable(fits: Sequence[Fit], name: str) -> list[Fit]:
-    """Fits that have a parameter, with a finite error."""
-    firsts = [(fit, next(iter(fit.results.values()))) for fit in fits]
-    return [fit for fit, r in firsts if name in r.free and np.isfinite(r.sigma(name))]
+def legend_below(axes: Axes, columns: int = 4, **options: Any) -> None:
+    """A legend of what is drawn in one panel, below all of them."""
+    handles, labels = axes.get_legend_handles_labels()
+    options = {"loc": "outside lower center", "ncols": columns, "frameon": False, **options}
+    axes.figure.legend(handles, labels, **options)
 
 
-def _limits(fits: Sequence[Fit], name: str) -> tuple[float, float] | None:
-    """Range of a parameter that shows all fits to four standard deviations."""
-    results = [next(iter(fit.results.values())) for fit in _drawable(fits, name)]
-    if not results:
-        return None
-    low = min(r.best_fit[name] - 4 * r.sigma(name) for r in results)
-    high = max(r.best_fit[name] + 4 * r.sigma(name) for r in results)
-    return low, high
+def spread(names: Sequence[str], count: int) -> list[str]:
+    """A few names, the first and the last among them, evenly spread."""
+    at = np.unique(np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int))
+    return [names[i] for i in at]
 
 
-def _grid_panel(axis: plt.Axes, result: FitResult, truth: Mapping[str, float] | None) -> None:
-    x, y = result.free
-    grid = [result.details["axes"][name] for name in (x, y)]
-    log_posterior = result.details["log_posterior"]
-    density = np.exp(log_posterior).T
-    axis.pcolormesh(*grid, density, cmap="Greys", vmin=0, vmax=1.4, rasterized=True)
-    axis.contour(
-        *grid, log_posterior.T, _levels(log_posterior), colors="#0072B2", linestyles=["--", "-"]
-    )
-    axis.plot([], [], color="#0072B2", label=r"1$\sigma$")
-    axis.plot([], [], color="#0072B2", linestyle="--", label=r"2$\sigma$")
-    axis.plot(result.best_fit[x], result.best_fit[y], "k+", ms=9, mew=1.5, label="best fit")
-    if truth and x in truth and y in truth:
-        axis.plot(truth[x], truth[y], "o", mfc="none", mec="#CC79A7", mew=1.6, label="truth")
-    axis.set(xlabel=_tex(x), ylabel=_tex(y))
-    axis.spines[:].set_visible(True)
+def color_limit(values: np.ndarray, quantile: float = 0.99) -> float:
+    """End of a scale of colours about zero: nearly all values are within."""
+    return float(np.nanquantile(np.abs(values), quantile)) or 1.0
 
 
-def _samples(result: FitResult, name: str) -> MCSamples:
-    details = result.details
-    chain = details["chain"][details["discard"] :: details["thin"]]
-    return MCSamples(
-        samples=chain.reshape(-1, len(result.free)),
-        names=list(result.free),
-        labels=[label(n) for n in result.free],
-        label=plain(name),
-    )
-
-
-def _density(fit: Fit, name: str) -> tuple[np.ndarray, np.ndarray, FitResult]:
-    """A marginal distribution from the best method there is: grid, chain or Gaussian."""
-    if "grid" in fit.results:
-        result = fit.results["grid"]
-        return result.details["axes"][name], result.details["marginals"][name], result
-    if "mcmc" in fit.results:
-        result = fit.results["mcmc"]
-        density = _samples(result, fit.stokes).get1DDensity(name)
-        return density.x, density.P, result
-    result = fit.results["gradient"]
-    sigma = result.sigma(name)
-    x = result.best_fit[name] + sigma * np.linspace(-5, 5, 201)
-    return x, np.exp(-0.5 * ((x - result.best_fit[name]) / sigma) ** 2), result
-
-
-def plot_marginals(
-    path: Path, fits: Sequence[Fit], truth: Mapping[str, float] | None, title: str
-) -> bool:
-    """Marginal probability of each parameter, for Q, U and both, with 68 % intervals."""
-    free = all_free(fits)
-    regions = _by_region(fits)
-    with mpl.rc_context(STYLE):
-        figure, axes = plt.subplots(
-            len(regions),
-            len(free),
-            figsize=(3.4 * len(free), 0.9 + 2.2 * len(regions)),
-            sharex="col",
-            squeeze=False,
-            layout="constrained",
-        )
-        for row, (region, members) in zip(axes, regions.items(), strict=True):
-            for axis, name in zip(row, free, strict=True):
-                for fit in _drawable(members, name):
-                    _marginal_curve(axis, fit, name)
-                if truth and name in truth:
-                    axis.axvline(truth[name], **TRUTH, label="truth")
-                axis.set(ylim=(0, 1.12), ylabel="relative probability", title=plain(region))
-                axis.xaxis.set_tick_params(labelbottom=True)
-        for axis, name in zip(axes[-1], free, strict=True):
-            axis.set(xlabel=_tex(name), xlim=_limits(fits, name))
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-        draw_title(figure, title, fontsize=9)
-        save(figure, path)
-    return True
-
-
-def _marginal_curve(axis: plt.Axes, fit: Fit, name: str) -> None:
-    x, density, result = _density(fit, name)
-    density = density / density.max()
-    color = COLORS[fit.stokes]
-    axis.plot(x, density, color=color, label=f"{' + '.join(fit.stokes)}, 68 % shaded")
-    low, high = result.interval_68[name]
-    inside = (x >= low) & (x <= high)
-    axis.fill_between(x[inside], density[inside], color=color, alpha=0.22, linewidth=0)
-
-
-def plot_posterior(
-    path: Path, fits: Sequence[Fit], truth: Mapping[str, float] | None, title: str
-) -> bool:
-    """The posterior of the chains, a colour for each region, for the most Stokes parameters.
-
-    Returns False, without a picture, if no fit has a chain.
-    """
-    with_chain = [f for f in fits if "mcmc" in f.results]
-    if not with_chain:
-        return False
-    most = max(with_chain, key=lambda f: len(f.stokes)).stokes
-    shown = [f for f in with_chain if f.stokes == most]
-    results = {f"{f.region}, {' + '.join(most)}": f.results["mcmc"] for f in shown}
-    plot_chains(path, results, truth, title)
-    return True
-
-
-def plot_chains(
-    path: Path, results: Mapping[str, FitResult], truth: Mapping[str, float] | None, title: str
+def _image(
+    axes: Axes,
+    pixels: np.ndarray,
+    limit: float,
+    label: str,
+    linear: bool = False,
+    middle: float = 0.0,
+    **options: Any,
 ) -> None:
-    """The posterior of chains of the same parameters by what they are of, a colour for each."""
-    samples = [_samples(result, name) for name, result in results.items()]
-    free = next(iter(results.values())).free
-    plotter = plots.get_subplot_plotter(width_inch=max(4.0, 1.6 * len(free)))
-    plotter.settings.axes_fontsize = 9
-    plotter.settings.axes_labelsize = 11
-    plotter.settings.legend_fontsize = 9
-    plotter.settings.title_limit_fontsize = 9
-    plotter.triangle_plot(
-        samples,
-        list(free),
-        filled=True,
-        contour_colors=list(REGION_COLORS[: len(samples)]),
-        title_limit=1 if len(samples) == 1 else 0,
-        markers={n: v for n, v in (truth or {}).items() if n in free},
-        marker_args={"color": TRUTH["color"], "lw": TRUTH["linewidth"], "ls": "-"},
+    """Values about zero with a bar of colours, linear up to a tenth of the limit, then logarithmic.
+
+    So the Galactic plane and high latitudes show in one picture. Or linear throughout, about any
+    value. The limit is rounded to one digit.
+    """
+    limit = float(f"{limit:.1g}")
+    norm: mpl.colors.Normalize
+    if linear:
+        norm, between = mpl.colors.Normalize(middle - limit, middle + limit), limit / 2
+    else:
+        norm, between = mpl.colors.AsinhNorm(limit / 10, -limit, limit), limit / 10
+    image = axes.imshow(pixels, origin="lower", cmap="RdBu_r", norm=norm, **options)
+    bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02, extend="both")
+    bar.set_ticks([middle + tick for tick in (-limit, -between, 0, between, limit)])
+    bar.ax.yaxis.set_major_formatter("{x:g}")
+    bar.ax.minorticks_off()
+    bar.set_label(label)
+
+
+def draw_map(
+    axes: Axes,
+    values: Float[np.ndarray, " pix"],
+    limit: float,
+    label: str,
+    middle: float | None = None,
+) -> None:
+    """A map of the full sky in Galactic coordinates, centred on l = 0, l growing to the left.
+
+    With a middle, the colours are linear about it.
+    """
+    nside = healpy.npix2nside(values.size)
+    projector = healpy.projector.MollweideProj(xsize=600)
+    pixels = projector.projmap(np.asarray(values), lambda x, y, z: healpy.vec2pix(nside, x, y, z))
+    pixels = np.ma.masked_invalid(np.where(pixels == -np.inf, np.nan, pixels))
+    _image(axes, pixels, limit, label, middle is not None, middle or 0.0)
+    axes.axis("off")
+
+
+class MapPanel(NamedTuple):
+    """A map with its title and what `draw_map` takes."""
+
+    title: str
+    values: Float[np.ndarray, " pix"]
+    limit: float
+    label: str
+    middle: float | None = None
+
+
+def stokes_panels(
+    name: str,
+    maps: Float[np.ndarray, "2 pix"],
+    limit: float,
+    unit: str,
+    middle: float | None = None,
+) -> list[MapPanel]:
+    """Q beside U."""
+    return [
+        MapPanel(plain(f"{name}: {stokes}"), values, limit, f"{stokes} [{UNITS[unit]}]", middle)
+        for values, stokes in zip(maps, "QU", strict=True)
+    ]
+
+
+def plot_maps(path: Path, rows: Sequence[Sequence[MapPanel]], title: str = "") -> None:
+    """Maps of the sky in rows and columns."""
+    columns = len(rows[0])
+    size = columns * COLUMN, len(rows) * MAP_HEIGHT + (0.4 if title else 0.0)
+    with draw_panels(path, title, size, len(rows), columns) as panels:
+        for axes, panel in zip(panels.flat, (one for row in rows for one in row), strict=True):
+            draw_map(axes, *panel[1:])
+            axes.set_title(panel.title)
+
+
+def draw_patch(
+    axes: Axes,
+    values: Float[np.ndarray, " pix"],
+    center: tuple[float, float],
+    size: float,
+    limit: float,
+    label: str,
+) -> None:
+    """A square patch of the sky about (l, b), all in degrees; gnomonic, l growing to the left.
+
+    Unlike those of `draw_map`, its colours are linear, and where its pixels are finer than those
+    of the map, values are interpolated between them.
+    """
+    nside, values = healpy.npix2nside(values.size), np.asarray(values)
+    xsize = 300
+    projector = healpy.projector.GnomonicProj(
+        rot=(*center, 0.0), xsize=xsize, reso=size * 60 / xsize
     )
-    for i, name in enumerate(free):
-        for result, color in zip(results.values(), REGION_COLORS, strict=False):
-            interval = result.interval_68[name]
-            plotter.subplots[i, i].axvspan(*interval, color=color, alpha=0.15, linewidth=0)
-    draw_title(plotter.fig, f"{title}; 68 % shaded", fontsize=8, y=1.03)
-    with mpl.rc_context(STYLE | {"savefig.dpi": 200}):
-        save(plotter.fig, path)
+    if size * 60 / xsize < healpy.nside2resol(nside, arcmin=True):
+        vectors = projector.xy2vec(projector.ij2xy())
+        theta, phi = healpy.vec2ang(np.stack(vectors, axis=-1).reshape(-1, 3))
+        pixels = healpy.get_interp_val(values, theta, phi).reshape(xsize, xsize)
+    else:
+        pixels = projector.projmap(values, lambda x, y, z: healpy.vec2pix(nside, x, y, z))
+    half = size / 2
+    _image(axes, pixels, limit, label, linear=True, extent=(half, -half, -half, half))
+    axes.set_xlabel(rf"$(l - {center[0]:g}^\circ)\,\cos b$ [deg]")
+    axes.set_ylabel(rf"$b - {center[1]:g}^\circ$ [deg]")
+
+
+def with_powers(spectrum: Float[np.ndarray, " ell"]) -> tuple[np.ndarray, np.ndarray]:
+    """Multipoles from 2 on, and D_l = l (l+1) C_l / 2 pi."""
+    ell = np.arange(2, len(spectrum))
+    return ell, ell * (ell + 1) / (2 * np.pi) * spectrum[2:]
+
+
+def round_numbers(axis: Axis, digits: Sequence[float] = (1, 2, 5)) -> None:
+    """Label a logarithmic axis with round numbers, those with the given first digits.
+
+    By default, labels run into each other where there is less than a decade.
+    """
+    axis.set_major_locator(mpl.ticker.LogLocator(subs=digits))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(mpl.ticker.NullFormatter())
+
+
+def draw_spectra(
+    axes: Axes, spectra: Mapping[str, Float[np.ndarray, " ell"]], unit: str, **options: Any
+) -> None:
+    """Spectra as D_l = l (l+1) C_l / 2 pi against l, both logarithmic; one colour each."""
+    for (name, spectrum), color in zip(spectra.items(), COLORS, strict=False):
+        axes.plot(*with_powers(spectrum), label=plain(name), **{"color": color, **options})
+    axes.set(xscale="log", yscale="log")
+    round_numbers(axes.xaxis, (1, 3))
+    axes.set_xlabel(r"multipole $\ell$")
+    axes.set_ylabel(rf"$\ell(\ell+1)C_\ell/2\pi$ [{UNITS[unit]}$^2$]")

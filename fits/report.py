@@ -8,7 +8,7 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from fits import plots
+from fits import posterior_plots
 from fits.inputs import Inputs
 from fits.record import leaks, write_json, write_log
 from fits.spectral_index import Fit, all_free
@@ -171,9 +171,9 @@ def write_report(
     written = [out / "result.json", out / "log.json"]
     write_json(written[0], result_json(inputs, settings, fits))
     for name, plot in {
-        "grid.png": plots.plot_grids,
-        "marginals.png": plots.plot_marginals,
-        "posterior.png": plots.plot_posterior,
+        "grid.png": posterior_plots.plot_grids,
+        "marginals.png": posterior_plots.plot_marginals,
+        "posterior.png": posterior_plots.plot_posterior,
     }.items():
         if plot(out / name, fits, known_truth(inputs, fits), settings.title):
             written.append(out / name)

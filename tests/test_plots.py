@@ -8,9 +8,9 @@ mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from fits.plots import label, plot_chains
+from fits.plots import draw_title, in_formula, label, plain, save
+from fits.posterior_plots import plot_chains
 from fits.results import FitResult
-from jaxsky.plots import draw_title, in_formula, plain, save
 
 NAMES = [
     "$x_$",

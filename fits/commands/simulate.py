@@ -1,10 +1,11 @@
 """`jaxsky simulate`."""
 
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from fits.commands import run
@@ -18,6 +19,10 @@ ONLY: dict[str, Callable[[list[str]], list[str]]] = {
     "foregrounds": lambda foregrounds: foregrounds,
     "cmb": lambda foregrounds: ["cmb"],
 }
+#: Bands shown on a sheet, and multipoles in its spectra.
+SHOWN, LMAX_SHOWN = 5, 1024
+#: Spectra are shown down to this fraction of the largest.
+DEPTH = 1e-7
 
 
 def simulate(
@@ -56,8 +61,7 @@ def simulate(
 
 
 def _work(settings, command: run.Run, indices: range) -> run.Report:
-    from jaxsky import experiment, montecarlo, plots
-    from jaxsky.io import read_maps
+    from jaxsky import experiment, montecarlo
 
     out, steps, options = command.out, command.steps, command.options
     steps.step("reading templates")
@@ -82,14 +86,9 @@ def _work(settings, command: run.Run, indices: range) -> run.Report:
             seconds[file.path] = file.seconds
     if settings.simulate.sheet:
         steps.step("drawing")
-        plots.contact_sheet(
-            out / f"sim_{indices.start:05d}.png",
-            montecarlo.paths(out, names, indices.start),
-            lambda path: read_maps(path, fields=["Q", "U"], missing=[]).maps,
-            setup.observation.lmax,
-            settings.simulate.unit,
-            settings.title,
-        )
+        files = montecarlo.paths(out, names, indices.start)
+        sheet = out / f"sim_{indices.start:05d}.png"
+        _draw_sheet(sheet, files, setup.observation.lmax, settings)
     kept = count - len(seconds)
     rate = f"{statistics.median(seconds.values()):.2g} s a band, " if seconds else ""
     remark = (
@@ -104,3 +103,32 @@ def _begin(command: run.Run, indices: range) -> None:
     """The folder is this simulation's: others may make other realisations in it."""
     command.folder.narrow(indices)
     command.begin()
+
+
+def _draw_sheet(path: Path, files: Mapping[str, Path], lmax: int, settings: Experiment) -> None:
+    """Q and U of some bands, from the files of their maps, and the spectra of their totals."""
+    import healpy
+    import jax.numpy as jnp
+
+    from fits.plots import UNITS, color_limit, draw_map, draw_panels, draw_spectra, plain, spread
+    from jaxsky.harmonics import analysis, power_spectrum
+    from jaxsky.io import read_maps
+
+    names, unit, spectra = spread(list(files), SHOWN), settings.simulate.unit, {}
+    size, heights = (7.2, 1.75 * len(names) + 3.2), [1.0] * len(names) + [1.6]
+    with draw_panels(
+        path, settings.title, size, len(names) + 1, 2, fontsize=10, height_ratios=heights
+    ) as panels:
+        for row, name in zip(panels, names, strict=False):
+            maps = np.asarray(read_maps(files[name], fields=["Q", "U"], missing=[]).maps)
+            # Without refinement: good to 1e-3 here, which no eye sees.
+            largest = min(lmax, LMAX_SHOWN, 2 * healpy.npix2nside(maps.shape[-1]))
+            spectra[name] = np.asarray(power_spectrum(analysis(jnp.asarray(maps), largest, 0)))
+            for axes, values, which in zip(row, maps, "QU", strict=True):
+                draw_map(axes, values, color_limit(maps), UNITS[unit])
+                axes.set_title(plain(f"{name}: {which}"))
+        for index, (axes, which) in enumerate(zip(panels[-1], ("EE", "BB"), strict=True)):
+            draw_spectra(axes, {n: s[index] for n, s in spectra.items()}, unit)
+            axes.set_title(which)
+            axes.set_ylim(bottom=axes.get_ylim()[1] * DEPTH)
+        panels[-1, 0].legend(title="band", ncols=2, frameon=False)

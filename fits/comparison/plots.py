@@ -2,21 +2,32 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import matplotlib as mpl
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
 from fits.comparison.compare import Comparison
 from fits.comparison.patches import PatchComparison
 from fits.comparison.pixels import Scatter
-from fits.comparison.spectra import LMIN, BandSpectra
+from fits.comparison.spectra import BandSpectra
 from fits.patches import PatchFits
+from fits.plots import (
+    COLORS,
+    UNITS,
+    MapPanel,
+    color_limit,
+    draw_panels,
+    legend_below,
+    plain,
+    plot_maps,
+    round_numbers,
+    with_powers,
+)
 from fits.record import probability, with_error
 from jaxsky.harmonics import average_pixels
-from jaxsky.plots import COLORS, STYLE, UNITS, draw_map, draw_title, plain, save
 
 OBSERVED, MODEL, FOREGROUNDS, NOISE = COLORS[1], COLORS[2], COLORS[0], "0.55"
 UNIT = UNITS["uK_RJ"]
@@ -53,15 +64,9 @@ def plot_scatter(
     """Observed against modelled pixels of a region: a row for Q, one for U (the paper's fig. 5)."""
     blocks = [bands[i : i + COLUMNS] for i in range(0, len(bands), COLUMNS)]
     names = list(comparison.prepared.bands)
-    with plt.rc_context(STYLE):
-        figure, grid = plt.subplots(
-            2 * len(blocks),
-            COLUMNS if len(bands) > COLUMNS else len(bands),
-            figsize=(2.4 * min(len(bands), COLUMNS), 4.7 * len(blocks) + 0.6),
-            squeeze=False,
-            layout="constrained",
-        )
-        pixels = comparison.regions[region]
+    pixels, columns = comparison.regions[region], min(len(bands), COLUMNS)
+    size = 2.4 * columns, 4.7 * len(blocks) + 0.6
+    with draw_panels(path, title, size, 2 * len(blocks), columns) as grid:
         for i, block in enumerate(blocks):
             for s, stokes in enumerate("QU"):
                 row = grid[2 * i + s]
@@ -74,13 +79,10 @@ def plot_scatter(
                     _scatter_panel(axes, comparison.scatter(band, region, stokes), x, y)
                     axes.set_xlabel(f"model [{UNIT}]")
                 row[0].set_ylabel(f"observed [{UNIT}]")
-        handles, labels = grid[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
-        draw_title(figure, title, fontsize=9)
-        save(figure, path)
+        legend_below(grid[0, 0], 2)
 
 
-def plot_maps(
+def plot_model_maps(
     path: Path, comparison: Comparison, stokes: str, bands: Sequence[str], nside: int, title: str
 ) -> None:
     """Observed maps beside the model, in one scale of colours (the paper's fig. 6).
@@ -94,69 +96,47 @@ def plot_maps(
     nside : of the pixels that are drawn
     title : of the figure
     """
-    names = list(comparison.prepared.bands)
+    names, rows = list(comparison.prepared.bands), []
     region = "full" if "full" in comparison.regions else next(iter(comparison.regions))
     weights = jnp.asarray(comparison.prepared.used[None], float)
     used = np.asarray(average_pixels(weights, nside))[0] > 0.5
-    with plt.rc_context(STYLE):
-        figure, grid = plt.subplots(
-            len(bands),
-            2 * len(stokes),
-            figsize=(7.0 * len(stokes), 1.85 * len(bands) + 0.4),
-            squeeze=False,
-            layout="constrained",
-        )
-        for row, band in zip(grid, bands, strict=True):
-            b = names.index(band)
-            both = [
-                np.asarray(average_pixels(m[b], nside))
-                for m in (comparison.prepared.data, comparison.model)
+    for band in bands:
+        both = [
+            np.where(used, average_pixels(maps[names.index(band)], nside), np.nan)
+            for maps in (comparison.prepared.data, comparison.model)
+        ]
+        row: list[MapPanel] = []
+        for kind in stokes:
+            observed, model = (maps["QU".index(kind)] for maps in both)
+            limit, scatter = color_limit(model), comparison.scatter(band, region, kind)
+            head = (
+                f"model; slope {with_error(scatter.slope, scatter.error)}, "
+                f"r = {scatter.correlation:.2f} ({region})"
+            )
+            row += [
+                MapPanel(plain(f"{band}: {kind} observed"), observed, limit, UNIT),
+                MapPanel(plain(head), model, limit, UNIT),
             ]
-            for s, kind in enumerate(stokes):
-                maps = [m["QU".index(kind)] for m in both]
-                limit = float(np.quantile(np.abs(maps[1]), 0.99)) or 1.0
-                scatter = comparison.scatter(band, region, kind)
-                heads = (
-                    f"{band}: {kind} observed",
-                    f"model; slope {with_error(scatter.slope, scatter.error)}, "
-                    f"r = {scatter.correlation:.2f} ({region})",
-                )
-                for axes, values, head in zip(row[2 * s :], maps, heads, strict=False):
-                    draw_map(axes, np.where(used, values, np.nan), limit, UNIT)
-                    axes.set_title(plain(head))
-        draw_title(figure, title, fontsize=9)
-        save(figure, path)
-
-
-def _dl(spectrum: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    ell = np.arange(LMIN, len(spectrum))
-    return ell, ell * (ell + 1) / (2 * np.pi) * spectrum[LMIN:]
-
-
-def _log_axes(axes: Axes) -> None:
-    axes.set(xscale="log", yscale="log")
-    axes.xaxis.set_major_locator(mpl.ticker.FixedLocator([2, 5, 10, 20, 50, 100, 200, 500, 1000]))
-    axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_locator(mpl.ticker.NullLocator())
+        rows.append(row)
+    plot_maps(path, rows, title)
 
 
 def _spectrum_panel(axes: Axes, spectra: BandSpectra, index: int) -> None:
     name = FIELDS[index]
-    ell, observed = _dl(spectra.observed[index])
-    _, error = _dl(spectra.error[index])
-    axes.fill_between(
-        ell, np.maximum(observed - error, 1e-3 * observed), observed + error, color=OBSERVED,
-        alpha=0.3, lw=0,
-    )  # fmt: skip
-    axes.plot(
-        ell, observed, color=OBSERVED, lw=2.2, alpha=0.8, label=r"observed $\pm\,\Delta C_\ell$"
-    )
-    axes.plot(*_dl(spectra.complete[index]), color=MODEL, lw=1.0, label="foregrounds + CMB + noise")
-    axes.plot(*_dl(spectra.foregrounds[index]), color=FOREGROUNDS, lw=1.0, ls="--",
-              label="foregrounds")  # fmt: skip
-    axes.plot(*_dl(spectra.noise[index]), color=NOISE, lw=1.0, ls=":", label="noise")
-    _log_axes(axes)
-    axes.set_ylim(bottom=0.3 * min(observed.min(), _dl(spectra.foregrounds[index])[1].min()))
+    ell, observed = with_powers(spectra.observed[index])
+    _, error = with_powers(spectra.error[index])
+    _, foregrounds = with_powers(spectra.foregrounds[index])
+    low = np.maximum(observed - error, 1e-3 * observed)
+    axes.fill_between(ell, low, observed + error, color=OBSERVED, alpha=0.3, lw=0)
+    label = r"observed $\pm\,\Delta C_\ell$"
+    axes.plot(ell, observed, color=OBSERVED, lw=2.2, alpha=0.8, label=label)
+    _, complete = with_powers(spectra.complete[index])
+    axes.plot(ell, complete, color=MODEL, lw=1.0, label="foregrounds + CMB + noise")
+    axes.plot(ell, foregrounds, color=FOREGROUNDS, lw=1.0, ls="--", label="foregrounds")
+    axes.plot(*with_powers(spectra.noise[index]), color=NOISE, lw=1.0, ls=":", label="noise")
+    axes.set(xscale="log", yscale="log")
+    round_numbers(axes.xaxis)
+    axes.set_ylim(bottom=0.3 * min(observed.min(), foregrounds.min()))
     bins = spectra.binned.shape[-1]
     axes.set_title(
         rf"{plain(spectra.band)}: {name}, $\chi^2$ = {spectra.chi2[index]:.1f} / {bins} bins, "
@@ -166,54 +146,37 @@ def _spectrum_panel(axes: Axes, spectra: BandSpectra, index: int) -> None:
 
 def plot_spectra(path: Path, spectra: Sequence[BandSpectra], title: str) -> None:
     """EE and BB of each band, observed and of the complete model (the paper's figs. 7 and 8)."""
-    with plt.rc_context(STYLE):
-        figure, grid = plt.subplots(
-            len(spectra), 2, figsize=(7.2, 2.3 * len(spectra) + 0.8), squeeze=False,
-            layout="constrained", sharex=True,
-        )  # fmt: skip
+    size = 7.2, 2.3 * len(spectra) + 0.8
+    with draw_panels(path, title, size, len(spectra), 2, sharex=True) as grid:
         for row, one in zip(grid, spectra, strict=True):
             for index, axes in enumerate(row):
                 _spectrum_panel(axes, one, index)
             row[0].set_ylabel(POWER)
         for axes in grid[-1]:
             axes.set_xlabel(r"multipole $\ell$")
-        handles, labels = grid[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-        draw_title(figure, title, fontsize=9)
-        save(figure, path)
+        legend_below(grid[0, 0])
 
 
 def plot_leakage(path: Path, spectra: Sequence[BandSpectra], title: str) -> None:
     """BB before and after leakage was subtracted, and noise (the paper's fig. 9)."""
-    with plt.rc_context(STYLE):
-        figure, grid = plt.subplots(
-            1, len(spectra), figsize=(3.6 * len(spectra), 3.2), squeeze=False, layout="constrained"
-        )
+    with draw_panels(path, title, (3.6 * len(spectra), 3.2), 1, len(spectra)) as grid:
         for axes, one in zip(grid[0], spectra, strict=True):
             assert one.uncorrected is not None  # as chosen by the caller
             assert one.pte_uncorrected is not None
             pte = [probability(p) for p in (one.pte_uncorrected[1], one.pte[1])]
-            axes.plot(*_dl(one.uncorrected[1]), color=COLORS[1], lw=1.2,
-                      label=f"before correction, PTE {pte[0]}")  # fmt: skip
-            axes.plot(*_dl(one.observed[1]), color=COLORS[0], lw=1.2,
-                      label=f"after correction, PTE {pte[1]}")  # fmt: skip
-            axes.plot(*_dl(one.foregrounds[1]), color="k", lw=0.9, ls="--", label="foregrounds")
-            axes.plot(*_dl(one.noise[1]), color=COLORS[2], lw=1.2, ls=":", label="noise")
-            _log_axes(axes)
-            axes.set(xlabel=r"multipole $\ell$", title=plain(f"{one.band}: BB"))
+            curves: list[tuple[str, np.ndarray, dict[str, Any]]] = [
+                (f"before correction, PTE {pte[0]}", one.uncorrected, {"color": COLORS[1]}),
+                (f"after correction, PTE {pte[1]}", one.observed, {"color": COLORS[0]}),
+                ("foregrounds", one.foregrounds, {"color": "k", "lw": 0.9, "ls": "--"}),
+                ("noise", one.noise, {"color": COLORS[2], "ls": ":"}),
+            ]
+            for label, spectrum, style in curves:
+                axes.plot(*with_powers(spectrum[1]), **{"lw": 1.2, "label": label, **style})
+            axes.set(xscale="log", yscale="log", xlabel=r"multipole $\ell$")
+            axes.set_title(plain(f"{one.band}: BB"))
+            round_numbers(axes.xaxis)
             axes.legend(frameon=False)
         grid[0, 0].set_ylabel(POWER)
-        draw_title(figure, title, fontsize=9)
-        save(figure, path)
-
-
-def _round_numbers(axes: Axes) -> None:
-    """Logarithmic axes with a few round numbers."""
-    axes.set(xscale="log", yscale="log")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(mpl.ticker.LogLocator(subs=(1, 2, 5)))
-        axis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(mpl.ticker.NullFormatter())
 
 
 def _patch_panel(
@@ -243,7 +206,9 @@ def _patch_panel(
         every += [x[shown], y[shown]]
     line = np.array([axes.get_xlim(), axes.get_ylim()])
     if logarithmic:
-        _round_numbers(axes)
+        axes.set(xscale="log", yscale="log")
+        round_numbers(axes.xaxis)
+        round_numbers(axes.yaxis)
         if (found := np.concatenate(every)).size:
             line = np.array([found.min() / 1.5, found.max() * 1.5])
     ends = line.min(), line.max()
@@ -254,18 +219,14 @@ def _patch_panel(
 
 def _plot_patch_pairs(path, points, star, labels, heads, title):
     """A on the left and alpha on the right."""
-    with plt.rc_context(STYLE):
-        figure, panels = plt.subplots(1, 2, figsize=(7.2, 4.0), layout="constrained")
+    with draw_panels(path, title, (7.2, 4.0), 1, 2) as panels:
         for axes, what, symbol, head in zip(
-            panels, ("A", "alpha"), (rf"$A$ [{UNIT}$^2$]", r"$\alpha$"), heads, strict=True
+            panels[0], ("A", "alpha"), (rf"$A$ [{UNIT}$^2$]", r"$\alpha$"), heads, strict=True
         ):
             _patch_panel(axes, points(what), star, what == "A")
             axes.set(xlabel=f"{symbol}, {labels[0]}", ylabel=f"{symbol}, {labels[1]}")
             axes.set_title(head, fontsize=8)
-        handles, names = panels[0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False)
-        draw_title(figure, title, fontsize=9)
-        save(figure, path)
+        legend_below(panels[0, 0])
 
 
 def _with_errors(fit: PatchFits, what: str, index: int) -> np.ndarray:

@@ -131,7 +131,7 @@ def write_report(
     nside = min(settings.compare.panel_nside, settings.common.nside)
     for stokes in "QU":
         written.append(out / f"maps_{stokes}.png")
-        plots.plot_maps(written[-1], comparison, stokes, bands, nside, title)
+        plots.plot_model_maps(written[-1], comparison, stokes, bands, nside, title)
     if comparison.spectra:
         written.append(out / "spectra.png")
         plots.plot_spectra(written[-1], comparison.spectra, title)

@@ -4,29 +4,25 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-import matplotlib.pyplot as plt
 import numpy as np
 
 from fits.forecast.b_modes import noise_spectrum, to_D
 from fits.forecast.fisher import Errors
 from fits.forecast.forecast import Forecast
-from fits.plots import label
-from jaxsky.plots import COLORS, STYLE, UNITS, plain, save
+from fits.plots import COLORS, COLUMN, UNITS, draw_panels, label, legend_below, plain
 from jaxsky.settings import Experiment
 
 #: Primordial spectra, from the largest r on.
 DASHES = ("-", "--", "-.", ":")
 LENSING = "#888888"
-#: Width of a column of a paper [inch].
-COLUMN = 3.5
 
 
 def plot_b_modes(path: Path, found: Forecast, settings: Experiment) -> None:
     """BB of the foregrounds in some bands and their noise, against primordial BB."""
     lmax = settings.forecast.lmax
     ell, D = np.arange(2, lmax + 1), to_D(lmax)[2:]
-    with mpl.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(COLUMN, 3.9), layout="constrained")
+    with draw_panels(path, "", (COLUMN, 3.9)) as panels:
+        axes = panels[0, 0]
         for (name, powers), color in zip(found.powers.items(), COLORS, strict=False):
             BB = np.where(powers[1] > 0, powers[1], np.nan)
             axes.loglog(found.spectra.centers, BB, color=color, lw=1.8, label=plain(_band(name)))
@@ -46,10 +42,9 @@ def plot_b_modes(path: Path, found: Forecast, settings: Experiment) -> None:
             xlabel=r"multipole $\ell$",
             ylabel=rf"$\ell(\ell+1)C_\ell^{{BB}}/2\pi$ [{UNITS['uK_CMB']}$^2$]",
         )
-        axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_major_locator(mpl.ticker.LogLocator(numticks=20))
-        figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=7)
-        save(figure, path)
+        legend_below(axes, 3, fontsize=7)
 
 
 def _band(name: str) -> str:
@@ -65,9 +60,9 @@ def plot_errors(path: Path, found: Forecast) -> None:
     count = len(names)
     matrix = np.array([[errors.correlation(a, b) for b in names] for a in names])
     matrix[np.triu_indices(count)] = np.nan
-    with mpl.rc_context(STYLE):
-        height = 0.75 + (COLUMN - 1.9) / max(count, 3) * count
-        figure, axes = plt.subplots(figsize=(COLUMN, height), layout="constrained")
+    height = 0.75 + (COLUMN - 1.9) / max(count, 3) * count
+    with draw_panels(path, "", (COLUMN, height)) as panels:
+        axes = panels[0, 0]
         axes.imshow(matrix, cmap="RdBu_r", vmin=-1.3, vmax=1.3, aspect="auto")
         for (row, column), value in np.ndenumerate(matrix):
             if row > column:
@@ -82,7 +77,6 @@ def plot_errors(path: Path, found: Forecast) -> None:
         axes.tick_params(length=0)
         axes.spines[:].set_visible(False)
         axes.set_title("errors of 68 % and their correlation", fontsize=8, loc="right")
-        save(figure, path)
 
 
 def _symbol(name: str) -> tuple[str, str]:

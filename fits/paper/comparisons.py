@@ -112,7 +112,7 @@ def figure_maps(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 6: observed maps beside the model."""
     found, picture = _compared(settings, sources), picture_of("Figure 6")
     nside = min(settings.compare.panel_nside, settings.common.nside)
-    plots.plot_maps(out / picture, found, "QU", _chosen(found, SHOWN), nside, settings.title)
+    plots.plot_model_maps(out / picture, found, "QU", _chosen(found, SHOWN), nside, settings.title)
     return Item(
         "Figure 6",
         "observed maps and the model",

@@ -4,11 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import healpy
-import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
 
-from jaxsky.plots import STYLE, UNITS, draw_patch, save
+from fits.plots import UNITS, draw_panels, draw_patch
 
 
 def disc(
@@ -26,10 +25,8 @@ def draw_patches(
     size: float,
 ) -> None:
     """Four patches: title, map, limit of the colours and unit of each."""
-    with plt.rc_context(STYLE):
-        figure, grid = plt.subplots(2, 2, figsize=(5.4, 4.4), layout="constrained")
+    with draw_panels(path, "", (5.4, 4.4), 2, 2) as grid:
         for axes, (title, (values, limit, unit)) in zip(grid.flat, panels.items(), strict=True):
             draw_patch(axes, values, center, size, limit, UNITS[unit])
             axes.set_title(title)
             axes.label_outer()
-        save(figure, path)

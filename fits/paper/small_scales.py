@@ -3,14 +3,13 @@
 from pathlib import Path
 
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Array, Float
 
 from fits.paper.item import Item, Number, picture_of
 from fits.paper.patches import disc, draw_patches
 from fits.paper.sources import Layer, Sources, listed
-from fits.paper.templates import COLUMN
+from fits.plots import COLORS, COLUMN, draw_panels, draw_spectra
 from fits.record import with_error
 from jaxsky.harmonics import (
     analysis,
@@ -21,7 +20,6 @@ from jaxsky.harmonics import (
     synthesis,
 )
 from jaxsky.keys import stream
-from jaxsky.plots import COLORS, STYLE, draw_spectra, save
 from jaxsky.settings import Experiment
 from jaxsky.small_scales import DUST, SYNCHROTRON, SmallScales, continue_templates
 from jaxsky.templates import polarization_template
@@ -79,9 +77,8 @@ def _ranges(sources: Sources) -> str:
 def figure_spectra(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 2: EE of both templates, of what continues them, and of both together."""
     fwhm, picture = settings.paper.fwhm, picture_of("Figure 2")
-    with plt.rc_context(STYLE):
-        figure, rows = plt.subplots(2, 1, figsize=(COLUMN, 5.2), sharex=True, layout="constrained")
-        for axes, name in zip(rows, NAMES, strict=True):
+    with draw_panels(out / picture, "", (COLUMN, 5.2), 2, sharex=True) as panels:
+        for axes, name in zip(panels[:, 0], NAMES, strict=True):
             layer, continued = sources.template(name), sources.continued(name)
             (alm,), (part,) = continued.alms, continued.parts
             (start, join), lmax = layer.small.EE, lmax_of(alm)
@@ -103,8 +100,7 @@ def figure_spectra(settings: Experiment, sources: Sources, out: Path) -> Item:
             axes.set_ylim(shown[-1] * 1e-2, shown.max() * 2)
             axes.set_title(f"{name} $EE$, {float(layer.component.nu_ref):g} GHz")
             axes.legend(frameon=False, loc="lower left", handlelength=1.4)
-        rows[0].set_xlabel("")
-        save(figure, out / picture)
+        panels[0, 0].set_xlabel("")
     return Item(
         "Figure 2",
         "spectra with small scales",

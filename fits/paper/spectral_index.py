@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from fits import plots
 from fits.paper.comparisons import shared_inputs
 from fits.paper.item import Impossible, Item, Number, picture_of
 from fits.paper.sources import Sources, listed
+from fits.posterior_plots import plot_grids
 from fits.regions import region_masks, region_words
 from fits.report import known_truth, with_errors
 from fits.resolution import prepare
@@ -38,7 +38,7 @@ def figure_probability(settings: Experiment, sources: Sources, out: Path) -> Ite
         fits = run(chosen, prepared, region_masks(chosen, spec.regions))
     except SettingsError as error:
         raise Impossible(str(error)) from None
-    plots.plot_grids(out / picture, fits, known_truth(inputs, fits), settings.title)
+    plot_grids(out / picture, fits, known_truth(inputs, fits), settings.title)
     numbers, truth = [], inputs.truth or {}
     for fit in fits:
         result = fit.results["grid"]

@@ -5,45 +5,30 @@ from pathlib import Path
 
 import healpy
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 from fits.paper.indices import STEEPENING, SYMBOLS, Index
 from fits.paper.item import Item, Number, picture_of
 from fits.paper.sources import NSIDE, Sources
+from fits.plots import UNITS, MapPanel, color_limit, plot_maps
 from fits.record import with_error
-from jaxsky.plots import STYLE, UNITS, draw_map, save
 from jaxsky.presets import preset
 from jaxsky.settings import Experiment
 from jaxsky.templates import coarse_pixels, correlation, polarization_template, steepening
 
-#: Width of a column [in].
-COLUMN = 3.5
 #: The paper's correlations of dust and AME.
 CORRELATIONS = {"Q": "0.71 ± 0.01", "U": "0.73 ± 0.01"}
 #: Blocks of the honest jackknife: pixels of 15 degrees.
 NSIDE_BLOCKS = 4
 
 
-def limit(values: np.ndarray) -> float:
-    """End of a scale of colours: 99 % of the values are within."""
-    return float(np.quantile(np.abs(values), 0.99)) or 1.0
-
-
 def _draw(path: Path, panels: Mapping[str, tuple[np.ndarray, str, float | None]]) -> None:
     """Maps below each other: title, values, label of the colours, and their middle or None."""
-    with plt.rc_context(STYLE):
-        figure, rows = plt.subplots(
-            len(panels),
-            1,
-            figsize=(COLUMN, 1.85 * len(panels)),
-            squeeze=False,
-            layout="constrained",
-        )
-        for axes, (title, (values, label, middle)) in zip(rows[:, 0], panels.items(), strict=True):
-            draw_map(axes, values, limit(values - (middle or 0.0)), label, middle)
-            axes.set_title(title)
-        save(figure, path)
+    rows = [
+        [MapPanel(title, values, color_limit(values - (middle or 0.0)), label, middle)]
+        for title, (values, label, middle) in panels.items()
+    ]
+    plot_maps(path, rows)
 
 
 def figure_templates(settings: Experiment, sources: Sources, out: Path) -> Item:

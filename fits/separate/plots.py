@@ -4,25 +4,28 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from fits.plots import label
+from fits.plots import (
+    COLORS,
+    COLUMN,
+    UNITS,
+    MapPanel,
+    color_limit,
+    draw_panels,
+    label,
+    legend_below,
+    plot_maps,
+    spread,
+    stokes_panels,
+)
 from fits.record import with_error
 from fits.separate.separate import Separation
-from jaxsky.plots import COLORS, STYLE, UNITS, draw_map, draw_title, plain, save
 
-#: Width of a column of a paper [inch].
-COLUMN = 3.5
 #: Bands whose residuals are drawn.
 SHOWN = 4
 CLEANED, NOISE, RESIDUAL, LEFT, LENSING, TRUTH = (*COLORS[:4], "0.5", COLORS[3])
-
-
-def _unit(found: Separation, name: str) -> str:
-    """Of a component's amplitude."""
-    return UNITS[found.like.sky[name].unit]
 
 
 def _title(found: Separation, name: str) -> str:
@@ -34,39 +37,21 @@ def _title(found: Separation, name: str) -> str:
 
 def plot_components(path: Path, found: Separation, title: str) -> None:
     """Q and U of the components, a row for each."""
-    with mpl.rc_context(STYLE):
-        figure, grid = plt.subplots(
-            len(found.components),
-            2,
-            figsize=(7.2, 1.95 * len(found.components) + 0.4),
-            squeeze=False,
-            layout="constrained",
-        )
-        for row, name, maps in zip(grid, found.components, found.maps[:, -2:], strict=True):
-            limit = float(np.nanquantile(np.abs(maps), 0.99))
-            for axes, values, stokes in zip(row, maps, "QU", strict=True):
-                draw_map(axes, values, limit, f"{stokes} [{_unit(found, name)}]")
-                axes.set_title(plain(f"{_title(found, name)}: {stokes}"))
-        draw_title(figure, title, fontsize=9)
-        save(figure, path)
+    rows = [
+        stokes_panels(_title(found, name), maps, color_limit(maps), found.like.sky[name].unit)
+        for name, maps in zip(found.components, found.maps[:, -2:], strict=True)
+    ]
+    plot_maps(path, rows, title)
 
 
 def plot_residuals(path: Path, found: Separation, unit: str, title: str) -> None:
     """Data less components in a few bands, Q beside U."""
-    names = list(found.setup.domain.bands)
-    at = np.unique(np.linspace(0, len(names) - 1, min(SHOWN, len(names))).round().astype(int))
-    with mpl.rc_context(STYLE):
-        figure, grid = plt.subplots(
-            len(at), 2, figsize=(7.2, 1.95 * len(at) + 0.4), squeeze=False, layout="constrained"
-        )
-        for row, b in zip(grid, at, strict=True):
-            maps = found.residuals[b, -2:]
-            limit = 3 * float(np.nanstd(maps))
-            for axes, values, stokes in zip(row, maps, "QU", strict=True):
-                draw_map(axes, values, limit, f"{stokes} [{UNITS[unit]}]", middle=0.0)
-                axes.set_title(plain(f"{names[b]}: {stokes}, data less components"))
-        draw_title(figure, title, fontsize=9)
-        save(figure, path)
+    names, rows = list(found.setup.domain.bands), []
+    for name in spread(names, SHOWN):
+        maps = found.residuals[names.index(name), -2:]
+        limit = 3 * float(np.nanstd(maps))
+        rows.append(stokes_panels(f"{name}, data less components", maps, limit, unit, 0.0))
+    plot_maps(path, rows, title)
 
 
 def plot_parameters(path: Path, found: Separation, title: str) -> bool:
@@ -74,29 +59,25 @@ def plot_parameters(path: Path, found: Separation, title: str) -> bool:
 
     Returns False, without a picture, if none has.
     """
-    varying = [name for name in found.fit.free if np.ndim(found.fit.best_fit[name])]
-    if not varying:
-        return False
-    with mpl.rc_context(STYLE):
-        figure, grid = plt.subplots(
-            len(varying),
-            2,
-            figsize=(7.2, 1.95 * len(varying) + 0.4),
-            squeeze=False,
-            layout="constrained",
+    rows = []
+    for name in found.fit.free:
+        if not np.ndim(found.fit.best_fit[name]):
+            continue
+        value, sigma = (found.of_pixel(name, x) for x in (found.fit.best_fit, found.sigma))
+        middle = float(np.nanmedian(value))
+        half = float(f"{np.nanquantile(sigma, 0.98) / 2:.1g}")
+        symbol, regions = label(name), len(found.fit.best_fit[name])
+        head, center = f"${symbol}$, {regions} regions", float(f"{middle:.3g}")
+        limit, error = color_limit(value - middle, 0.98), "its standard deviation"
+        rows.append(
+            [
+                MapPanel(head, value, limit, f"${symbol}$", center),
+                MapPanel(error, sigma, half, rf"$\sigma({symbol})$", half),
+            ]
         )
-        for row, name in zip(grid, varying, strict=True):
-            value, sigma = (found.of_pixel(name, x) for x in (found.fit.best_fit, found.sigma))
-            middle = float(np.nanmedian(value))
-            limit = float(np.nanquantile(np.abs(value - middle), 0.98)) or 1.0
-            draw_map(row[0], value, limit, f"${label(name)}$", middle=float(f"{middle:.3g}"))
-            half = float(f"{np.nanquantile(sigma, 0.98) / 2:.1g}")
-            draw_map(row[1], sigma, half, rf"$\sigma({label(name)})$", middle=half)
-            row[0].set_title(f"${label(name)}$, {len(found.fit.best_fit[name])} regions")
-            row[1].set_title("its standard deviation")
-        draw_title(figure, title, fontsize=9)
-        save(figure, path)
-    return True
+    if rows:
+        plot_maps(path, rows, title)
+    return bool(rows)
 
 
 def _positive(values: np.ndarray) -> np.ndarray:
@@ -110,8 +91,8 @@ def plot_spectra(path: Path, found: Separation, title: str) -> None:
     width = np.stack([ell - edges[:-1], edges[1:] - 1 - ell])
     signal = ratio.powers - ratio.model.additive
     error = np.sqrt(np.diagonal(ratio.covariance))
-    with mpl.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(COLUMN, 4.2), layout="constrained")
+    with draw_panels(path, title, (COLUMN, 4.2), fontsize=8) as panels:
+        axes = panels[0, 0]
         seen = signal > 0
         axes.errorbar(
             ell[seen],
@@ -158,16 +139,14 @@ def plot_spectra(path: Path, found: Separation, title: str) -> None:
         low = min(np.nanmin(_positive(values)) for values in lowest) / 3
         axes.set_ylim(bottom=max(low, np.nanmax(ratio.model.lensing) * 1e-8))
         axes.yaxis.set_major_locator(mpl.ticker.LogLocator(numticks=20))
-        figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=7)
-        draw_title(figure, title, fontsize=8)
-        save(figure, path)
+        legend_below(axes, 2, fontsize=7)
 
 
 def plot_ratio(path: Path, found: Separation, title: str) -> None:
     """The posterior of the tensor-to-scalar ratio."""
     ratio = found.tensors
-    with mpl.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(COLUMN, 3.2), layout="constrained")
+    with draw_panels(path, title, (COLUMN, 3.2), fontsize=8) as panels:
+        axes = panels[0, 0]
         axes.plot(ratio.grid, ratio.posterior, color=CLEANED, label=r"posterior, $r \geq 0$")
         below = ratio.grid <= ratio.upper_95
         axes.fill_between(
@@ -190,9 +169,7 @@ def plot_ratio(path: Path, found: Separation, title: str) -> None:
             ylabel="relative probability",
         )
         axes.ticklabel_format(axis="x", style="sci", scilimits=(-2, 3), useMathText=True)
-        figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=7)
-        draw_title(figure, title, fontsize=8)
-        save(figure, path)
+        legend_below(axes, 2, fontsize=7)
 
 
 def _interval(axes: Axes, r: float, sigma: float) -> None:

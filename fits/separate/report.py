@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from fits.plots import plot_chains
+from fits.posterior_plots import plot_chains
 from fits.record import leaks, probability, with_error, write_json, write_log
 from fits.separate import plots
 from fits.separate.separate import SAMPLED, Separation

@@ -1,0 +1,200 @@
+"""Pictures of fits: the grid, the marginal distributions, the posterior of the chains."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+from getdist import MCSamples, chains, plots
+
+from fits.plots import COLORS, STYLE, draw_panels, draw_title, label, legend_below, plain, save
+from fits.results import FitResult
+from fits.spectral_index import Fit, all_free
+
+chains.print_load_details = False  # getdist otherwise prints about burn-in
+
+STOKES_COLORS = {"Q": COLORS[0], "U": COLORS[1], "QU": COLORS[6]}
+TRUTH = {"color": COLORS[3], "linewidth": 1.6}
+
+
+def _tex(name: str) -> str:
+    return f"${label(name)}$"
+
+
+def _levels(log_posterior: np.ndarray) -> list[float]:
+    """Heights of the contours that hold 95.45 % and 68.27 % of the probability."""
+    density = np.sort(np.exp(log_posterior).ravel())[::-1]
+    held = np.cumsum(density) / density.sum()
+    return [float(np.log(density[np.searchsorted(held, p)])) for p in (0.9545, 0.6827)]
+
+
+def _by_region(fits: Sequence[Fit]) -> dict[str, list[Fit]]:
+    regions: dict[str, list[Fit]] = {}
+    for fit in fits:
+        regions.setdefault(fit.region, []).append(fit)
+    return regions
+
+
+def plot_grids(
+    path: Path, fits: Sequence[Fit], truth: Mapping[str, float] | None, title: str
+) -> bool:
+    """The probability on the grid, Q beside U, a row for each region: the paper's figure.
+
+    Returns False, without a picture, if no fit has a grid of two parameters.
+    """
+    with_grid = [f for f in fits if "grid" in f.results and len(f.results["grid"].free) == 2]
+    if not with_grid:
+        return False
+    regions = _by_region(with_grid)
+    x, y = with_grid[0].results["grid"].free
+    columns = max(len(r) for r in regions.values())
+    size = 1.2 + 2.6 * columns, 0.8 + 2.4 * len(regions)
+    with draw_panels(path, title, size, len(regions), columns) as panels:
+        for row, (region, members) in zip(panels, regions.items(), strict=True):
+            for axes in row[len(members) :]:
+                axes.set_visible(False)
+            for axes, fit in zip(row, members, strict=False):
+                _grid_panel(axes, fit.results["grid"], truth)
+                alike = [f for f in with_grid if f.stokes == fit.stokes]
+                axes.set(xlim=_limits(alike, x), ylim=_limits(alike, y))
+                axes.set_title(plain(f"{region}, {' + '.join(fit.stokes)}"))
+        legend_below(panels[0, 0])
+    return True
+
+
+def _drawable(fits: Sequence[Fit], name: str) -> list[Fit]:
+    """Fits that have a parameter, with a finite error."""
+    firsts = [(fit, next(iter(fit.results.values()))) for fit in fits]
+    return [fit for fit, r in firsts if name in r.free and np.isfinite(r.sigma(name))]
+
+
+def _limits(fits: Sequence[Fit], name: str) -> tuple[float, float] | None:
+    """Range of a parameter that shows all fits to four standard deviations."""
+    results = [next(iter(fit.results.values())) for fit in _drawable(fits, name)]
+    if not results:
+        return None
+    low = min(r.best_fit[name] - 4 * r.sigma(name) for r in results)
+    high = max(r.best_fit[name] + 4 * r.sigma(name) for r in results)
+    return low, high
+
+
+def _grid_panel(axes: plt.Axes, result: FitResult, truth: Mapping[str, float] | None) -> None:
+    x, y = result.free
+    grid = [result.details["axes"][name] for name in (x, y)]
+    log_posterior = result.details["log_posterior"]
+    density = np.exp(log_posterior).T
+    axes.pcolormesh(*grid, density, cmap="Greys", vmin=0, vmax=1.4, rasterized=True)
+    axes.contour(
+        *grid, log_posterior.T, _levels(log_posterior), colors=COLORS[0], linestyles=["--", "-"]
+    )
+    axes.plot([], [], color=COLORS[0], label=r"1$\sigma$")
+    axes.plot([], [], color=COLORS[0], linestyle="--", label=r"2$\sigma$")
+    axes.plot(result.best_fit[x], result.best_fit[y], "k+", ms=9, mew=1.5, label="best fit")
+    if truth and x in truth and y in truth:
+        axes.plot(truth[x], truth[y], "o", mfc="none", mec=TRUTH["color"], mew=1.6, label="truth")
+    axes.set(xlabel=_tex(x), ylabel=_tex(y))
+    axes.spines[:].set_visible(True)
+
+
+def _samples(result: FitResult, name: str) -> MCSamples:
+    details = result.details
+    chain = details["chain"][details["discard"] :: details["thin"]]
+    return MCSamples(
+        samples=chain.reshape(-1, len(result.free)),
+        names=list(result.free),
+        labels=[label(n) for n in result.free],
+        label=plain(name),
+    )
+
+
+def _density(fit: Fit, name: str) -> tuple[np.ndarray, np.ndarray, FitResult]:
+    """A marginal distribution from the best method there is: grid, chain or Gaussian."""
+    if "grid" in fit.results:
+        result = fit.results["grid"]
+        return result.details["axes"][name], result.details["marginals"][name], result
+    if "mcmc" in fit.results:
+        result = fit.results["mcmc"]
+        density = _samples(result, fit.stokes).get1DDensity(name)
+        return density.x, density.P, result
+    result = fit.results["gradient"]
+    sigma = result.sigma(name)
+    x = result.best_fit[name] + sigma * np.linspace(-5, 5, 201)
+    return x, np.exp(-0.5 * ((x - result.best_fit[name]) / sigma) ** 2), result
+
+
+def plot_marginals(
+    path: Path, fits: Sequence[Fit], truth: Mapping[str, float] | None, title: str
+) -> bool:
+    """Marginal probability of each parameter, for Q, U and both, with 68 % intervals."""
+    free, regions = all_free(fits), _by_region(fits)
+    size = 3.4 * len(free), 0.9 + 2.2 * len(regions)
+    with draw_panels(path, title, size, len(regions), len(free), sharex="col") as panels:
+        for row, (region, members) in zip(panels, regions.items(), strict=True):
+            for axes, name in zip(row, free, strict=True):
+                for fit in _drawable(members, name):
+                    _marginal_curve(axes, fit, name)
+                if truth and name in truth:
+                    axes.axvline(truth[name], **TRUTH, label="truth")
+                axes.set(ylim=(0, 1.12), ylabel="relative probability", title=plain(region))
+                axes.xaxis.set_tick_params(labelbottom=True)
+        for axes, name in zip(panels[-1], free, strict=True):
+            axes.set(xlabel=_tex(name), xlim=_limits(fits, name))
+        legend_below(panels[0, 0])
+    return True
+
+
+def _marginal_curve(axes: plt.Axes, fit: Fit, name: str) -> None:
+    x, density, result = _density(fit, name)
+    density = density / density.max()
+    color = STOKES_COLORS[fit.stokes]
+    axes.plot(x, density, color=color, label=f"{' + '.join(fit.stokes)}, 68 % shaded")
+    low, high = result.interval_68[name]
+    inside = (x >= low) & (x <= high)
+    axes.fill_between(x[inside], density[inside], color=color, alpha=0.22, linewidth=0)
+
+
+def plot_posterior(
+    path: Path, fits: Sequence[Fit], truth: Mapping[str, float] | None, title: str
+) -> bool:
+    """The posterior of the chains, a colour for each region, for the most Stokes parameters.
+
+    Returns False, without a picture, if no fit has a chain.
+    """
+    with_chain = [f for f in fits if "mcmc" in f.results]
+    if not with_chain:
+        return False
+    most = max(with_chain, key=lambda f: len(f.stokes)).stokes
+    shown = [f for f in with_chain if f.stokes == most]
+    results = {f"{f.region}, {' + '.join(most)}": f.results["mcmc"] for f in shown}
+    plot_chains(path, results, truth, title)
+    return True
+
+
+def plot_chains(
+    path: Path, results: Mapping[str, FitResult], truth: Mapping[str, float] | None, title: str
+) -> None:
+    """The posterior of chains of the same parameters by what they are of, a colour for each."""
+    samples = [_samples(result, name) for name, result in results.items()]
+    free = next(iter(results.values())).free
+    plotter = plots.get_subplot_plotter(width_inch=max(4.0, 1.6 * len(free)))
+    plotter.settings.axes_fontsize = 9
+    plotter.settings.axes_labelsize = 11
+    plotter.settings.legend_fontsize = 9
+    plotter.settings.title_limit_fontsize = 9
+    plotter.triangle_plot(
+        samples,
+        list(free),
+        filled=True,
+        contour_colors=list(COLORS[: len(samples)]),
+        title_limit=1 if len(samples) == 1 else 0,
+        markers={n: v for n, v in (truth or {}).items() if n in free},
+        marker_args={"color": TRUTH["color"], "lw": TRUTH["linewidth"], "ls": "-"},
+    )
+    for i, name in enumerate(free):
+        for result, color in zip(results.values(), COLORS, strict=False):
+            interval = result.interval_68[name]
+            plotter.subplots[i, i].axvspan(*interval, color=color, alpha=0.15, linewidth=0)
+    draw_title(plotter.fig, f"{title}; 68 % shaded", fontsize=8, y=1.03)
+    with mpl.rc_context(STYLE | {"savefig.dpi": 200}):
+        save(plotter.fig, path)

@@ -9,7 +9,7 @@ import numpy as np
 from fits.forecast.b_modes import noise_spectrum, to_D
 from fits.forecast.fisher import Errors
 from fits.forecast.forecast import Forecast
-from fits.plots import COLORS, COLUMN, UNITS, draw_panels, label, legend_below, plain
+from fits.plots import COLORS, COLUMN, UNITS, draw_panels, label, legend_below, plain, round_numbers
 from jaxsky.settings import Experiment
 
 #: Primordial spectra, from the largest r on.
@@ -42,7 +42,7 @@ def plot_b_modes(path: Path, found: Forecast, settings: Experiment) -> None:
             xlabel=r"multipole $\ell$",
             ylabel=rf"$\ell(\ell+1)C_\ell^{{BB}}/2\pi$ [{UNITS['uK_CMB']}$^2$]",
         )
-        axes.xaxis.set_major_formatter("{x:g}")
+        round_numbers(axes.xaxis)
         axes.yaxis.set_major_locator(mpl.ticker.LogLocator(numticks=20))
         legend_below(axes, 3, fontsize=7)
 

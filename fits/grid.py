@@ -10,7 +10,7 @@ import numpy as np
 from fits.priors import Prior, bounds, check_priors, log_prior
 from fits.results import FitResult
 from fits.template_likelihood import Likelihood, PixelLikelihood, chi2
-from jaxsky.types import Numeric
+from jaxsky.checks import Numeric
 
 #: The grid is narrowed to where the posterior exceeds exp(-NARROW/2) of its maximum (6 sigma).
 NARROW = 36.0

@@ -30,10 +30,9 @@ from jaxsky.io.observations import Observed, read_observed
 from jaxsky.keys import realisation_key
 from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum, uniform_covariance
 from jaxsky.noise_inputs import read_noise
-from jaxsky.observation import Observation, ObservedBand
-from jaxsky.preparation import prepare
+from jaxsky.observation import Observation, ObservedBand, prepare
 from jaxsky.settings import BandTable, Experiment, SettingsError, at_key, find_file
-from jaxsky.simulate import observe_bands
+from jaxsky.simulation import observe_bands
 
 
 class Leakage(NamedTuple):

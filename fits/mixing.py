@@ -18,9 +18,9 @@ from jaxtyping import Array, Float
 from fits.template_likelihood import Bands
 from jaxsky import Sky, parameter_names, set_parameters
 from jaxsky.bandpass import Samples, average
+from jaxsky.checks import Numeric
 from jaxsky.interpolation import band_seds, choose_nodes
 from jaxsky.sed import cmb_derivative
-from jaxsky.types import Numeric
 from jaxsky.units import parse_unit
 
 #: parameter of a band -> its value if not given

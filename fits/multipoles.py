@@ -11,9 +11,8 @@ from jaxtyping import Array, Float
 from fits.amplitudes import Pixels
 from fits.compress import Layout
 from fits.noise import bare
-from jaxsky.checks import UNSEEN, check_double, check_finite
+from jaxsky.checks import UNSEEN, Numeric, check_double, check_finite
 from jaxsky.harmonics import gaussian_beam, lmax_of, low_multipoles
-from jaxsky.types import Numeric
 
 #: A band is left out where its beam is below this: its weight would be lost in rounding.
 BEAM = 1e-5

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxsky.bare import refuse_unit, takes_quantities
-from jaxsky.types import Numeric
+from jaxsky.checks import Numeric
 
 #: Pixels per pass.
 CHUNK = 1 << 15

@@ -21,7 +21,7 @@ from fits.priors import (
 )
 from fits.results import FitResult, help_by_prior
 from fits.template_likelihood import Likelihood, chi2
-from jaxsky.types import Numeric
+from jaxsky.checks import Numeric
 
 #: What finds an optimum: by residuals, or by a function alone.
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser

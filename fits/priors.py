@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxsky.checks import Numeric
 from jaxsky.settings import Experiment
-from jaxsky.types import Numeric
 
 #: A value this close to the edge of a uniform prior, in units of its width, is at the edge.
 EDGE = 1e-4

@@ -28,9 +28,8 @@ from fits.regions import Cells, check_labels, intersections
 from fits.template_likelihood import Likelihood, named_bands
 from jaxsky import Bandpass, Component, Sky, get_parameters, set_parameters
 from jaxsky.bandpass import Samples, stack_bands
-from jaxsky.checks import as_array, check_double, check_finite
-from jaxsky.parameters import check_parameter, unknown_parameter
-from jaxsky.types import Numeric
+from jaxsky.checks import Numeric, as_array, check_double, check_finite
+from jaxsky.sky import check_parameter, unknown_parameter
 from jaxsky.units import parse_unit
 
 #: Pixels that are treated at once.

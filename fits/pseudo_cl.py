@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from fits.discs import zonal, zonal_products
 from jaxsky.checks import check_finite, is_concrete
-from jaxsky.correlated import realisation
+from jaxsky.cmb import gaussian_fields
 from jaxsky.harmonics import analysis, expand, lmax_of, power_spectrum, synthesis
 
 #: Fewest modes of a field in a bin that a mean power can be taken of.
@@ -332,7 +332,7 @@ def band_covariance(
     rows = [np.asarray(row)[: spectra.lmax + 1] for row in (EE, BB)]
     matrix = jnp.array([[rows[0], zero], [zero, rows[1]]])
     powers = [
-        band_powers(spectra, synthesis(realisation(one, matrix), nside))
+        band_powers(spectra, synthesis(gaussian_fields(one, matrix), nside))
         for one in jax.random.split(key, simulations)
     ]
     scale = np.std(powers, axis=0, ddof=1) / np.sqrt(np.einsum("ibib->ib", covariance))

@@ -13,11 +13,10 @@ import numpy as np
 import scipy.cluster.vq
 from jaxtyping import Bool, Float, Int
 
-from jaxsky.checks import check_seed
+from jaxsky.checks import Numeric, check_seed
 from jaxsky.inputs import mask_at
 from jaxsky.io import degrade_mask, read_mask
 from jaxsky.settings import Experiment, MaskFile, find_file, parse_region
-from jaxsky.types import Numeric
 
 COMPARISONS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 

@@ -15,8 +15,8 @@ from fits.record import fingerprint
 from fits.template_likelihood import CovarianceOf, Likelihood, likelihood
 from fits.template_noise import prepared_variance
 from jaxsky import Bandpass, Sky, observe
+from jaxsky.checks import Numeric
 from jaxsky.harmonics import beam_ratio, gaussian_beam, pixel_window
-from jaxsky.types import Numeric
 
 #: A pixel is used if no more than this fraction of what was smoothed or averaged was missing.
 MISSING = 0.01

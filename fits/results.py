@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxsky.types import Numeric
+from jaxsky.checks import Numeric
 
 #: A chi^2 above so many times the degrees of freedom, taken as `FEW` if they are fewer, is that of
 #: no fit. Real skies, with laws that vary, errors that are too small and bright planes, have

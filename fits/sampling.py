@@ -15,8 +15,7 @@ from fits.optimize import best_fit
 from fits.priors import Prior, bounds, check_priors, log_prior
 from fits.results import FitResult
 from fits.template_likelihood import Likelihood, chi2
-from jaxsky.checks import check_seed
-from jaxsky.types import Numeric
+from jaxsky.checks import Numeric, check_seed
 
 #: A chain shorter than this many autocorrelation times is reported as too short.
 ENOUGH = 50

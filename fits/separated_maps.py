@@ -15,7 +15,7 @@ from fits.amplitudes import Pixels
 from fits.compress import Layout, used_pixels
 from fits.noise import Noise, as_noise, bare, chunks
 from fits.profile_likelihood import SpectralLikelihood
-from jaxsky.types import Numeric
+from jaxsky.checks import Numeric
 
 
 class ComponentMaps(NamedTuple):

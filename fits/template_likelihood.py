@@ -29,11 +29,9 @@ from jaxtyping import Array, Float, Int
 
 from fits.compress import gram, square_root
 from jaxsky import Bandpass, Sky, observe_components, parameter_names, set_parameters
-from jaxsky.checks import UNSEEN, as_array, check_double
+from jaxsky.checks import UNSEEN, Numeric, as_array, check_double
 from jaxsky.interpolation import NodeCounts, Nodes
-from jaxsky.parameters import OFFSET, unknown_parameter
-from jaxsky.sky import interpolation_nodes
-from jaxsky.types import Numeric
+from jaxsky.sky import OFFSET, interpolation_nodes, unknown_parameter
 
 #: Covariance of the inner products <rows, data>: (band, row, stokes, pix) -> square matrix over
 #: (band, row) flattened. `fits.covariance.Fluctuations.covariance` is one.

@@ -3,8 +3,15 @@
 import jaxsky.bare
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import AME, CMB, Component, Dust, Synchrotron
-from jaxsky.parameters import get_parameters, parameter_names, set_parameters
-from jaxsky.sky import Sky, observe, observe_band, observe_components
+from jaxsky.sky import (
+    Sky,
+    get_parameters,
+    observe,
+    observe_band,
+    observe_components,
+    parameter_names,
+    set_parameters,
+)
 
 __version__ = "0.1.0"
 

@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxsky.checks import as_array, check_finite, check_positive, is_concrete
+from jaxsky.checks import Numeric, as_array, check_finite, check_positive, is_concrete
 from jaxsky.sed import cmb_derivative
-from jaxsky.types import Numeric
 from jaxsky.units import band_conversion, parse_unit
 
 #: convention -> factor that turns its weights into weights on antenna temperature

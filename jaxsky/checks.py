@@ -1,11 +1,18 @@
-"""Checks of arguments, at construction and at the border: one sentence an error."""
+"""Types and checks of arguments, at construction and at the border: one sentence an error."""
+
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxsky.bare import refuse_unit, takes_quantities
+
+#: What the spectral laws take: numbers or arrays that broadcast.
+Numeric: TypeAlias = float | Array | np.ndarray
+#: A spectral parameter: a number or a map; an array, once a component holds it.
+Parameter: TypeAlias = Float[Array, ""] | Float[Array, " pix"] | float
 
 
 def is_concrete(x: object) -> bool:

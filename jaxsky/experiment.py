@@ -18,9 +18,8 @@ from jaxsky.io.observations import Observed
 from jaxsky.keys import realisation_key
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import DTYPES, Observation, ObservedBand, Source
-from jaxsky.parameters import get_parameters, parameter_names
 from jaxsky.settings import BandTable, Experiment, SettingsError, at_key, find_file
-from jaxsky.sky import Sky, observe_band
+from jaxsky.sky import Sky, get_parameters, observe_band, parameter_names
 from jaxsky.small_scales import SmallScales
 
 #: A map resolves beams of so many pixels: there b_l is down to 0.43 at l = 2 nside.

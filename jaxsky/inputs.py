@@ -18,7 +18,6 @@ from jaxsky.galaxy import EmbeddedSky, GalaxyModel, embedded_sky
 from jaxsky.io import Maps, degrade_mask, read_bandpass, read_maps, unit_factor
 from jaxsky.io.columns import sentinels
 from jaxsky.io.folders import kept
-from jaxsky.parameters import set_parameters
 from jaxsky.settings import (
     BandpassSpec,
     ComponentTable,
@@ -30,7 +29,7 @@ from jaxsky.settings import (
     check_sign,
     find_file,
 )
-from jaxsky.sky import Sky
+from jaxsky.sky import Sky, set_parameters
 
 
 def parameter_unit(name: str) -> str:

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsky import chebyshev
 from jaxsky.bandpass import Bandpass, Samples, average, stack_bands
 from jaxsky.checks import is_concrete
 from jaxsky.components import Component
@@ -45,6 +44,46 @@ TRACED_NODES = 16
 AT_ONCE = 4096
 #: With more maps than this in one component, a tensor of nodes would cost more than the sum.
 MAX_DIMENSIONS = 2
+
+
+def _chebyshev_nodes(n: int) -> Float[np.ndarray, " n"]:
+    """The n Chebyshev points of the first kind in (-1, 1)."""
+    return np.polynomial.chebyshev.chebpts1(n)
+
+
+def _coefficients(values: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Chebyshev coefficients of the tensor of values at the nodes, along every axis."""
+    for axis, n in enumerate(values.shape):
+        inverse = np.polynomial.chebyshev.chebvander(_chebyshev_nodes(n), n - 1).T * 2 / n
+        inverse[0] /= 2
+        moved = jnp.tensordot(jnp.asarray(inverse, values.dtype), values, axes=(1, axis))
+        values = jnp.moveaxis(moved, 0, axis)
+    return values
+
+
+def _polynomials(n: int, point: Float[Array, "..."]) -> Float[Array, "n ..."]:
+    """The first n Chebyshev polynomials at points in [-1, 1]."""
+    rows = [jnp.ones_like(point), point]
+    for _ in range(n - 2):
+        rows.append(2 * point * rows[-1] - rows[-2])
+    return jnp.stack(rows[:n])
+
+
+def _evaluate(coefs: Float[Array, "..."], *points: Float[Array, " pix"]) -> Float[Array, " pix"]:
+    """The series at points in [-1, 1]^d (one array a dimension), by Clenshaw's recurrence.
+
+    The loops are unrolled: the node counts are small and the whole becomes one fused pass.
+    """
+    if not points:
+        return coefs
+    t, *rest = points
+    terms = [_evaluate(c, *rest) for c in coefs]
+    if len(terms) == 1:
+        return terms[0] * jnp.ones_like(t)
+    high, higher = terms[-1], jnp.zeros_like(t)
+    for term in terms[-2:0:-1]:
+        high, higher = 2 * t * high - higher + term, high
+    return t * high - higher + terms[0]
 
 
 def _is_map(leaf: Any) -> bool:
@@ -79,7 +118,7 @@ def _tail(
 ) -> Float[Array, " node"]:
     """See `_tails`: along one parameter, in one band."""
     line = jax.vmap(lambda *v: average(rebuild(v).sed, band))(*values)
-    coefs = jnp.abs(chebyshev.coefficients(line))
+    coefs = jnp.abs(_coefficients(line))
     return jnp.cumsum(coefs[::-1])[::-1] / jnp.abs(line).min()
 
 
@@ -91,7 +130,7 @@ def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
     """
     maps, rebuild = _split(component)
     ranges = [_range(m) for m in maps]
-    grid = jnp.asarray(chebyshev.nodes(MAX_NODES))
+    grid = jnp.asarray(_chebyshev_nodes(MAX_NODES))
     worst = []
     for axis in range(len(maps)):
         lines = []
@@ -144,12 +183,12 @@ def _series(
         value = average(component.sed, band)
         return value, value
     axes = [
-        mid + half * jnp.asarray(chebyshev.nodes(n), mid.dtype)
+        mid + half * jnp.asarray(_chebyshev_nodes(n), mid.dtype)
         for (mid, half), n in zip(map(_range, maps), counts, strict=True)
     ]
     mesh = [axis.ravel() for axis in jnp.meshgrid(*axes, indexing="ij")]
     values = jax.vmap(lambda *v: average(rebuild(v).sed, band))(*mesh).reshape(counts)
-    return chebyshev.coefficients(values), values
+    return _coefficients(values), values
 
 
 @partial(jax.jit, static_argnames="counts")
@@ -235,7 +274,7 @@ def _weights(component, samples, vectors, counts):
 @jax.jit
 def term(component: Component, coefs: Float[Array, "..."]) -> Float[Array, " pix"]:
     """A term (`Terms.coefs`) in each pixel; a number if no parameter is a map."""
-    return chebyshev.evaluate(coefs, *_points(component))
+    return _evaluate(coefs, *_points(component))
 
 
 def band_sed(
@@ -253,10 +292,10 @@ def band_sed(
     coefs, values = _series(component, band, nodes.counts)
     points = _points(component)
     if nodes.tolerance is None:
-        return chebyshev.evaluate(coefs, *points)
+        return _evaluate(coefs, *points)
     return jax.lax.cond(
         _resolved(coefs, values, nodes.tolerance),
-        lambda: chebyshev.evaluate(coefs, *points),
+        lambda: _evaluate(coefs, *points),
         lambda: average(component.sed, band),
     )
 
@@ -298,7 +337,7 @@ def band_seds(
     def pixel(points):
         product = coefs
         for n, point in zip(nodes.counts[::-1], points[::-1], strict=True):
-            product = product @ chebyshev.polynomials(n, point)
+            product = product @ _polynomials(n, point)
         return product
 
     def interpolated():

@@ -21,9 +21,9 @@ from jaxsky.io.files import check_guards
 from jaxsky.io.folders import alone
 from jaxsky.io.observations import observed_tables
 from jaxsky.keys import realisation_key
-from jaxsky.preparation import Prepared, plan, prepare
+from jaxsky.observation import Prepared, plan, prepare
 from jaxsky.settings import Experiment, found_files
-from jaxsky.simulate import observe_bands
+from jaxsky.simulation import observe_bands
 
 LOG = "simulation.json"
 PACKAGES = ("jaxsky", "jax", "numpy", "healpy", "ducc0", "jaxbind", "camb")

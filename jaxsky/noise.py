@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxsky.checks import as_array, check_finite, is_concrete
+from jaxsky.checks import Numeric, as_array, check_finite, is_concrete
 from jaxsky.harmonics import alm_ell, analysis, children, expand
 from jaxsky.keys import stokes_noise
-from jaxsky.types import Numeric
 
 #: Pixels that are checked at once.
 _PIECE = 1 << 20

@@ -1,17 +1,43 @@
-"""What is observed, and how: components with their beams, bands with theirs, pixels."""
+"""What is observed, and how: components with their beams, bands with theirs, pixels.
 
+Components are brought into harmonic space once, ready to be seen in any band: templates get their
+small scales; a component whose law is the same everywhere is transformed once for all bands, one
+whose parameters are maps a few times (`interpolation.choose_terms`).
+"""
+
+import math
 from collections.abc import Mapping
+from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
+import healpy
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from jaxsky.bandpass import Bandpass
+from jaxsky.bandpass import Bandpass, Samples, average, stack_bands
+from jaxsky.checks import is_concrete
 from jaxsky.components import Component
-from jaxsky.small_scales import SmallScales
+from jaxsky.harmonics import (
+    analysis,
+    expand,
+    gaussian_beam,
+    low_multipoles,
+    resample,
+    synthesis,
+)
+from jaxsky.interpolation import Terms, choose_terms, term, term_weights
+from jaxsky.keys import stream
+from jaxsky.small_scales import SmallScales, continue_templates
 
 #: Types of numbers by the name of their precision.
 DTYPES: dict[str, type[np.floating]] = {"double": np.float64, "single": np.float32}
+#: Error of the varying laws, relative to the maps of a band.
+TOLERANCE = 1e-7
+#: Most Jacobi steps of an analysis; below nside 128, where the quadrature is worse, one more.
+STEPS = 2
 
 
 class Source(eqx.Module):
@@ -110,3 +136,234 @@ class Observation(eqx.Module):
     def bands(self) -> tuple[Bandpass, ...]:
         """The bandpasses in order."""
         return tuple(self.channels[name].band for name in self.names)
+
+
+class Prepared(NamedTuple):
+    """A component in harmonic space.
+
+    Parameters
+    ----------
+    alms : coefficients of the template times each term of its law, with the beam that it has
+    weights : of the terms in each band; None where bands are averaged one by one
+    component : where they are, the law, with parameters at the resolution of the observation
+    template : where they are, the template
+    fwhm : beam [arcmin]
+    repaired : multipoles whose matrix of correlated small scales was repaired
+    """
+
+    alms: tuple[Float[Array, "stokes alm"], ...]
+    weights: tuple[Float[Array, " term"], ...] | None
+    component: Component | None
+    template: Float[Array, "stokes pix"] | None
+    fwhm: Float[Array, ""] | float
+    repaired: Int[Array, ""] | int = 0
+
+
+def _continued(
+    key: Array, sources: Mapping[str, Source], observation: Observation
+) -> dict[str, tuple[Float[Array, "2 alm"], Int[Array, ""] | int, Array | float]]:
+    """Coefficients of the sources that have small scales, how many repaired, and their beam: 0."""
+    leaders = {
+        name: source.correlated_with or name
+        for name, source in sources.items()
+        if source.small_scales is not None
+    }
+    result: dict[str, tuple[Array, Array | int, Array | float]] = {}
+    for leader in sorted(set(leaders.values())):
+        group = [leader, *sorted(n for n, first in leaders.items() if first == leader != n)]
+        members = [sources[name] for name in group]
+        try:
+            continued = continue_templates(
+                stream(key, "small scales", leader),
+                [source.component.template.astype(float) for source in members],
+                [source.fwhm for source in members],
+                [source.small_scales for source in members if source.small_scales is not None],
+                observation.nside,
+                observation.lmax,
+            )
+        except ValueError as error:
+            raise ValueError(f"Small scales of {', '.join(group)}: {error}") from None
+        for name, alm in zip(group, continued.alms, strict=True):
+            result[name] = alm, continued.repaired, 0.0
+    return result
+
+
+def _at(component: Component, nside: int) -> Component:
+    """A component whose parameters that are maps have the resolution of the observation."""
+
+    def bring(leaf):
+        if leaf.ndim != 1 or leaf.shape[-1] == healpy.nside2npix(nside):
+            return leaf
+        lmax = 2 * min(nside, healpy.npix2nside(leaf.shape[-1]))
+        return resample(leaf[None], jnp.ones(lmax + 1, leaf.dtype), nside)[0]
+
+    return jax.tree.map(bring, component)
+
+
+def _law(component: Component) -> Component:
+    """A component without the pixels of its template."""
+    return jax.tree.map(
+        lambda leaf: np.zeros((len(leaf), 0), leaf.dtype) if leaf.ndim == 2 else leaf, component
+    )
+
+
+def plan(
+    sources: Mapping[str, Source], observation: Observation, tolerance: float = TOLERANCE
+) -> dict[str, Terms | None]:
+    """Terms of each source for `prepare`, chosen from values that are not being traced.
+
+    Parameters
+    ----------
+    sources, observation : what is observed, and how
+    tolerance : error of varying laws relative to the maps of a band
+    """
+    # Terms are for the ranges of the maps as they are used.
+    components = {n: _at(source.component, observation.nside) for n, source in sources.items()}
+    if any(_varies(component) for component in components.values()):
+        importance = _importance(components, stack_bands(observation.bands))
+    else:
+        importance = dict.fromkeys(components)
+    return {
+        name: choose_terms(component, observation.bands, importance[name], tolerance)
+        for name, component in components.items()
+    }
+
+
+def _varies(component: Component) -> bool:
+    """True if a parameter is a map."""
+    return any(leaf.ndim == 1 for leaf in jax.tree.leaves(component))
+
+
+@jax.jit
+def _importance(
+    components: dict[str, Component], samples: Samples
+) -> dict[str, Float[Array, " band"]]:
+    """The rms of each template relative to all that is seen in each band.
+
+    By its law in each band at the mean of its parameters.
+    """
+    rms, levels = {}, {}
+    for name, component in components.items():
+        middle = jax.tree.map(lambda x: x.mean() if x.ndim == 1 else x, component)
+        rms[name] = jnp.sqrt(jnp.mean(component.template**2))
+        levels[name] = rms[name] * jax.vmap(partial(average, middle.sed))(samples)
+    total = jnp.sqrt(sum(level**2 for level in levels.values()))
+    return {name: value / total for name, value in rms.items()}
+
+
+def _iterations(size: float, nside: int, beam: Array | float) -> int:
+    """Jacobi steps for a term that adds so much to the maps, for an error below `TOLERANCE`.
+
+    Without steps a spectrum like that of the Galaxy is wrong by some 3e-5 of the map at nside
+    256 and a beam of 2 pixels, in proportion to the pixel, and to what the beam leaves of the
+    multipoles where the quadrature is bad. Each step gains at least a factor of 20.
+    """
+    pixels = float(beam) / healpy.nside2resol(nside, arcmin=True) if is_concrete(beam) else 0.0
+    error = 3e-5 * (256 / nside) * (2 / max(pixels, 1.0)) ** 2 * size
+    needed = math.ceil(math.log(max(error / TOLERANCE, 1.0)) / math.log(20))
+    return min(needed, STEPS + (nside < 128))
+
+
+def prepare(
+    key: Array,
+    sources: Mapping[str, Source],
+    observation: Observation,
+    terms: Mapping[str, Terms | None] | None = None,
+    *,
+    release: bool = False,
+) -> dict[str, Prepared]:
+    """Sources with their small scales, in harmonic space.
+
+    Parameters
+    ----------
+    key : of jax.random, for the small scales
+    sources : by name
+    observation : how they are observed
+    terms : from `plan`, by default made here; None for a source averages its bands one by one,
+        as is necessary where its parameters that are maps are being traced
+    release : take each source out of `sources`, a dict, when it has served, to free its memory
+    """
+    _check_sources(sources, observation)
+    terms = plan(sources, observation) if terms is None else terms
+    lmax, nside, dtype = observation.lmax, observation.nside, observation.dtype
+    continued = _continued(key, sources, observation)
+    result = {}
+    for name in list(sources):
+        chosen, component = terms[name], _law(_at(sources[name].component, nside))
+        if name in continued:
+            alm, repaired, fwhm = continued[name]
+        else:
+            repaired, fwhm = 0, sources[name].fwhm
+            alm = _low_multipoles(sources[name].component.template.astype(dtype), observation)
+        alm = alm.astype(dtype)
+        if release:
+            assert isinstance(sources, dict)
+            del sources[name]
+        if chosen is not None and not chosen.counts:
+            weights = term_weights(component, observation.bands, chosen)
+            result[name] = Prepared((alm,), weights, None, None, fwhm, repaired)
+            continue
+        if name in continued:
+            fwhm = observation.finest
+            alm = alm * expand(gaussian_beam(fwhm, lmax).astype(dtype))
+        template = synthesis(alm, nside)
+        if chosen is None:
+            result[name] = Prepared((), None, component, template, fwhm, repaired)
+            continue
+        alms = []
+        for i, size in enumerate(chosen.sizes):
+            steps = _iterations(size, nside, observation.finest)
+            alms.append(_term_alm(template, component, chosen.coefs(i), lmax, steps))
+            if is_concrete(alms[-1]):
+                # JAX would make the maps of all terms ahead of their analysis.
+                alms[-1].block_until_ready()
+        weights = term_weights(component, observation.bands, chosen)
+        result[name] = Prepared(tuple(alms), weights, None, None, fwhm, repaired)
+    return result
+
+
+def _low_multipoles(
+    template: Float[Array, "stokes pix"], observation: Observation
+) -> Float[Array, "stokes alm"]:
+    """Coefficients of a template, with the steps that its pixels need at the beam observed."""
+    steps = _iterations(1.0, healpy.npix2nside(template.shape[-1]), observation.finest)
+    return low_multipoles(template, observation.lmax, steps)
+
+
+@partial(jax.jit, static_argnames=("lmax", "steps"))
+def _term_alm(
+    template: Float[Array, "stokes pix"],
+    component: Component,
+    coefs: Float[Array, "..."],
+    lmax: int,
+    steps: int,
+) -> Float[Array, "stokes alm"]:
+    """Coefficients of a template times a term of the law; in one program the product is no map."""
+    return analysis(template * term(component, coefs).astype(template.dtype), lmax, steps)
+
+
+def _check_sources(sources: Mapping[str, Source], observation: Observation) -> None:
+    for name, source in sources.items():
+        rows, wanted = len(source.component.template), observation.stokes
+        if rows != len(wanted):
+            raise ValueError(
+                f"Component {name!r} has {rows} Stokes parameters, but {wanted} are observed."
+            )
+        if source.small_scales is not None and rows != 2:
+            raise ValueError(
+                f"Component {name!r} has small scales, which are added to Q and U only; observe "
+                "stokes 'QU'."
+            )
+        leader = source.correlated_with
+        if leader is not None and (
+            leader not in sources
+            or leader == name
+            or sources[leader].small_scales is None
+            or sources[leader].correlated_with is not None
+            or source.small_scales is None
+        ):
+            raise ValueError(
+                f"The small scales of {name!r} are to be correlated with those of {leader!r}: "
+                "both need to be components with small scales, and the second one must not be "
+                "correlated with yet another."
+            )

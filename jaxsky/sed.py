@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsky.checks import Numeric
 from jaxsky.constants import H_OVER_K, T_CMB
-from jaxsky.types import Numeric
 
 
 def _log_planck_excess(x: Numeric) -> Numeric:

@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from jaxsky import correlated
 from jaxsky.checks import as_array, check_finite, check_positive, is_concrete
+from jaxsky.cmb import gaussian_fields, repair
 from jaxsky.harmonics import (
     analysis,
     expand,
@@ -32,8 +32,7 @@ from jaxsky.harmonics import (
     resize,
     synthesis,
 )
-from jaxsky.harmonics.beams import NEGLIGIBLE
-from jaxsky.power_law import PowerLaw, fit_power_law
+from jaxsky.harmonics.windows import NEGLIGIBLE
 
 
 def _numbers(name: str, value: ArrayLike, count: int = 1) -> Array:
@@ -98,6 +97,43 @@ class SmallScales(eqx.Module):
 #: The paper's ranges for its templates.
 SYNCHROTRON = SmallScales(EE=(10, 120), BB=(4, 40))
 DUST = SmallScales(EE=(60, 600), BB=(60, 600))
+
+
+class PowerLaw(NamedTuple):
+    """C_l = exp(log_amplitude) (l / pivot)^slope, with the covariance of the two numbers."""
+
+    log_amplitude: Float[Array, ""]
+    slope: Float[Array, ""]
+    covariance: Float[Array, "2 2"]
+    pivot: int
+
+    def __call__(self, lmax: int) -> Float[Array, " ell"]:
+        """C_l of l = 0 ... lmax, zero below l = 2."""
+        ell = jnp.arange(lmax + 1)
+        log = jnp.log(jnp.maximum(ell, 1) / self.pivot)
+        return jnp.where(ell < 2, 0.0, jnp.exp(self.log_amplitude + self.slope * log))
+
+
+def fit_power_law(spectrum: Float[Array, " ell"], lmin: int, lmax: int) -> PowerLaw:
+    """Straight line through log C_l against log l by least squares, every l counting alike.
+
+    The paper's fit; its errors come from the scatter about the line.
+
+    Parameters
+    ----------
+    spectrum : C_l, l = 0 ...
+    lmin, lmax : range of the fit, both included; lmax is the pivot of the result
+    """
+    if not 2 <= lmin <= lmax - 3 or lmax >= len(spectrum):
+        raise ValueError(
+            f"A power law cannot be fitted from l = {lmin} to {lmax} to a spectrum that ends at "
+            f"{len(spectrum) - 1}; it needs four multipoles from l = 2 on."
+        )
+    part = spectrum[lmin : lmax + 1]
+    check_positive("spectrum", part)
+    log = jnp.log(jnp.arange(lmin, lmax + 1) / lmax)
+    (slope, log_amplitude), covariance = jnp.polyfit(log, jnp.log(part), 1, cov=True)
+    return PowerLaw(log_amplitude, slope, covariance[::-1, ::-1], lmax)
 
 
 class Extrapolation(NamedTuple):
@@ -311,8 +347,8 @@ def continue_templates(
     ]
     # One for all: two that differ would make the maps less correlated than the fields.
     gain = sum(gains) / len(gains)
-    matrix, repaired = correlated.repair(matrix / jnp.mean(gain**2))
-    drawn = correlated.realisation(key, matrix)
+    matrix, repaired = repair(matrix / jnp.mean(gain**2))
+    drawn = gaussian_fields(key, matrix)
     result = []
     for i, (template, how) in enumerate(zip(stay, small, strict=True)):
         added = analysis(gain * synthesis(drawn[2 * i : 2 * i + 2], nside), lmax)

@@ -18,10 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxsky.checks import as_array, check_finite, check_positive, is_concrete
+from jaxsky.checks import Numeric, as_array, check_finite, check_positive, is_concrete
 from jaxsky.harmonics import analysis, beam_ratio, expand, needed_lmax, resize, synthesis
 from jaxsky.harmonics.resolution import MARGIN
-from jaxsky.types import Numeric
 
 #: First and last frequency of an interval [GHz].
 Interval: TypeAlias = tuple[ArrayLike, ArrayLike] | Float[Array, "2"]

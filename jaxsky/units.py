@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsky.checks import Numeric
 from jaxsky.constants import MJYSR_PER_K_RJ_AT_1GHZ
 from jaxsky.sed import cmb_derivative
-from jaxsky.types import Numeric
 
 _PREFIXES = {"": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9}
 #: name -> (size in the unit of its kind, kind)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsky.correlated import realisation, repair
+from jaxsky.cmb import gaussian_fields, repair
 from jaxsky.harmonics import alm_ell, power_spectrum
 
 LMAX = 40
@@ -46,7 +46,7 @@ def mixed(level, coefficient):
 
 def test_spectra_are_recovered(spectra):
     count = 100
-    fields = jax.vmap(lambda key: realisation(key, spectra))(jax.random.split(KEY, count))
+    fields = jax.vmap(lambda key: gaussian_fields(key, spectra))(jax.random.split(KEY, count))
     assert fields.shape == (count, 4, (LMAX + 1) ** 2)
     ell = np.arange(2, LMAX + 1)
     scores = []
@@ -68,7 +68,7 @@ def test_a_single_field_is_white_noise_times_the_root_of_its_spectrum():
     spectrum = jnp.arange(5.0)
     white = jax.random.normal(KEY, (1, 25))
     expected = white * np.sqrt(spectrum)[alm_ell(4)]
-    np.testing.assert_allclose(realisation(KEY, spectrum[None, None]), expected, rtol=1e-14)
+    np.testing.assert_allclose(gaussian_fields(KEY, spectrum[None, None]), expected, rtol=1e-14)
 
 
 def test_what_is_fine_is_left_as_it_is(spectra):
@@ -84,7 +84,7 @@ def test_two_fields_that_are_too_correlated_become_proportional():
     assert int(count) == 1
     # Eigenvalues are kept above 1e-10, so the coefficient is 1 within that.
     np.testing.assert_allclose(mended[..., 0], [[4, -6], [-6, 9]], rtol=1e-9)
-    E, B = realisation(KEY, mended)
+    E, B = gaussian_fields(KEY, mended)
     np.testing.assert_allclose(B, -1.5 * E, atol=1e-4 * float(jnp.abs(E).max()))
 
 
@@ -116,7 +116,7 @@ def test_without_power_there_are_no_correlations():
     assert int(count) == 2  # those of before; nothing had to be mended here
     assert np.all(mended[..., 0] == 0)
     assert np.all(mended[2, :, 1] == 0)
-    fields = realisation(KEY, mended)
+    fields = gaussian_fields(KEY, mended)
     assert bool(jnp.isfinite(fields).all())
     assert np.all(fields[:, alm_ell(5) == 0] == 0)
     assert np.all(fields[2, alm_ell(5) == 1] == 0)
@@ -129,7 +129,7 @@ def test_derivatives(argument):
 
     def fields(value):
         values = [*at[:argument], value, *at[argument + 1 :]]
-        return realisation(KEY, repair(mixed(*values))[0])
+        return gaussian_fields(KEY, repair(mixed(*values))[0])
 
     tangent = jax.jvp(fields, (at[argument],), (jnp.ones(()),))[1]
     h = 1e-4
@@ -145,7 +145,7 @@ def test_derivatives(argument):
 
 def test_derivatives_in_every_spectrum_are_finite():
     given = mixed(1.0, 0.9)
-    slopes = jax.grad(lambda s: jnp.sum(realisation(KEY, repair(s)[0]) ** 2))(given)
+    slopes = jax.grad(lambda s: jnp.sum(gaussian_fields(KEY, repair(s)[0]) ** 2))(given)
     assert bool(jnp.isfinite(slopes).all())
     assert np.all(slopes[..., 0] == 0)
     assert float(slopes[0, 0, 2]) > 0

@@ -22,7 +22,7 @@ from jaxsky.io import read_maps, write_maps
 from jaxsky.io.folders import occupied
 from jaxsky.keys import realisation_key
 from jaxsky.settings import load
-from jaxsky.simulate import simulate
+from jaxsky.simulation import simulate
 
 TEMPLATE = DEFAULTS / "experiment.toml"
 NSIDE = 8

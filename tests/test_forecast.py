@@ -15,7 +15,7 @@ from jaxsky import AME, Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.instrument import Channel, Instrument, load_instrument
 from jaxsky.noise import uniform_covariance
 from jaxsky.observation import ObservedBand
-from jaxsky.parameters import set_parameters
+from jaxsky.sky import set_parameters
 from systems import spread
 
 LMIN, LMAX, FRACTION = 2, 40, 0.6

@@ -17,10 +17,9 @@ from fits.paper.item import NUMBERS
 from fits.paper.run import labels_of
 from jaxsky.harmonics import gaussian_beam, power_spectrum
 from jaxsky.io import read_maps
-from jaxsky.observation import Source
-from jaxsky.power_law import fit_power_law
-from jaxsky.preparation import prepare
+from jaxsky.observation import Source, prepare
 from jaxsky.settings import Experiment, load
+from jaxsky.small_scales import fit_power_law
 
 LABELS = [*(f"Figure {n}" for n in (1, 2, 3, 4, 13)), "Table 1", "Figure 14"]
 REAL = """

@@ -12,7 +12,7 @@ import pytest
 from fits.discs import Patch, bicep2_mask, disc_centers, disc_mask
 from fits.patches import EDGES, fit_patches, prepare_patches
 from fits.patches.bands import Bands, decorrelate, minimise
-from jaxsky.correlated import realisation
+from jaxsky.cmb import gaussian_fields
 from jaxsky.harmonics import gaussian_beam, synthesis
 
 NSIDE, LMAX = 64, 128
@@ -40,7 +40,7 @@ def patches():
 def sky(key, EE, BB):
     zero = jnp.zeros_like(EE)
     spectra = jnp.stack([jnp.stack([EE, zero]), jnp.stack([zero, BB])])
-    return synthesis(realisation(key, spectra), NSIDE)
+    return synthesis(gaussian_fields(key, spectra), NSIDE)
 
 
 def simulated(noise, count, cross=False, signal=1.0):

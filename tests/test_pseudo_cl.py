@@ -21,7 +21,7 @@ from fits.pseudo_cl import (
     masked_spectra,
     pure_coupling_matrices,
 )
-from jaxsky.correlated import realisation
+from jaxsky.cmb import gaussian_fields
 from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis
 
 NSIDE, LMAX = 64, 128
@@ -42,7 +42,7 @@ def sky(key, EE, BB, nside=NSIDE):
     """Maps Q, U of a Gaussian sky."""
     zero = jnp.zeros_like(EE)
     spectra = jnp.stack([jnp.stack([EE, zero]), jnp.stack([zero, BB])])
-    return synthesis(realisation(key, spectra), nside)
+    return synthesis(gaussian_fields(key, spectra), nside)
 
 
 def test_coupling_matrices_are_sums_of_wigner_symbols():
@@ -78,7 +78,7 @@ def test_purified_multipoles_do_not_mix():
 
 
 def test_the_full_sky_has_its_own_spectra():
-    alm = realisation(jax.random.key(1), jnp.asarray(np.eye(2)[..., None] * DUST[0]))
+    alm = gaussian_fields(jax.random.key(1), jnp.asarray(np.eye(2)[..., None] * DUST[0]))
     whole = np.ones(12 * NSIDE**2)
     spectra = masked_spectra(whole, EDGES, lmax=LMAX)
     D = ELL * (ELL + 1) / (2 * np.pi) * np.asarray(power_spectrum(alm))

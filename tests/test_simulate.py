@@ -22,9 +22,8 @@ from jaxsky.harmonics import (
     synthesis,
 )
 from jaxsky.keys import stream
-from jaxsky.observation import Observation, ObservedBand, Source
-from jaxsky.preparation import plan, prepare
-from jaxsky.simulate import observe_bands, simulate
+from jaxsky.observation import Observation, ObservedBand, Source, plan, prepare
+from jaxsky.simulation import observe_bands, simulate
 from jaxsky.small_scales import SmallScales
 
 NSIDE = 8

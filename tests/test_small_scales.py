@@ -18,13 +18,13 @@ from jaxsky.harmonics import (
     synthesis,
 )
 from jaxsky.io import read_maps
-from jaxsky.power_law import fit_power_law
 from jaxsky.small_scales import (
     SYNCHROTRON,
     SmallScales,
     add_small_scales,
     continue_templates,
     extrapolate,
+    fit_power_law,
     modulation,
 )
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from fits.comparison.simulations import Simulated, full_sky_spectra
 from fits.pseudo_cl import bin_edges
 from fits.resolution import Prepared
-from jaxsky.types import Numeric
+from jaxsky.checks import Numeric
 
 #: Polarization has no multipoles below.
 LMIN = 2

@@ -32,7 +32,7 @@ from fits.forecast.b_modes import PIVOT, BandLaw
 from jaxsky import Bandpass, Sky, get_parameters, parameter_names, set_parameters
 from jaxsky.bandpass import Samples, average, stack_bands
 from jaxsky.checks import check_double
-from jaxsky.parameters import unknown_parameter
+from jaxsky.sky import unknown_parameter
 
 #: Combinations of parameters that change the data by less than this, relative to each parameter
 #: by itself, are not told apart.

@@ -21,9 +21,9 @@ from fits.pseudo_cl import (
 from jaxsky.checks import check_double
 from jaxsky.cmb import camb_spectra, tensor_spectra
 from jaxsky.harmonics import beam_ratio, gaussian_beam
-from jaxsky.parameters import unknown_parameter
 from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
+from jaxsky.sky import unknown_parameter
 
 FIELDS = ("EE", "BB")
 

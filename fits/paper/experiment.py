@@ -12,10 +12,9 @@ from fits.paper.sources import PAPER_FWHM, Sources
 from jaxsky.experiment import cmb_spectra
 from jaxsky.instrument import load_instrument
 from jaxsky.interpolation import term_weights
-from jaxsky.observation import Observation, ObservedBand, Source
-from jaxsky.preparation import Prepared, plan, prepare
+from jaxsky.observation import Observation, ObservedBand, Prepared, Source, plan, prepare
 from jaxsky.settings import Experiment
-from jaxsky.simulate import observe_bands
+from jaxsky.simulation import observe_bands
 
 BANDS = ("45", "105", "315")
 #: The paper's resolution of the CMB [arcmin], and what dominates each band there.

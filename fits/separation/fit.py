@@ -28,7 +28,7 @@ from fits.profile_likelihood import SpectralLikelihood
 from fits.results import astray, help_by_prior, misfit
 from fits.separation.results import SpectralFit
 from fits.systems import Factor, assembled, degenerate, variances
-from jaxsky.types import Numeric
+from jaxsky.checks import Numeric
 
 #: The optimum is reached this close to it, in standard deviations of a parameter.
 REACHED = 1e-3

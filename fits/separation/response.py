@@ -11,7 +11,7 @@ from fits.priors import Gaussian, Prior
 from fits.profile_likelihood import SpectralLikelihood
 from fits.results import FitResult
 from fits.systems import Factor
-from jaxsky.types import Numeric
+from jaxsky.checks import Numeric
 
 
 class Response:

@@ -25,8 +25,7 @@ from fits.sampling import ensemble, ensemble_summary, summary
 from fits.separation.agreement import agreement
 from fits.separation.fit import fit_spectra, start_vector
 from fits.unbounded import scaled_posterior
-from jaxsky.checks import check_seed
-from jaxsky.types import Numeric
+from jaxsky.checks import Numeric, check_seed
 
 #: What each sampler takes, with the values if they are not given.
 OPTIONS: dict[str, dict[str, Any]] = {

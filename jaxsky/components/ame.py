@@ -6,9 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky import sed
-from jaxsky.checks import as_array, is_concrete
+from jaxsky.checks import Parameter, as_array, is_concrete
 from jaxsky.components.base import Component, parameter, reference, template
-from jaxsky.types import Parameter
 
 
 class AME(Component, law="ame"):

@@ -5,9 +5,9 @@ from typing import ClassVar
 from jaxtyping import Array, Float
 
 from jaxsky import sed
+from jaxsky.checks import Parameter
 from jaxsky.components.base import Component, parameter, template
 from jaxsky.constants import T_CMB
-from jaxsky.types import Parameter
 
 
 class CMB(Component, law="cmb"):

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsky.checks import Numeric, Parameter
 from jaxsky.components.base import Component, parameter, reference, template
-from jaxsky.types import Numeric, Parameter
 
 
 def _emissivity(nu: Numeric, T_e: Numeric) -> Float[Array, "..."]:

@@ -3,8 +3,8 @@
 from jaxtyping import Array, Float
 
 from jaxsky import sed
+from jaxsky.checks import Parameter
 from jaxsky.components.base import Component, parameter, reference, template
-from jaxsky.types import Parameter
 
 
 class Synchrotron(Component, law="synchrotron"):

@@ -7,7 +7,6 @@ one spin-2 field with coefficients E and B. Smoothing Q and U as two scalars wou
 several percent.
 """
 
-from jaxsky.harmonics.beams import beam_ratio, gaussian_beam, needed_lmax, pixel_window
 from jaxsky.harmonics.packing import (
     alm_ell,
     alm_from_healpy,
@@ -25,3 +24,4 @@ from jaxsky.harmonics.resolution import (
     smooth,
 )
 from jaxsky.harmonics.transforms import ENGINES, adjoint_synthesis, analysis, rotate, synthesis
+from jaxsky.harmonics.windows import beam_ratio, gaussian_beam, needed_lmax, pixel_window

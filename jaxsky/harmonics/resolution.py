@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.checks import check_finite, is_concrete
-from jaxsky.harmonics.beams import beam_ratio, needed_lmax
 from jaxsky.harmonics.packing import expand, resize
 from jaxsky.harmonics.transforms import analysis, synthesis
+from jaxsky.harmonics.windows import beam_ratio, needed_lmax
 
 #: Multipoles analysed by `low_multipoles`, in units of those kept, as far as the map resolves them.
 MARGIN = 3

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.bare import takes_quantities
+from jaxsky.checks import Numeric
 from jaxsky.io.columns import (
     ZEROS,
     Columns,
@@ -28,7 +29,6 @@ from jaxsky.io.files import whole
 from jaxsky.io.quantities import unit_factor, unit_name
 from jaxsky.io.rotation import blocks, to_galactic
 from jaxsky.io.tables import InputError, equals
-from jaxsky.types import Numeric
 from jaxsky.units import UNITS
 
 

@@ -8,7 +8,7 @@ from astropy import units as u
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.bare import takes_quantities
-from jaxsky.types import Numeric
+from jaxsky.checks import Numeric
 from jaxsky.units import UNITS, conversion, parse_unit
 
 _DIMENSIONLESS = {"", "1", "none", "n/a", "na", "unitless", "dimensionless", "index", "ratio"}

@@ -11,7 +11,7 @@ from fits.multipoles import check_alm, compressed, multipoles_of
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.template_likelihood import named_bands
 from jaxsky import Bandpass, Component, Sky, get_parameters
-from jaxsky.types import Numeric
+from jaxsky.checks import Numeric
 
 
 def _refuse_maps(sky: Sky, start: Mapping[str, Numeric]) -> None:

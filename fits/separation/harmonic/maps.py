@@ -15,9 +15,8 @@ from fits import amplitudes
 from fits.compress import Layout
 from fits.multipoles import check_alm, compressed, multipoles_of, positions
 from fits.profile_likelihood import SpectralLikelihood
-from jaxsky.checks import as_array, check_finite
+from jaxsky.checks import Numeric, as_array, check_finite
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
-from jaxsky.types import Numeric
 
 
 class HarmonicMaps(NamedTuple):

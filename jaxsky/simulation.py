@@ -19,8 +19,7 @@ from jaxsky.harmonics import analysis, beam_ratio, expand, resample, synthesis
 from jaxsky.interpolation import Terms, band_sed
 from jaxsky.keys import stream
 from jaxsky.noise import draw, uniform_alm, uniform_map
-from jaxsky.observation import Observation, ObservedBand, Source
-from jaxsky.preparation import Prepared, prepare
+from jaxsky.observation import Observation, ObservedBand, Prepared, Source, prepare
 
 
 class _Part(NamedTuple):

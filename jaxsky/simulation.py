@@ -1,6 +1,6 @@
 """Observing the sky with an experiment: the paper's procedure as a function of its parameters.
 
-Every component, prepared once (`jaxsky.preparation`), is scaled to a band, all are brought to the
+Every component, prepared once (`jaxsky.observation`), is scaled to a band, all are brought to the
 band's beam and added up in harmonic space, and noise is added; bands are made one by one. With
 fixed keys the maps are differentiable in all numbers: spectral parameters, slopes and amplitudes
 of small scales, beams, band centres.

@@ -1,22 +1,54 @@
-"""The command line: `jaxsky simulate`, `fit`, `compare`, `separate`, `forecast` and others."""
+"""The command line: `jaxsky simulate`, `fit`, `compare`, `separate`, `forecast` and others.
+
+A command is declared here; its module in `fits.commands` is imported when it runs.
+"""
 
 import contextlib
 import ctypes
 import sys
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import jaxsky
-from fits.commands import compare, data, fit, forecast, init, paper, separate, simulate
-from fits.commands.console import replace_unprintable
-from fits.commands.errors import print_error
-from fits.commands.interrupt import prompt
-from jaxsky.io.folders import cache_folder
+from fits.commands.console import print_written, replace_unprintable
+from fits.commands.data import data_commands
+from fits.commands.endings import print_error, prompt
+from fits.commands.run import DEFAULTS, Options, run
+from jaxsky.io.folders import ALL, cache_folder
 from jaxsky.programs import keep_programs
 
 #: Parameters of glibc's mallopt: M_ARENA_MAX, M_MMAP_THRESHOLD.
 MALLOC = {-8: 1, -3: 8 * 2**20}
+#: The experiment file that has all keys, with comments.
+TEMPLATE = "experiment"
+#: What `jaxsky simulate` may be restricted to.
+ONLY = ("noise", "signal", "foregrounds", "cmb")
+#: Commands that fit observed maps, or those that are simulated for them.
+ANALYSES = {
+    "fit": "Fit spectral indices to polarization maps: on a grid, by gradient and by MCMC.",
+    "compare": "Compare observed maps with the model of foregrounds, CMB and noise.",
+    "separate": "Separate CMB and foregrounds by their laws, and measure r from cleaned B modes.",
+}
+
+SettingsPath = Annotated[
+    Path | None,
+    typer.Argument(metavar="[EXPERIMENT.toml]", help="Without, one with the embedded sky."),
+]
+Out = Annotated[Path, typer.Option(help="Folder for the results.")]
+Values = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Any key of the file; repeatable."),
+]
+Resume = Annotated[bool, typer.Option("--resume", help="Keep what is in --out, and go on with it.")]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace the results that are in --out.")
+]
+
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 
 
 def _version(value: bool) -> None:
@@ -25,21 +57,126 @@ def _version(value: bool) -> None:
         raise typer.Exit
 
 
-Version = Annotated[
-    bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
-]
-app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
-
-
 @app.callback()
-def options(version: Version = False) -> None:
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
     """A JAX-differentiable model of the polarized microwave sky, with the tools to fit it."""
 
 
-for _command in (init, simulate, fit, compare, separate, forecast, paper):
-    _name = _command.__name__.rpartition(".")[2]
-    app.command(_name)(getattr(_command, _name))
-app.add_typer(data.data, name="data")
+def _experiments(incomplete: str = "") -> list[str]:
+    """The experiments of `jaxsky init` that begin so."""
+    return sorted(p.stem for p in DEFAULTS.glob("*.toml") if p.stem.startswith(incomplete))
+
+
+@app.command("init")
+def _init(
+    name: Annotated[
+        str,
+        typer.Argument(
+            help=f"{TEMPLATE}: all keys, commented; planck-44-70, planck-separate: Planck's maps "
+            "of 2018; or a command, for what it does without a file.",
+            autocompletion=_experiments,
+        ),
+    ] = TEMPLATE,
+    out: Annotated[
+        Path | None, typer.Option(help="File to write.", show_default="NAME.toml")
+    ] = None,
+) -> None:
+    """Write an experiment file to start from."""
+    if name not in _experiments():
+        raise ValueError(f"There is no experiment {name!r}; there are {', '.join(_experiments())}.")
+    path = out or Path(f"{name}.toml")
+    if path.exists():
+        raise ValueError(f"{path}: exists already and is left as it is.")
+    path.write_text((DEFAULTS / f"{name}.toml").read_text())
+    print_written([path])
+
+
+@app.command("simulate")
+def _simulate(
+    settings_file: SettingsPath = None,
+    out: Annotated[Path, typer.Option(help="Folder for the maps.")] = Path("results/simulate"),
+    nsims: Annotated[int, typer.Option(min=1, help="Number of realisations.")] = 1,
+    first: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Number of the first one.")] = 0,
+    only: Annotated[
+        str | None, typer.Option(help=f"Simulate one thing only: {', '.join(ONLY)}.")
+    ] = None,
+    values: Values = None,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Simulate maps of the microwave sky as an experiment observes it."""
+    from fits.commands.simulate import simulation
+
+    if only is not None and only not in ONLY:
+        raise ValueError(f"--only must be one of {', '.join(ONLY)}, not {only!r}.")
+    indices = range(first, first + nsims)
+    options = Options(settings_file, out, values, resume, overwrite)
+    # With --overwrite all realisations are removed, so nobody else may be making any.
+    run(simulation(indices, only), options, ALL if overwrite else indices)
+
+
+def _analysis(name: str) -> Callable[..., None]:
+    """A command with the options of all that work on maps."""
+
+    def command(
+        settings_file: SettingsPath = None,
+        out: Out = Path(f"results/{name}"),
+        maps: Annotated[
+            Path | None,
+            typer.Option(
+                help="Folder of a realisation of `jaxsky simulate`, for bands without a file."
+            ),
+        ] = None,
+        values: Values = None,
+        resume: Resume = False,
+        overwrite: Overwrite = False,
+    ) -> None:
+        options = Options(settings_file, out, values, resume, overwrite, maps)
+        run(import_module(f"fits.commands.{name}").COMMAND, options)
+
+    return command
+
+
+for _name, _help in ANALYSES.items():
+    app.command(_name, help=_help)(_analysis(_name))
+
+
+@app.command("forecast")
+def _forecast(
+    settings_file: SettingsPath = None,
+    out: Out = Path("results/forecast"),
+    values: Values = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Forecast B modes: foregrounds against primordial ones, and errors on r and the laws."""
+    from fits.commands.forecast import COMMAND
+
+    run(COMMAND, Options(settings_file, out, values, overwrite=overwrite))
+
+
+@app.command("paper")
+def _paper(
+    settings_file: SettingsPath = None,
+    out: Out = Path("results/paper"),
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="A figure by its number, or 'table 1'; repeatable. Default all."),
+    ] = None,
+    values: Values = None,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Make the figures and tables of the paper again, and a page that shows them."""
+    from fits.commands.paper import figures
+
+    run(figures(only or ()), Options(settings_file, out, values, resume, overwrite))
+
+
+app.add_typer(data_commands, name="data")
 
 
 def _return_memory() -> None:

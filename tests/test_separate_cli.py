@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from commands import jaxsky, one_sentence, said
-from fits.commands.separate import KIND
+from fits.commands.separate import COMMAND
 from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.harmonics import alm_ell, gaussian_beam, resample, synthesis
 from jaxsky.io import read_maps, write_maps
@@ -97,7 +97,7 @@ def test_maps_of_ones_own(folder, tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr()
     assert "dust.beta_dust, median of 2 regions" in printed.out
     names = {p.name for p in out.iterdir()}
-    assert names == {*KIND.results, "index.html", "log.txt"}
+    assert names == {*COMMAND.results, "index.html", "log.txt"}
     for picture in out.glob("*.png"):
         assert picture.read_bytes().startswith(b"\x89PNG")
     result = json.loads((out / "result.json").read_text())
@@ -140,7 +140,10 @@ def test_multipoles_of_files(folder, tmp_path, monkeypatch):
         assert abs(found["best_fit"] - truth) < 5 * found["sigma"]
     assert not (out / "parameters.png").exists()
     names = {p.name for p in out.iterdir()}
-    assert names == {*KIND.results, "index.html", "log.txt"} - {"parameters.fits", "parameters.png"}
+    assert names == {*COMMAND.results, "index.html", "log.txt"} - {
+        "parameters.fits",
+        "parameters.png",
+    }
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from rich.text import Text
 
 from fits.commands.console import console, print_tables
 
-data = typer.Typer(
+data_commands = typer.Typer(
     help="Official data products: what there is, download, and checks.", no_args_is_help=True
 )
 
@@ -27,7 +27,7 @@ Folder = Annotated[
 ]  # fmt: skip
 
 
-@data.command("list")
+@data_commands.command("list")
 def list_products(products: Words = None, folder: Folder = None) -> None:
     """Name the products and sets of them, and say which are there."""
     from jaxsky.archive import cache_folder, find, product_sets, total_size
@@ -63,7 +63,7 @@ def list_products(products: Words = None, folder: Folder = None) -> None:
     print_tables([table], width=None if console.is_terminal else 200)
 
 
-@data.command()
+@data_commands.command()
 def fetch(
     products: Annotated[
         list[str],
@@ -116,7 +116,7 @@ def fetch(
     console.print(f"In {folder}: {len(wanted)} files.", soft_wrap=True)
 
 
-@data.command()
+@data_commands.command()
 def verify(products: Words = None, folder: Folder = None) -> None:
     """Check files that are there: size, hash, columns, units, and that they are complete."""
     from jaxsky import archive

@@ -1,44 +1,27 @@
-"""`jaxsky paper`."""
+"""`jaxsky paper`, from settings to a page."""
 
-from pathlib import Path
-from typing import Annotated
+from collections.abc import Sequence
 
-import typer
-
-from fits.commands import run
+from fits.commands.run import PAGE, Command, Report, Run
+from fits.paper.run import run as make
 from jaxsky.settings import Experiment
 
 
-def paper(
-    settings_file: run.SettingsPath = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results/paper"),
-    only: Annotated[
-        list[str] | None,
-        typer.Option(help="A figure by its number, or 'table 1'; repeatable. Default all."),
-    ] = None,
-    values: run.Values = None,
-    resume: run.Resume = False,
-    overwrite: run.Overwrite = False,
-) -> None:
-    """Make the figures and tables of the paper again, and a page that shows them."""
+def figures(only: Sequence[str]) -> Command:
+    """The command that makes some figures, or all; each sees to what is kept of it."""
 
-    def work(settings: Experiment, command: run.Run) -> run.Report:
-        from fits.paper.run import run as make
-
-        options = command.options
+    def work(settings: Experiment, command: Run) -> Report:
         items = make(
             settings,
             command.out,
-            only or (),
-            resume=options.resume,
-            overwrite=options.overwrite,
+            only,
+            resume=command.options.resume,
+            overwrite=command.options.overwrite,
             begin=command.begin,
             progress=command.steps,
         )
         missing = [f"{i.label}: {i.differs}" for i in items if not (i.picture or i.table)]
-        count = f"{len(items)} figures and tables ({command.steps.seconds:.1f} s)"
-        page = command.out / run.PAGE
-        return run.Report("", (), missing, [page], f"{count}.", page=False)
+        remark = f"{len(items)} figures and tables ({command.steps.seconds:.1f} s)."
+        return Report("", (), missing, [command.out / PAGE], remark, page=False)
 
-    # What is kept and what is replaced is seen to figure by figure.
-    run.run(run.Kind("paper", ()), work, run.Options(settings_file, out, values, resume, overwrite))
+    return Command("paper", work)

@@ -8,14 +8,12 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
-import typer
 from rich.table import Table
 
 from fits.commands.console import Steps, console, print_tables, print_written, warn
-from fits.commands.errors import logged
-from fits.commands.interrupt import interruptible
+from fits.commands.endings import interruptible, logged
 from fits.commands.page import Section, table_of, write_page
 from jaxsky.io.folders import ALL, Folder, occupied
 from jaxsky.settings import Experiment, load, of_file
@@ -26,38 +24,6 @@ LOG, PAGE = "log.txt", "index.html"
 PART_LOG = "log_{:05d}.txt"
 #: Experiments that commands have without a file.
 DEFAULTS = Path(__file__).parents[1] / "defaults"
-
-SettingsPath = Annotated[
-    Path | None,
-    typer.Argument(metavar="[EXPERIMENT.toml]", help="Without, one with the embedded sky."),
-]
-Values = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Any key of the file; repeatable."),
-]
-Maps = Annotated[
-    Path | None,
-    typer.Option(help="Folder of a realisation of `jaxsky simulate`, for bands without a file."),
-]
-Resume = Annotated[bool, typer.Option("--resume", help="Keep what is in --out, and go on with it.")]
-Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="Replace the results that are in --out.")
-]
-
-
-class Kind(NamedTuple):
-    """What a command is.
-
-    Parameters
-    ----------
-    name : of the command, and of the settings that it takes without a file
-    results : patterns of what is in the folder of the results
-    resumable : whether a stopped command can be gone on with
-    """
-
-    name: str
-    results: tuple[str, ...]
-    resumable: bool = True
 
 
 class Options(NamedTuple):
@@ -95,7 +61,7 @@ class Run(NamedTuple):
     """A command at work: what it may write, and to whom it says what it does."""
 
     options: Options
-    kind: Kind
+    results: Sequence[str]
     folder: Folder
     steps: Steps
     part: range = ALL
@@ -108,7 +74,7 @@ class Run(NamedTuple):
     def begin(self) -> None:
         """Nothing is wrong with the input: what is to be replaced goes, and the log begins."""
         if self.options.overwrite:
-            self.folder.remove(self.kind.results)
+            self.folder.remove(self.results)
         self.steps.keep(self.log)
 
     @property
@@ -118,22 +84,29 @@ class Run(NamedTuple):
         return self.out / (LOG if whole else PART_LOG.format(self.part.start))
 
 
-def run(
-    kind: Kind,
-    work: Callable[[Experiment, Run], Report],
-    options: Options,
-    part: range = ALL,
-) -> None:
-    """Run a command.
+class Command(NamedTuple):
+    """What a command is.
 
     Parameters
     ----------
-    kind : what it works with
+    name : of the command, and of the settings that it takes without a file
     work : from settings to what was found; calls `Run.begin` before it writes
-    options : of the command line
-    part : of the results that is made, see `jaxsky.io.folders.occupied`
+    results : patterns of what is in the folder of the results
+    resumable : whether a stopped command can be gone on with
     """
-    path, out = options.settings_file or DEFAULTS / f"{kind.name}.toml", options.out
+
+    name: str
+    work: Callable[[Experiment, Run], Report]
+    results: tuple[str, ...] = ()
+    resumable: bool = True
+
+
+def run(command: Command, options: Options, part: range = ALL) -> None:
+    """Run a command with what the command line says.
+
+    `part` of the results is made, see `jaxsky.io.folders.occupied`.
+    """
+    path, out = options.settings_file or DEFAULTS / f"{command.name}.toml", options.out
     values = list(options.values or ())
     if options.maps is not None:
         values.append(f"common.maps={json.dumps(str(options.maps.resolve()))}")
@@ -142,8 +115,8 @@ def run(
         of_file(path),
         results_folder(
             out,
-            kind.results,
-            resume=options.resume if kind.resumable else None,
+            command.results,
+            resume=options.resume if command.resumable else None,
             overwrite=options.overwrite,
             part=part,
         ) as folder,
@@ -152,8 +125,8 @@ def run(
         import matplotlib as mpl
 
         mpl.use("Agg")  # pictures go to files
-        command = Run(options, kind, folder, steps, part)
-        report = work(settings, command)
+        running = Run(options, command.results, folder, steps, part)
+        report = command.work(settings, running)
         report = report._replace(warnings=[*report.warnings, *_other_sky(settings)])
         if report.page:
             _show(out, settings.title, report, steps.seconds)
@@ -163,7 +136,7 @@ def run(
     for sentence in report.warnings:
         warn(sentence)
     pages = [out / PAGE] if report.page else []
-    print_written([*pages, *report.written, command.log])
+    print_written([*pages, *report.written, running.log])
     if report.remark:
         console.print(report.remark, soft_wrap=True)
 

@@ -1,68 +1,53 @@
 """`jaxsky simulate`."""
 
 import statistics
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
 
+import healpy
+import jax.numpy as jnp
 import numpy as np
-import typer
 
-from fits.commands import run
-from jaxsky.io.folders import ALL
+from fits.commands.run import Command, Report, Run
+from fits.plots import UNITS, color_limit, draw_map, draw_panels, draw_spectra, plain, spread
+from jaxsky import experiment, montecarlo
+from jaxsky.harmonics import analysis, power_spectrum
+from jaxsky.io import read_maps
 from jaxsky.settings import Experiment
 
-#: What is simulated with --only: from the names of the foregrounds.
-ONLY: dict[str, Callable[[list[str]], list[str]]] = {
-    "noise": lambda foregrounds: ["noise"],
-    "signal": lambda foregrounds: [*foregrounds, "cmb"],
-    "foregrounds": lambda foregrounds: foregrounds,
-    "cmb": lambda foregrounds: ["cmb"],
-}
 #: Bands shown on a sheet, and multipoles in its spectra.
 SHOWN, LMAX_SHOWN = 5, 1024
 #: Spectra are shown down to this fraction of the largest.
 DEPTH = 1e-7
 
 
-def simulate(
-    settings_file: run.SettingsPath = None,
-    out: Annotated[Path, typer.Option(help="Folder for the maps.")] = Path("results/simulate"),
-    nsims: Annotated[int, typer.Option(min=1, help="Number of realisations.")] = 1,
-    first: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Number of the first one.")] = 0,
-    only: Annotated[
-        str | None, typer.Option(help=f"Simulate one thing only: {', '.join(ONLY)}.")
-    ] = None,
-    values: run.Values = None,
-    resume: run.Resume = False,
-    overwrite: run.Overwrite = False,
-) -> None:
-    """Simulate maps of the microwave sky as an experiment observes it."""
-    if only is not None and only not in ONLY:
-        raise ValueError(f"--only must be one of {', '.join(ONLY)}, not {only!r}.")
-    indices = range(first, first + nsims)
+def simulation(indices: range, only: str | None = None) -> Command:
+    """The command that makes some realisations, of one thing only if that is asked for.
 
-    def work(settings: Experiment, command: run.Run) -> run.Report:
+    What is kept and what is replaced is seen to map by map.
+    """
+
+    def work(settings: Experiment, command: Run) -> Report:
         if only is not None:
-            included = settings.included()
-            wanted = ONLY[only]([name for name in settings.sky.components if name in included])
-            include = [name for name in wanted if name in included]
-            if not include:
-                raise ValueError(f"--only {only}: nothing is left that simulate.include names.")
-            spec = settings.simulate.model_copy(update={"include": include})
-            settings = settings.model_copy(update={"simulate": spec})
+            settings = _restricted(settings, only)
         return _work(settings, command, indices)
 
-    # What is kept and what is replaced is seen to map by map. With --overwrite all realisations
-    # are removed, so nobody else may be making any.
-    options = run.Options(settings_file, out, values, resume, overwrite)
-    part = ALL if overwrite else indices
-    run.run(run.Kind("simulate", ()), work, options, part)
+    return Command("simulate", work)
 
 
-def _work(settings, command: run.Run, indices: range) -> run.Report:
-    from jaxsky import experiment, montecarlo
+def _restricted(settings: Experiment, only: str) -> Experiment:
+    """Settings that include noise, signal, foregrounds or CMB only."""
+    included = settings.included()
+    foregrounds = [name for name in settings.sky.components if name in included]
+    wanted = {"signal": [*foregrounds, "cmb"], "foregrounds": foregrounds}.get(only, [only])
+    include = [name for name in wanted if name in included]
+    if not include:
+        raise ValueError(f"--only {only}: nothing is left that simulate.include names.")
+    spec = settings.simulate.model_copy(update={"include": include})
+    return settings.model_copy(update={"simulate": spec})
 
+
+def _work(settings: Experiment, command: Run, indices: range) -> Report:
     out, steps, options = command.out, command.steps, command.options
     steps.step("reading templates")
     montecarlo.check_folder(out, settings, options.resume, options.overwrite, indices)
@@ -96,10 +81,10 @@ def _work(settings, command: run.Run, indices: range) -> run.Report:
         + (f"; {kept} maps were there already" if kept else "")
         + f" ({rate}{steps.seconds:.1f} s in all)."
     )
-    return run.Report(setup.description, (), list(notes), sorted(out.glob("sim_*.png")), remark)
+    return Report(setup.description, (), list(notes), sorted(out.glob("sim_*.png")), remark)
 
 
-def _begin(command: run.Run, indices: range) -> None:
+def _begin(command: Run, indices: range) -> None:
     """The folder is this simulation's: others may make other realisations in it."""
     command.folder.narrow(indices)
     command.begin()
@@ -107,13 +92,6 @@ def _begin(command: run.Run, indices: range) -> None:
 
 def _draw_sheet(path: Path, files: Mapping[str, Path], lmax: int, settings: Experiment) -> None:
     """Q and U of some bands, from the files of their maps, and the spectra of their totals."""
-    import healpy
-    import jax.numpy as jnp
-
-    from fits.plots import UNITS, color_limit, draw_map, draw_panels, draw_spectra, plain, spread
-    from jaxsky.harmonics import analysis, power_spectrum
-    from jaxsky.io import read_maps
-
     names, unit, spectra = spread(list(files), SHOWN), settings.simulate.unit, {}
     size, heights = (7.2, 1.75 * len(names) + 3.2), [1.0] * len(names) + [1.6]
     with draw_panels(

@@ -1,10 +1,15 @@
 """Skies, parameters by name, and what is refused."""
 
+import ast
+import importlib
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxsky
 import systems
 from jaxsky import (
     Bandpass,
@@ -148,3 +153,19 @@ def test_importing_jaxsky_touches_neither_healpy_nor_precision():
         "assert not jax.config.read('jax_enable_x64')"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_every_public_name_is_imported_when_it_is_asked_for_and_known_to_type_checkers():
+    (block,) = (
+        node for node in ast.parse(Path(jaxsky.__file__).read_text()).body if type(node) is ast.If
+    )
+    typed = {name.name: line.module for line in block.body for name in line.names}
+    assert sorted(typed) == jaxsky.__all__
+    for name, module in typed.items():
+        assert getattr(jaxsky, name) is getattr(importlib.import_module(module), name)
+        assert name in dir(jaxsky)
+        assert getattr(jaxsky, name).__doc__
+    with pytest.raises(AttributeError, match="module 'jaxsky' has no attribute 'Skies'"):
+        jaxsky.Skies  # noqa: B018
+    with pytest.raises(ImportError, match="cannot import name 'Skies'"):
+        from jaxsky import Skies  # noqa: F401

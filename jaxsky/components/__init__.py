@@ -22,6 +22,7 @@ from jaxsky.components.base import (
 )
 from jaxsky.components.cmb import CMB
 from jaxsky.components.dust import Dust
+from jaxsky.components.free_free import FreeFree
 from jaxsky.components.synchrotron import Synchrotron
 
 for _module in pkgutil.iter_modules(__path__):

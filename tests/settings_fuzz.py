@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import fits.forecast.setup
 import fits.separate.setup
+from fits.commands.forecast import forecast_inputs
 from fits.commands.run import DEFAULTS
 from fits.inputs import inputs_of
 from fits.regions import region_masks
@@ -42,7 +42,7 @@ KINDS = {
     "fit": Kind(DEFAULTS / "fit.toml", partial(_prepared, regions="fit")),
     "compare": Kind(DEFAULTS / "compare.toml", partial(_prepared, regions="compare")),
     "separate": Kind(DEFAULTS / "separate.toml", fits.separate.setup.build),
-    "forecast": Kind(DEFAULTS / "forecast.toml", fits.forecast.setup.build),
+    "forecast": Kind(DEFAULTS / "forecast.toml", forecast_inputs),
     "paper": Kind(DEFAULTS / "paper.toml", partial(_prepared, regions="compare")),
 }
 

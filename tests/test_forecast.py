@@ -8,9 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fits.forecast import fisher
-from fits.forecast.b_modes import BandLaw, noise_level, noise_spectrum
-from fits.forecast.fisher import Model, covariance, fiducial, fisher_errors, foreground_names
+from fits import fisher
+from fits.b_modes import BandLaw, noise_level, noise_weights
+from fits.fisher import (
+    ForecastModel,
+    covariance_of_bands,
+    fiducial,
+    fisher_errors,
+    foreground_names,
+)
 from jaxsky import AME, Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.instrument import Channel, Instrument, load_instrument
 from jaxsky.noise import uniform_covariance
@@ -36,11 +42,11 @@ def bandpasses(centers=CENTERS) -> list[Bandpass]:
     return [Bandpass.top_hat(center, 0.2 * center, samples=9) for center in centers]
 
 
-def model(centers=CENTERS, noise=2.0, fields=("BB",), bodies=1, sky=None) -> Model:
+def model(centers=CENTERS, noise=2.0, fields=("BB",), bodies=1, sky=None) -> ForecastModel:
     rows = [("EE", "BB").index(field) for field in fields]
     levels = np.radians(noise / 60) * np.ones(len(centers))
     beams = np.exp(-1e-5 * np.outer(ELL**2, 1 + np.arange(len(centers))))
-    return Model.of(
+    return ForecastModel.of(
         sky or laws_sky(bodies),
         bandpasses(centers),
         jnp.asarray(beams / levels),
@@ -52,7 +58,7 @@ def model(centers=CENTERS, noise=2.0, fields=("BB",), bodies=1, sky=None) -> Mod
     )
 
 
-def values(system: Model, r=0.01, amplitudes=(0.1, 1.0), rho=0.4) -> dict[str, float]:
+def values(system: ForecastModel, r=0.01, amplitudes=(0.1, 1.0), rho=0.4) -> dict[str, float]:
     laws, correlations = {}, {}
     for field in system.fields:
         for name, amplitude, slope in zip(system.sky, amplitudes, (-2.4, -2.6), strict=True):
@@ -122,13 +128,15 @@ FREE = (
 )  # fmt: skip
 
 
-def dense(system: Model, params: dict[str, float], free) -> np.ndarray:
+def dense(system: ForecastModel, params: dict[str, float], free) -> np.ndarray:
     """The Fisher matrix from central differences of the covariance of bands."""
-    C = np.asarray(covariance(params, system))
+    C = np.asarray(covariance_of_bands(params, system))
     derivatives = []
     for name in free:
         step = 1e-5 * max(abs(params[name]), 0.1)
-        up, down = (covariance({**params, name: params[name] + s}, system) for s in (step, -step))
+        up, down = (
+            covariance_of_bands({**params, name: params[name] + s}, system) for s in (step, -step)
+        )
         derivatives.append(np.asarray(up - down) / (2 * step))
     solved = [np.linalg.solve(C, d) for d in derivatives]
     return np.array([[np.einsum("l,flij,flji->", modes(), a, b) for a in solved] for b in solved])
@@ -150,11 +158,11 @@ def test_scatter_of_the_likelihoods_slope():
     system = model(centers=(30.0, 150.0, 340.0))
     params = {k: jnp.asarray(v) for k, v in values(system).items()}
     free = ("r", "dust.beta_dust", "BB.synchrotron.amplitude")
-    C = covariance(params, system)[0]
+    C = covariance_of_bands(params, system)[0]
     degrees = modes() * 2
 
     def log_likelihood(theta, seen):
-        assumed = covariance({**params, **dict(zip(free, theta, strict=True))}, system)[0]
+        assumed = covariance_of_bands({**params, **dict(zip(free, theta, strict=True))}, system)[0]
         solved = jnp.linalg.solve(assumed, seen)
         terms = jnp.trace(solved, axis1=1, axis2=2) + jnp.linalg.slogdet(assumed)[1]
         return -0.5 * jnp.sum(degrees * terms)
@@ -180,7 +188,7 @@ def test_scatter_of_the_likelihoods_slope():
     np.testing.assert_allclose(np.cov(unit.T), np.eye(3), atol=5 * (2 / count) ** 0.5)
 
 
-def with_modes(system: Model, degrees: np.ndarray) -> Model:
+def with_modes(system: ForecastModel, degrees: np.ndarray) -> ForecastModel:
     """The model with other numbers of modes."""
     return eqx.tree_at(lambda m: m.sky_fraction, system, jnp.asarray(degrees / (2 * ELL + 1)))
 
@@ -190,7 +198,7 @@ def test_order_of_bands_does_not_matter():
     free = ("r", "dust.beta_dust", "dust.T_dust", "BB.dust.slope")
     straight = fisher_errors(system, values(system), free)
     order = [3, 0, 5, 1, 4, 2]
-    turned = Model.of(
+    turned = ForecastModel.of(
         system.sky, [bandpasses()[i] for i in order], system.weights[:, jnp.array(order)],
         system.tensors, system.scalars, system.ell, system.sky_fraction, system.fields,
     )  # fmt: skip
@@ -214,7 +222,7 @@ def test_noise_is_the_same_in_all_units():
     observed = load_instrument("planck").observed()["143"]
     sigma = np.radians(7.30 / 60) / np.sqrt(8 * np.log(2))
     expected = np.radians(70.2 / 60) ** 2 * np.exp(300 * 301 * sigma**2)
-    np.testing.assert_allclose(noise_spectrum(observed, 300)[300], expected, rtol=1e-6)
+    np.testing.assert_allclose(noise_weights(observed, 300)[300] ** -2, expected, rtol=1e-6)
 
 
 def test_better_or_other_data():
@@ -292,7 +300,7 @@ def test_covariance_is_that_of_maps_in_bands():
     system = model(sky=Sky(components))
     laws = {("BB", n): BandLaw(80 * 81 / (2 * np.pi) * a**2, -2.0) for n, a in amplitudes.items()}
     pairs = {("BB", *pair): 1.0 for pair in itertools.combinations(components, 2)}
-    found = covariance(fiducial(system.sky, laws, pairs, 0.01, 0.5), system)[0]
+    found = covariance_of_bands(fiducial(system.sky, laws, pairs, 0.01, 0.5), system)[0]
     sky = Sky({n: eqx.tree_at(lambda c: c.amplitude, c, amplitudes[n] * one)
                for n, c in components.items()})  # fmt: skip
     bands = bandpasses()

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from commands import jaxsky, one_sentence
+from fits.b_modes import BandLaw, band_correlation, equal_r, fit_law, foreground_powers, to_D
+from fits.commands.forecast import forecast, forecast_warnings
 from fits.commands.run import DEFAULTS
-from fits.forecast import equal_r, fit_law, forecast
-from fits.forecast.b_modes import BandLaw, correlation, foreground_powers, to_D
-from fits.forecast.report import warnings
 from fits.pseudo_cl import band_covariance, bin_edges, masked_spectra, sky_fraction
 from fits.regions import apodize
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe_band
@@ -117,7 +116,7 @@ def test_laws_in_closed_form():
         wrong = D.copy()
         wrong[at] *= 1.5
         assert least < abs(fit_law(full, wrong, (2, 61), "D").slope + 2.4) < most
-    assert correlation(full, 0.3 * D, D, D, (2, 61)) == pytest.approx(0.3)
+    assert band_correlation(full, 0.3 * D, D, D, (2, 61)) == pytest.approx(0.3)
     with pytest.raises(
         ValueError, match=r"The law of D takes three bins, but 1 of those from l = 2 to 61"
     ):
@@ -273,8 +272,10 @@ def test_laws_that_vary_and_coarse_masks(folder):
     found = forecast(load(path))
     # The northern half has the larger index.
     assert 1.53 < found.errors.fiducial["dust.beta_dust"] < 1.57
-    assert 0.4 < sky_fraction(found.setup.mask) < 0.5
-    assert any("Laws of dust vary over the sky" in sentence for sentence in warnings(found))
+    assert 0.4 < sky_fraction(found.inputs.mask) < 0.5
+    assert any(
+        "Laws of dust vary over the sky" in sentence for sentence in forecast_warnings(found)
+    )
 
 
 def test_settings_that_come_along():

@@ -6,7 +6,7 @@ import stat
 import numpy as np
 import pytest
 
-from fits.forecast.setup import build as build_forecast
+from fits.commands.forecast import forecast_inputs
 from fits.inputs import inputs_of
 from fits.paper.sources import Sources
 from fits.record import write_log
@@ -283,8 +283,8 @@ def paper(settings):
             SEPARATION,
             {"free": f", regions = {{ clusters = 2, of = [{{ {NONE} }}] }}"},
         ),
-        (build_forecast, FORECAST.replace('"dust.fits"', '"none.fits"'), {}),
-        (build_forecast, FORECAST, {"forecast": f"region = 'a'\n{REGION}"}),
+        (forecast_inputs, FORECAST.replace('"dust.fits"', '"none.fits"'), {}),
+        (forecast_inputs, FORECAST, {"forecast": f"region = 'a'\n{REGION}"}),
         (build_experiment, EXPERIMENT, {"beam": 'beam = "none.fits"'}),
         (build_experiment, EXPERIMENT, {"bandpass": f"{{ {NONE} }}"}),
         (build_experiment, EXPERIMENT, {"noise": f"{{ map = {{ {NONE} }} }}"}),

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from fits.commands.forecast import forecast
 from fits.commands.run import DEFAULTS
 from fits.comparison import compare
-from fits.forecast.forecast import forecast
 from fits.inputs import inputs_of
 from fits.paper import STEPS, run
 from fits.paper.forecasts import _settings

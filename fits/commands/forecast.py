@@ -1,24 +1,368 @@
-"""`jaxsky forecast`, from settings to a report."""
+"""`jaxsky forecast`: foreground B modes against primordial ones, and errors on r and the laws."""
 
+import itertools
+from typing import Any, NamedTuple
+
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from rich.table import Table
+
+from fits import b_modes
+from fits.b_modes import BandLaw
 from fits.commands.run import Command, Report, Run
-from fits.forecast import report
-from fits.forecast.forecast import forecast
-from jaxsky.settings import Experiment
+from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors, foreground_names, unit_sky
+from fits.preparation import Preparation, prepare_component
+from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra, sky_fraction
+from fits.record import write_json, write_log
+from fits.regions import apodize, region_mask
+from jaxsky import Sky
+from jaxsky.checks import check_double
+from jaxsky.cmb import camb_spectra, tensor_spectra
+from jaxsky.components import declared
+from jaxsky.experiment import map_nside, read_channel
+from jaxsky.harmonics import gaussian_beam
+from jaxsky.inputs import Template, read_sky
+from jaxsky.io import degrade_mask
+from jaxsky.observation import ObservedBand
+from jaxsky.progress import QUIET, Progress
+from jaxsky.settings import Experiment, SettingsError, at_key
+from jaxsky.sky import unknown_parameter
+
+#: What is in the folder of the results.
+RESULTS = ("forecast.json", "log.json", "bb.png", "fisher.png")
+FIELDS = ("EE", "BB")
+#: Spectra are corrected for beams down to this window.
+LEAST_WINDOW = 0.05
 
 
-def _work(settings: Experiment, command: Run) -> Report:
-    found = forecast(settings, command.steps)
-    command.steps.step("drawing")
-    command.begin()
-    written = report.write_report(command.out, found, settings, command.steps.seconds)
-    return Report(
-        found.setup.description,
-        report.tables(found),
-        [*report.warnings(found), *settings.left_out("forecast")],
-        written,
+class ForecastInputs(NamedTuple):
+    """What is forecast.
+
+    Parameters
+    ----------
+    sky : foregrounds, with one beam and one nside
+    fwhm : their beam [arcmin]
+    mask : weight of each pixel, 0 to 1
+    bands : all bands
+    shown : names of those of which spectra are taken
+    description : what the foregrounds are
+    """
+
+    sky: Sky
+    fwhm: float
+    mask: Float[np.ndarray, " pix"]
+    bands: dict[str, ObservedBand]
+    shown: tuple[str, ...]
+    description: str
+
+
+class Forecast(NamedTuple):
+    """What a forecast finds.
+
+    Parameters
+    ----------
+    inputs : what was forecast
+    spectra : how band powers were taken
+    powers : band powers D_b of EE and BB by band [uK_CMB^2]
+    laws : power laws fitted to BB, by band
+    equal_r : r whose BB equals the foregrounds, by band and range of multipoles
+    tensors : C_l of TT, EE, BB, TE for r = 1 [uK_CMB^2]
+    lensed : those of lensed scalars
+    parameters : all parameters of the bands' covariance, with their values
+    errors : from the Fisher matrix
+    without_foregrounds : error of r without any, None where r is not free
+    """
+
+    inputs: ForecastInputs
+    spectra: MaskedSpectra
+    powers: dict[str, Float[np.ndarray, "2 bin"]]
+    laws: dict[str, BandLaw]
+    equal_r: dict[str, dict[str, float]]
+    tensors: Float[np.ndarray, "4 ell"]
+    lensed: Float[np.ndarray, "4 ell"]
+    parameters: dict[str, float]
+    errors: Errors
+    without_foregrounds: float | None
+
+
+def forecast_inputs(settings: Experiment) -> ForecastInputs:
+    """Read what the settings name, bring it to one resolution, and check that it can work."""
+    spec = settings.forecast
+    if not settings.cmb.include:
+        raise SettingsError("cmb.include: is false, but a forecast has a CMB.")
+    if settings.cmb.spectra is not None:
+        raise SettingsError("cmb.spectra: a forecast changes r, which takes spectra of CAMB.")
+    templates, description = read_sky(settings, names=settings.modelled())
+    if not templates:
+        raise SettingsError("sky: has no components; a forecast takes some.")
+    if not settings.bands:
+        raise SettingsError("bands: there are none.")
+    pixels = map_nside(settings, templates)
+    bands = {str(one.name): read_channel(settings, one, pixels) for one in settings.bands}
+    for name, band in bands.items():
+        if band.noise is None:
+            raise SettingsError(f"bands.{name}.noise: is missing.")
+    shown = spec.bands or _few(tuple(bands))
+    for name in shown:
+        if name not in bands:
+            raise SettingsError(f"forecast.bands: {name!r} is none of {', '.join(bands)}.")
+    fwhm = max(template.fwhm for template in templates.values())
+    nside = min(healpy.npix2nside(template.used.size) for template in templates.values())
+    _check_resolution(spec.lmax, nside, fwhm)
+    used = region_mask(settings, spec.region, nside, coarser=True)
+    for template in templates.values():
+        used &= degrade_mask(template.used, nside, 1.0)
+    sky = Sky({name: _prepared(template, nside, fwhm) for name, template in templates.items()})
+    mask = apodize(used, spec.apodization)
+    if not mask.any():
+        raise SettingsError("forecast.region: leaves no pixel.")
+    return ForecastInputs(sky, fwhm, mask, bands, tuple(shown), description)
+
+
+def _few(names: tuple[str, ...], most: int = 5) -> list[str]:
+    """The names, or a few of them that are evenly spread."""
+    at = np.linspace(0, len(names) - 1, min(most, len(names)))
+    return [names[i] for i in at.round().astype(int)]
+
+
+def _check_resolution(lmax: int, nside: int, fwhm: float) -> None:
+    if lmax > 2 * nside - 1:
+        raise SettingsError(
+            f"forecast.lmax: {lmax} is beyond what templates of nside {nside} resolve, "
+            f"{2 * nside - 1}."
+        )
+    if (window := float(gaussian_beam(fwhm, lmax)[lmax])) < LEAST_WINDOW:
+        raise SettingsError(
+            f"forecast.lmax: the templates' beam of {fwhm:g} arcmin leaves {window:.2g} of the "
+            f"amplitude at l = {lmax}; a correction takes {LEAST_WINDOW:g}."
+        )
+
+
+def _prepared(template: Template, nside: int, fwhm: float):
+    own = healpy.npix2nside(template.used.size)
+    if own == nside and template.fwhm == fwhm:
+        return template.component
+    operator = Preparation.smoothing(own, template.fwhm, nside, fwhm, 2 * nside)
+    return prepare_component(template.component, operator, template.used)
+
+
+def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
+    """Foreground B modes against primordial ones, and errors from the Fisher matrix.
+
+    Parameters
+    ----------
+    settings : what is forecast
+    progress : told of each step of the work
+
+    Raises
+    ------
+    RuntimeError
+        Without double precision.
+    jaxsky.io.InputError, KeyError, ValueError
+        For settings and files that cannot work; see `forecast_inputs` and
+        `fits.fisher.fisher_errors`.
+    """
+    check_double("A forecast")
+    progress.step("reading templates and mask")
+    inputs, spec = forecast_inputs(settings), settings.forecast
+    progress.step("spectra outside the mask")
+    edges = bin_edges(spec.lmin, spec.lmax, spec.width)
+    window = np.asarray(gaussian_beam(inputs.fwhm, 2 * edges[-1]))
+    spectra = masked_spectra(inputs.mask, edges, window=window)
+    bands = {name: inputs.bands[name].band for name in inputs.shown}
+    powers = b_modes.foreground_powers(inputs.sky, bands, spectra)
+    with at_key("forecast.fit"):
+        laws = {
+            name: b_modes.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
+            for name, D in powers.items()
+        }
+    highest = max(spectra.lmax, spec.fisher_lmax, b_modes.PIVOT)
+    with at_key("cmb.cosmology"):
+        tensors = tensor_spectra(highest, **settings.cmb.cosmology)
+        lensed = camb_spectra(highest, **settings.cmb.cosmology)
+    equal = {
+        name: b_modes.equal_r(spectra, powers[name], law, tensors) for name, law in laws.items()
+    }
+    progress.step("Fisher matrix")
+    model, parameters = _model(settings, inputs, spectra, tensors, lensed)
+    errors, without = _errors(settings, model, parameters)
+    return Forecast(
+        inputs, spectra, powers, laws, equal, tensors, lensed, parameters, errors, without
     )
 
 
-COMMAND = Command(
-    "forecast", _work, ("forecast.json", "log.json", "bb.png", "fisher.png"), resumable=False
-)
+def _model(
+    settings: Experiment,
+    inputs: ForecastInputs,
+    spectra: MaskedSpectra,
+    tensors: np.ndarray,
+    lensed: np.ndarray,
+) -> tuple[ForecastModel, dict[str, float]]:
+    """The covariance of all bands, with the foregrounds' spectra measured outside the mask."""
+    spec = settings.forecast
+    sky, fields = inputs.sky, tuple(f for f in FIELDS if f in spec.spectra)
+    rows = {field: FIELDS.index(field) for field in fields}
+    maps = {name: sky[name].amplitude for name in sky}
+    auto = {name: band_powers(spectra, values) for name, values in maps.items()}
+    laws: dict[tuple[str, str], BandLaw] = {
+        (field, name): b_modes.fit_law(spectra, D[row], spec.fit, f"{field} of {name!r}")
+        for field, row in rows.items()
+        for name, D in auto.items()
+    }
+    correlations: dict[tuple[str, str, str], float] = {}
+    for first, second in itertools.combinations(maps, 2):
+        cross = band_powers(spectra, maps[first], maps[second])
+        for field, row in rows.items():
+            correlations[field, first, second] = b_modes.band_correlation(
+                spectra, cross[row], auto[first][row], auto[second][row], spec.fit
+            )
+    ell, bands = np.arange(spec.lmin, spec.fisher_lmax + 1), inputs.bands.values()
+    weights = [b_modes.noise_weights(band, spec.fisher_lmax)[ell] for band in bands]
+    cmb_rows = 1 + np.array(list(rows.values()))[:, None]
+    model = ForecastModel.of(
+        unit_sky(sky, inputs.mask),
+        [band.band for band in bands],
+        jnp.asarray(np.stack(weights, axis=1)),
+        jnp.asarray(tensors[cmb_rows, ell]),
+        jnp.asarray(lensed[cmb_rows, ell]),
+        jnp.asarray(ell, float),
+        jnp.asarray(sky_fraction(inputs.mask)),
+        fields,
+    )
+    return model, fiducial(model.sky, laws, correlations, settings.cmb.r, settings.cmb.A_lens)
+
+
+def _errors(
+    settings: Experiment, model: ForecastModel, parameters: dict[str, float]
+) -> tuple[Errors, float | None]:
+    """Errors of all that is free, and that of r without foregrounds."""
+    spec = settings.forecast
+    nuisance = foreground_names(model.sky, model.fields, spec.foregrounds)
+    spectral = settings.free_in("forecast")
+    widths = {n: one.gaussian[1] for n, one in spectral.items() if one.gaussian is not None}
+    for name in spec.priors:
+        if name in widths:
+            raise SettingsError(f"forecast.priors: the prior of {name!r} is in the table free.")
+    with at_key("free"):
+        for name in spectral:
+            if name not in parameters:
+                raise unknown_parameter(name, parameters)
+    with at_key("forecast"):
+        free = list(dict.fromkeys((*spec.free, *spectral, *nuisance)))
+        errors = fisher_errors(model, parameters, free, widths | spec.priors)
+    if "r" not in spec.free:
+        return errors, None
+    none = {n: 0.0 if n.endswith(".amplitude") else v for n, v in parameters.items()}
+    return errors, fisher_errors(model, none, ["r"]).sigma("r")
+
+
+def _numbers(found: Forecast, settings: Experiment) -> dict[str, Any]:
+    """All numbers, D_l in uK_CMB^2 unless their key says otherwise."""
+    errors, spectra, lmax = found.errors, found.spectra, settings.forecast.lmax
+    results: dict[str, Any] = {
+        "description": found.inputs.description,
+        "bands": list(found.inputs.bands),
+        "sky_fraction": sky_fraction(found.inputs.mask),
+        "bins": {"first": spectra.edges[:-1], "last": [e - 1 for e in spectra.edges[1:]]},
+        "foregrounds": {
+            name: {
+                "EE": powers[0],
+                "BB": powers[1],
+                "BB_law": found.laws[name]._asdict(),
+                "equal_r": found.equal_r[name],
+            }
+            for name, powers in found.powers.items()
+        },
+        "C_l_BB": {
+            "tensors_r_1": found.tensors[2, : lmax + 1],
+            "lensing": found.lensed[2, : lmax + 1],
+        },
+        "parameters": found.parameters,
+        "fisher": {
+            "free": errors.free,
+            "sigma": {name: errors.sigma(name) for name in errors.free},
+            "sigma_all_others_known": errors.known,
+            "covariance": errors.covariance,
+            "priors": errors.priors,
+        },
+    }
+    if found.without_foregrounds is not None:
+        results["sigma_r"] = {
+            "foregrounds_free": errors.sigma("r"),
+            "all_else_known": errors.known["r"],
+            "no_foregrounds": found.without_foregrounds,
+        }
+    return results
+
+
+def _tables(found: Forecast) -> list[Table]:
+    """The foregrounds in bands, and the errors, for the terminal."""
+    bands = Table(caption=f"BB of foregrounds at l = {b_modes.PIVOT}, and the r that has as much")
+    ranges = [f"r, {where}" for where in next(iter(found.equal_r.values()))]
+    bands.add_column("band")
+    for heading in ("D_l / uK_CMB^2", "slope of C_l", *ranges):
+        bands.add_column(heading, justify="right")
+    for name, law in found.laws.items():
+        equal = [f"{r:.3g}" for r in found.equal_r[name].values()]
+        bands.add_row(name, f"{law.amplitude:.3g}", f"{law.slope:.2f}", *equal)
+
+    errors = found.errors
+    numbers = Table(caption="errors of 68 %, all free parameters marginalised")
+    numbers.add_column("parameter")
+    for heading in ("value", "error", "others known", "prior"):
+        numbers.add_column(heading, justify="right")
+    for name in errors.free:
+        numbers.add_row(
+            name,
+            f"{errors.fiducial[name]:.4g}",
+            f"{errors.sigma(name):.2g}",
+            f"{errors.known[name]:.2g}",
+            f"{errors.priors[name]:.2g}" if name in errors.priors else "",
+        )
+    if found.without_foregrounds is not None:
+        numbers.add_section()
+        numbers.add_row("r, without foregrounds", "", f"{found.without_foregrounds:.2g}")
+    return [bands, numbers]
+
+
+def forecast_warnings(found: Forecast) -> list[str]:
+    """What a user should know before using the numbers, a sentence each."""
+    sentences = []
+    errors, sky = found.errors, found.inputs.sky
+    for name in errors.free:
+        component, *field = name.split(".")
+        if component not in sky or not declared(type(sky[component]), field[0])["positive"]:
+            continue
+        if errors.sigma(name) > errors.fiducial[name]:
+            sentences.append(
+                f"{name}: the error is larger than the value; the Fisher matrix, good for small "
+                "errors, says only that this is not measured."
+            )
+    varying = [name for name in sky if any(x.ndim == 1 for x in jax.tree.leaves(sky[name]))]
+    if varying:
+        sentences.append(
+            f"Laws of {', '.join(varying)} vary over the sky; the Fisher matrix has their mean "
+            "and leaves out what the variation takes from the correlation of bands."
+        )
+    return sentences
+
+
+def _work(settings: Experiment, command: Run) -> Report:
+    from fits.commands import forecast_pictures as pictures
+
+    found = forecast(settings, command.steps)
+    command.steps.step("drawing")
+    command.begin()
+    written = [command.out / name for name in RESULTS]
+    write_json(written[0], _numbers(found, settings))
+    write_log(written[1], settings, command.steps.seconds)
+    pictures.plot_b_modes(written[2], found, settings)
+    pictures.plot_errors(written[3], found)
+    warnings = [*forecast_warnings(found), *settings.left_out("forecast")]
+    return Report(found.inputs.description, _tables(found), warnings, written)
+
+
+COMMAND = Command("forecast", _work, RESULTS, resumable=False)

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from fits.forecast.b_modes import PIVOT
-from fits.forecast.forecast import Forecast, forecast
-from fits.forecast.plots import plot_b_modes
+from fits.b_modes import PIVOT
+from fits.commands.forecast import Forecast, forecast
+from fits.commands.forecast_pictures import plot_b_modes
 from fits.paper.item import Impossible, Item, Number, picture_of
 from fits.paper.sources import Sources
 from fits.pseudo_cl import sky_fraction
@@ -45,7 +45,7 @@ def figure_b_modes(settings: Experiment, sources: Sources, out: Path) -> Item:
         raise Impossible(str(reason)) from None
     picture = picture_of("Figure 12")
     plot_b_modes(out / picture, found, chosen)
-    fraction = 100 * sky_fraction(found.setup.mask)
+    fraction = 100 * sky_fraction(found.inputs.mask)
     sky = sources.sky_differs
     if sources.embedded:
         sky = f"The sky is the embedded model of the Galaxy at nside {NSIDE}."

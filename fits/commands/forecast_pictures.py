@@ -6,9 +6,9 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 
-from fits.forecast.b_modes import noise_spectrum, to_D
-from fits.forecast.fisher import Errors
-from fits.forecast.forecast import Forecast
+from fits.b_modes import noise_weights, to_D
+from fits.commands.forecast import Forecast
+from fits.fisher import Errors
 from fits.plots import COLORS, COLUMN, UNITS, draw_panels, label, legend_below, plain, round_numbers
 from jaxsky.settings import Experiment
 
@@ -26,7 +26,7 @@ def plot_b_modes(path: Path, found: Forecast, settings: Experiment) -> None:
         for (name, powers), color in zip(found.powers.items(), COLORS, strict=False):
             BB = np.where(powers[1] > 0, powers[1], np.nan)
             axes.loglog(found.spectra.centers, BB, color=color, lw=1.8, label=plain(_band(name)))
-            noise = noise_spectrum(found.setup.bands[name], lmax)[2:]
+            noise = noise_weights(found.inputs.bands[name], lmax)[2:] ** -2
             axes.loglog(ell, D * noise, color=color, lw=0.7)
         axes.loglog(ell, D * found.lensed[2, 2 : lmax + 1], color=LENSING, lw=1.2)
         bottom = 1.0

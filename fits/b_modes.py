@@ -59,9 +59,9 @@ def noise_level(band: ObservedBand) -> float:
     return level * float(band.band.conversion("uK_RJ", "uK_CMB"))
 
 
-def noise_spectrum(band: ObservedBand, lmax: int) -> Float[np.ndarray, " ell"]:
-    """Spectrum N_l / b_l^2 of the noise of a band, its beam taken out [uK_CMB^2]."""
-    return noise_level(band) ** 2 / np.asarray(beam_ratio(band.beam, 0.0, lmax)) ** 2
+def noise_weights(band: ObservedBand, lmax: int) -> Float[np.ndarray, " ell"]:
+    """Beam over noise of a band, b_l / sqrt(N_l) [1 / uK_CMB]; its inverse square is the noise."""
+    return np.asarray(beam_ratio(band.beam, 0.0, lmax)) / noise_level(band)
 
 
 def _modes(spectra: MaskedSpectra) -> Float[np.ndarray, " bin"]:
@@ -70,6 +70,7 @@ def _modes(spectra: MaskedSpectra) -> Float[np.ndarray, " bin"]:
 
 
 def _inside(spectra: MaskedSpectra, fit: tuple[int, int], what: str) -> np.ndarray:
+    """True for the bins that are within the multipoles of a fit."""
     edges = np.array(spectra.edges)
     inside = (edges[:-1] >= fit[0]) & (edges[1:] - 1 <= fit[1])
     if inside.sum() < 3:
@@ -104,7 +105,7 @@ def fit_law(
     return BandLaw(float(np.exp(logarithm)), float(slope) - 2)
 
 
-def correlation(
+def band_correlation(
     spectra: MaskedSpectra,
     cross: Float[np.ndarray, " bin"],
     first: Float[np.ndarray, " bin"],
@@ -141,8 +142,7 @@ def equal_r(
     law : fitted to BB
     tensors : spectra C_l of TT, EE, BB, TE for r = 1 [uK_CMB^2], up to `spectra.lmax` and 80
     """
-    primordial = PIVOT * (PIVOT + 1) / (2 * np.pi) * tensors[2, PIVOT]
-    found = {f"l = {PIVOT}": float(law.amplitude / primordial)}
+    found = {f"l = {PIVOT}": float(law.amplitude / (to_D(PIVOT)[-1] * tensors[2, PIVOT]))}
     low = spectra.centers <= REIONISATION
     if low.any():
         binned = np.einsum("bjl,jl->b", spectra.windows[1], tensors[1:3, : spectra.lmax + 1])

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.forecast.b_modes import PIVOT, BandLaw
+from fits.b_modes import PIVOT, BandLaw
 from jaxsky import Bandpass, Sky, get_parameters, parameter_names, set_parameters
 from jaxsky.bandpass import Samples, average, stack_bands
 from jaxsky.checks import check_double
@@ -43,8 +43,8 @@ LEAST_SHARE = 0.01
 ROUNDING = 1e-12
 
 
-class Model(eqx.Module):
-    """What a covariance of bands depends on beside its parameters.
+class ForecastModel(eqx.Module):
+    """What the covariance of bands depends on next to its parameters.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class Model(eqx.Module):
     fields: tuple[str, ...] = eqx.field(static=True)
 
     @classmethod
-    def of(cls, sky: Sky, bands: Sequence[Bandpass], *rest: Any) -> "Model":
+    def of(cls, sky: Sky, bands: Sequence[Bandpass], *rest: Any) -> "ForecastModel":
         """The model for bandpasses; the rest are the fields from `weights` on."""
         factors = [band.conversion("uK_RJ", "uK_CMB") for band in bands]
         return cls(sky, stack_bands(bands), jnp.stack(factors), *rest)
@@ -134,14 +134,14 @@ def foreground_names(
     kinds : of "amplitude" (D_l at l = 80, uK_RJ^2 at the reference frequency), "slope" (of C_l)
         and "correlation" (of a pair, "BB.dust.synchrotron.correlation")
     """
-    components = tuple(components)
-    names = []
-    for field in fields:
-        for kind in kinds:
-            pairs = itertools.combinations(components, 2)
-            of = map(".".join, pairs) if kind == "correlation" else components
-            names += [f"{field}.{which}.{kind}" for which in of]
-    return tuple(names)
+    singles = list(components)
+    pairs = [".".join(pair) for pair in itertools.combinations(singles, 2)]
+    return tuple(
+        f"{field}.{which}.{kind}"
+        for field in fields
+        for kind in kinds
+        for which in (pairs if kind == "correlation" else singles)
+    )
 
 
 def fiducial(
@@ -165,33 +165,30 @@ def fiducial(
     names = [name for name in parameter_names(sky) if not name.endswith(".amplitude")]
     values = {"r": r, "A_lens": A_lens}
     values |= {name: float(value) for name, value in get_parameters(sky, names).items()}
-    for (field, component), law in laws.items():
-        values[f"{field}.{component}.amplitude"] = law.amplitude
-        values[f"{field}.{component}.slope"] = law.slope
-    for key, value in correlations.items():
-        values[".".join(key) + ".correlation"] = value
-    return values
+    for key, law in laws.items():
+        values |= {".".join((*key, kind)): value for kind, value in law._asdict().items()}
+    return values | {".".join((*key, "correlation")): v for key, v in correlations.items()}
 
 
 def _check_correlations(
     components: list[str], correlations: Mapping[tuple[str, str, str], float]
 ) -> None:
     for field in {field for field, _, _ in correlations}:
-        matrix = np.eye(len(components))
+        matrix, pairs = np.eye(len(components)), []
         for (of, *pair), value in correlations.items():
             if of == field:
                 i, j = map(components.index, pair)
                 matrix[i, j] = matrix[j, i] = value
+                pairs.append(f"{pair[0]} x {pair[1]} {value:.3g}")
         if (least := np.linalg.eigvalsh(matrix).min()) < -ROUNDING:
-            listed = ", ".join(f"{a} x {b} {v:.3g}" for (f, a, b), v in correlations.items()
-                               if f == field)  # fmt: skip
             raise ValueError(
-                f"The correlations of {field}, {listed}, are those of no sky (their matrix has the "
-                f"eigenvalue {least:.2g}); use more of the sky, or a wider range of multipoles."
+                f"The correlations of {field}, {', '.join(pairs)}, are those of no sky (their "
+                f"matrix has the eigenvalue {least:.2g}); use more of the sky, or a wider range of "
+                "multipoles."
             )
 
 
-def _laws(params: Mapping[str, Array], model: Model) -> Float[Array, "band component"]:
+def _laws(params: Mapping[str, Array], model: ForecastModel) -> Float[Array, "band component"]:
     """What each component shows in each band [uK_CMB], the CMB last."""
     known = parameter_names(model.sky)
     sky = set_parameters(model.sky, {name: params[name] for name in params if name in known})
@@ -203,30 +200,31 @@ def _laws(params: Mapping[str, Array], model: Model) -> Float[Array, "band compo
 
 
 def _spectra(
-    params: Mapping[str, Array], model: Model
+    params: Mapping[str, Array], model: ForecastModel
 ) -> Float[Array, "field ell component component"]:
     """Spectra C_l of the components [uK_RJ^2], that of the CMB last [uK_CMB^2]."""
-    names = list(model.sky)
-    found = []
+    names, found = list(model.sky), []
     for field, tensors, scalars in zip(model.fields, model.tensors, model.scalars, strict=True):
-        lensing = params["A_lens"] if field == "BB" else 1.0
-        matrix = [[jnp.zeros_like(model.ell)] * (1 + len(names)) for _ in range(1 + len(names))]
-        matrix[-1][-1] = params["r"] * tensors + lensing * scalars
         roots = []
         for name in names:
             to_C = 2 * jnp.pi / (PIVOT * (PIVOT + 1)) * params[f"{field}.{name}.amplitude"]
             slope = params[f"{field}.{name}.slope"]
             roots.append(jnp.sqrt(to_C) * (model.ell / PIVOT) ** (slope / 2))
-        for i, j in itertools.product(range(len(names)), repeat=2):
-            first, second = names[min(i, j)], names[max(i, j)]
-            rho = 1.0 if i == j else params[f"{field}.{first}.{second}.correlation"]
-            matrix[i][j] = rho * roots[i] * roots[j]
-        found.append(jnp.stack([jnp.stack(row) for row in matrix]))
-    return jnp.moveaxis(jnp.stack(found), -1, 1)
+        rho = jnp.eye(len(names))
+        for i, j in itertools.combinations(range(len(names)), 2):
+            value = params[f"{field}.{names[i]}.{names[j]}.correlation"]
+            rho = rho.at[(i, j), (j, i)].set(value)
+        foregrounds = jnp.einsum("ij,il,jl->lij", rho, jnp.stack(roots), jnp.stack(roots))
+        lensing = params["A_lens"] if field == "BB" else 1.0
+        cmb = params["r"] * tensors + lensing * scalars
+        found.append(jnp.pad(foregrounds, ((0, 0), (0, 1), (0, 1))).at[:, -1, -1].set(cmb))
+    return jnp.stack(found)
 
 
 @jax.jit
-def covariance(params: Mapping[str, Array], model: Model) -> Float[Array, "field ell band band"]:
+def covariance_of_bands(
+    params: Mapping[str, Array], model: ForecastModel
+) -> Float[Array, "field ell band band"]:
     """The covariance C_l of bands, their beams taken out [uK_CMB^2]: the formula above."""
     laws = _laws(params, model)
     noise = jax.vmap(jnp.diag)(model.weights**-2)
@@ -260,7 +258,7 @@ def _columns(weights, modes, spectra, d_spectra, laws, d_laws):
 
 @partial(jax.jit, static_argnames="free")
 def _root(
-    params: Mapping[str, Array], model: Model, free: tuple[str, ...]
+    params: Mapping[str, Array], model: ForecastModel, free: tuple[str, ...]
 ) -> Float[Array, "par par"]:
     """A triangular root of the Fisher matrix, F = root^T root."""
 
@@ -278,7 +276,7 @@ def _root(
 
 
 def fisher_errors(
-    model: Model,
+    model: ForecastModel,
     params: Mapping[str, float],
     free: Sequence[str],
     priors: Mapping[str, float] | None = None,
@@ -320,9 +318,12 @@ def fisher_errors(
     rows = [np.eye(len(free))[free.index(name)] / sigma for name, sigma in priors.items()]
     root = np.concatenate([root, *np.reshape(rows, (1, -1, len(free)))])
     size = np.linalg.norm(root, axis=0)
-    _refuse_degenerate(root, size, free)
+    if blind := [name for name, s in zip(free, size, strict=True) if s == 0]:
+        raise ValueError(f"Nothing that is observed depends on {', '.join(blind)}.")
     # Of F = V s^2 V^T, relative to the size of each parameter.
-    _, singular, vectors = np.linalg.svd(root / size, full_matrices=False)
+    _, singular, vectors = np.linalg.svd(root / size)
+    singular = np.pad(singular, (0, len(free) - len(singular)))
+    _refuse_degenerate(vectors[singular < LEAST_CHANGE], free)
     scaled = vectors.T / singular
     return Errors(
         free,
@@ -333,12 +334,8 @@ def fisher_errors(
     )
 
 
-def _refuse_degenerate(root: np.ndarray, size: np.ndarray, free: tuple[str, ...]) -> None:
-    if blind := [name for name, s in zip(free, size, strict=True) if s == 0]:
-        raise ValueError(f"Nothing that is observed depends on {', '.join(blind)}.")
-    _, singular, vectors = np.linalg.svd(root / size)
-    singular = np.pad(singular, (0, len(free) - len(singular)))
-    null = vectors[singular < LEAST_CHANGE]
+def _refuse_degenerate(null: Float[np.ndarray, "combination par"], free: tuple[str, ...]) -> None:
+    """Name the parameters of combinations that the data do not see, if there are any."""
     if len(null):
         part = np.abs(null).max(axis=0) > LEAST_SHARE
         names = [name for name, within in zip(free, part, strict=True) if within]

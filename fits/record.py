@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from jaxsky.io import write_text
-from jaxsky.settings import Experiment, SettingsFile, found_files, leakage_warning
+from jaxsky.settings import Experiment, found_files, leakage_warning
 
 PACKAGES = (
     "jaxsky",
@@ -77,7 +77,7 @@ def write_json(path: Path, results: dict[str, Any]) -> None:
     write_text(path, json.dumps(_plain(results), indent=2, allow_nan=False) + "\n")
 
 
-def write_log(path: Path, settings: SettingsFile, seconds: float) -> None:
+def write_log(path: Path, settings: Experiment, seconds: float) -> None:
     """When, where, how long, with which versions, settings and files a run was made."""
     log = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -299,8 +299,7 @@ def _noise_unit(spec: BandTable, where: str) -> str:
     assert noise is not None  # as called
     if noise.estimate_above is not None:
         raise SettingsError(f"{where}.estimate_above: is of a map, but here none is read.")
-    observations = noise.hits or noise.weights
-    own = noise.map or noise.covariance or (observations and observations.sigma0_unit)
+    own = noise.map or noise.covariance
     if unit := noise.unit or spec.unit or ("uK_CMB" if own or spec.file is None else None):
         return unit
     raise SettingsError(f"{where}.unit: is missing; it is that of the map, which is not read here.")

@@ -132,7 +132,7 @@ def read(
     return read_maps(
         [find_file(folder, name) for name in spec.files],
         fields=spec.fields,
-        hdu=spec.hdu,
+        hdu=spec.hdu or 1,
         unit=spec.unit,
         ordering=spec.ordering,
         coordinates=spec.coordinates,

@@ -18,7 +18,15 @@ from jaxsky.noise import (
     uniform_covariance,
     weights_covariance,
 )
-from jaxsky.settings import Hits, MapFile, MapKeys, NoiseColumns, NoiseTable, SettingsError, at_key
+from jaxsky.settings import (
+    Columns,
+    MapFile,
+    MapKeys,
+    NoiseColumns,
+    NoiseTable,
+    SettingsError,
+    at_key,
+)
 
 #: Noise outside of this range, relative to the rms of its map, is a mistake unless it is meant.
 PLAUSIBLE = (1e-6, 10.0)
@@ -87,13 +95,14 @@ def _covariance(folder, noise, at, nside, stokes, where, unit, own):
     if noise.rms is not None:
         rms = noise.rms * unit_factor(unit, "uK_RJ", at)
         return rms_covariance(narrow(np.full((n, npix), rms))), np.ones(npix, bool)
-    kinds = ("map", "covariance", "hits", "weights")
-    kind = next(k for k in kinds if getattr(noise, k) is not None)
+    kind = next(
+        k for k in ("map", "covariance", "hits", "weights") if getattr(noise, k) is not None
+    )
     spec, where = getattr(noise, kind), f"{where}.{kind}"
     if noise.unit and spec.unit is None and kind in ("map", "covariance"):
         squared = "^2" if kind == "covariance" else ""
         spec = spec.model_copy(update={"unit": noise.unit + squared})
-    found = _read_columns(folder, _file(spec, own, where), kind, where)
+    found = _read_columns(folder, _file(spec, own, kind, where), kind, where)
     if found.nside != nside:
         raise SettingsError(f"{where}: nside is {found.nside}, but that of the map is {nside}.")
     given, known = found.unit, np.asarray(found.mask)
@@ -111,33 +120,32 @@ def _covariance(folder, noise, at, nside, stokes, where, unit, own):
     if given:
         raise SettingsError(f"{where}.unit: {kind} are pure numbers, but are said to be {given}.")
     _check_number(f"{where}.sigma0", len(spec.sigma0), stokes)
-    factor = float(unit_factor(spec.sigma0_unit or unit, "uK_RJ", at))
-    sigma0 = jnp.array(spec.sigma0, maps.dtype)[-n:] * factor
+    sigma0 = jnp.array(spec.sigma0, maps.dtype)[-n:] * float(unit_factor(unit, "uK_RJ", at))
+    sigma0 = jnp.broadcast_to(sigma0, (n,))
     if kind == "weights":
         if n != 2:
             raise SettingsError(f"{where}: weights are those of Q and U, not of {stokes}.")
         known = known & np.asarray(maps[0] * maps[2] > 0)
         nothing = jnp.array([1.0, 0.0, 1.0], maps.dtype)[:, None]
-        weights = jnp.where(known, maps, nothing)
-        return weights_covariance(jnp.broadcast_to(sigma0, (n,)), weights), known
+        return weights_covariance(sigma0, jnp.where(known, maps, nothing)), known
     known = known & np.asarray(maps[0] != 0)
-    hits = jnp.where(known, maps[0], 1.0)
-    return hits_covariance(jnp.broadcast_to(sigma0, (n,)), hits, n), known
+    return hits_covariance(sigma0, jnp.where(known, maps[0], 1.0), n), known
 
 
 def _read_columns(folder: Path, spec: MapFile, kind: str, where: str) -> Maps:
     """Columns about the noise, with the Stokes parameters that their place in the settings says."""
     tables = max(len(spec.files), len(spec.hdu) if isinstance(spec.hdu, list) else 1)
-    number = max(tables, len(spec.fields or []))
-    if kind == "map" and spec.fields is None and tables == 1:
+    fields = spec.fields or []
+    number = max(tables, len(fields))
+    if kind == "map" and not fields and tables == 1:
         number = len(read(folder, spec).names)
+    six = ("II", "IQ", "IU", "QQ", "QU", "UU")
     pairs: dict[str, dict[int, tuple[str, ...]]] = {
-        "map": {1: (), 2: ("QQ", "UU"), 3: ("II", "QQ", "UU")},
-        "covariance": {3: ("QQ", "QU", "UU"), 6: ("II", "IQ", "IU", "QQ", "QU", "UU")},
-        "weights": {3: ("QQ", "QU", "UU")},
+        "map": {2: ("QQ", "UU"), 3: ("II", "QQ", "UU")},
+        "covariance": {3: six[3:], 6: six},
+        "weights": {3: six[3:]},
     }
     wanted = pairs.get(kind, {}).get(number, ())
-    fields = spec.fields or []
     said = [stokes_of(name) if isinstance(name, str) else None for name in fields]
     if any(s is not None and w not in (s, s * 2) for s, w in zip(said, wanted, strict=False)):
         listed = ", ".join(w[0] if kind == "map" else w for w in wanted)
@@ -147,17 +155,17 @@ def _read_columns(folder: Path, spec: MapFile, kind: str, where: str) -> Maps:
     return read(folder, spec, stokes=wanted or "")
 
 
-def _file(spec: MapFile | NoiseColumns, own: MapKeys | None, where: str) -> MapFile:
+def _file(spec: NoiseColumns, own: MapKeys | None, kind: str, where: str) -> MapFile:
     """The columns to read; those without a file are in that of the map."""
-    said = spec.model_dump(include=set(MapFile.model_fields), exclude_none=True)
-    if isinstance(spec, Hits):
+    said = spec.model_dump(exclude={"sigma0"}, exclude_none=True)
+    if kind in ("hits", "weights"):
         said.setdefault("unit", "")  # a number, whatever the header calls it
-    if "file" not in said:
+    if spec.file is None:
         if own is None:
             raise SettingsError(f"{where}: file is missing.")
-        if len(own.files) > 1 or (isinstance(own.hdu, list) and "hdu" not in said):
+        if len(own.files) > 1 or (isinstance(own.hdu, list) and spec.hdu is None):
             raise SettingsError(f"{where}: the map has several files or HDUs; give file and hdu.")
-        taken = set(MapFile.model_fields) - {"fields", "unit", "stokes", "missing"}
+        taken = set(Columns.model_fields) - {"fields", "unit", "missing"}
         said = own.model_dump(include=taken, exclude_none=True) | said
     return MapFile(**said)
 

@@ -127,7 +127,7 @@ def test_settings_expand_their_folder_and_refuse_what_is_none(places):
         path.write_text(f"data_dir = '{given}'")
         with pytest.raises(SettingsError, match=words):
             load(path)
-    with pytest.raises(ValueError, match="must be the name of a file"):
+    with pytest.raises(ValueError, match="at least 1 character"):
         MapFile(file="")
 
 
@@ -295,7 +295,7 @@ def paper(settings):
         (
             paper,
             PAPER,
-            {"common": "[paper.beta_syn]\nfile = 'beta.fits'\nspectrum = 'none.fits'"},
+            {"common": "[paper.beta_syn]\nfile = 'beta.fits'\nsteepening = 'none.fits'"},
         ),
     ],
 )

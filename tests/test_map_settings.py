@@ -215,19 +215,19 @@ def test_footprints_and_marks_in_settings(tmp_path):
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
-        ({"file": []}, "must be the name of a file, or a list of them"),
-        ({"file": ["a.fits", 3]}, "must be the name of a file, or a list of them"),
-        ({"hdu": 0}, "must be the number of an HDU, 1 or more, or a list of them, not 0"),
-        ({"hdu": [1, True]}, "must be the number of an HDU"),
-        ({"hdu": "MAP"}, "must be the number of an HDU"),
+        ({"file": []}, "file.*at least 1 item"),
+        ({"file": ["a.fits", 3]}, "file.*valid string"),
+        ({"hdu": 0}, "hdu.*greater than or equal to 1"),
+        ({"hdu": [1, True]}, "hdu.*valid integer"),
+        ({"hdu": "MAP"}, "hdu.*valid integer"),
         ({"stokes": "QV"}, "`stokes` must name I, Q, U or pairs"),
-        ({"stokes": 3}, "`stokes` must name I, Q, U or pairs"),
-        ({"missing": "zero"}, "`missing` must be a number or a list of them, not"),
-        ({"missing": True}, "`missing` must be a number or a list of them, not"),
+        ({"stokes": 3}, "stokes.*valid string"),
+        ({"missing": "zero"}, "missing.*valid number"),
+        ({"missing": True}, "missing.*valid number"),
     ],
 )
 def test_mistakes_in_map_entries(entry, words):
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=f"(?s){words}"):
         MapFile.model_validate({"file": "m.fits"} | entry)
 
 

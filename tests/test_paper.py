@@ -59,7 +59,7 @@ fields = ["BETA_D"]
 [paper.beta_syn]
 file = "templates/pysm2_s1_QU23GHz_betas_n64.fits"
 fields = ["BETA_S"]
-spectrum = "{spectrum}"
+steepening = "{spectrum}"
 """
 
 
@@ -360,8 +360,8 @@ def test_settings_that_cannot_work(real):
     raw["paper"]["ame"] |= {"fields": ["I_STOKES", "Q_STOKES"]}
     with pytest.raises(ValueError, match=r"paper.ame.fields: must name one intensity map"):
         Sources(Experiment.model_validate(raw)).ame()
-    raw["paper"]["beta_syn"] |= {"spectrum": "absent.txt"}
-    with pytest.raises(ValueError, match=r"paper.beta_syn.spectrum: .*absent.txt"):
+    raw["paper"]["beta_syn"] |= {"steepening": "absent.txt"}
+    with pytest.raises(ValueError, match=r"paper.beta_syn.steepening: .*absent.txt"):
         Sources(Experiment.model_validate(raw)).index("beta_syn")
     del raw["sky"]["sky_synchrotron"]
     with pytest.raises(Impossible, match="one template of the law 'synchrotron', but there are 0"):

@@ -158,7 +158,7 @@ def folder(tmp_path_factory):
             {"hits": {"fields": ["HITS"], "sigma0": 100.0}},
         ),
         (
-            {"hits": {"fields": ["HITS"], "sigma0": 0.1, "sigma0_unit": "mK_CMB"}},
+            {"hits": {"fields": ["HITS"], "sigma0": 0.1}, "unit": "mK_CMB"},
             {"hits": {"fields": ["HITS"], "sigma0": 0.1}},
         ),
         (

@@ -79,20 +79,19 @@ def read_index(folder: Path, name: str, spec: IndexFile) -> Index:
     values, used = parameter_map(found, name, found.nside, where, stated=stated)
     smooth = dust_index(values, spec.fwhm, fwhm, found.nside, None if used.all() else used)
     if name == "beta_syn":
-        by = spec.steepening + _of_spectrum(folder, spec.spectrum)
+        given = spec.steepening
+        by = _of_spectrum(folder, given) if isinstance(given, str) else given
         origin += f", made steeper by {by:.2f}" if by else ", not made steeper"
     return Index(smooth + by, fwhm, by, origin)
 
 
-def _of_spectrum(folder: Path, file: str | None) -> float:
-    """By how much a spectrum in a file steepens; 0 without one."""
-    if file is None:
-        return 0.0
+def _of_spectrum(folder: Path, file: str) -> float:
+    """By how much a spectrum in a file steepens."""
     try:
         path = find_file(folder, file)
         nu, temperature = np.loadtxt(path, unpack=True, usecols=(0, 1))
         return float(steepening(nu, temperature))
     except InputError as error:
-        raise SettingsError(f"paper.beta_syn.spectrum: {error}") from None
+        raise SettingsError(f"paper.beta_syn.steepening: {error}") from None
     except (OSError, ValueError) as error:
-        raise SettingsError(f"paper.beta_syn.spectrum: {path}: {error}") from None
+        raise SettingsError(f"paper.beta_syn.steepening: {path}: {error}") from None

@@ -3,14 +3,13 @@
 from jaxsky.settings.experiment import Common, Experiment, IndexFile, parse_region
 from jaxsky.settings.files import (
     BandpassSpec,
-    Hits,
+    BeamedMap,
+    Columns,
     MapFile,
     MapKeys,
     MaskFile,
     NoiseColumns,
     NoiseTable,
-    SettingsError,
-    SettingsFile,
 )
 from jaxsky.settings.tables import (
     BandTable,
@@ -20,4 +19,4 @@ from jaxsky.settings.tables import (
     leakage_warning,
 )
 from jaxsky.settings.toml import at_key, find_file, found_files, load, named_files, of_file
-from jaxsky.settings.types import check_sign
+from jaxsky.settings.types import SettingsError, check_sign

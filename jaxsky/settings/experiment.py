@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
 from jaxsky.instrument import band_tables
-from jaxsky.settings.files import FileName, MapFile, MaskFile, SettingsError, SettingsFile, Table
+from jaxsky.settings.files import BeamedMap, MaskFile
 from jaxsky.settings.tables import (
     BandTable,
     CMBTable,
@@ -17,13 +17,19 @@ from jaxsky.settings.tables import (
     SmallScalesTable,
 )
 from jaxsky.settings.types import (
+    WORDS,
     Distinct,
+    FileName,
     MistakeAt,
+    Multipole,
     Nside,
     Pair,
+    Positive,
     RegionName,
     Seed,
+    SettingsError,
     Several,
+    Table,
     Word,
     check_names,
     check_reference,
@@ -31,17 +37,8 @@ from jaxsky.settings.types import (
 )
 from jaxsky.small_scales import DUST, SYNCHROTRON
 
-Positive = Annotated[float, Field(gt=0)]
-Multipole = Annotated[int, Field(ge=2)]
-
 #: Regions that need not be named.
 REGIONS: dict[str, str | MaskFile] = {"strip": "|b| <= 20", "outside": "|b| > 20", "full": "full"}
-#: First parts of free parameters that are no components, and the commands that have them.
-WORDS = {
-    "calibration": "fit", "offset": "fit",
-    "gain": "separate", "shift": "separate", "width": "separate", "angle": "separate",
-    "r": "forecast", "A_lens": "forecast",
-}  # fmt: skip
 
 
 def parse_region(text: str) -> tuple[str, float] | None:
@@ -198,17 +195,15 @@ class Forecast(Table):
         return self
 
 
-class IndexFile(MapFile):
+class IndexFile(BeamedMap):
     """A map of spectral indices, beta_syn in either sign; or an intensity, at `nu_ref` [GHz].
 
     A map of beta_syn at radio frequencies is made steeper: by a number, the paper's is 0.13, or as
-    a spectrum says, a table of frequency [GHz] and antenna temperature.
+    a spectrum says, a file with a table of frequency [GHz] and antenna temperature.
     """
 
-    nu_ref: float | None = Field(None, gt=0)
-    fwhm: float = Field(0.0, ge=0)
-    steepening: float = 0.0
-    spectrum: FileName | None = None
+    nu_ref: Positive | None = None
+    steepening: float | FileName = 0.0
 
 
 class Paper(Table):
@@ -235,24 +230,22 @@ class Paper(Table):
     def _plausible(self) -> "Paper":
         if self.ame is not None and self.ame.nu_ref is None:
             raise MistakeAt("ame.nu_ref", "is missing")
-        steeper = {"steepening", "spectrum"}
-        others = {"ame": steeper, "beta_dust": {"nu_ref", *steeper}, "beta_syn": {"nu_ref"}}
-        fields = IndexFile.model_fields  # what is as by default may be from a log
-        for key, keys in others.items():
+        keys = {"ame": "steepening", "beta_dust": "nu_ref steepening", "beta_syn": "nu_ref"}
+        for key, others in keys.items():
             one: IndexFile | None = getattr(self, key)
-            wrong = [k for k in keys if one and getattr(one, k) != fields[k].default]
-            if wrong:
-                raise MistakeAt(f"{key}.{min(wrong)}", "unknown key")
+            if one and (wrong := one.changed(others.split())):
+                raise MistakeAt(f"{key}.{wrong[0]}", "unknown key")
         if self.ame is not None:
             check_reference("ame", self.ame.nu_ref, {})
         return self
 
 
-class Experiment(SettingsFile):
+class Experiment(Table):
     """All settings: a sky, the bands in which it is observed, and what is done with them.
 
     Parameters
     ----------
+    title, data_dir : name of the experiment; folder of its files, relative to that of this one
     seed : of all that is random, but for the model of the Galaxy
     sky, bands, cmb : what is observed, and how; bands without a map are simulated
     common, regions : the resolution at which maps are compared, and parts of the sky by name
@@ -261,6 +254,8 @@ class Experiment(SettingsFile):
     simulate, fit, compare, separate, forecast, paper : of the command of this name
     """
 
+    title: str = ""
+    data_dir: str = "."
     seed: Seed = 0
     sky: SkyTable = SkyTable()
     bands: list[BandTable] = Field(default=[])

@@ -3,20 +3,23 @@
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from jaxsky.components import AME, component_class
-from jaxsky.settings.files import BandpassSpec, FileName, MapFile, MapKeys, NoiseTable, Table
+from jaxsky.settings.files import BandpassSpec, BeamedMap, MapFile, MapKeys, NoiseTable
 from jaxsky.settings.types import (
     BandName,
+    FileName,
     Law,
     MistakeAt,
     Nside,
     Pair,
+    Positive,
     Seed,
     Several,
+    Table,
     TensorRatio,
     Word,
     check_component_names,
@@ -101,7 +104,7 @@ class SmallScalesTable(Table):
     slope: float | Pair[float] | None = None
     tilt: float = 0.0
     amplitude: float = Field(1.0, ge=0)
-    modulation_fwhm: float = Field(180.0, gt=0)
+    modulation_fwhm: Positive = 180.0
     correlated_with: str | None = None
 
     @model_validator(mode="after")
@@ -122,7 +125,7 @@ class ComponentTable(MapKeys):
     """
 
     law: Law | None = None
-    nu_ref: float | None = Field(None, gt=0)
+    nu_ref: Positive | None = None
     fwhm: float = Field(0.0, ge=0)
     angles: str | None = None
     parameters: dict[str, float | list[float] | MapFile] = Field(default={})
@@ -235,12 +238,6 @@ class CMBTable(Table):
         return self
 
 
-class Leakage(MapFile):
-    """What leaked from intensity into Q and U, to be subtracted; in the map's unit."""
-
-    fwhm: float = Field(0.0, ge=0)
-
-
 class BandTable(MapKeys):
     """A band: how it observes, and its map; without a map it is simulated.
 
@@ -250,6 +247,7 @@ class BandTable(MapKeys):
     instrument : of which it is a channel, for what is not given here
     samples : of the top-hat of a bandpass that is no table
     fwhm, beam : FWHM of a Gaussian beam [arcmin], or the file of a window
+    leakage : what leaked from intensity into Q and U, to be subtracted
     """
 
     name: BandName | None = None
@@ -260,7 +258,7 @@ class BandTable(MapKeys):
     fwhm: float | None = Field(None, ge=0)
     beam: FileName | None = None
     noise: NoiseTable | None = None
-    leakage: Leakage | None = None
+    leakage: BeamedMap | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> "BandTable":
@@ -272,11 +270,7 @@ class BandTable(MapKeys):
             raise MistakeAt("file", "is of one band; give its name")
         if self.fwhm is not None and self.beam is not None:
             raise ValueError("give the beam either as fwhm or as the file of a window, beam")
-        if (
-            self.samples != type(self).model_fields["samples"].default
-            and self.bandpass
-            and not self.bandpass.width
-        ):
+        if self.changed(["samples"]) and self.bandpass and not self.bandpass.width:
             raise MistakeAt("samples", "is of a top-hat, but the bandpass has no width")
         if self.noise is not None and 0 in (self.noise.level, self.noise.rms):
             raise MistakeAt("noise", "must be greater than 0, not 0")
@@ -317,8 +311,6 @@ class BandTable(MapKeys):
 class Regions(Table):
     """Where a parameter has values of its own: exactly one of these."""
 
-    KINDS: ClassVar[tuple[str, ...]] = ("nside", "latitudes", "clusters", "file")
-
     nside: Nside | None = None
     latitudes: list[float] | None = Field(None, min_length=1)
     clusters: int | None = Field(None, ge=1)
@@ -327,12 +319,7 @@ class Regions(Table):
 
     @model_validator(mode="after")
     def _one_kind(self) -> "Regions":
-        given = [kind for kind in self.KINDS if getattr(self, kind) is not None]
-        if len(given) != 1:
-            raise ValueError(
-                f"give the regions as exactly one of {', '.join(self.KINDS)}, "
-                f"not {', '.join(given) or 'none'}"
-            )
+        self.one_of("regions", ("nside", "latitudes", "clusters", "file"))
         if self.of and self.clusters is None:
             raise ValueError("of goes with clusters only")
         return self

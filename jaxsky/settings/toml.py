@@ -14,8 +14,7 @@ from pydantic import BaseModel, ValidationError
 from jaxsky.io import InputError, MissingFileError, check_file
 from jaxsky.io.folders import cache_folder
 from jaxsky.settings.experiment import Experiment
-from jaxsky.settings.files import NamedFile, SettingsError, SettingsFile, expand
-from jaxsky.settings.types import mistakes
+from jaxsky.settings.types import NamedFile, SettingsError, mistakes
 
 
 @contextmanager
@@ -121,6 +120,20 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
     return settings.model_copy(update={"data_dir": str(folder)})
 
 
+def expand(text: str) -> str:
+    """Expand `~` and environment variables, $NAME or ${NAME:-default}, in a path."""
+
+    def value(match: re.Match[str]) -> str:
+        name, default = match["braced"] or match["plain"], match["default"]
+        found = os.environ.get(name) or default
+        if found is None:
+            raise ValueError(f"the environment variable {name} is not set")
+        return found
+
+    pattern = r"\$(?:\{(?P<braced>\w+)(?::-(?P<default>[^}]*))?\}|(?P<plain>\w+))"
+    return os.path.expanduser(re.sub(pattern, value, text))
+
+
 def find_file(folder: Path, name: str) -> Path:
     """Find a file that settings name.
 
@@ -166,7 +179,7 @@ def _missing(path: Path, cache: Path | None) -> str:
     return said
 
 
-def found_files(settings: SettingsFile) -> dict[str, str]:
+def found_files(settings: Experiment) -> dict[str, str]:
     """The files that settings name and that are there: name -> path."""
     found = {}
     for name in named_files(settings):

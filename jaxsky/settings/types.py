@@ -6,9 +6,36 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, Field, Strict, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    Strict,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 
 from jaxsky.components import component_class, declared
+from jaxsky.io.columns import parse_stokes
+
+T = TypeVar("T")
+
+#: Names are parts of file names and of columns in FITS files.
+LONGEST = 40
+#: First parts of free parameters that are no components, and the commands that have them.
+WORDS = {
+    "calibration": "fit", "offset": "fit",
+    "gain": "separate", "shift": "separate", "width": "separate", "angle": "separate",
+    "r": "forecast", "A_lens": "forecast",
+}  # fmt: skip
+#: What else is called by a name in results and columns.
+RESERVED = ("cmb", "noise", "total", "residual", "center", "embedded", *map(str.lower, WORDS))
+
+
+class SettingsError(ValueError):
+    """Settings that cannot work, as one sentence that names the file and the key."""
 
 
 class MistakeAt(ValueError):
@@ -19,6 +46,101 @@ class MistakeAt(ValueError):
         if isinstance(mistake, MistakeAt):
             self.key, self.words = f"{key}.{mistake.key}", mistake.words
         super().__init__(f"{self.key}: {self.words}")
+
+
+class Table(BaseModel):
+    """A table of settings: its fields are the keys, and no others, with values of their types.
+
+    A number in quotes, a switch where a number is meant and an empty word are mistakes.
+    """
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
+
+    @field_validator("*")
+    @classmethod
+    def _not_empty(cls, value: Any, info: ValidationInfo) -> Any:
+        if value == "" and info.field_name not in ("title", "unit"):
+            raise ValueError("must not be empty")
+        return value
+
+    def changed(self, keys: Iterable[str]) -> list[str]:
+        """Those of some keys that are not as by default; others may be from a log."""
+        fields = type(self).model_fields
+        return [key for key in keys if getattr(self, key) != fields[key].default]
+
+    def one_of(self, what: str, kinds: Sequence[str]) -> None:
+        """Raise ValueError unless exactly one of some keys is given."""
+        if len(given := self.changed(kinds)) != 1:
+            raise ValueError(
+                f"give the {what} as exactly one of {', '.join(kinds)}, "
+                f"not {', '.join(given) or 'none'}"
+            )
+
+
+class NamedFile(str):
+    """The name of a file, told from other text; see `find_file`."""
+
+    __slots__ = ()
+
+
+def _power_of_two(value: int) -> int:
+    if value & (value - 1):
+        raise ValueError(f"nside must be a power of two, not {value}")
+    return value
+
+
+def _distinct(values: list[T]) -> list[T]:
+    for i, value in enumerate(values):
+        if value in values[:i]:
+            raise ValueError(f"has {value!r} twice")
+    return values
+
+
+def _law(value: str) -> str:
+    component_class(value)
+    return value
+
+
+def _stokes(value: str | list[str]) -> str | list[str]:
+    parse_stokes(value)
+    return value
+
+
+def _name(value: str, characters: str, reserved: Collection[str] = ()) -> str:
+    if value.lower() in reserved:
+        raise ValueError(f"the name {value!r} has a meaning of its own in results; choose another")
+    if len(value) > LONGEST:
+        raise ValueError(f"a name has at most {LONGEST} characters, not {len(value)}: {value!r}")
+    if not re.fullmatch(rf"[A-Za-z0-9_+][A-Za-z0-9_+{characters}-]*", value):
+        others = f"_ + - {characters}".strip()
+        raise ValueError(
+            f"a name consists of letters, digits and {others}, and begins with a letter or digit, "
+            f"unlike {value!r}"
+        )
+    return value
+
+
+Positive = Annotated[float, Field(gt=0)]
+Multipole = Annotated[int, Field(ge=2)]
+#: The largest leaves the tensors far above all else.
+TensorRatio = Annotated[float, Field(ge=0, le=1000)]
+Nside = Annotated[int, Field(gt=0, le=8192), AfterValidator(_power_of_two)]
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
+Word = Annotated[str, Field(min_length=1)]
+FileName = Annotated[Word, AfterValidator(NamedFile)]
+Files = FileName | Annotated[list[FileName], Field(min_length=1)]
+_Hdu = Annotated[int, Field(ge=1)]
+Hdus = _Hdu | Annotated[list[_Hdu], Field(min_length=1)]
+Stokes = Annotated[str | list[str], AfterValidator(_stokes)]
+#: A list without repetitions, and one that is not empty either.
+Distinct = Annotated[list[T], AfterValidator(_distinct)]
+Several = Annotated[list[T], Field(min_length=1), AfterValidator(_distinct)]
+#: Two values; a list in TOML.
+Pair = Annotated[tuple[T, T], Strict(False)]
+#: The law of a component: a name, or "module:Class" (`jaxsky.components.component_class`).
+Law = Annotated[str, AfterValidator(_law)]
+BandName = Annotated[str, AfterValidator(lambda value: _name(value, "."))]
+RegionName = Annotated[str, AfterValidator(lambda value: _name(value, ""))]
 
 
 def _key(raw: Any, place: Sequence[str | int], missing: bool) -> str:
@@ -42,26 +164,26 @@ def mistakes(
     """A sentence about what is wrong with tables, with the keys; options add to those of a key."""
     wrong: dict[str, list[str]] = {}
     types: dict[str, str] = {}
-    for item in error.errors():
-        what = item["msg"].removeprefix("Value error, ").rstrip(".")
-        where = _key(raw, item["loc"], item["type"] == "missing")
-        mistake = item.get("ctx", {}).get("error")
+    for found in error.errors():
+        what = found["msg"].removeprefix("Value error, ").rstrip(".")
+        where = _key(raw, found["loc"], found["type"] == "missing")
+        mistake = found.get("ctx", {}).get("error")
         if isinstance(mistake, MistakeAt):
             where = f"{where}.{mistake.key}" if where else mistake.key
             what = mistake.words.rstrip(".")
-        elif item["type"] == "extra_forbidden":
+        elif found["type"] == "extra_forbidden":
             what = "unknown key"
-        elif item["type"] == "missing":
+        elif found["type"] == "missing":
             what = "is missing"
-        elif item["type"].endswith(("_type", "literal_error")):
+        elif found["type"].endswith(("_type", "literal_error")):
             wanted = what.removeprefix("Input should be ").partition(" or instance")[0]
             wanted = wanted.replace("dictionary", "table")
             known = types.get(where, "input should be ").partition(", not ")[0]
             joined = known + ("" if known.endswith("be ") else " or ") + wanted
-            types[where] = f"{joined}, not {reprlib.repr(item['input'])}"
+            types[where] = f"{joined}, not {reprlib.repr(found['input'])}"
             continue
-        elif item["msg"] == what:
-            value = "" if ", not " in what else f", not {reprlib.repr(item['input'])}"
+        elif found["msg"] == what:
+            value = "" if ", not " in what else f", not {reprlib.repr(found['input'])}"
             what = f"{what[0].lower()}{what[1:]}{value}"
         wrong.setdefault(where, []).append(what)
     # Of a value that may be of several types, those that it is not matter only if it is none.
@@ -73,6 +195,26 @@ def mistakes(
         ": ".join(filter(None, (k, " or ".join(w)))) + options.get(k, "") for k, w in wrong.items()
     ]
     return "; ".join(sentences)
+
+
+def check_names(kind: str, names: Iterable[str]) -> None:
+    """Raise ValueError if names are the same, or differ by capital letters only."""
+    names = list(names)
+    for known, more in ((set(names), ""), ({n.lower() for n in names}, " by more than capitals")):
+        if len(known) < len(names):
+            raise ValueError(
+                f"the names of the {kind} must differ{more}, but are {', '.join(names)}"
+            )
+
+
+def check_component_names(names: Collection[str]) -> None:
+    """Raise MistakeAt its name if a component cannot be called so."""
+    check_names("components", names)
+    for name in names:
+        try:
+            _name(name, "", RESERVED)
+        except ValueError as error:
+            raise MistakeAt(name, error) from None
 
 
 def check_reference(law: str, nu_ref: float | None, parameters: Mapping[str, Any]) -> None:
@@ -113,118 +255,3 @@ def check_signs(table: str, values: Mapping[str, Any]) -> None:
             check_sign(name, *(x for x in numbers if isinstance(x, int | float)))
         except ValueError as error:
             raise MistakeAt(table, error) from None
-
-
-def file_names(value: Any) -> Any:
-    """The name of a file, or several."""
-    names = value if isinstance(value, list | tuple) else [value]
-    if not names or not all(isinstance(name, str) and name for name in names):
-        raise ValueError(f"must be the name of a file, or a list of them, not {value!r}")
-    return value
-
-
-def hdu_numbers(value: Any) -> Any:
-    """The number of an HDU, or several."""
-    numbers = value if isinstance(value, list | tuple) else [value]
-    whole = all(isinstance(n, int) and not isinstance(n, bool) and n >= 1 for n in numbers)
-    if not numbers or not whole:
-        raise ValueError(
-            f"must be the number of an HDU, 1 or more, or a list of them, not {value!r}"
-        )
-    return value
-
-
-def stokes_words(value: Any) -> Any:
-    """What `jaxsky.io.read_maps` takes as `stokes`."""
-    from jaxsky.io.columns import parse_stokes  # reading is slow to import
-
-    parse_stokes(value if isinstance(value, str | list | tuple) else [value])
-    return value
-
-
-def missing_numbers(value: Any) -> Any:
-    """What `jaxsky.io.read_maps` takes as `missing`."""
-    from jaxsky.io.columns import parse_missing
-
-    parse_missing([value] if not isinstance(value, list | tuple) else value)
-    return value
-
-
-T = TypeVar("T")
-
-#: Names are parts of file names and of columns in FITS files.
-LONGEST = 40
-#: What else is called by a name in results, columns, and parameters such as "calibration.44".
-RESERVED = (
-    "cmb", "noise", "total", "residual", "r", "a_lens", "calibration", "offset", "gain", "shift",
-    "width", "angle", "center", "embedded",
-)  # fmt: skip
-
-
-def _power_of_two(value: int) -> int:
-    if value & (value - 1):
-        raise ValueError(f"nside must be a power of two, not {value}")
-    return value
-
-
-def _distinct(values: list[T]) -> list[T]:
-    for i, value in enumerate(values):
-        if value in values[:i]:
-            raise ValueError(f"has {value!r} twice")
-    return values
-
-
-def _law(value: str) -> str:
-    component_class(value)
-    return value
-
-
-def _name(value: str, characters: str, reserved: Collection[str] = ()) -> str:
-    if value.lower() in reserved:
-        raise ValueError(f"the name {value!r} has a meaning of its own in results; choose another")
-    if len(value) > LONGEST:
-        raise ValueError(f"a name has at most {LONGEST} characters, not {len(value)}: {value!r}")
-    if not re.fullmatch(rf"[A-Za-z0-9_+][A-Za-z0-9_+{characters}-]*", value):
-        others = f"_ + - {characters}".strip()
-        raise ValueError(
-            f"a name consists of letters, digits and {others}, and begins with a letter or digit, "
-            f"unlike {value!r}"
-        )
-    return value
-
-
-#: The largest leaves the tensors far above all else.
-TensorRatio = Annotated[float, Field(ge=0, le=1000)]
-Nside = Annotated[int, Field(gt=0, le=8192), AfterValidator(_power_of_two)]
-Seed = Annotated[int, Field(ge=0, lt=2**32)]
-Word = Annotated[str, Field(min_length=1)]
-#: A list without repetitions, and one that is not empty either.
-Distinct = Annotated[list[T], AfterValidator(_distinct)]
-Several = Annotated[list[T], Field(min_length=1), AfterValidator(_distinct)]
-#: Two values; a list in TOML.
-Pair = Annotated[tuple[T, T], Strict(False)]
-#: The law of a component: a name, or "module:Class" (`jaxsky.components.component_class`).
-Law = Annotated[str, AfterValidator(_law)]
-BandName = Annotated[str, AfterValidator(lambda value: _name(value, "."))]
-RegionName = Annotated[str, AfterValidator(lambda value: _name(value, ""))]
-
-
-def check_names(kind: str, names: Iterable[str]) -> None:
-    """Raise ValueError if names are the same, or differ by capital letters only."""
-    names = list(names)
-    for known, more in ((set(names), ""), ({n.lower() for n in names}, " by more than capitals")):
-        if len(known) < len(names):
-            raise ValueError(
-                f"the names of the {kind} must differ{more}, but are {', '.join(names)}"
-            )
-
-
-def check_component_names(names: Iterable[str]) -> None:
-    """Raise MistakeAt its name if a component cannot be called so."""
-    names = list(names)
-    check_names("components", names)
-    for name in names:
-        try:
-            _name(name, "", RESERVED)
-        except ValueError as error:
-            raise MistakeAt(name, error) from None

@@ -15,9 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.preparation import Preparation
 from jaxsky.cmb import realisation
-from jaxsky.harmonics import adjoint_synthesis, alm_ell, expand, synthesis
+from jaxsky.harmonics import Preparation, adjoint_synthesis, alm_ell, expand, synthesis
 from jaxsky.keys import stream
 from jaxsky.noise import draw, uniform_alm
 

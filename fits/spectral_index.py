@@ -13,11 +13,11 @@ import scipy.stats
 from jaxtyping import Bool
 
 from fits.chains import kept_chain
+from fits.common import CommonMaps
 from fits.grid import grid_fit, grid_is_possible
 from fits.optimize import best_fit
 from fits.priors import priors_of
 from fits.record import fingerprint
-from fits.resolution import Prepared
 from fits.results import FitResult
 from fits.sampling import sample
 from fits.template_likelihood import chi2
@@ -62,7 +62,7 @@ def all_free(fits: Sequence[Fit]) -> tuple[str, ...]:
 
 def fit_pixels(
     settings: Experiment,
-    prepared: Prepared,
+    prepared: CommonMaps,
     used: Bool[np.ndarray, " pix"],
     region: str,
     stokes: str,
@@ -134,7 +134,7 @@ def fit_pixels(
 
 
 def _expected(
-    prepared: Prepared, used: Bool[np.ndarray, " pix"], stokes: str, left_out: Sequence[str]
+    prepared: CommonMaps, used: Bool[np.ndarray, " pix"], stokes: str, left_out: Sequence[str]
 ) -> float:
     """Mean square of noise and CMB in a pixel over that of the noise, which chi^2 counts alone."""
     power = prepared.fluctuations.cmb_power().sum(axis=1)
@@ -148,7 +148,7 @@ def _expected(
 
 
 def weightless(
-    prepared: Prepared,
+    prepared: CommonMaps,
     params: Mapping[str, float],
     used: Bool[np.ndarray, " pix"],
     stokes: str,
@@ -173,7 +173,7 @@ def weightless(
 
 def run(
     settings: Experiment,
-    prepared: Prepared,
+    prepared: CommonMaps,
     regions: dict[str, Bool[np.ndarray, " pix"]],
     chains: Path | None = None,
     progress: Progress = QUIET,

@@ -16,11 +16,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fits.compress import gram
-from fits.preparation import Preparation
 from fits.results import FitResult
 from fits.template_likelihood import Likelihood, TemplateLikelihood
 from jaxsky import Sky
-from jaxsky.harmonics import gaussian_beam, pixel_window
+from jaxsky.harmonics import Preparation, gaussian_beam, pixel_window
 from jaxsky.inputs import Template
 from jaxsky.noise_inputs import read_noise
 from jaxsky.settings import ComponentTable, SettingsError

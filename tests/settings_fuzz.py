@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import fits.separate.setup
 from fits.commands.forecast import forecast_inputs
 from fits.commands.run import DEFAULTS
+from fits.common import common_maps
 from fits.inputs import inputs_of
 from fits.regions import region_masks
-from fits.resolution import prepare
 from jaxsky import experiment
 from jaxsky.io import InputError
 from jaxsky.settings import Experiment, SettingsError, at_key, load, of_file
@@ -33,7 +33,7 @@ def _prepared(settings: Experiment, regions: str) -> None:
     region_masks(settings, getattr(settings, regions).regions)
     inputs = inputs_of(settings)
     with at_key("common"):
-        prepare(inputs, settings.common.nside, settings.common.fwhm)
+        common_maps(inputs, settings.common.nside, settings.common.fwhm)
 
 
 KINDS = {

@@ -11,6 +11,7 @@ import pytest
 import scipy.stats
 
 from commands import jaxsky
+from fits.common import common_maps
 from fits.comparison import compare
 from fits.comparison.pixels import compare_pixels
 from fits.comparison.report import warnings
@@ -18,7 +19,6 @@ from fits.comparison.simulations import full_sky_spectra, simulate
 from fits.comparison.spectra import compare_spectra, cosmic_error, hotelling
 from fits.inputs import inputs_of
 from fits.regions import region_masks
-from fits.resolution import prepare
 from jaxsky.io import InputError
 from jaxsky.settings import Experiment, SettingsError, load
 
@@ -57,7 +57,7 @@ def settings(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def prepared(settings):
-    return prepare(inputs_of(settings), settings.common.nside, settings.common.fwhm)
+    return common_maps(inputs_of(settings), settings.common.nside, settings.common.fwhm)
 
 
 @pytest.fixture(scope="module")
@@ -229,7 +229,7 @@ def test_spectra_are_healpys(prepared, model, simulated):
 
 
 def test_spectra_do_not_depend_on_the_common_nside(settings, prepared):
-    fine = prepare(inputs_of(settings), 32, settings.common.fwhm)
+    fine = common_maps(inputs_of(settings), 32, settings.common.fwhm)
     found, finer = full_sky_spectra(prepared.data, 25), full_sky_spectra(fine.data, 25)
     np.testing.assert_allclose(found[..., 2:], finer[..., 2:], rtol=1e-2)
 
@@ -347,7 +347,7 @@ def test_wmap_on_the_real_sky(data_dir, monkeypatch):
     monkeypatch.setenv("JAXSKY_DATA", str(data_dir))
     settings = load(EXAMPLE, ["compare.nsims=30"])
     regions = region_masks(settings, ["strip", "outside"])
-    found = compare(settings, prepare(inputs_of(settings), 32, 0.0), regions)
+    found = compare(settings, common_maps(inputs_of(settings), 32, 0.0), regions)
     for scatter in found.scatters:
         assert abs(scatter.slope - 1) < 3 * scatter.error
         assert scatter.rms == pytest.approx(scatter.expected, rel=0.15)

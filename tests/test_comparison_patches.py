@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fits.common import common_maps
 from fits.comparison.patches import _noise, compare_patches, template_patches
 from fits.comparison.plots import plot_patches, plot_template_patches
 from fits.discs import paper_patches
 from fits.inputs import inputs_of
 from fits.patches import fit_patches, prepare_patches
 from fits.pseudo_cl import band_powers
-from fits.resolution import prepare
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.settings import Experiment
 
@@ -48,7 +48,7 @@ def test_noise_is_that_of_each_patch(inputs):
     band = inputs.bands["353"]
     north = healpy.pix2ang(NSIDE, np.arange(band.used.size), lonlat=True)[1] > 0
     uneven = band._replace(noise=band.noise * jnp.where(north, 4.0, 1.0))
-    prepared = prepare(inputs._replace(bands={"353": uneven}), NSIDE, 60.0)
+    prepared = common_maps(inputs._replace(bands={"353": uneven}), NSIDE, 60.0)
     patches = prepare_patches(
         itertools.islice(paper_patches(NSIDE), 0, 48, 16), np.asarray(gaussian_beam(60.0, 128))
     )

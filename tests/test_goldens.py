@@ -14,7 +14,6 @@ import pytest
 
 import systems
 from fits.covariance import Fluctuations
-from fits.preparation import Preparation
 from fits.pseudo_cl import masked_spectra
 from fits.separation import hessian, spectral_likelihood
 from fits.separation.harmonic import harmonic_likelihood
@@ -22,7 +21,7 @@ from fits.template_likelihood import chi2, likelihood
 from jaxsky import Bandpass, Sky, get_parameters, observe, parameter_names, set_parameters
 from jaxsky.cmb import realisation
 from jaxsky.components import FreeFree
-from jaxsky.harmonics import gaussian_beam, synthesis
+from jaxsky.harmonics import Preparation, gaussian_beam, synthesis
 
 PATH = Path(__file__).with_name("goldens.json")
 #: Relative to the largest number of an entry: sums in another order differ by less.

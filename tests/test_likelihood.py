@@ -15,11 +15,10 @@ import systems
 from fits.compress import gram, square_root
 from fits.covariance import Fluctuations
 from fits.optimize import best_fit
-from fits.preparation import Preparation
 from fits.template_likelihood import chi2, likelihood
 from jaxsky import AME, Bandpass, Dust, Sky, Synchrotron, observe, parameter_names, set_parameters
 from jaxsky.cmb import camb_spectra
-from jaxsky.harmonics import adjoint_synthesis, alm_ell, gaussian_beam
+from jaxsky.harmonics import Preparation, adjoint_synthesis, alm_ell, gaussian_beam
 from jaxsky.noise import uniform_covariance
 
 NSIDE = 4

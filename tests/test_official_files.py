@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from astropy.io import fits as pyfits
 
+from fits.common import common_maps
 from fits.inputs import inputs_of
-from fits.resolution import prepare
 from jaxsky.experiment import leak
 from jaxsky.harmonics import gaussian_beam, resample, synthesis
 from jaxsky.inputs import read
@@ -155,13 +155,13 @@ def test_leakage_is_subtracted_at_the_common_resolution(folder):
     """The correction has its own nside and beam, and what is left is the sky that did not leak."""
     inputs = inputs_of(settings(folder, PLANCK | {"leakage": LEAKAGE}))
     factor = float(inputs.bands["70"].bandpass.conversion("uK_CMB", "uK_RJ"))
-    prepared = prepare(inputs, NSIDE, 800.0)
+    prepared = common_maps(inputs, NSIDE, 800.0)
     alone = resample(smooth_maps(2, 2 * NSIDE, 0.0), gaussian_beam(800.0, 16), NSIDE)
     # Single precision of the files, and l > 16 of what the pixels alias.
     np.testing.assert_allclose(prepared.data[0], factor * alone, atol=1e-4 * factor)
     assert float(jnp.abs(prepared.leakage["70"]).max()) > 0.1 * factor
     # Without it the map is as it was, but for the last multipoles, to which the coarser limits it.
-    before = prepare(inputs_of(settings(folder, PLANCK)), NSIDE, 800.0)
+    before = common_maps(inputs_of(settings(folder, PLANCK)), NSIDE, 800.0)
     assert not before.leakage
     np.testing.assert_allclose(
         before.data[0], prepared.data[0] + prepared.leakage["70"], atol=1e-5 * factor

@@ -6,6 +6,7 @@ import pytest
 
 from fits.commands.forecast import forecast
 from fits.commands.run import DEFAULTS
+from fits.common import common_maps
 from fits.comparison import compare
 from fits.inputs import inputs_of
 from fits.paper import STEPS, run
@@ -13,7 +14,6 @@ from fits.paper.forecasts import _settings
 from fits.paper.sources import Sources
 from fits.record import with_error
 from fits.regions import region_masks
-from fits.resolution import prepare
 from jaxsky.settings import Experiment, load
 
 LABELS = [f"Figure {n}" for n in range(5, 13)]
@@ -59,7 +59,7 @@ def test_figures(made):
 def test_numbers_are_those_of_the_comparison(small, made):
     found = compare(
         small,
-        prepare(inputs_of(small), small.common.nside, small.common.fwhm),
+        common_maps(inputs_of(small), small.common.nside, small.common.fwhm),
         region_masks(small, small.compare.regions),
     )
     shown = numbers(made[1])

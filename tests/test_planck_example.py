@@ -10,15 +10,14 @@ import pytest
 
 from fits import inputs as fit_inputs
 from fits.commands.run import DEFAULTS
+from fits.common import common_maps
 from fits.inputs import Band, Inputs, read_band
-from fits.preparation import Preparation
 from fits.record import leaks
 from fits.report import result_json, warnings
-from fits.resolution import prepare
 from fits.spectral_index import run
 from fits.template_noise import TemplateNoise, prepared_variance
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, inputs, observe
-from jaxsky.harmonics import alm_ell, gaussian_beam, resample, synthesis
+from jaxsky.harmonics import Preparation, alm_ell, gaussian_beam, resample, synthesis
 from jaxsky.inputs import Template
 from jaxsky.io import write_maps
 from jaxsky.noise import draw, uniform_covariance
@@ -216,9 +215,9 @@ def test_a_band_without_weight_is_named_and_not_counted():
     inside = {"all": np.ones(NPIX, bool)}
     bands = {"30": (30.0, 10.0), "353": (353.0, 10.0)}
     settings, sky = settings_of(), sky_of(2)
-    (plain,) = run(settings, prepare(inputs_of(sky, bands), NSIDE, 0.0), inside)
+    (plain,) = run(settings, common_maps(inputs_of(sky, bands), NSIDE, 0.0), inside)
     made = inputs_of(sky, bands | {"70": (70.0, 1e12)})
-    (fit,) = run(settings, prepare(made, NSIDE, 0.0), inside)
+    (fit,) = run(settings, common_maps(made, NSIDE, 0.0), inside)
     assert (plain.weightless, fit.weightless) == ((), ("70",))
     assert (fit.dof, fit.dof_amplitudes) == (plain.dof, plain.dof_amplitudes) == (3070, 6)
     said = " ".join(warnings(made, settings, [fit]))
@@ -252,7 +251,7 @@ def test_noise_of_templates_moves_a_fit_as_computed():
 
 
 def fitted(made, settings, inside):
-    (fit,) = run(settings, prepare(made, NSIDE, 0.0), inside)
+    (fit,) = run(settings, common_maps(made, NSIDE, 0.0), inside)
     return fit
 
 
@@ -368,7 +367,7 @@ def test_large_maps_are_kept_in_single_precision(folder, monkeypatch):
     assert single.noise.dtype == np.float32
     np.testing.assert_allclose(single.maps, double.maps, rtol=1e-6)
     np.testing.assert_allclose(single.noise, double.noise, rtol=1e-6)
-    data = [prepare(Inputs({}, {"x": b}, None, None, ""), 4, 900.0) for b in (double, single)]
+    data = [common_maps(Inputs({}, {"x": b}, None, None, ""), 4, 900.0) for b in (double, single)]
     assert data[1].data.dtype == np.float64
     np.testing.assert_allclose(data[1].data, data[0].data, atol=1e-6 * float(data[0].data.std()))
     np.testing.assert_allclose(data[1].sigma, data[0].sigma, rtol=1e-6)

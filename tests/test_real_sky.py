@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from commands import jaxsky
+from fits.common import common_maps
 from fits.inputs import inputs_of
 from fits.regions import region_masks
-from fits.resolution import prepare
 from fits.spectral_index import run
 from jaxsky.settings import Experiment, load
 
@@ -42,7 +42,7 @@ def test_wmap_from_the_command_line(wmap, tmp_path, monkeypatch):
 def test_published_noise_is_recovered_from_the_maps(wmap):
     """About 5.5 uK_CMB a pixel in V and 8.6 in W at high latitude, large scales included."""
     inputs = inputs_of(wmap)
-    sigma = prepare(inputs, 32, 0.0).sigma[:, :, 0]
+    sigma = common_maps(inputs, 32, 0.0).sigma[:, :, 0]
     for (name, expected), row in zip({"V": 5.5, "W": 8.6}.items(), sigma, strict=True):
         factor = float(inputs.bands[name].bandpass.conversion("uK_CMB", "uK_RJ"))
         assert float(row[0]) / factor == pytest.approx(expected, rel=0.06)
@@ -63,10 +63,10 @@ def test_a_map_of_the_dust_index_shifts_as_a_whole(wmap):
     raw["fit"] |= {"methods": ["gradient"], "stokes": ["QU"], "regions": ["strip"]}
     settings = Experiment.model_validate(raw)
     inputs = inputs_of(settings)
-    (fit,) = run(settings, prepare(inputs, 32, 0.0), region_masks(settings, ["strip"]))
+    (fit,) = run(settings, common_maps(inputs, 32, 0.0), region_masks(settings, ["strip"]))
     (constant,) = run(
         wmap.model_copy(update={"fit": settings.fit}),
-        prepare(inputs_of(wmap), 32, 0.0),
+        common_maps(inputs_of(wmap), 32, 0.0),
         region_masks(settings, ["strip"]),
     )
     by_map, by_number = fit.results["gradient"], constant.results["gradient"]

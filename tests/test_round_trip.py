@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from commands import jaxsky, one_sentence
+from fits.common import common_maps
 from fits.inputs import inputs_of
-from fits.resolution import prepare
 from fits.results import misfit
 from fits.spectral_index import _expected
 from jaxsky.experiment import build, cmb_spectra
@@ -355,7 +355,9 @@ def test_a_folder_without_the_maps_is_named(folder, monkeypatch, capsys):
 
 
 def test_a_cmb_above_the_noise_is_no_misfit(folder):
-    prepared = prepare(inputs_of(load(folder / "x.toml", ['bands.0.channels = ["140"]'])), 16, 480)
+    prepared = common_maps(
+        inputs_of(load(folder / "x.toml", ['bands.0.channels = ["140"]'])), 16, 480
+    )
     used = np.arange(NPIX) % 2 == 0
     expected = _expected(prepared, used, "U", ())
     squares = []

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from fits.commands.run import DEFAULTS
+from fits.common import common_maps, prepare_component
 from fits.covariance import Fluctuations, uniform_level
 from fits.inputs import Band, Inputs, inputs_of
 from fits.optimize import best_fit
-from fits.preparation import Preparation, prepare_component
 from fits.regions import region_masks
-from fits.resolution import prepare
 from fits.spectral_index import run
 from fits.template_likelihood import likelihood
 from jaxsky import Bandpass, Dust, Sky, observe
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.galaxy import embedded_sky
 from jaxsky.harmonics import (
+    Preparation,
     alm_ell,
     analysis,
     gaussian_beam,
@@ -159,23 +159,23 @@ def one_band_inputs(nside=16, fwhm=0.0, used=None, template_fwhm=0.0) -> Inputs:
 def test_a_target_finer_than_a_map_names_both():
     words = r"target beam of 30 arcmin is finer than that of band '353', 60 arcmin"
     with pytest.raises(ValueError, match=words):
-        prepare(one_band_inputs(fwhm=60.0), 8, 30.0)
+        common_maps(one_band_inputs(fwhm=60.0), 8, 30.0)
     words = r"target beam of 30 arcmin is finer than that of template 'dust', 40 arcmin"
     with pytest.raises(ValueError, match=words):
-        prepare(one_band_inputs(template_fwhm=40.0), 8, 30.0)
+        common_maps(one_band_inputs(template_fwhm=40.0), 8, 30.0)
     with pytest.raises(ValueError, match=r"nside 32 is larger than that of template 'dust', 16"):
-        prepare(one_band_inputs(), 32, 0.0)
+        common_maps(one_band_inputs(), 32, 0.0)
 
 
 def test_missing_pixels_take_their_surroundings_along():
     used = np.ones(healpy.nside2npix(16), bool)
     hole = healpy.query_disc(16, healpy.ang2vec(np.pi / 2, 0), np.radians(10))
     used[hole] = False
-    smoothed = prepare(one_band_inputs(used=used), 8, 400.0).used
+    smoothed = common_maps(one_band_inputs(used=used), 8, 400.0).used
     angle = healpy.rotator.angdist(healpy.pix2ang(8, np.arange(768)), (np.pi / 2, 0.0))
     assert not smoothed[angle < np.radians(12)].any()
     assert smoothed[angle > np.radians(25)].all()
-    averaged = prepare(one_band_inputs(used=used), 8, 0.0).used
+    averaged = common_maps(one_band_inputs(used=used), 8, 0.0).used
     assert 700 < averaged.sum() < 768
 
 
@@ -198,14 +198,14 @@ def test_missing_pixels_do_not_bias():
         "",
     )
     start = {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}
-    fit = best_fit(prepare(inputs, 16, 200.0).likelihood(start), start)
+    fit = best_fit(common_maps(inputs, 16, 200.0).likelihood(start), start)
     for name, truth in (("dust.beta_dust", 1.53), ("synchrotron.beta_syn", 3.1)):
         assert abs(fit.best_fit[name] - truth) < 0.05 * fit.sigma(name)
 
 
 def test_both_ways_of_preparing_reproduce_the_sky():
     for fwhm in (0.0, 400.0):
-        prepared = prepare(one_band_inputs(), 8, fwhm)
+        prepared = common_maps(one_band_inputs(), 8, fwhm)
         np.testing.assert_allclose(
             observe(prepared.sky, list(prepared.bands.values())), prepared.data, atol=1e-12
         )
@@ -239,7 +239,7 @@ def test_embedded_run_recovers_the_truth(quick_settings, tmp_path):
     free = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1}
     assert {name: inputs.truth[name] for name in free} == pytest.approx(free)
     assert "not data" in inputs.description
-    prepared = prepare(inputs, 16, 300.0)
+    prepared = common_maps(inputs, 16, 300.0)
     regions = region_masks(quick_settings, quick_settings.fit.regions)
     fits = run(quick_settings, prepared, regions, tmp_path / "chain.h5")
     assert [(f.region, f.stokes) for f in fits] == [

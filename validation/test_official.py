@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from fits.commands.run import DEFAULTS
+from fits.common import common_maps
 from fits.inputs import inputs_of
 from fits.optimize import best_fit
 from fits.regions import region_masks
-from fits.resolution import prepare
 from jaxsky.settings import load
 
 TRUTH = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1}
@@ -54,7 +54,7 @@ def test_pulls_over_fifty_skies(maker, settings, monkeypatch):
         line = ["make_files.py", folder, "--nside", "128", "--seed", str(seed)]
         monkeypatch.setattr(sys, "argv", line)
         maker.main()
-        prepared = prepare(inputs_of(settings), settings.common.nside, settings.common.fwhm)
+        prepared = common_maps(inputs_of(settings), settings.common.nside, settings.common.fwhm)
         row = []
         for inside in region_masks(settings, settings.fit.regions).values():
             fit = best_fit(prepared.likelihood(start, region=inside), start)

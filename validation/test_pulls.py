@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from fits.commands.run import DEFAULTS
+from fits.common import common_maps
 from fits.inputs import inputs_of
 from fits.optimize import best_fit
-from fits.resolution import prepare
 from jaxsky.galaxy import embedded_sky
 from jaxsky.settings import load
 
@@ -21,7 +21,7 @@ def pulls():
     start, rows = settings.start("fit"), []
     for seed in range(SKIES):
         inputs = inputs_of(settings.model_copy(update={"seed": seed}), galaxy=galaxy)
-        found = best_fit(prepare(inputs, 16, 300.0).likelihood(start), start)
+        found = best_fit(common_maps(inputs, 16, 300.0).likelihood(start), start)
         rows.append(
             [(found.best_fit[name] - inputs.truth[name]) / found.sigma(name) for name in found.free]
         )

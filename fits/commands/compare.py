@@ -1,10 +1,10 @@
 """`jaxsky compare`, from settings to a report."""
 
 from fits.commands.run import Command, Report, Run
+from fits.common import common_maps
 from fits.comparison import check_comparison, compare, compare_patches, report
 from fits.inputs import inputs_of
 from fits.regions import region_masks
-from fits.resolution import prepare
 from jaxsky.settings import Experiment, at_key
 
 
@@ -13,7 +13,7 @@ def _work(settings: Experiment, command: Run) -> Report:
     regions = region_masks(settings, settings.compare.regions)
     inputs = inputs_of(settings)
     with at_key("common"):
-        prepared = prepare(inputs, settings.common.nside, settings.common.fwhm)
+        prepared = common_maps(inputs, settings.common.nside, settings.common.fwhm)
     check_comparison(settings, prepared, regions)
     command.begin()
     out, steps = command.out, command.steps

@@ -2,9 +2,9 @@
 
 from fits import report, spectral_index
 from fits.commands.run import Command, Report, Run
+from fits.common import common_maps
 from fits.inputs import inputs_of
 from fits.regions import region_masks
-from fits.resolution import prepare
 from jaxsky.settings import Experiment, at_key
 
 
@@ -13,7 +13,7 @@ def _work(settings: Experiment, command: Run) -> Report:
     regions = region_masks(settings, settings.fit.regions)
     inputs = inputs_of(settings)
     with at_key("common"):
-        prepared = prepare(inputs, settings.common.nside, settings.common.fwhm)
+        prepared = common_maps(inputs, settings.common.nside, settings.common.fwhm)
     inputs = inputs._replace(bands={})  # their maps have served
     command.begin()
     chains = command.out / "chain.h5"

@@ -13,8 +13,8 @@ from rich.table import Table
 from fits import b_modes
 from fits.b_modes import BandLaw
 from fits.commands.run import Command, Report, Run
+from fits.common import prepare_component
 from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors, foreground_names, unit_sky
-from fits.preparation import Preparation, prepare_component
 from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra, sky_fraction
 from fits.record import write_json, write_log
 from fits.regions import apodize, region_mask
@@ -23,7 +23,7 @@ from jaxsky.checks import check_double
 from jaxsky.cmb import camb_spectra, tensor_spectra
 from jaxsky.components import declared
 from jaxsky.experiment import map_nside, read_channel
-from jaxsky.harmonics import gaussian_beam
+from jaxsky.harmonics import Preparation, gaussian_beam
 from jaxsky.inputs import Template, read_sky
 from jaxsky.io import degrade_mask
 from jaxsky.observation import ObservedBand

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from fits.common import CommonMaps
 from fits.comparison.pixels import Scatter, compare_pixels
 from fits.comparison.simulations import simulate
 from fits.comparison.spectra import LMIN, BandSpectra, compare_spectra
 from fits.patches import EDGES
 from fits.pseudo_cl import bin_edges
 from fits.record import fingerprint
-from fits.resolution import Prepared
 from jaxsky.progress import QUIET
 from jaxsky.settings import Experiment, SettingsError
 
@@ -33,7 +33,7 @@ class Comparison(NamedTuple):
     spectra : by band; none if pixels are missing
     """
 
-    prepared: Prepared
+    prepared: CommonMaps
     model: Float[Array, "band stokes pix"]
     regions: dict[str, Bool[np.ndarray, " pix"]]
     scatters: list[Scatter]
@@ -46,7 +46,7 @@ class Comparison(NamedTuple):
 
 
 def check_comparison(
-    settings: Experiment, prepared: Prepared, regions: Mapping[str, Bool[np.ndarray, " pix"]]
+    settings: Experiment, prepared: CommonMaps, regions: Mapping[str, Bool[np.ndarray, " pix"]]
 ) -> None:
     """Refuse at once what `compare` and `compare_patches` would find out late."""
     how = settings.compare
@@ -84,7 +84,7 @@ def check_comparison(
 
 def compare(
     settings: Experiment,
-    prepared: Prepared,
+    prepared: CommonMaps,
     regions: Mapping[str, Bool[np.ndarray, " pix"]],
     simulations: Path | None = None,
     report: Callable[[int, int], None] = QUIET.advance,

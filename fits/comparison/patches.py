@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fits.common import CommonMaps, common_maps
 from fits.discs import paper_patches
 from fits.inputs import Band, Inputs
 from fits.patches import PatchFits, PreparedPatches, fit_patches, prepare_patches
-from fits.resolution import Prepared, prepare
 from jaxsky.harmonics import average_pixels, beam_ratio, gaussian_beam, pixel_window
 from jaxsky.keys import realisation_key, stream
 from jaxsky.settings import Experiment
@@ -80,7 +80,7 @@ def _window(band: Band, nside: int, fwhm: float, lmax: int) -> Float[Array, " el
 
 
 def _noise(
-    band: Band, prepared: Prepared, patches: PreparedPatches
+    band: Band, prepared: CommonMaps, patches: PreparedPatches
 ) -> Float[np.ndarray, "patch 2 ell"]:
     """Spectrum of the noise in the prepared maps, on each patch that of its own pixels."""
     (preparation,), lmax = prepared.fluctuations.preparations, patches.spectra[0].lmax
@@ -121,7 +121,7 @@ def compare_patches(settings: Experiment, inputs: Inputs) -> PatchComparison:
     name, nside = str(settings.compare.patches), settings.compare.patches_nside
     fwhm = settings.common.fwhm
     band = inputs.bands[name]
-    prepared = prepare(inputs._replace(bands={name: band}), nside, fwhm)
+    prepared = common_maps(inputs._replace(bands={name: band}), nside, fwhm)
     lmax = 2 * nside
     window = np.asarray(_window(band, nside, fwhm, lmax))
     patches = prepare_patches(paper_patches(nside), window)

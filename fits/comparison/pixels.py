@@ -9,9 +9,9 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Array, Bool, Float
 
+from fits.common import CommonMaps
 from fits.comparison.simulations import Simulated, sums_of_squares
 from fits.record import probability
-from fits.resolution import Prepared
 
 STOKES = ("Q", "U", "QU")
 
@@ -59,7 +59,7 @@ class Scatter(NamedTuple):
 
 
 def _slopes(
-    prepared: Prepared, model: Float[Array, "band stokes pix"], inside: Bool[Array, "region pix"]
+    prepared: CommonMaps, model: Float[Array, "band stokes pix"], inside: Bool[Array, "region pix"]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Slopes and their errors, shape (band, region, 3).
 
@@ -82,7 +82,7 @@ def _slopes(
 
 
 def compare_pixels(
-    prepared: Prepared,
+    prepared: CommonMaps,
     model: Float[Array, "band stokes pix"],
     regions: Mapping[str, Bool[np.ndarray, " pix"]],
     simulated: Simulated,

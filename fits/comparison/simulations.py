@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from fits.common import CommonMaps
 from fits.realisations import realisations
-from fits.resolution import Prepared
 from jaxsky.checks import check_seed
 from jaxsky.harmonics import analysis, lmax_of, power_spectrum
 from jaxsky.progress import QUIET
@@ -57,7 +57,7 @@ def _alms(maps: Float[Array, "band stokes pix"], lmax: int) -> Float[Array, "ban
 
 
 def _realisation(
-    prepared: Prepared,
+    prepared: CommonMaps,
     foregrounds: Float[Array, "band 2 alm"],
     regions: Bool[Array, "region pix"],
     key: Array,
@@ -73,7 +73,7 @@ def _realisation(
 
 
 def simulate(
-    prepared: Prepared,
+    prepared: CommonMaps,
     model: Float[Array, "band stokes pix"],
     regions: Mapping[str, Bool[np.ndarray, " pix"]],
     lmax: int,

@@ -8,9 +8,9 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Array, Float
 
+from fits.common import CommonMaps
 from fits.comparison.simulations import Simulated, full_sky_spectra
 from fits.pseudo_cl import bin_edges
-from fits.resolution import Prepared
 from jaxsky.checks import Numeric
 
 #: Polarization has no multipoles below.
@@ -120,7 +120,7 @@ def _binned(spectra: Float[np.ndarray, "... ell"], edges: tuple[int, ...]) -> np
 
 
 def compare_spectra(
-    prepared: Prepared,
+    prepared: CommonMaps,
     model: Float[Array, "band stokes pix"],
     simulated: Simulated,
     width: int,

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fits.common import common_maps
 from fits.comparison import Comparison, compare, compare_patches, plots
 from fits.comparison.patches import template_patches
 from fits.comparison.spectra import BandSpectra
@@ -13,7 +14,6 @@ from fits.paper.item import Impossible, Item, Number, picture_of
 from fits.paper.sources import Sources, listed
 from fits.record import probability, with_error
 from fits.regions import region_masks, region_words
-from fits.resolution import prepare
 from jaxsky.settings import Experiment
 
 PLANCK, WMAP = ("30", "44", "70", "353"), ("K", "Ka", "Q", "V", "W")
@@ -30,7 +30,7 @@ def shared_inputs(settings: Experiment, sources: Sources) -> Inputs:
 def _compared(settings: Experiment, sources: Sources) -> Comparison:
     def make() -> Comparison:
         inputs = shared_inputs(settings, sources)
-        prepared = prepare(inputs, settings.common.nside, settings.common.fwhm)
+        prepared = common_maps(inputs, settings.common.nside, settings.common.fwhm)
         return compare(settings, prepared, region_masks(settings, settings.compare.regions))
 
     return sources.once("comparison", make)

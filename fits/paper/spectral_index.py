@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
+from fits.common import common_maps
 from fits.paper.comparisons import shared_inputs
 from fits.paper.item import Impossible, Item, Number, picture_of
 from fits.paper.sources import Sources, listed
 from fits.posterior_plots import plot_grids
 from fits.regions import region_masks, region_words
 from fits.report import known_truth, with_errors
-from fits.resolution import prepare
 from fits.spectral_index import run
 from jaxsky.settings import Experiment, SettingsError
 
@@ -33,7 +33,7 @@ def figure_probability(settings: Experiment, sources: Sources, out: Path) -> Ite
         update={"methods": ["grid"], "stokes": ["Q", "U", "QU"], "regions": ["strip", "full"]}
     )
     chosen, common = settings.model_copy(update={"fit": spec}), settings.common
-    prepared = prepare(inputs._replace(bands=bands), common.nside, common.fwhm)
+    prepared = common_maps(inputs._replace(bands=bands), common.nside, common.fwhm)
     try:
         fits = run(chosen, prepared, region_masks(chosen, spec.regions))
     except SettingsError as error:

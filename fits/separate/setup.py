@@ -8,17 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from fits.common import common_maps
 from fits.covariance import uniform_level
 from fits.inputs import Band, Inputs, inputs_of
 from fits.mixing import NOMINAL
 from fits.noise import Noise, as_noise
-from fits.preparation import Preparation
 from fits.regions import apodize, clusters, latitude_bands, region_mask, superpixels
-from fits.resolution import prepare
 from fits.separate.domains import Domain, HarmonicDomain, PixelDomain
 from fits.separation.harmonic import harmonic_coefficients
 from jaxsky import Component, Sky, set_parameters
 from jaxsky.components import component_class
+from jaxsky.harmonics import Preparation
 from jaxsky.inputs import one_column, read, read_parameter
 from jaxsky.settings import Experiment, MapFile, Regions, SettingsError, at_key
 
@@ -171,7 +171,7 @@ def _factors(settings: Experiment, inputs: Inputs) -> Float[np.ndarray, " band"]
 def _pixels(settings, sky, inputs, foregrounds, inside):
     common = settings.common
     with at_key("common"):
-        prepared = prepare(inputs, common.nside, common.fwhm)
+        prepared = common_maps(inputs, common.nside, common.fwhm)
     used = prepared.used & inside
     if not used.any():
         raise SettingsError("separate.region: leaves no pixel.")

@@ -17,6 +17,7 @@ from jaxsky.harmonics.packing import (
     resize,
 )
 from jaxsky.harmonics.resolution import (
+    Preparation,
     average_pixels,
     children,
     low_multipoles,

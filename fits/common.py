@@ -1,28 +1,29 @@
-"""Templates and maps at a common resolution, where they can be compared."""
+"""Templates, maps and their noise at a common resolution, where they can be compared."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import healpy
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fits.covariance import Fluctuations, uniform_level
 from fits.inputs import Inputs
-from fits.preparation import Preparation, prepare_component
 from fits.record import fingerprint
 from fits.template_likelihood import CovarianceOf, Likelihood, likelihood
 from fits.template_noise import prepared_variance
 from jaxsky import Bandpass, Sky, observe
 from jaxsky.checks import Numeric
-from jaxsky.harmonics import beam_ratio, gaussian_beam, pixel_window
+from jaxsky.components import Component
+from jaxsky.harmonics import Preparation, beam_ratio, gaussian_beam, pixel_window
 
 #: A pixel is used if no more than this fraction of what was smoothed or averaged was missing.
 MISSING = 0.01
 
 
-class Prepared(NamedTuple):
+class CommonMaps(NamedTuple):
     """Templates and maps at the common resolution.
 
     `sky` is None where there are no templates. `leakage` is what was subtracted from the data, by
@@ -79,7 +80,7 @@ class Prepared(NamedTuple):
         )
 
 
-def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
+def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
     """Bring templates and maps to a common nside and, if fwhm > 0, a common beam.
 
     With fwhm = 0 pixels are averaged and beams stay as they are. Otherwise all maps are cut at
@@ -90,97 +91,62 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
     inputs : templates and maps
     nside, fwhm : common resolution; fwhm in arcmin
     """
-    maps: dict[str, tuple[Bool[np.ndarray, " pix"], Any]] = {
-        f"template {name!r}": (t.used, t.fwhm) for name, t in inputs.templates.items()
+    templates = {f"template {name!r}": t for name, t in inputs.templates.items()}
+    bands = {f"band {name!r}": b for name, b in inputs.bands.items()}
+    leaked = {f"leakage of {what}": b.leakage for what, b in bands.items() if b.leakage is not None}
+    given: dict[str, tuple[Bool[np.ndarray, " pix"], Any]] = {
+        what: (t.used, t.fwhm) for what, t in templates.items()
     }
-    maps |= {f"band {name!r}": (b.used, b.beam) for name, b in inputs.bands.items()}
-    maps |= {
-        f"leakage of band {name!r}": (b.leakage.used, b.leakage.beam)
-        for name, b in inputs.bands.items()
-        if b.leakage is not None
-    }
-    nsides = {name: healpy.npix2nside(used.size) for name, (used, _) in maps.items()}
+    given |= {what: (each.used, each.beam) for what, each in (bands | leaked).items()}
+    nsides = {what: healpy.npix2nside(used.size) for what, (used, _) in given.items()}
     lmax = min(3 * nside - 1, 2 * min(nsides.values()))
-    operators = {}
-    for name, (_, own) in maps.items():
-        if fwhm:
-            operator = Preparation.smoothing(nsides[name], own, nside, fwhm, lmax, name)
-        else:
-            operator = Preparation.averaging(nsides[name], nside, name)
-        operators[name] = operator
-
-    holes = _common_holes([own_used for own_used, _ in maps.values()]) if fwhm else {}
-    used = np.ones(healpy.nside2npix(nside), bool)
-    for name, (own_used, _) in maps.items():
-        if not own_used.all():
-            spread = operators[name]
-            if fwhm:  # the whole beam, without the ringing that the cut at lmax causes
-                window = gaussian_beam(fwhm, 2 * nsides[name])
-                spread = Preparation(window, nsides[name], nside)
-                own_used = holes[nsides[name]]
-            kept = spread(jnp.asarray(own_used[None], float))[0]
-            used &= np.asarray(kept) > 1 - MISSING
-    sky = {
-        name: prepare_component(
-            template.component,
-            operators[f"template {name!r}"],
-            holes.get(nsides[f"template {name!r}"]),
-        )
-        for name, template in inputs.templates.items()
+    operators = {
+        what: Preparation.smoothing(nsides[what], own, nside, fwhm, lmax, what)
+        if fwhm
+        else Preparation.averaging(nsides[what], nside, what)
+        for what, (_, own) in given.items()
     }
-    preparations = tuple(operators[f"band {name!r}"] for name in inputs.bands)
-    whole = [holes.get(op.nside_in) for op in preparations]
+    holes = _common_holes([used for used, _ in given.values()]) if fwhm else {}
+    kept = {what: holes.get(own) for what, own in nsides.items()}
+
+    used = np.ones(healpy.nside2npix(nside), bool)
+    for what, (own_used, _) in given.items():
+        if not own_used.all():
+            spread = operators[what]
+            if fwhm:  # the whole beam, without the ringing that the cut at lmax causes
+                window = gaussian_beam(fwhm, 2 * nsides[what])
+                spread, own_used = Preparation(window, nsides[what], nside), holes[nsides[what]]
+            left = spread(jnp.asarray(own_used[None], float))[0]
+            used &= np.asarray(left) > 1 - MISSING
+    sky = {
+        name: prepare_component(template.component, operators[what], kept[what])
+        for (what, template), name in zip(templates.items(), inputs.templates, strict=True)
+    }
+
+    def brought(what: str, maps: Array) -> Array:
+        """Maps in double precision without holes, at the common resolution."""
+        maps = jnp.asarray(maps, float)
+        return operators[what](maps if kept[what] is None else maps * kept[what])
+
     leakage = {
-        name: operators[f"leakage of band {name!r}"](
-            _without(band.leakage.maps, holes.get(healpy.npix2nside(band.leakage.used.size)))
-        )
+        name: brought(f"leakage of band {name!r}", band.leakage.maps)
         for name, band in inputs.bands.items()
         if band.leakage is not None
     }
-    data = jnp.stack(
-        [
-            # Band by band: JAX would make what all of them need ahead of their transforms.
-            (op(_without(band.maps, kept)) - leakage.get(name, 0.0)).block_until_ready()
-            for op, (name, band), kept in zip(
-                preparations, inputs.bands.items(), whole, strict=True
-            )
-        ]
-    )
-    bandpasses = {name: band.bandpass for name, band in inputs.bands.items()}
-    factors = jnp.stack([b.conversion("uK_CMB", "uK_RJ") for b in bandpasses.values()])
-    spectra = windows = None
-    if not fwhm:  # averaged pixels hold multipoles beyond those they resolve
-        lmax = 4 * nside
-    if inputs.cmb is not None:
-        beams = [fwhm or band.beam for band in inputs.bands.values()]
-        windows = jnp.stack([beam_ratio(beam, 0.0, lmax) for beam in beams])
-        if not fwhm:
-            windows = windows * pixel_window(nside, lmax)
-        spectra = jnp.asarray(inputs.cmb(lmax)[1:3])
-    noise = tuple(
-        band.noise if kept is None else band.noise * kept
-        for band, kept in zip(inputs.bands.values(), whole, strict=True)
-    )
-    correlated = tuple(
-        _prepared_spectrum(band.correlated, op, lmax)
-        for op, band in zip(preparations, inputs.bands.values(), strict=True)
-    )
-    fluctuations = Fluctuations(
-        preparations,
-        noise,
-        correlated,
-        spectra,
-        windows,
-        factors,
-        tuple(inputs.bands),
-        tuple(map(uniform_level, noise)),
+    data = [
+        # Band by band: JAX would make what all of them need ahead of their transforms.
+        (brought(f"band {name!r}", band.maps) - leakage.get(name, 0.0)).block_until_ready()
+        for name, band in inputs.bands.items()
+    ]
+    fluctuations = _fluctuations(
+        inputs, [operators[w] for w in bands], [kept[w] for w in bands], fwhm, lmax
     )
     sigma = fluctuations.sigma()
     known = np.asarray(jnp.isfinite(sigma).all(axis=(0, 1)))
-    return Prepared(
+    return CommonMaps(
         Sky(sky) if sky else None,
-        bandpasses,
-        data,
+        {name: band.bandpass for name, band in inputs.bands.items()},
+        jnp.stack(data),
         jnp.where(known, sigma, jnp.inf),
         used & known,
         fluctuations,
@@ -194,6 +160,75 @@ def prepare(inputs: Inputs, nside: int, fwhm: float) -> Prepared:
             for name, noise in inputs.template_noise.items()
         },
     )
+
+
+def _fluctuations(
+    inputs: Inputs,
+    operators: Sequence[Preparation],
+    kept: Sequence[np.ndarray | None],
+    fwhm: float,
+    lmax: int,
+) -> Fluctuations:
+    """Noise and CMB of the bands at the common resolution.
+
+    Parameters
+    ----------
+    inputs : the bands
+    operators, kept : of each band, and the pixels of it that are not holes; None if there are none
+    fwhm, lmax : common beam [arcmin], 0 for averages of pixels, and largest multipole
+    """
+    bands = inputs.bands.values()
+    factors = jnp.stack([band.bandpass.conversion("uK_CMB", "uK_RJ") for band in bands])
+    nside = operators[0].nside
+    if not fwhm:  # averaged pixels hold multipoles beyond those they resolve
+        lmax = 4 * nside
+    spectra = windows = None
+    if inputs.cmb is not None:
+        windows = jnp.stack([beam_ratio(fwhm or band.beam, 0.0, lmax) for band in bands])
+        if not fwhm:
+            windows = windows * pixel_window(nside, lmax)
+        spectra = jnp.asarray(inputs.cmb(lmax)[1:3])
+    noise = tuple(
+        band.noise if own is None else band.noise * own
+        for band, own in zip(bands, kept, strict=True)
+    )
+    correlated = tuple(
+        _prepared_spectrum(band.correlated, op, lmax)
+        for op, band in zip(operators, bands, strict=True)
+    )
+    return Fluctuations(
+        tuple(operators),
+        noise,
+        correlated,
+        spectra,
+        windows,
+        factors,
+        tuple(inputs.bands),
+        tuple(map(uniform_level, noise)),
+    )
+
+
+def prepare_component(
+    component: Component, preparation: Preparation, kept: Bool[np.ndarray, " pix"] | None = None
+) -> Component:
+    """A component with its amplitude, and parameters that are maps, at the common resolution.
+
+    Parameters
+    ----------
+    component, preparation : what is prepared, and how
+    kept : pixels of the amplitude that are not set to zero; default all
+    """
+
+    def brought(leaf):
+        if leaf.ndim not in (1, 2):
+            return leaf
+        values = jnp.atleast_2d(jnp.asarray(leaf, float))
+        if leaf.ndim == 2:
+            values = values if kept is None else values * kept
+        prepared = preparation(values).block_until_ready()
+        return prepared if leaf.ndim == 2 else prepared[0]
+
+    return jax.tree.map(brought, component)
 
 
 def _remembered(covariance_of: CovarianceOf) -> CovarianceOf:
@@ -225,11 +260,6 @@ def _common_holes(maps: Sequence[Bool[np.ndarray, " pix"]]) -> dict[int, np.ndar
         )
         for nside in nsides
     }
-
-
-def _without(maps: Float[Array, "stokes pix"], kept: np.ndarray | None) -> Array:
-    """Maps in double precision, zero outside the pixels that are kept; None keeps all."""
-    return jnp.asarray(maps, float) if kept is None else jnp.asarray(maps, float) * kept
 
 
 def _prepared_spectrum(

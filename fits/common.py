@@ -125,8 +125,8 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
 
     def brought(what: str, maps: Array) -> Array:
         """Maps in double precision without holes, at the common resolution."""
-        maps = jnp.asarray(maps, float)
-        return operators[what](maps if kept[what] is None else maps * kept[what])
+        maps, own = jnp.asarray(maps, float), kept[what]
+        return operators[what](maps if own is None else maps * own)
 
     leakage = {
         name: brought(f"leakage of band {name!r}", band.leakage.maps)

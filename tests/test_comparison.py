@@ -11,12 +11,10 @@ import pytest
 import scipy.stats
 
 from commands import jaxsky
+from fits.commands.compare import comparison_warnings
 from fits.common import common_maps
-from fits.comparison import compare
-from fits.comparison.pixels import compare_pixels
-from fits.comparison.report import warnings
-from fits.comparison.simulations import full_sky_spectra, simulate
-from fits.comparison.spectra import compare_spectra, cosmic_error, hotelling
+from fits.comparison import compare, compare_pixels, simulated_fluctuations
+from fits.full_sky import compare_spectra, cosmic_error, full_sky_spectra, hotelling
 from fits.inputs import inputs_of
 from fits.regions import region_masks
 from jaxsky.io import InputError
@@ -72,7 +70,7 @@ def regions(settings):
 
 @pytest.fixture(scope="module")
 def simulated(prepared, model, regions):
-    return simulate(prepared, model, regions, 25, 150, 0)
+    return simulated_fluctuations(prepared, model, regions, 25, 150, 0)
 
 
 @pytest.fixture(scope="module")
@@ -205,7 +203,7 @@ def test_hotelling_is_exact():
 
 
 def test_spectra_are_healpys(prepared, model, simulated):
-    found = compare_spectra(prepared, model, simulated, 8)
+    found = compare_spectra(prepared, model, simulated.spectra, simulated.noise, 8)
     zero = np.zeros(prepared.used.size)
     for spectra, maps in zip(found, prepared.data, strict=True):
         cls = healpy.anafast([zero, *np.asarray(maps)], lmax=40, iter=10)[1:3, :26]
@@ -239,10 +237,10 @@ def test_missing_pixels_leave_spectra_out(settings, prepared, model, regions, si
     used[:3] = False
     holes = prepared._replace(used=used)
     with pytest.raises(ValueError, match="3 of 3072 have no value"):
-        compare_spectra(holes, model, simulated, 8)
+        compare_spectra(holes, model, simulated.spectra, simulated.noise, 8)
     found = compare(settings, holes, regions)
     assert not found.spectra
-    assert "3 of 3072 pixels have no value" in warnings(found, settings)[0]
+    assert "3 of 3072 pixels have no value" in comparison_warnings(found, settings)[0]
     assert found.scatter("K", "outside", "Q").pixels == int(regions["outside"].sum()) - 3
 
 
@@ -252,11 +250,11 @@ def test_realisations_are_kept(prepared, model, regions, tmp_path):
     def count(done, of):
         counts.append(done)
 
-    first = simulate(prepared, model, regions, 20, 2, 0, path, "a")
-    more = simulate(prepared, model, regions, 20, 3, 0, path, "a", count)
+    first = simulated_fluctuations(prepared, model, regions, 20, 2, 0, path, "a")
+    more = simulated_fluctuations(prepared, model, regions, 20, 3, 0, path, "a", count)
     assert counts == [2, 3]
     np.testing.assert_array_equal(more.chi2[:2], first.chi2)
-    fresh = simulate(prepared, model, regions, 20, 3, 0)
+    fresh = simulated_fluctuations(prepared, model, regions, 20, 3, 0)
     np.testing.assert_allclose(more.spectra, fresh.spectra, rtol=1e-12)
 
     def stop(done, of):
@@ -264,14 +262,14 @@ def test_realisations_are_kept(prepared, model, regions, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        simulate(prepared, model, regions, 20, 9, 0, path, "a", stop)
-    simulate(prepared, model, regions, 20, 5, 0, path, "a", count)
+        simulated_fluctuations(prepared, model, regions, 20, 9, 0, path, "a", stop)
+    simulated_fluctuations(prepared, model, regions, 20, 5, 0, path, "a", count)
     assert counts == [2, 3, 4, 5]
     with pytest.raises(InputError, match="holds realisations of other data or settings"):
-        simulate(prepared, model, regions, 20, 3, 0, path, "b")
+        simulated_fluctuations(prepared, model, regions, 20, 3, 0, path, "b")
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(InputError, match=r"sims.npz: is damaged .* start again with --overwrite"):
-        simulate(prepared, model, regions, 20, 3, 0, path, "a")
+        simulated_fluctuations(prepared, model, regions, 20, 3, 0, path, "a")
 
 
 def test_what_cannot_be_compared_is_refused(settings, prepared, regions):
@@ -334,7 +332,7 @@ def test_command_line(tmp_path, monkeypatch, capsys):
 
 def test_a_model_that_is_wrong_is_pointed_out(settings, prepared, regions):
     bright = prepared._replace(data=1.5 * prepared.data)
-    sentences = " ".join(warnings(compare(settings, bright, regions), settings))
+    sentences = " ".join(comparison_warnings(compare(settings, bright, regions), settings))
     assert "44, strip: the slope is 1.5" in sentences
     assert "more than in any of 30 realisations of noise and CMB" in sentences
     found = compare(settings, bright, regions).scatter("K", "strip", "QU")

@@ -5,13 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
+from fits.commands import compare_pictures as pictures
 from fits.common import common_maps
-from fits.comparison import Comparison, compare, compare_patches, plots
-from fits.comparison.patches import template_patches
-from fits.comparison.spectra import BandSpectra
+from fits.comparison import Comparison, compare
+from fits.full_sky import BandSpectra
 from fits.inputs import Inputs, inputs_of
 from fits.paper.item import Impossible, Item, Number, picture_of
 from fits.paper.sources import Sources, listed
+from fits.patch_comparison import compare_patches, template_patches
 from fits.record import probability, with_error
 from fits.regions import region_masks, region_words
 from jaxsky.settings import Experiment
@@ -79,7 +80,7 @@ def figure_scatter(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 5: observed against modelled pixels along the plane."""
     found, picture = _compared(settings, sources), picture_of("Figure 5")
     bands, region = _chosen(found, SHOWN), _region(found)
-    plots.plot_scatter(out / picture, found, region, bands, settings.title)
+    pictures.plot_scatter(out / picture, found, region, bands, settings.title)
     numbers = []
     for band in bands:
         scatter = found.scatter(band, region, "QU")
@@ -112,7 +113,9 @@ def figure_maps(settings: Experiment, sources: Sources, out: Path) -> Item:
     """Figure 6: observed maps beside the model."""
     found, picture = _compared(settings, sources), picture_of("Figure 6")
     nside = min(settings.compare.panel_nside, settings.common.nside)
-    plots.plot_model_maps(out / picture, found, "QU", _chosen(found, SHOWN), nside, settings.title)
+    pictures.plot_model_maps(
+        out / picture, found, "QU", _chosen(found, SHOWN), nside, settings.title
+    )
     return Item(
         "Figure 6",
         "observed maps and the model",
@@ -136,7 +139,7 @@ def _spectra(
         raise Impossible("Spectra of the full sky take maps without missing pixels.")
     if not spectra:
         raise Impossible(f"None of the bands {', '.join(wanted)} is there.")
-    plots.plot_spectra(out / picture, spectra, settings.title)
+    pictures.plot_full_sky(out / picture, spectra, settings.title)
     name, (what, paper) = (
         ("Planck", ("70", "10 %")) if wanted is PLANCK else ("WMAP", ("V", "23 %"))
     )
@@ -202,7 +205,7 @@ def figure_leakage(settings: Experiment, sources: Sources, out: Path) -> Item:
     leaky = [s for s in found.spectra if s.uncorrected is not None]
     if not leaky:
         raise Impossible("No band has a map of leakage to subtract.")
-    plots.plot_leakage(out / picture, leaky, settings.title)
+    pictures.plot_leakage(out / picture, leaky, settings.title)
     differs = _differs(sources)
     if sources.simulated:
         fractions = listed(
@@ -239,7 +242,7 @@ def figure_patches(settings: Experiment, sources: Sources, out: Path) -> Item:
     if settings.compare.patches is None:
         return _template_patches(settings, sources, out, picture)
     found = compare_patches(settings, shared_inputs(settings, sources))
-    plots.plot_patches(out / picture, found, settings.title)
+    pictures.plot_patches(out / picture, found, settings.title)
     numbers = []
     for i, name in enumerate(("EE", "BB")):
         A, alpha = found.correlation(i)
@@ -269,7 +272,7 @@ def figure_patches(settings: Experiment, sources: Sources, out: Path) -> Item:
 def _template_patches(settings: Experiment, sources: Sources, out: Path, picture: str) -> Item:
     layer = sources.template("dust")
     found = template_patches(layer.maps, layer.fwhm)
-    plots.plot_template_patches(out / picture, found, settings.title)
+    pictures.plot_template_patches(out / picture, found, settings.title)
     both = found.detected.all(axis=1)
     ratio = np.median(found.A[both, 1] / found.A[both, 0])
     slopes = np.median(found.alpha[both], axis=0)

@@ -9,12 +9,13 @@ import scipy.stats
 from jaxtyping import Array, Float
 
 from fits.common import CommonMaps
-from fits.comparison.simulations import Simulated, full_sky_spectra
 from fits.pseudo_cl import bin_edges
 from jaxsky.checks import Numeric
+from jaxsky.harmonics import analysis, power_spectrum
 
 #: Polarization has no multipoles below.
 LMIN = 2
+FIELDS = ("EE", "BB")
 
 
 class BandSpectra(NamedTuple):
@@ -71,6 +72,23 @@ class BandSpectra(NamedTuple):
         return (self.error[:, LMIN:] / self.observed[:, LMIN:]).max(axis=-1)
 
 
+def polarization_alms(
+    maps: Float[Array, "band stokes pix"], lmax: int
+) -> Float[Array, "band 2 alm"]:
+    """Coefficients of E and B of each band."""
+    return jnp.stack([analysis(band, lmax) for band in maps])
+
+
+def full_sky_spectra(
+    maps: Float[Array, "band stokes pix"], lmax: int
+) -> Float[Array, "band 2 ell"]:
+    """C_l of EE and BB of each band, up to lmax.
+
+    At 1.5 nside good to 1e-3, where maps hold multipoles up to 3 nside that pixels confuse.
+    """
+    return power_spectrum(polarization_alms(maps, lmax))
+
+
 def cosmic_error(power: Float[Array, "... ell"], signal: Numeric = 0.0) -> Float[Array, "... ell"]:
     """Standard deviation of the full-sky spectrum of a random field, the paper's eq. 9.
 
@@ -113,16 +131,15 @@ def _binned(spectra: Float[np.ndarray, "... ell"], edges: tuple[int, ...]) -> np
     """Mean D_l = l (l+1) C_l / 2 pi of each bin."""
     ell = np.arange(spectra.shape[-1])
     scaled = ell * (ell + 1) / (2 * np.pi) * spectra
-    return np.stack(
-        [scaled[..., a:b].mean(axis=-1) for a, b in itertools.pairwise(edges)],
-        axis=-1,
-    )
+    means = [scaled[..., a:b].mean(axis=-1) for a, b in itertools.pairwise(edges)]
+    return np.stack(means, axis=-1)
 
 
 def compare_spectra(
     prepared: CommonMaps,
     model: Float[Array, "band stokes pix"],
-    simulated: Simulated,
+    simulated: Float[np.ndarray, "sim band 2 ell"],
+    noises: Float[np.ndarray, "sim band 2 ell"],
     width: int,
 ) -> list[BandSpectra]:
     """Spectra of the observed maps against those of the complete model.
@@ -133,7 +150,7 @@ def compare_spectra(
     ----------
     prepared : templates and maps at the common resolution, without missing pixels
     model : foregrounds of each band [uK_RJ]
-    simulated : realisations
+    simulated, noises : spectra of realisations of the complete model, and of the noise alone
     width : multipoles in a bin
     """
     if missing := int(np.sum(~prepared.used)):
@@ -141,38 +158,33 @@ def compare_spectra(
             f"Spectra of the full sky need all pixels, but {missing} of {prepared.used.size} have "
             "no value."
         )
-    lmax = simulated.spectra.shape[-1] - 1
+    lmax = simulated.shape[-1] - 1
     edges = bin_edges(LMIN, lmax, width)
     observed = np.asarray(full_sky_spectra(prepared.data, lmax))
     foregrounds = np.asarray(full_sky_spectra(model, lmax))
-    noise = simulated.noise.mean(axis=0)
+    noise = noises.mean(axis=0)
     cmb = np.zeros_like(noise)
     theory = prepared.fluctuations.cmb_power()[..., : lmax + 1]
     cmb[..., : theory.shape[-1]] = theory
     error = np.asarray(cosmic_error(jnp.asarray(cmb + noise)))
     results = []
     for b, band in enumerate(prepared.bands):
-        uncorrected = None
+        sims = _binned(simulated[:, b], edges)
+        before = binned_before = pte_before = None
         if band in prepared.leakage:
-            before = prepared.data[b] + prepared.leakage[band]
-            uncorrected = np.asarray(full_sky_spectra(before[None], lmax))[0]
-        sims = _binned(simulated.spectra[:, b], edges)
-
-        def test(spectrum, sims=sims):
-            binned = _binned(spectrum, edges)
-            return binned, np.array([hotelling(binned[i], sims[:, i]) for i in (0, 1)]).T
-
-        binned, (chi2, pte) = test(observed[b])
-        binned_before, (_, pte_before) = (
-            (None, (None, None)) if uncorrected is None else test(uncorrected)
-        )
+            maps = prepared.data[b] + prepared.leakage[band]
+            before = np.asarray(full_sky_spectra(maps[None], lmax))[0]
+            binned_before = _binned(before, edges)
+            _, pte_before = _tested(binned_before, sims)
+        binned = _binned(observed[b], edges)
+        chi2, pte = _tested(binned, sims)
         results.append(
             BandSpectra(
                 band,
                 observed[b],
-                uncorrected,
+                before,
                 foregrounds[b],
-                simulated.spectra[0, b],
+                simulated[0, b],
                 noise[b],
                 cmb[b],
                 error[b],
@@ -187,3 +199,10 @@ def compare_spectra(
             )
         )
     return results
+
+
+def _tested(
+    binned: Float[np.ndarray, "2 bin"], simulated: Float[np.ndarray, "sim 2 bin"]
+) -> Float[np.ndarray, "2 2"]:
+    """chi^2 of EE and BB among simulations, and the probabilities to exceed them."""
+    return np.array([hotelling(binned[i], simulated[:, i]) for i in (0, 1)]).T

@@ -9,10 +9,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 
-from fits.comparison.compare import Comparison
-from fits.comparison.patches import PatchComparison
-from fits.comparison.pixels import Scatter
-from fits.comparison.spectra import BandSpectra
+from fits.comparison import Comparison, Scatter
+from fits.full_sky import FIELDS, BandSpectra
+from fits.patch_comparison import PatchComparison
 from fits.patches import PatchFits
 from fits.plots import (
     COLORS,
@@ -32,7 +31,6 @@ from jaxsky.harmonics import average_pixels
 OBSERVED, MODEL, FOREGROUNDS, NOISE = COLORS[1], COLORS[2], COLORS[0], "0.55"
 UNIT = UNITS["uK_RJ"]
 POWER = rf"$D_\ell$ [{UNIT}$^2$]"
-FIELDS = ("EE", "BB")
 #: Panels beside each other.
 COLUMNS = 3
 
@@ -144,7 +142,7 @@ def _spectrum_panel(axes: Axes, spectra: BandSpectra, index: int) -> None:
     )
 
 
-def plot_spectra(path: Path, spectra: Sequence[BandSpectra], title: str) -> None:
+def plot_full_sky(path: Path, spectra: Sequence[BandSpectra], title: str) -> None:
     """EE and BB of each band, observed and of the complete model (the paper's figs. 7 and 8)."""
     size = 7.2, 2.3 * len(spectra) + 0.8
     with draw_panels(path, title, size, len(spectra), 2, sharex=True) as grid:

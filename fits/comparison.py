@@ -1,0 +1,311 @@
+"""Observed maps against the model of foregrounds, CMB and noise: the paper's section 4.
+
+Pixel by pixel: the slope of the observed maps against the model, with an honest error. How far
+from the model maps may be by chance is seen in simulated noise and CMB.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+from jaxtyping import Array, Bool, Float
+
+from fits.common import CommonMaps
+from fits.full_sky import LMIN, BandSpectra, compare_spectra, polarization_alms
+from fits.patches import EDGES
+from fits.pseudo_cl import bin_edges
+from fits.realisations import realisations
+from fits.record import fingerprint, probability
+from jaxsky.harmonics import power_spectrum
+from jaxsky.progress import QUIET
+from jaxsky.settings import Experiment, SettingsError
+
+STOKES = ("Q", "U", "QU")
+#: A slope and a correlation take a few pixels.
+LEAST_PIXELS = 10
+
+
+class Simulated(NamedTuple):
+    """Of each realisation, what is compared with the data.
+
+    Parameters
+    ----------
+    chi2 : of the residual maps, for Q, U and both
+    squares : sum of their squares [uK_RJ^2]
+    spectra : C_l of EE and BB of the complete model: foregrounds, CMB, noise [uK_RJ^2]
+    noise : C_l of the noise alone
+    """
+
+    chi2: Float[np.ndarray, "sim band region 3"]
+    squares: Float[np.ndarray, "sim band region 3"]
+    spectra: Float[np.ndarray, "sim band 2 ell"]
+    noise: Float[np.ndarray, "sim band 2 ell"]
+
+
+class Scatter(NamedTuple):
+    """Observed against modelled pixels of a band, in one region.
+
+    Parameters
+    ----------
+    band, region, stokes : which pixels
+    pixels : how many, of Q and U together for both
+    slope, error : of the observed maps on the model, weighted by 1/sigma^2, through the origin;
+        the error is that of noise and CMB together, correlated as they are between pixels
+    correlation : Pearson's coefficient
+    rms, expected : rms of observed - model, and that of noise and CMB [uK_RJ]
+    chi2 : sum of (observed - model)^2 / sigma^2, sigma that of the noise
+    pte : probability that noise and CMB alone give a larger chi2, from simulations; never below
+        `floor`, one in their number
+    """
+
+    band: str
+    region: str
+    stokes: str
+    pixels: int
+    slope: float
+    error: float
+    correlation: float
+    rms: float
+    expected: float
+    chi2: float
+    pte: float
+    floor: float
+
+    @property
+    def pte_text(self) -> str:
+        """The probability in words, an upper limit where no realisation exceeds the maps."""
+        if self.pte > self.floor:
+            return probability(self.pte)
+        return f"<{probability(self.floor)}"
+
+    @property
+    def slope_pte(self) -> float:
+        """Probability of a slope as far from 1 in either direction."""
+        return float(2 * scipy.stats.norm.sf(abs(self.slope - 1) / self.error))
+
+
+class Comparison(NamedTuple):
+    """Observed maps, the model, and how they compare.
+
+    Parameters
+    ----------
+    prepared : templates and maps at the common resolution
+    model : foregrounds of each band [uK_RJ]
+    regions : pixels of each region that are used
+    scatters : by band, region and Stokes parameter
+    spectra : by band; none if pixels are missing
+    """
+
+    prepared: CommonMaps
+    model: Float[Array, "band stokes pix"]
+    regions: dict[str, Bool[np.ndarray, " pix"]]
+    scatters: list[Scatter]
+    spectra: list[BandSpectra]
+
+    def scatter(self, band: str, region: str, stokes: str) -> Scatter:
+        """One of the scatters."""
+        wanted = (band, region, stokes)
+        return next(s for s in self.scatters if (s.band, s.region, s.stokes) == wanted)
+
+
+def check_comparison(
+    settings: Experiment, prepared: CommonMaps, regions: Mapping[str, Bool[np.ndarray, " pix"]]
+) -> None:
+    """Refuse at once what `compare` and `compare_patches` would find out late."""
+    how = settings.compare
+    for name, inside in regions.items():
+        if (inside & prepared.used).sum() < LEAST_PIXELS:
+            raise SettingsError(
+                f"compare.regions: region {name!r} leaves fewer than {LEAST_PIXELS} pixels."
+            )
+    if how.lmax > (limit := 2 * settings.common.nside):
+        raise SettingsError(
+            f"compare.lmax: multipoles reach to 2 nside, {limit}, but {how.lmax} is asked for."
+        )
+    bins = len(bin_edges(LMIN, how.lmax, how.width)) - 1
+    if bins > how.nsims / 2:
+        raise SettingsError(
+            f"compare.width: {how.width} makes {bins} bins up to l = {how.lmax}, and these take "
+            f"twice as many realisations; compare.nsims is {how.nsims}."
+        )
+    if how.patches is None:
+        return
+    others = tuple(f"band {band!r}" for band in prepared.bands if band != how.patches)
+    sources = {what: n for what, n in prepared.sources.items() if not what.endswith(others)}
+    coarsest = min(sources, key=sources.__getitem__)
+    if how.patches_nside > sources[coarsest]:
+        raise SettingsError(
+            f"compare.patches_nside: {how.patches_nside} is finer than that of {coarsest}, "
+            f"{sources[coarsest]}."
+        )
+    if 2 * how.patches_nside < EDGES[-1] - 1:
+        raise SettingsError(
+            f"compare.patches_nside: {how.patches_nside} resolves l = {2 * how.patches_nside}, "
+            f"and the patches take {EDGES[-1] - 1}."
+        )
+
+
+def compare(
+    settings: Experiment,
+    prepared: CommonMaps,
+    regions: Mapping[str, Bool[np.ndarray, " pix"]],
+    simulations: Path | None = None,
+    report: Callable[[int, int], None] = QUIET.advance,
+) -> Comparison:
+    """Compare the maps with the model of foregrounds, CMB and noise.
+
+    Parameters
+    ----------
+    settings : how; the parameters of the model are those of the prepared sky
+    prepared : templates and maps at the common resolution
+    regions : pixels of each region
+    simulations : file that keeps realisations; those that it has are not made again
+    report : called with the number of realisations done, and that of all
+
+    Raises
+    ------
+    SettingsError, jaxsky.io.InputError
+        For a region without pixels, multipoles that the maps do not have, or a file of
+        realisations of other data.
+    """
+    check_comparison(settings, prepared, regions)
+    how = settings.compare
+    used = {name: inside & prepared.used for name, inside in regions.items()}
+    model = prepared.model()
+    simulated = simulated_fluctuations(
+        prepared,
+        model,
+        used,
+        how.lmax,
+        how.nsims,
+        settings.seed,
+        simulations,
+        f"{fingerprint((prepared, used))} {settings.seed} {how.lmax}",
+        report,
+    )
+    scatters = compare_pixels(prepared, model, used, simulated)
+    spectra = []
+    if prepared.used.all():
+        spectra = compare_spectra(prepared, model, simulated.spectra, simulated.noise, how.width)
+    return Comparison(prepared, model, used, scatters, spectra)
+
+
+def simulated_fluctuations(
+    prepared: CommonMaps,
+    model: Float[Array, "band stokes pix"],
+    regions: Mapping[str, Bool[np.ndarray, " pix"]],
+    lmax: int,
+    nsims: int,
+    seed: int,
+    path: Path | None = None,
+    mark: str = "",
+    report: Callable[[int, int], None] = QUIET.advance,
+) -> Simulated:
+    """Realisations of noise and CMB on top of the model's foregrounds.
+
+    Parameters
+    ----------
+    prepared : templates and maps at the common resolution
+    model : foregrounds of each band [uK_RJ]
+    regions : pixels of each region
+    lmax : largest multipole of the spectra
+    nsims, seed, path, mark, report : see `fits.realisations.realisations`
+    """
+    foregrounds = polarization_alms(model, lmax)
+    inside = jnp.asarray(np.stack(list(regions.values())))
+
+    def make(key):
+        noise = prepared.fluctuations.noise_realisation(key)
+        cmb = prepared.fluctuations.cmb_realisation(key)
+        noise_alms = polarization_alms(noise, lmax)
+        spectra = power_spectrum(foregrounds + noise_alms + polarization_alms(cmb, lmax))
+        chi2 = _sums_of_squares((noise + cmb) / prepared.sigma, inside)
+        squares = _sums_of_squares(noise + cmb, inside)
+        return chi2, squares, spectra, power_spectrum(noise_alms)
+
+    return Simulated(*realisations(make, Simulated._fields, nsims, seed, path, mark, report))
+
+
+@jax.jit
+def _sums_of_squares(
+    maps: Float[Array, "band stokes pix"], regions: Bool[Array, "region pix"]
+) -> Float[Array, "band region 3"]:
+    """Sum over the pixels of each region of the squares of Q, of U and of both."""
+    single = jnp.einsum("bsp,rp->brs", maps**2, regions.astype(maps.dtype))
+    return jnp.concatenate([single, single.sum(axis=-1, keepdims=True)], axis=-1)
+
+
+def _slopes(
+    prepared: CommonMaps, model: Float[Array, "band stokes pix"], inside: Bool[Array, "region pix"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes and their errors, shape (band, region, 3).
+
+    m^T W d / m^T W m, whose error follows from the covariance C of what the maps d hold besides
+    the model m: m^T W C W m / (m^T W m)^2.
+    """
+    weighted = jnp.where(jnp.isfinite(prepared.sigma), model / prepared.sigma**2, 0.0)
+    # A row for each region and Stokes parameter, zero in the other one.
+    rows = jnp.einsum("bsp,rp,st->brtsp", weighted, inside.astype(model.dtype), jnp.eye(2))
+    bands, regions = rows.shape[:2]
+    flat = rows.reshape(bands, 2 * regions, 2, -1)
+    total = prepared.fluctuations.covariance(flat).reshape(bands, regions, 2, bands, regions, 2)
+    own = jnp.einsum("brsbrt->brst", total)
+    norm = jnp.einsum("brtsp,bsp->brt", rows, model)
+    product = jnp.einsum("brtsp,bsp->brt", rows, prepared.data)
+    slopes = jnp.concatenate([product / norm, (product.sum(-1) / norm.sum(-1))[..., None]], axis=-1)
+    variance = jnp.einsum("brss->brs", own) / norm**2
+    both = own.sum(axis=(-2, -1)) / norm.sum(axis=-1) ** 2
+    return np.asarray(slopes), np.sqrt(np.concatenate([variance, both[..., None]], axis=-1))
+
+
+def compare_pixels(
+    prepared: CommonMaps,
+    model: Float[Array, "band stokes pix"],
+    regions: Mapping[str, Bool[np.ndarray, " pix"]],
+    simulated: Simulated,
+) -> list[Scatter]:
+    """The observed maps against the model, in each region, for Q, U and both.
+
+    Parameters
+    ----------
+    prepared : templates and maps at the common resolution
+    model : foregrounds of each band [uK_RJ]
+    regions : pixels of each region that are used
+    simulated : realisations of noise and CMB, with the same regions
+    """
+    inside = jnp.asarray(np.stack(list(regions.values())))
+    slopes, errors = _slopes(prepared, model, inside)
+    residual = prepared.data - model
+    found = np.asarray(_sums_of_squares(residual / prepared.sigma, inside))
+    exceeding = (simulated.chi2 >= found).sum(axis=0)
+    pte = (1 + exceeding) / (1 + len(simulated.chi2))
+    squares = simulated.squares.mean(axis=0)
+    rows = []
+    for b, band in enumerate(prepared.bands):
+        for r, (region, pixels) in enumerate(regions.items()):
+            observed, modelled = (np.asarray(m[b])[:, pixels] for m in (prepared.data, model))
+            for s, stokes in enumerate(STOKES):
+                pick = slice(None) if stokes == "QU" else slice(s, s + 1)
+                x, y = modelled[pick].ravel(), observed[pick].ravel()
+                rows.append(
+                    Scatter(
+                        band,
+                        region,
+                        stokes,
+                        x.size,
+                        float(slopes[b, r, s]),
+                        float(errors[b, r, s]),
+                        float(np.corrcoef(x, y)[0, 1]),
+                        float(np.sqrt(np.mean((y - x) ** 2))),
+                        math.sqrt(float(squares[b, r, s]) / x.size),
+                        float(found[b, r, s]),
+                        float(pte[b, r, s]),
+                        1 / (1 + len(simulated.chi2)),
+                    )
+                )
+    return rows

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from astropy.io import fits as pyfits
 
-from jaxsky.io import InputError, read_maps, read_mask
+from jaxsky.io import read_maps, read_mask
+from refusals import refused
 
 NSIDE = 8
 NPIX = 12 * NSIDE**2
@@ -59,7 +60,7 @@ def test_spass_has_one_stokes_parameter_per_file(tmp_path, scheme):
         )
         for name, values in zip("iqu", (I, Q, U), strict=True)
     ]
-    with pytest.raises(InputError, match=r"spass.u.*IAU sign of U.*UNKNOWN1.*give `stokes`"):
+    with refused(r"spass.u.*IAU sign of U.*UNKNOWN1.*give `stokes`"):
         read_maps(paths[2])
     found = read_maps(paths[1:], stokes="QU")
     np.testing.assert_array_equal(found.maps, [Q, -U])
@@ -77,14 +78,14 @@ def test_columns_without_names_are_turned_as_they_are_said_to_be(tmp_path, frame
     healpy.write_map(path, [extra, *source], coord=frame, column_units="K_RJ", dtype=np.float64)
     columns = ["COLUMN_2", "COLUMN_3", "COLUMN_4"]
     words = r"not in Galactic coordinates.*COLUMN_3.*give `stokes`"
-    with pytest.raises(InputError, match=words):
+    with refused(words):
         read_maps(path, fields=columns[1:])
     found = read_maps(path, fields=columns, stokes="IQU").maps
     assert np.abs(found - expected).max() < 1e-6 * np.abs(expected).max()
     for given in ("Q", "U"):
-        with pytest.raises(InputError, match=r"COLUMN_3 cannot be turned.*Q followed by U"):
+        with refused(r"COLUMN_3 cannot be turned.*Q followed by U"):
             read_maps(path, fields="COLUMN_3", stokes=given)
-    with pytest.raises(InputError, match="cannot be turned"):
+    with refused("cannot be turned"):
         read_maps(path, fields=columns[1:], stokes="UQ")
 
 
@@ -106,7 +107,7 @@ def test_q_and_u_of_two_files_or_hdus_are_one_field(tmp_path):
     for path, values in zip(files, source[1:], strict=True):
         options = {"coord": "C", "column_units": "K_CMB", "overwrite": True, "dtype": np.float64}
         healpy.write_map(path, values, **options)
-    with pytest.raises(InputError, match=r"name of column T does not say.*give `stokes`"):
+    with refused(r"name of column T does not say.*give `stokes`"):
         read_maps(files)
     found = read_maps(files, stokes=["Q", "U"]).maps
     assert np.abs(found - expected[1:]).max() < 1e-6 * np.abs(expected).max()
@@ -132,12 +133,12 @@ def test_files_of_one_field_must_agree(tmp_path):
         ({"POLCCONV": "IAU"}, "K_CMB", {"stokes": "QV"}, "must name I, Q, U or pairs.*is 'QV'"),
     ]:
         u = save(tmp_path / "u.fits", {"U": U}, unit, **header)
-        with pytest.raises(InputError, match=words):
+        with refused(words):
             read_maps([q, u], **arguments)
     save(u, {"U": U})
     np.testing.assert_array_equal(read_maps([q, u], polarization="IAU").maps, [Q, -U])
     coarse = save(tmp_path / "c.fits", {"U": np.ones(48)}, NSIDE=2, POLCCONV="IAU")
-    with pytest.raises(InputError, match=r"c.fits, HDU 1: nside is 2, but that of .*q.fits.* is 8"):
+    with refused(r"c.fits, HDU 1: nside is 2, but that of .*q.fits.* is 8"):
         read_maps([q, coarse])
 
 
@@ -154,10 +155,15 @@ def test_names_that_are_certain_tell_the_sign(tmp_path, name, sign):
     np.testing.assert_array_equal(read_maps(path, fields=name).maps[0], sign * U)
 
 
+def test_without_turns_or_signs_no_name_is_needed(tmp_path):
+    path = save(tmp_path / "m.fits", {"COLUMN_2": Q, "COLUMN_3": U})
+    np.testing.assert_array_equal(read_maps(path, fields=[0, 1]).maps, [Q, U])
+
+
 @pytest.mark.parametrize("name", ["COLUMN_2", "UNKNOWN1", "UNITS", "USTOKES", "SIGNAL", "U_X"])
 def test_other_names_are_asked_about(tmp_path, name):
     path = save(tmp_path / "m.fits", {name: U, "X": Q}, POLCCONV="IAU")
-    with pytest.raises(InputError, match=f"the name of column {name} does not say.*`stokes`"):
+    with refused(f"the name of column {name} does not say.*`stokes`"):
         read_maps(path, fields=name)
     np.testing.assert_array_equal(read_maps(path, fields=name, stokes="U").maps[0], -U)
     np.testing.assert_array_equal(read_maps(path, fields=name, stokes=["QU"]).maps[0], -U)
@@ -205,27 +211,27 @@ def test_hits_have_nulls_too(tmp_path):
     path = integers(tmp_path / "h.fits", hits, -1, kind="J", name="N_OBS")
     assert (~read_maps(path, fields="N_OBS").mask).sum() == 9
     bad = integers(tmp_path / "b.fits", hits, "many", kind="J")
-    with pytest.raises(InputError, match="TNULL1 is many, which is not a whole number"):
+    with refused("TNULL1 is many, which is not a whole number"):
         read_maps(bad)
 
 
 @pytest.mark.parametrize(
     ("mark", "share"),
-    [(-1e30, 0.3), (-999.0, 0.05), (-9999.0, 0.5), (99999.0, 0.1), (-777.0, 0.2), (1e20, 0.01)],
+    [(-1e30, 0.3), (-999.0, 0.05), (-9999.0, 0.5), (-32768.0, 0.03), (99999.0, 0.1), (1e20, 0.01)],
 )
 def test_undeclared_marks_are_asked_about(tmp_path, mark, share):
     holes = np.arange(NPIX) < max(2, share * NPIX)
     values = np.where(holes, mark, 100 * I)
     path = save(tmp_path / "m.fits", {"I": values}, formats={"I": "E"})
     words = rf"m.fits.*column I is .* in {holes.sum()} of 768 pixels.*give `missing`"
-    with pytest.raises(InputError, match=words):
+    with refused(words):
         read_maps(path)
     found = read_maps(path, missing=mark)
     np.testing.assert_array_equal(found.mask, ~holes)
     np.testing.assert_array_equal(read_maps(path, missing=[1, mark]).mask, ~holes)
     assert read_maps(path, missing=[]).mask.all()
     # A mark that is not in the file does not answer the question.
-    with pytest.raises(InputError, match=words):
+    with refused(words):
         read_maps(path, missing=-12345.0)
 
 
@@ -233,7 +239,7 @@ def test_the_lowest_integer_is_asked_about(tmp_path):
     stored = np.where(np.arange(NPIX) < 20, -32768, np.arange(NPIX))
     for scale in (None, 0.01):
         path = integers(tmp_path / "i.fits", stored, scale=scale)
-        with pytest.raises(InputError, match=r"I_STOKES is -32[76.8]+ in 20 of 768 pixels"):
+        with refused(r"I_STOKES is -32[76.8]+ in 20 of 768 pixels"):
             read_maps(path)
     assert read_maps(path, missing=-327.68).mask.sum() == NPIX - 20
 
@@ -242,7 +248,7 @@ def test_two_marks_are_named_at_once(tmp_path):
     values = I.copy()
     values[:30], values[30:60] = -999.0, 1e30
     path = save(tmp_path / "m.fits", {"I": values})
-    with pytest.raises(InputError, match=r"is -999 in 30 .*; column I is 1e.30 in 30"):
+    with refused(r"is -999 in 30 .*; column I is 1e.30 in 30"):
         read_maps(path)
     assert read_maps(path, missing=[-999, 1e30]).mask.sum() == NPIX - 60
 
@@ -252,7 +258,7 @@ def test_footprints_of_zeros_are_asked_about(tmp_path, share):
     holes = np.arange(NPIX) < share * NPIX
     columns = {n: np.where(holes, 0.0, v) for n, v in {"Q": Q, "U": U}.items()}
     path = save(tmp_path / "m.fits", columns | {"I": I})
-    with pytest.raises(InputError, match=rf"Q, U: exactly 0 in .*{share:.0%} of.*`missing`"):
+    with refused(rf"Q, U: exactly 0 in .*{share:.0%} of.*`missing`"):
         read_maps(path, fields=["Q", "U"])
     assert read_maps(path).mask.all()  # I has values there
     assert read_maps(path, fields=["Q", "U"], missing=[]).mask.all()
@@ -302,7 +308,7 @@ def test_bad_data_as_text(tmp_path, text):
     path = save(tmp_path / "m.fits", {"I": values}, BAD_DATA=text)
     assert (~read_maps(path).mask).nonzero()[0].tolist() == list(range(7))
     path = save(path, {"I": values}, BAD_DATA="none")
-    with pytest.raises(InputError, match="BAD_DATA is NONE, which is not a number"):
+    with refused("BAD_DATA is NONE, which is not a number"):
         read_maps(path)
 
 
@@ -319,7 +325,7 @@ def test_bad_data_as_text(tmp_path, text):
 )
 def test_columns_that_are_no_real_numbers(tmp_path, form, array, what):
     path = save(tmp_path / "m.fits", {"Q": array, "I": I}, formats={"Q": form})
-    with pytest.raises(InputError, match=f"column Q holds {what}, not real numbers"):
+    with refused(f"column Q holds {what}, not real numbers"):
         read_maps(path, fields="Q")
     np.testing.assert_array_equal(read_maps(path, fields="I").maps[0], I)
 
@@ -327,7 +333,7 @@ def test_columns_that_are_no_real_numbers(tmp_path, form, array, what):
 @pytest.mark.parametrize("missing", ["-999", True, [None], ["x"]])
 def test_missing_must_be_numbers(tmp_path, missing):
     path = save(tmp_path / "m.fits", {"I": I})
-    with pytest.raises(InputError, match="`missing` must be a number or a list of them, not"):
+    with refused("`missing` must be a number or a list of them, not"):
         read_maps(path, missing=missing)
 
 
@@ -394,7 +400,7 @@ def test_partial_maps(tmp_path, given, scheme):
 )
 def test_pixel_numbers_that_are_none(tmp_path, given, words):
     path = partial(tmp_path / "p.fits", **given)
-    with pytest.raises(InputError, match=words) as info:
+    with refused(words, file=path) as info:
         read_maps(path)
     assert "truncated" not in str(info.value)
 
@@ -405,7 +411,7 @@ def test_full_maps_with_pixel_numbers(tmp_path):
     np.testing.assert_array_equal(read_maps(path).maps[0, order], I)
     columns = {"PIXEL": order, "I": I}
     path = save(path, columns, formats={"PIXEL": "J"}, INDXSCHM="IMPLICIT")
-    with pytest.raises(InputError, match="IMPLICIT, but column PIXEL has the pixels in another"):
+    with refused("IMPLICIT, but column PIXEL has the pixels in another"):
         read_maps(path)
     columns["PIXEL"] = np.arange(NPIX)
     path = save(path, columns, formats={"PIXEL": "J"}, INDXSCHM="IMPLICIT")
@@ -417,10 +423,10 @@ def test_nested_takes_powers_of_two_and_ring_any(tmp_path):
     path = save(tmp_path / "m.fits", {"I": values}, NSIDE=12)
     np.testing.assert_array_equal(read_maps(path).maps[0], values)
     path = save(tmp_path / "m.fits", {"I": values}, NSIDE=12, ORDERING="NESTED")
-    with pytest.raises(InputError, match="ordering is NESTED, but nside is 12, no power of 2"):
+    with refused("ordering is NESTED, but nside is 12, no power of 2"):
         read_maps(path)
     np.savez(tmp_path / "m.npz", a=np.ones(values.size))
-    with pytest.raises(InputError, match="ordering is NESTED, but nside is 12"):
+    with refused("ordering is NESTED, but nside is 12"):
         read_mask(tmp_path / "m.npz", ordering="NESTED")
 
 
@@ -438,16 +444,16 @@ def test_sizes_types_and_packing(tmp_path, nside, form):
 def test_columns_in_the_table_by_name(tmp_path):
     path = save(tmp_path / "m.fits", {"beta": I, "BETA": Q})
     np.testing.assert_array_equal(read_maps(path, fields="BETA").maps[0], Q)
-    with pytest.raises(InputError, match="2 columns are called 'Beta'"):
+    with refused("2 columns are called 'Beta'"):
         read_maps(path, fields="Beta")
     for odd in (True, -1, 7):
-        with pytest.raises(InputError, match=f"no column {odd}; it has beta, BETA"):
+        with refused(f"no column {odd}; it has beta, BETA"):
             read_maps(path, fields=[odd])
-    with pytest.raises(InputError, match="no HDU True"):
+    with refused("no HDU True"):
         read_maps(path, hdu=True, fields="BETA")
     cube = save(tmp_path / "c.fits", {"I": np.ones((NPIX, 4))}, formats={"I": "4D"}, NSIDE=None)
     assert read_maps(cube, nside=16).nside == 16  # packed by rows, as HEALPix writes
-    with pytest.raises(InputError, match="NSIDE is 8, but its columns have 3072 pixels"):
+    with refused("NSIDE is 8, but its columns have 3072 pixels"):
         read_maps(save(cube, {"I": np.ones((NPIX, 4))}, formats={"I": "4D"}))
 
 
@@ -456,19 +462,19 @@ def test_only_what_is_cut_is_called_so(tmp_path):
     whole = path.read_bytes()
     assert b"TFORM1" in whole
     path.write_bytes(whole.replace(b"TFORM1  = 'D", b"TFORM1  = 'Y"))
-    with pytest.raises(InputError) as info:
+    with refused("m.fits") as info:
         read_maps(path)
     assert "truncated" not in str(info.value)
     for cut, packed in ((whole[:-3000], False), (whole[:-3000], True)):
         path = tmp_path / ("c.fits.gz" if packed else "c.fits")
         path.write_bytes(gzip.compress(cut) if packed else cut)
-        with pytest.raises(InputError, match="not a FITS file, or a truncated one"):
+        with refused("not a FITS file, or a truncated one"):
             read_maps(path)
-    with pytest.raises(InputError, match="is a folder"):
+    with refused("is a folder"):
         read_maps(tmp_path)
     image = tmp_path / "image.fits"
     pyfits.HDUList([pyfits.PrimaryHDU(), pyfits.ImageHDU(np.ones((3, 4)))]).writeto(image)
-    with pytest.raises(InputError, match="HDU 1 holds no binary table"):
+    with refused("HDU 1 holds no binary table"):
         read_maps(image)
 
 
@@ -499,17 +505,18 @@ def test_masks_with_other_values_say_which(tmp_path):
         (np.where(np.arange(NPIX) < 9, -999.0, 1.0), "9 of 768 pixels have others, such as -999"),
         (np.where(np.arange(NPIX) < 9, 0.5, 1.0), "such as 0.5"),
         (np.full(NPIX, 255.0), "768 of 768 pixels have others, such as 255"),
+        (np.zeros(NPIX), "the mask leaves no pixel"),
     ]:
         path = save(tmp_path / "m.fits", {"M": values}, None)
-        with pytest.raises(InputError, match=words):
+        with refused(words):
             read_mask(path)
     # WMAP's: the mask is N_OBS, and the column TEMPERATURE is zero.
     columns = {"TEMPERATURE": np.zeros(NPIX), "N_OBS": (I > 0).astype(float)}
     wmap = save(tmp_path / "w.fits", columns, None)
-    with pytest.raises(InputError, match="leaves no pixel; give `key` out of N_OBS"):
+    with refused("leaves no pixel; give `key` out of N_OBS"):
         read_mask(wmap)
     np.testing.assert_array_equal(read_mask(wmap, key="N_OBS"), I > 0)
     for array in (np.full(NPIX, "a"), np.ones(NPIX, complex), np.ones((4, NPIX))):
         np.savez(tmp_path / "m.npz", a=array)
-        with pytest.raises(InputError, match=r"m.npz: a is no mask, but has type"):
+        with refused(r"m.npz: a is no mask, but has type"):
             read_mask(tmp_path / "m.npz")

@@ -111,6 +111,7 @@ def test_construction_inside_jit():
 @pytest.mark.parametrize(
     ("nu", "weights", "convention", "words"),
     [
+        ([30e9, 31e9], [1.0, 1.0], "RJ", "`nu` .*GHz"),
         ([30.0, 31.0], [1.0, 1.0, 1.0], "RJ", r"must have one shape \(sample,\)"),
         ([], [], "RJ", r"must have one shape"),
         ([31.0, 30.0], [1.0, 1.0], "RJ", "`nu` must increase strictly"),
@@ -138,9 +139,11 @@ def test_units_are_refused():
         Bandpass(NU * u.GHz, np.ones(NU.size))
 
 
-def test_a_width_that_is_not_positive_is_refused():
+def test_bad_top_hats_are_refused():
     with pytest.raises(ValueError, match="`width` must be positive"):
         Bandpass.top_hat(70.0, 0.0)
+    with pytest.raises(ValueError, match="`samples`"):
+        Bandpass.top_hat(70.0, 8.0, samples=1)
 
 
 def test_stacked_bands_have_the_same_averages():

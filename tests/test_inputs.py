@@ -286,6 +286,8 @@ def test_settings_with_values_replaced(tmp_path, monkeypatch):
     # A table that the file does not have; one that is none is a mistake, as without.
     path.write_text("")
     assert load(path, ["common.nside=2"]).common.nside == 2
+    with pytest.raises(SettingsError, match="bands"):
+        inputs_of(load(path))
     path.write_text("common = 3")
     with pytest.raises(SettingsError, match=r"common: input should be a valid table, not 3"):
         load(path)

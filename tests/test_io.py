@@ -8,13 +8,8 @@ import pytest
 from astropy.io import fits as pyfits
 
 from jaxsky.bandpass import Bandpass
-from jaxsky.io import (
-    InputError,
-    degrade_mask,
-    read_maps,
-    read_mask,
-    write_maps,
-)
+from jaxsky.io import degrade_mask, read_maps, read_mask, write_maps
+from refusals import refused
 
 NSIDE = 8
 NPIX = 12 * NSIDE**2
@@ -86,9 +81,9 @@ def test_wmap_map_needs_unit_and_coordinates(tmp_path, rng):
     units = dict(zip(names, ["mK", *["mK,thermodynamic"] * 2, "counts"], strict=True))
     maps = {name: rng.normal(size=NPIX) for name in names}
     path = save(tmp_path / "wmap.fits", maps, units, ORDERING="NESTED", COORDSYS=None)
-    with pytest.raises(InputError, match=r"TEMPERATURE has the unit 'mK', which leaves open"):
+    with refused(r"TEMPERATURE has the unit 'mK', which leaves open"):
         read_maps(path, coordinates="G")
-    with pytest.raises(InputError, match=r"wmap.fits, HDU 1: the header has no COORDSYS; give"):
+    with refused(r"wmap.fits, HDU 1: the header has no COORDSYS; give"):
         read_maps(path, unit="mK_CMB")
     read = read_maps(path, unit="mK_CMB", coordinates="G")
     assert (read.unit, read.names) == ("mK_CMB", tuple(names[:3]))
@@ -115,7 +110,7 @@ def test_bad_data_and_not_finite_are_masked(tmp_path):
     assert (~read.mask).nonzero()[0].tolist() == [0, 1, 2, 3]
     assert read.maps[0].sum() == NPIX - 4
     empty = save(tmp_path / "e.fits", {"I": np.full(NPIX, np.nan)}, {"I": "uK_RJ"})
-    with pytest.raises(InputError, match=r"e.fits.*no pixel has values in I"):
+    with refused(r"e.fits.*no pixel has values in I"):
         read_maps(empty)
 
 
@@ -267,10 +262,8 @@ GOOD = {"unit": "uK_CMB", "coordinates": "G"}
     ],
 )
 def test_bad_arguments(bare, arguments, words):
-    before = bare.read_bytes()
-    with pytest.raises(ValueError, match=words):
+    with refused(words, ValueError, bare):
         read_maps(bare, **(GOOD | arguments))
-    assert bare.read_bytes() == before
 
 
 @pytest.mark.parametrize(
@@ -281,6 +274,7 @@ def test_bad_arguments(bare, arguments, words):
         ({"COORDSYS": "X"}, {}, "COORDSYS is X, which is none of G, C, E"),
         ({"COORDSYS": "C"}, {"coordinates": "G"}, "is G, but the header says C"),
         ({"POLCCONV": "IAU"}, {"polarization": "COSMO"}, "is COSMO, but the header says IAU"),
+        ({"POLCCONV": "XYZ"}, {}, "POLCCONV is XYZ"),
         ({"NSIDE": 16}, {}, r"NSIDE is 16, but its columns have 768 pixels \(nside 8\)"),
         ({"PIXTYPE": "CAR"}, {}, "not a HEALPix map, PIXTYPE is CAR"),
         ({"INDXSCHM": "EXPLICIT"}, {}, "no column 'PIXEL'"),
@@ -293,36 +287,35 @@ def test_bad_arguments(bare, arguments, words):
 def test_bad_headers(tmp_path, header, arguments, words):
     maps, units = {k: np.ones(NPIX) for k in ("Q_X", "T_D", "V")}, ("uK_CMB", "K", "MJy/sr")
     path = save(tmp_path / "m.fits", maps, dict(zip(maps, units, strict=True)), **header)
-    with pytest.raises(InputError, match=words) as info:
+    with refused(words, file=path) as info:
         read_maps(path, **arguments)
     assert str(path) in str(info.value)
-    assert "\n" not in str(info.value)
 
 
 def test_files_that_are_no_maps(tmp_path, bare):
-    with pytest.raises(InputError, match=r"none.fits: no such file"):
+    with refused(r"none.fits: no such file"):
         read_maps(tmp_path / "none.fits")
     text = tmp_path / "text.fits"
-    text.write_text("not a map")
-    with pytest.raises(InputError, match=r"text.fits: not a FITS file"):
-        read_maps(text, **GOOD)
+    for content in (b"", b"not a map", bytes(range(256)), b"SIMPLE  =                    T"):
+        text.write_bytes(content.ljust(80) if content else content)
+        with refused(r"text.fits: not a FITS file", file=text):
+            read_maps(text, **GOOD)
     odd = save(tmp_path / "odd.fits", {"I": np.ones(100)}, NSIDE=None)
-    with pytest.raises(InputError, match="its columns have 100 values"):
+    with refused("its columns have 100 values"):
         read_maps(odd, unit="K_RJ")
     cut = tmp_path / "cut.fits.gz"
     cut.write_bytes(gzip.compress(bare.read_bytes())[:-2000])
-    with pytest.raises(InputError, match=r"cut.fits.gz.*truncated"):
+    with refused(r"cut.fits.gz.*truncated"):
         read_maps(cut, **GOOD)
     two = save(tmp_path / "two.fits", {"A": np.ones(NPIX), "B": np.ones(NPIX)})
-    with pytest.raises(InputError, match="no column is named as I, Q or U; give `fields` out of"):
+    with refused("no column is named as I, Q or U; give `fields` out of"):
         read_maps(two, unit="K_RJ")
     whole = bare.read_bytes()
     for length in (100, 2880, 3500, 6000, len(whole) - 2881, len(whole) - 1):
         cut = tmp_path / "cut.fits"
         cut.write_bytes(whole[:length])
-        with pytest.raises(InputError, match=r"cut.fits.*truncated"):
+        with refused(r"cut.fits.*truncated", file=cut):
             read_maps(cut, **GOOD)
-        assert cut.read_bytes() == whole[:length]
 
 
 def test_real_maps(data_dir):
@@ -376,7 +369,7 @@ def test_bad_masks(tmp_path):
         (tmp_path / "none.npz", {}, r"none.npz: no such file"),
         (tmp_path / "none.fits", {}, r"none.fits: no such file"),
     ]:
-        with pytest.raises(InputError, match=words):
+        with refused(words):
             read_mask(path, **arguments)
 
 
@@ -402,5 +395,5 @@ def test_real_masks(data_dir):
 
 def test_a_column_is_not_two(tmp_path):
     healpy.write_map(tmp_path / "m.fits", np.ones((3, 12)), dtype=np.float64)
-    with pytest.raises(InputError, match=r"m.fits, HDU 1: `fields` names a column twice"):
+    with refused(r"m.fits, HDU 1: `fields` names a column twice"):
         read_maps(tmp_path / "m.fits", fields=["Q_POLARISATION", "Q_POLARISATION"], unit="K_CMB")

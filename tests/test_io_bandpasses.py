@@ -7,7 +7,8 @@ from astropy import units as u
 from astropy.io import fits as pyfits
 
 from jaxsky.bandpass import Bandpass
-from jaxsky.io import InputError, from_quantity, read_bandpass, unit_factor, unit_name
+from jaxsky.io import from_quantity, read_bandpass, unit_factor, unit_name
+from refusals import refused
 
 #: MJy/sr per K_CMB, Planck 2013 results IX, table 6.
 HFI = {"100": 244.10, "143": 371.74, "217": 483.690, "353": 287.450, "545": 58.04, "857": 2.27}
@@ -140,7 +141,7 @@ def test_text_tables(tmp_path):
 )
 def test_bad_text_tables(tmp_path, lines, words):
     path = table(tmp_path / "b.txt", *lines)
-    with pytest.raises(InputError, match=words):
+    with refused(words):
         read_bandpass(path, convention="RJ")
 
 
@@ -237,7 +238,7 @@ def test_wavenumbers_and_wavelengths(tmp_path, content, arguments):
 def test_text_that_is_refused(tmp_path, content, arguments, words):
     path = tmp_path / "b.txt"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=rf"b\.txt.*{words}"):
+    with refused(rf"b\.txt.*{words}"):
         read_bandpass(path, convention="RJ", **arguments)
 
 
@@ -263,13 +264,13 @@ def test_bad_rimos(tmp_path):
         ("twice", {"band": "30"}, "2 HDUs are named 'BANDPASS_030' and differ"),
         ("falling", {"band": "30"}, r"falling.fits: frequencies .* must increase"),
     ]:
-        with pytest.raises(InputError, match=words):
+        with refused(words):
             read_bandpass(files[name], **arguments)
     whole = files["good"].read_bytes()
     for length in (2000, 3000, len(whole) - 3000):
         cut = tmp_path / "cut.fits"
         cut.write_bytes(whole[:length])
-        with pytest.raises(InputError, match=r"cut.fits"):
+        with refused(r"cut.fits"):
             read_bandpass(cut, "30")
 
 

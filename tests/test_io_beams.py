@@ -7,7 +7,8 @@ from astropy.io import fits as pyfits
 
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.instrument import load_instrument
-from jaxsky.io import InputError, read_beam
+from jaxsky.io import read_beam
+from refusals import refused
 
 LMAX = 40
 ELL = np.arange(LMAX + 1)
@@ -42,7 +43,7 @@ def test_wmap_tables_hold_amplitudes(data_dir, band, lmax):
     angle = 4 * np.pi / np.sum((2 * np.arange(lmax + 1) + 1) * window)
     size = float(load_instrument("wmap")[band].fwhm) / 60
     assert 1.0 < np.degrees(np.sqrt(angle)) / size < 1.2
-    with pytest.raises(InputError, match=rf"wmap_beam_{band}.tbl: ends at l = {lmax}, but lmax is"):
+    with refused(rf"wmap_beam_{band}.tbl: ends at l = {lmax}, but lmax is"):
         read_beam(path, lmax + 1)
 
 
@@ -53,7 +54,7 @@ def test_planck_instrument_model(data_dir):
         assert window[0] == 1
         # The effective beams are nearly Gaussian; the square is off by 0.2 and more.
         assert np.abs(window - gaussian_beam(fwhm, 1000)).max() < 0.03
-    with pytest.raises(InputError, match=r"give `hdu`, one of BEAMWF_030X030, BEAMWF_044X044"):
+    with refused(r"give `hdu`, one of BEAMWF_030X030, BEAMWF_044X044"):
         read_beam(path, 1000)
 
 
@@ -113,7 +114,7 @@ def test_bad_windows(tmp_path):
         (binary, {}, "b.dat: neither a FITS file nor a text table"),
         (tmp_path / "none.txt", {}, "none.txt: no such file"),
     ]:
-        with pytest.raises(InputError, match=words):
+        with refused(words):
             read_beam(path, LMAX, **arguments)
     with pytest.raises(ValueError, match="`lmax` must not be negative, but is -1"):
         read_beam(tmp_path / "c.txt", -1)
@@ -129,5 +130,5 @@ def test_damaged_rows_are_not_skipped(tmp_path):
         ("0 1\n1\n", "line 2: 1 numbers, but 2 in the lines above"),
     ]:
         path.write_text(content)
-        with pytest.raises(InputError, match=rf"b.txt, {words}"):
+        with refused(rf"b.txt, {words}"):
             read_beam(path, 1)

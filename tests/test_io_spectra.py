@@ -7,7 +7,8 @@ import pytest
 from astropy.io import fits as pyfits
 
 from jaxsky.cmb import camb_spectra
-from jaxsky.io import InputError, read_spectra
+from jaxsky.io import read_spectra
+from refusals import refused
 
 LMAX = 30
 ELL = np.arange(LMAX + 1)
@@ -137,7 +138,7 @@ def test_text_that_leaves_something_open(tmp_path):
         ),
         (tmp_path / "p.txt", {"unit": "K^2"}, "`unit` is for FITS files, text is in uK"),
     ]:
-        with pytest.raises(InputError, match=words):
+        with refused(words):
             read_spectra(path, LMAX, **arguments)
     with pytest.raises(ValueError, match="`format` must be one of planck, camb, not 'class'"):
         read_spectra(tmp_path / "p.txt", LMAX, format="class")
@@ -158,12 +159,12 @@ def test_damaged_text(tmp_path):
         (["# L TT EE BB TE"], "b_totCls.dat: no line has numbers"),
     ]:
         bad.write_text("\n".join(lines) + "\n")
-        with pytest.raises(InputError, match=words):
+        with refused(words):
             read_spectra(bad, LMAX)
     bad.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="neither a FITS file nor a text table"):
+    with refused("neither a FITS file nor a text table"):
         read_spectra(bad, LMAX)
-    with pytest.raises(InputError, match=r"none.txt: no such file"):
+    with refused(r"none.txt: no such file"):
         read_spectra(tmp_path / "none.txt", LMAX)
 
 
@@ -184,7 +185,7 @@ def test_spectra_that_cannot_be(tmp_path):
         cl = CL.copy()
         cl[row, 7] = value
         path = fits(tmp_path / f"{i}.fits", cl, column_units="uK^2")
-        with pytest.raises(InputError, match=words):
+        with refused(words):
             read_spectra(path, LMAX)
         # What is wrong above lmax does not matter.
         assert read_spectra(path, 6).shape == (4, 7)
@@ -231,11 +232,11 @@ def test_fits_that_leave_something_open(tmp_path):
         (tmp_path / "image.fits", {}, "image.fits: HDU 1 holds no table"),
         (tmp_path / "empty.fits", {}, r"empty.fits: no HDU 1; it has 0 \(PRIMARY\)"),
     ]:
-        with pytest.raises(InputError, match=words):
+        with refused(words):
             read_spectra(path, LMAX, **arguments)
     whole = (tmp_path / "b.fits").read_bytes()
     (tmp_path / "cut.fits").write_bytes(whole[:-2880])
-    with pytest.raises(InputError, match=r"cut.fits: not a FITS file, or a truncated one"):
+    with refused(r"cut.fits: not a FITS file, or a truncated one"):
         read_spectra(tmp_path / "cut.fits", LMAX)
 
 
@@ -258,7 +259,7 @@ def test_fits_that_leave_something_open(tmp_path):
 def test_damaged_rows_are_not_skipped(tmp_path, content, words):
     path = tmp_path / "b.txt"
     path.write_text(content)
-    with pytest.raises(InputError, match=rf"b.txt.*{words}"):
+    with refused(rf"b.txt.*{words}"):
         read_spectra(path, 2)
 
 

@@ -178,7 +178,6 @@ def test_options_replace_settings_and_results_are_kept(folder, tmp_path, monkeyp
     assert jaxsky(monkeypatch, "fit", path, *options, "--resume") == 0
     again = json.loads((out / "result.json").read_text())
     assert again["results"] == json.loads(before)["results"]
-    assert jaxsky(monkeypatch, "fit", path, *other, "--overwrite") == 0
 
 
 @pytest.mark.slow
@@ -357,11 +356,6 @@ def test_mistakes_in_the_noise_are_one_sentence(
 def test_absent_settings_are_one_sentence(tmp_path, monkeypatch, capsys):
     assert jaxsky(monkeypatch, "fit", tmp_path / "none.toml", "--out", tmp_path / "out") == 2
     assert "none.toml: cannot be read (No such file or directory)" in one_sentence(capsys)
-
-
-def test_version(monkeypatch, capsys):
-    assert jaxsky(monkeypatch, "--version") == 0
-    assert capsys.readouterr().out.startswith("jaxsky 0.")
 
 
 def test_swapped_columns_are_refused(folder, tmp_path, monkeypatch, capsys):

@@ -182,6 +182,7 @@ def test_ctrl_c_before_there_is_a_folder(monkeypatch, capsys):
     assert run(monkeypatch, capsys, raises(KeyboardInterrupt())) == (130, "Stopped. ")
 
 
+@pytest.mark.slow
 def test_ctrl_c_at_the_end_of_the_interpreter_says_nothing():
     code = (
         "import atexit, signal, sys; atexit.register(signal.raise_signal, signal.SIGINT)\n"

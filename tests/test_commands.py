@@ -2,7 +2,6 @@
 
 import io
 import itertools
-import os
 import re
 import subprocess
 import sys
@@ -12,6 +11,7 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
+from commands import jaxsky
 from fits.commands import console as terminal
 from fits.commands.page import Section, key_of, table_of, write_page
 from fits.commands.run import DEFAULTS
@@ -148,31 +148,26 @@ def test_page(tmp_path):
     assert key_of("Figure 1: a") == "figure-1"
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        ["-m", "jaxsky", "--version"],
-        ["-m", "jaxsky", "fit", "--version"],
-        ["-c", "from fits.app import main; main()", "data", "fetch", "--version"],
-    ],
-)
-def test_version(line):
-    done = subprocess.run([sys.executable, *line], capture_output=True, text=True, check=True)
-    assert re.fullmatch(r"jaxsky \d+\.\d+\.\d+\n", done.stdout)
+def test_version(monkeypatch, capsys):
+    printed = subprocess.check_output(
+        [sys.executable, "-m", "jaxsky", "fit", "--version"], text=True
+    )
+    assert re.fullmatch(r"jaxsky \d+\.\d+\.\d+\n", printed)
+    for line in (["--version"], ["data", "fetch", "--version"]):
+        assert jaxsky(monkeypatch, *line) == 0
+        assert capsys.readouterr().out == printed
 
 
 @pytest.mark.parametrize(
     ("words", "completed"),
     [("se", ["separate"]), ("init pl", ["planck-44-70", "planck-separate"])],
 )
-def test_shells_complete_commands_and_experiments(words, completed):
-    line = {"_JAXSKY_COMPLETE": "complete_bash", "COMP_WORDS": f"jaxsky {words}"}
-    line["COMP_CWORD"] = str(len(words.split()))
-    jaxsky = Path(sys.executable).with_name("jaxsky")
-    done = subprocess.run(
-        [jaxsky], env=os.environ | line, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.split() == completed
+def test_shells_complete_commands_and_experiments(words, completed, monkeypatch, capsys):
+    monkeypatch.setenv("_JAXSKY_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", f"jaxsky {words}")
+    monkeypatch.setenv("COMP_CWORD", str(len(words.split())))
+    assert jaxsky(monkeypatch) == 0
+    assert capsys.readouterr().out.split() == completed
 
 
 def test_nothing_in_jaxsky_imports_fits_but_main():

@@ -1,5 +1,6 @@
 """Likelihoods against dense sums over pixels, each other, and finite differences."""
 
+import functools
 import subprocess
 import sys
 
@@ -45,6 +46,7 @@ def papers_chi2(sky, params, data, sigma, calibration=(1.0, 1.0), offset=0.0):
     return np.sum(((np.asarray(data) - model) / np.asarray(sigma)) ** 2)
 
 
+@functools.cache
 def fluctuations(cmb: bool = True) -> Fluctuations:
     """Noise at nside 8, smoothed to nside 4; correlated noise in one band; CMB."""
     lmax, nside_in = 8, 8
@@ -72,13 +74,15 @@ def fluctuations(cmb: bool = True) -> Fluctuations:
     )
 
 
-def dense_covariance(model: Fluctuations) -> np.ndarray:
+@functools.cache
+def dense_covariance(cmb: bool = True) -> np.ndarray:
     """Covariance of all values (band, stokes, pix) of the prepared maps, mode by mode."""
-    blocks = []
+    model, blocks = fluctuations(cmb), []
     for b, (preparation, noise) in enumerate(zip(model.preparations, model.noise, strict=True)):
         npix_in = noise.shape[-1]
         basis = jnp.eye(2 * npix_in).reshape(-1, 2, npix_in)
-        A = np.stack([np.asarray(preparation(e)).ravel() for e in basis], axis=1)
+        A = np.asarray(jax.lax.map(preparation, basis, batch_size=256))
+        A = A.reshape(2 * npix_in, -1).T
         N = np.zeros((2, npix_in, 2, npix_in))
         for s in range(2):
             for t in range(2):
@@ -103,7 +107,8 @@ def dense_covariance(model: Fluctuations) -> np.ndarray:
 
 def synthesis_matrix(lmax: int) -> np.ndarray:
     rows = jnp.eye(2 * NPIX).reshape(-1, 2, NPIX)
-    return np.stack([np.asarray(adjoint_synthesis(r, lmax)).ravel() for r in rows])
+    columns = jax.lax.map(lambda r: adjoint_synthesis(r, lmax), rows, batch_size=256)
+    return np.asarray(columns).reshape(len(rows), -1)
 
 
 def test_inner_products_do_not_depend_on_chunks_and_add_up():
@@ -167,13 +172,13 @@ def test_calibration_offset_and_mask(pixelwise):
 def test_exact_covariance_is_the_dense_one(cmb):
     model = fluctuations(cmb)
     rows = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3, 2, NPIX)))
-    dense = dense_covariance(model)
+    dense = dense_covariance(cmb)
     flat = np.zeros((2, 3, 2, 2 * NPIX))
     for b in range(2):
         flat[b, :, b] = np.asarray(rows[b]).reshape(3, -1)
     flat = flat.reshape(6, -1)
     np.testing.assert_allclose(model.covariance(rows), flat @ dense @ flat.T, rtol=1e-9, atol=1e-9)
-    sigma = np.sqrt(np.diag(dense_covariance(fluctuations(False)))).reshape(2, 2, NPIX)
+    sigma = np.sqrt(np.diag(dense_covariance(False))).reshape(2, 2, NPIX)
     # The map of variances neglects the rotation of Q and U within the kernel and their
     # correlation, which at a beam of 25 degrees is at its worst.
     np.testing.assert_allclose(model.sigma(), sigma, rtol=0.15)
@@ -184,7 +189,7 @@ def test_exact_likelihood_is_that_of_the_amplitudes():
     sky, data, sigma = problem()
     model = fluctuations()
     like = likelihood(sky, BANDS, data, sigma, START, covariance_of=model.covariance)
-    dense = dense_covariance(model)
+    dense = dense_covariance()
     rows = []
     for b in range(2):
         for s in range(2):

@@ -122,7 +122,9 @@ def near(value, truth, sigma):
 TRUTH = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.05}
 
 
-@pytest.mark.parametrize("command", ["fit", "separate", "compare"])
+@pytest.mark.parametrize(
+    "command", ["fit", "separate", pytest.param("compare", marks=pytest.mark.slow)]
+)
 def test_commands_find_the_truth_in_simulated_maps(folder, command, monkeypatch):
     out, maps = folder / command, folder / "sims/sim_00000"
     # With "compare" the model is the sky itself.

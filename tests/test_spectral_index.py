@@ -70,15 +70,14 @@ def test_own_beams_are_accounted_for():
 def test_variance_of_prepared_noise():
     """Against 400 draws: a map of variances is smoothed by the square of the kernel."""
     nside_in, nside = 32, 16
+    keys = jax.random.split(jax.random.key(0), 400)
     latitude = healpy.pix2ang(nside_in, np.arange(healpy.nside2npix(nside_in)), lonlat=True)[1]
     covariance = uniform_covariance(1000.0, nside_in) * (1.5 + np.cos(np.radians(latitude)))
     for preparation in (
         Preparation.smoothing(nside_in, 60.0, nside, 400.0, 47),
         Preparation.averaging(nside_in, nside),
     ):
-        draws = jnp.stack(
-            [preparation(draw(k, covariance)) for k in jax.random.split(jax.random.key(0), 400)]
-        )
+        draws = jax.lax.map(lambda k, p=preparation: p(draw(k, covariance)), keys, batch_size=50)
         model = Fluctuations(
             (preparation,), (covariance,), (None,), None, None, jnp.ones(1), ("44",), (None,)
         )
@@ -240,11 +239,10 @@ def test_embedded_run_recovers_the_truth(quick_settings, tmp_path):
     assert {name: inputs.truth[name] for name in free} == pytest.approx(free)
     assert "not data" in inputs.description
     prepared = common_maps(inputs, 16, 300.0)
-    regions = region_masks(quick_settings, quick_settings.fit.regions)
-    fits = run(quick_settings, prepared, regions, tmp_path / "chain.h5")
-    assert [(f.region, f.stokes) for f in fits] == [
-        (region, stokes) for region in ("strip", "full") for stokes in ("Q", "U", "QU")
-    ]
+    how = quick_settings.fit.model_copy(update={"stokes": ["U", "QU"]})
+    quick_settings = quick_settings.model_copy(update={"fit": how})
+    fits = run(quick_settings, prepared, region_masks(quick_settings, ["strip"]), tmp_path / "c.h5")
+    assert [(f.region, f.stokes) for f in fits] == [("strip", "U"), ("strip", "QU")]
     for fit in fits:
         results = fit.results
         assert set(results) == {"grid", "gradient", "mcmc"}

@@ -16,7 +16,6 @@ import urllib3
 from jaxsky.archive.products import (
     DownloadError,
     Product,
-    alone,
     check_size,
     check_structure,
     checksums,
@@ -26,7 +25,7 @@ from jaxsky.archive.products import (
     writing,
 )
 from jaxsky.io import InputError
-from jaxsky.io.folders import cache_folder
+from jaxsky.io.folders import cache_folder, locked
 
 #: Seconds to wait for a connection, and for more bytes.
 TIMEOUT = (10.0, 60.0)
@@ -48,17 +47,12 @@ class RefusedError(Exception):
 
 
 class _State(NamedTuple):
-    """What a partial file is of, kept next to it.
-
-    Parameters
-    ----------
-    address : where it comes from
-    version : the server's strong ETag or date of the file
-    total : bytes of the whole file, None if the server did not say
-    """
+    """What a partial file is of, kept next to it."""
 
     address: str
+    #: The server's strong ETag or date of the file.
     version: str
+    #: Bytes of the whole file, None if the server did not say.
     total: int | None
 
 
@@ -76,12 +70,6 @@ def _state(part: Path) -> _State | None:
     return None if not have or (state.total is not None and have > state.total) else state
 
 
-def source(part: Path) -> str | None:
-    """Address of which a partial file is, None if there is none that can be resumed."""
-    state = _state(part)
-    return state and state.address
-
-
 def discard(part: Path) -> None:
     """Remove a partial file and what is known of it, in an order that allows to be interrupted."""
     _beside(part).unlink(missing_ok=True)
@@ -89,22 +77,12 @@ def discard(part: Path) -> None:
 
 
 def _transfer(address: str, part: Path, report: Report, size: int | None = None) -> None:
-    """Bring a file, or what is missing of it.
-
-    Parameters
-    ----------
-    address : http or https
-    part : the partial file
-    report : called with the bytes that are there, and all bytes or None
-    size : bytes that the file has, None if not known
-    """
+    """Bring a file of so many bytes, or what is missing of the part that is there."""
     state = _state(part)
-    if state is not None and state.address != address:
-        state = None
-    if state is not None and part.stat().st_size == state.total:
-        return
-    if state is not None and _resume(address, part, state, report, size):
-        return
+    if state is not None and state.address == address:
+        whole = part.stat().st_size == state.total
+        if whole or _resume(address, part, state, report, size):
+            return
     with _get(address, {}) as answer:
         answer.raise_for_status()
         if answer.status_code != requests.codes.ok:
@@ -278,7 +256,7 @@ def fetch(
         return _kept(product, path, part)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        with alone(folder / f".{product.name}.lock", waiting):
+        with locked(folder / f".{product.name}.lock", waiting=waiting):
             if path.exists():  # another process has brought it
                 return _kept(product, path, part)
             found = _download(product, addresses, part, accept, report)
@@ -325,8 +303,8 @@ def _download(
 ) -> str:
     """Bring the file from the first address that has it; returns its hash."""
     failures = []
-    begun = source(part)
-    for address in sorted(addresses, key=lambda a: a != begun):
+    begun = _state(part)
+    for address in sorted(addresses, key=lambda a: begun is None or a != begun.address):
         try:
             _transfer(address, part, report, None if accept else product.size)
             return _checked(product, part, accept)

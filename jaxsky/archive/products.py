@@ -5,19 +5,19 @@ import json
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import filelock
 import pooch
 from astropy.io import fits as pyfits
+from rich.filesize import decimal
 
 from jaxsky.io import InputError, read_spectra
-from jaxsky.io.folders import NO_LOCKS
+from jaxsky.io.folders import locked
 from jaxsky.io.quantities import unit_name
 from jaxsky.io.tables import HealpixTable, open_fits
 
@@ -61,15 +61,7 @@ class ProductSet(NamedTuple):
     files: tuple[str, ...]
 
 
-def _product(
-    name: str, entry: dict[str, Any], group: str, common: dict[str, Any], sources: dict[str, str]
-) -> Product:
-    said = {k: v for k, v in common.items() if k != "files"} | entry
-    addresses = tuple(sources[source] + name for source in said.pop("sources"))
-    columns = tuple(said.pop("columns", ()))
-    return Product(name=name, group=group, addresses=addresses, columns=columns, **said)
-
-
+@cache
 def _table() -> dict[str, Any]:
     return tomllib.loads((files("jaxsky.archive") / "products.toml").read_text())
 
@@ -98,12 +90,14 @@ def catalogue() -> dict[str, Product]:
     >>> catalogue()["wmap_band_iqumap_r9_9yr_K_v5.fits"].unit
     'mK_CMB'
     """
-    table = _table()
-    return {
-        name: _product(name, entry, group, common, table["sources"])
-        for group, common in table["groups"].items()
-        for name, entry in common["files"].items()
-    }
+    found, sources = {}, _table()["sources"]
+    for group, common in _table()["groups"].items():
+        shared = {key: value for key, value in common.items() if key != "files"}
+        for name, entry in common["files"].items():
+            said = {"name": name, "group": group, "columns": ()} | shared | entry
+            said["addresses"] = tuple(sources[source] + name for source in said.pop("sources"))
+            found[name] = Product(**said | {"columns": tuple(said["columns"])})
+    return found
 
 
 def find(words: Sequence[str] = ()) -> list[Product]:
@@ -128,16 +122,8 @@ def find(words: Sequence[str] = ()) -> list[Product]:
 
 
 def in_words(size: float) -> str:
-    """A number of bytes with its unit.
-
-    Examples
-    --------
-    >>> in_words(771840), in_words(1.8e9)
-    ('772 kB', '1.8 GB')
-    """
-    if size >= 1e9:
-        return f"{size / 1e9:.1f} GB"
-    return f"{size / 1e6:.0f} MB" if size >= 1e6 else f"{size / 1e3:.0f} kB"
+    """A number of bytes with its unit."""
+    return decimal(int(size), precision=int(size >= 1e9))
 
 
 def total_size(products: Sequence[Product]) -> str:
@@ -194,35 +180,11 @@ def file_hash(path: Path, like: str = "sha256:") -> str:
 
 def remember(product: Product, folder: Path, value: str) -> None:
     """Record the hash of a product's file."""
-    with alone(folder / f".{CHECKSUMS}.lock"):
+    with locked(folder / f".{CHECKSUMS}.lock"):
         known = checksums(folder) | {product.name: value}
         new = folder / f".{CHECKSUMS}.new"
         new.write_text(json.dumps(known, indent=2, sort_keys=True) + "\n")
         os.replace(new, folder / CHECKSUMS)
-
-
-@contextmanager
-def alone(path: Path, waiting: Callable[[], None] = lambda: None) -> Iterator[None]:
-    """Hold a lock, which ends with the process; without one where a file system has none.
-
-    Parameters
-    ----------
-    path : of the lock
-    waiting : called if another process has it
-    """
-    lock = filelock.FileLock(path, fallback_to_soft=False)
-    try:
-        lock.acquire(blocking=False)
-    except filelock.Timeout:
-        waiting()
-        lock.acquire()
-    except OSError as error:
-        if error.errno not in NO_LOCKS:
-            raise
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 @contextmanager
@@ -242,13 +204,7 @@ def writing(folder: Path) -> Iterator[None]:
 
 
 def verify(product: Product, folder: Path) -> str:
-    """Check a product's file; returns in words what was checked.
-
-    Parameters
-    ----------
-    product : from the catalogue
-    folder : where the file is
-    """
+    """Check a product's file in a folder; returns in words what was checked."""
     path = folder / product.name
     if not path.is_file():
         raise InputError(f"{path}: is not there; fetch it with `jaxsky data fetch`.")
@@ -289,16 +245,12 @@ def check_structure(product: Product, path: Path) -> list[str]:
     if start.lstrip().startswith(b"<"):
         raise InputError(f"{path}: is no table, it begins with {shown!r}.")
     if product.lmax is not None:
-        _check_text(path, product.lmax)
+        read_spectra(path, product.lmax)
+        with path.open("rb") as file:
+            file.seek(-1, 2)
+            if file.read() != b"\n":
+                raise InputError(f"{path}: ends in the middle of a line.")
     return ["complete"]
-
-
-def _check_text(path: Path, lmax: int) -> None:
-    read_spectra(path, lmax)
-    with path.open("rb") as file:
-        file.seek(-1, 2)
-        if file.read() != b"\n":
-            raise InputError(f"{path}: ends in the middle of a line.")
 
 
 def _check_whole(hdus: pyfits.HDUList) -> None:
@@ -315,12 +267,10 @@ def _check_maps(table: HealpixTable, product: Product) -> None:
     if table.nside != product.nside:
         raise InputError(f"{table.where}: nside is {table.nside}, but {product.nside} is expected.")
     for name in product.columns:
-        index = table.index(name)
+        text = table.unit(table.index(name))
         # Hits and covariances have units of their own.
-        if product.unit is None or name.upper() in ("N_OBS", "HITS") or name.endswith("_COV"):
-            continue
-        text = table.unit(index)
-        if text is None:
+        other = name.upper() in ("N_OBS", "HITS") or name.endswith("_COV")
+        if product.unit is None or other or text is None:
             continue
         try:
             unit = unit_name(text)

@@ -12,9 +12,9 @@ from jaxtyping import Float
 
 from jaxsky.bandpass import CONVENTIONS, Bandpass
 from jaxsky.constants import GHZ_PER_INVERSE_CM
-from jaxsky.io.spectra import is_fits
-from jaxsky.io.tables import InputError, open_fits, select_hdu
-from jaxsky.io.text import TextTable, number, read_text
+from jaxsky.io.files import InputError, is_fits
+from jaxsky.io.tables import open_fits, select_hdu
+from jaxsky.io.text import TextTable, read_text
 
 #: astropy's name of a unit -> how it is spelt; wavenumbers and wavelengths are converted.
 _UNITS = {
@@ -51,7 +51,7 @@ def _units(line: str) -> list[str]:
     return list(found)
 
 
-def frequency_unit(path: Path, table: TextTable, column: int, given: str | None) -> str | None:
+def _frequency_unit(path: Path, table: TextTable, column: int, given: str | None) -> str | None:
     """The unit of the frequencies in a column, by the header or the argument `unit`.
 
     Of a text table the line above the rows counts first; what is said above that is overruled by
@@ -80,7 +80,7 @@ def frequency_unit(path: Path, table: TextTable, column: int, given: str | None)
     return stated[0] if stated else None
 
 
-def to_GHz(
+def _to_GHz(
     path: Path, samples: Float[np.ndarray, "2 sample"], unit: str
 ) -> Float[np.ndarray, "2 sample"]:
     """Frequencies, wavenumbers or wavelengths with their weights, as frequencies in GHz."""
@@ -93,17 +93,6 @@ def to_GHz(
         nu = u.Quantity(samples[0], known).to_value(u.GHz, equivalencies=u.spectral())
     falls = u.Unit(known).physical_type == "length"
     return np.array([nu, samples[1]])[:, :: -1 if falls else 1]
-
-
-def check_plausible(path: Path, center: float, unit: str | None) -> None:
-    """Raise InputError if the middle of a band [GHz] shows that its unit is another one."""
-    low, high = _BARE if unit is None else _STATED
-    if not low <= center <= high:
-        asked = "" if unit else "; give `unit`, such as MHz or THz, or GHz if it is right"
-        raise InputError(
-            f"{path}: in {unit or 'GHz'}, the middle of the band is at {center:g} GHz, outside of "
-            f"{low:g} to {high:g} GHz{asked}."
-        )
 
 
 #: Frequencies [GHz] and weights of a table.
@@ -231,8 +220,7 @@ def _read_rimo(
 
 def _columns(path: Path, table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
     """Numbers of the columns of frequency and weight."""
-    width = len(table.rows[0].cells)
-    names = table.names(width)
+    width, names = table.width, table.names()
     if fields is None:
         shown = f" ({' '.join(names)})" if names else ""
         if width > _WIDEST:
@@ -267,16 +255,17 @@ def _read_text(
     """Frequencies and weights of a table, and the convention, which IPAC tables have."""
     table = read_text(path)
     columns = _columns(path, table, fields)
-    rows = []
-    for line, text, cells in table.rows:
-        values = [number(cells[c]) if c < len(cells) else None for c in columns]
-        if None in values:
-            raise InputError(f"{path}, line {line}: not two numbers: {text!r}.")
-        rows.append(values)
-    samples = np.array(rows, np.float64).T
-    unit = frequency_unit(path, table, columns[0], given)
-    nu, weights = _checked(path, *to_GHz(path, samples, unit or "GHz"))
-    check_plausible(path, float(np.average(nu, weights=np.abs(weights))), unit)
+    samples = table.numbers(columns).T
+    unit = _frequency_unit(path, table, columns[0], given)
+    nu, weights = _checked(path, *_to_GHz(path, samples, unit or "GHz"))
+    center = float(np.average(nu, weights=np.abs(weights)))
+    low, high = _BARE if unit is None else _STATED
+    if not low <= center <= high:
+        asked = "" if unit else "; give `unit`, such as MHz or THz, or GHz if it is right"
+        raise InputError(
+            f"{path}: in {unit or 'GHz'}, the middle of the band is at {center:g} GHz, outside of "
+            f"{low:g} to {high:g} GHz{asked}."
+        )
     return (nu, weights), "power" if table.bars else None
 
 

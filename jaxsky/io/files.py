@@ -47,6 +47,13 @@ def check_guards() -> None:
         guard()
 
 
+def is_fits(path: Path) -> bool:
+    """True for a FITS file, compressed or not; raises InputError if there is no file."""
+    check_file(path)
+    with path.open("rb") as stream:
+        return stream.read(6).startswith((b"SIMPLE", b"\x1f\x8b"))
+
+
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """A place beside a file to write to; it takes the file's place unless there is an error.
@@ -58,7 +65,8 @@ def whole(path: Path) -> Iterator[Path]:
     check_guards()
     try:
         yield beside
-        _to_disk(beside)
+        with beside.open("rb") as file:
+            os.fsync(file.fileno())
         check_guards()
         beside.replace(path)
     except OSError as error:
@@ -79,14 +87,6 @@ def _reason(error: OSError) -> str:
             return first.strerror
         first = first.__context__
     return str(error).rstrip(".")
-
-
-def _to_disk(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -37,14 +37,9 @@ def cache_folder() -> Path:
 def kept(
     kind: str, mark: object, shape: tuple[int, ...], make: Callable[[], np.ndarray]
 ) -> np.ndarray:
-    """An array that takes long to make, from the cache folder if it was made before.
+    """An array that takes long to make, from a folder of the cache if it was made before.
 
-    Parameters
-    ----------
-    kind : of the array, a folder in the cache
-    mark : all that it depends on
-    shape : that it has
-    make : called if it is not there, or is damaged
+    `mark` is all that it depends on; it is made if it is not there, damaged or of another shape.
     """
     name = hashlib.sha256(repr(mark).encode()).hexdigest()
     path = cache_folder() / kind / f"{name}.npy"
@@ -87,10 +82,15 @@ class Owner(NamedTuple):
         return f"process {self.pid}{where}, started {when}"
 
 
-def _acquire(lock: filelock.BaseFileLock) -> bool:
+def _lock(path: Path) -> filelock.BaseFileLock:
+    # The operating system releases it when a process dies; filelock's other kind would stay.
+    return filelock.FileLock(path, timeout=0, fallback_to_soft=False)
+
+
+def _acquire(lock: filelock.BaseFileLock, timeout: float = 0) -> bool:
     """Lock a file; False if the file system has no locks."""
     try:
-        lock.acquire()
+        lock.acquire(timeout)
     except OSError as error:
         if error.errno in NO_LOCKS:
             return False
@@ -98,9 +98,24 @@ def _acquire(lock: filelock.BaseFileLock) -> bool:
     return True
 
 
-def _lock(path: Path, timeout: float = 0) -> filelock.BaseFileLock:
-    # The operating system releases it when a process dies; filelock's other kind would stay.
-    return filelock.FileLock(path, timeout=timeout, fallback_to_soft=False)
+@contextmanager
+def locked(
+    path: Path, timeout: float = -1, waiting: Callable[[], None] = lambda: None
+) -> Iterator[bool]:
+    """Hold a lock; False where the file system has none.
+
+    `timeout` is in seconds, -1 for ever; `waiting` is called if another process has the lock.
+    """
+    lock = _lock(path)
+    try:
+        held = _acquire(lock)
+    except filelock.Timeout:
+        waiting()
+        held = _acquire(lock, timeout)
+    try:
+        yield held
+    finally:
+        lock.release()
 
 
 @contextmanager
@@ -109,15 +124,12 @@ def alone(out: Path) -> Iterator[bool]:
 
     False where the file system has no locks.
     """
-    lock = _lock(out / GATE, 60)
-    locked = _acquire(lock)
-    try:
-        yield locked
-    finally:
-        if locked:
-            if not any(out.glob(f"{OWNER}-*")):
+    with locked(out / GATE, 60) as held:
+        try:
+            yield held
+        finally:
+            if held and not any(out.glob(f"{OWNER}-*")):
                 (out / GATE).unlink(missing_ok=True)
-            lock.release()
 
 
 def _owners(out: Path) -> Iterator[Owner]:
@@ -137,12 +149,10 @@ class Folder:
     """A folder in which this process works on a part of the results; see `occupied`."""
 
     def __init__(self, path: Path, part: range) -> None:
-        self.path = path
-        self._owner = Owner(
-            os.getpid(), time.time_ns(), part.start, part.stop, socket.gethostname()
-        )
+        self.path, self.locked = path, False
+        me, now, host = os.getpid(), time.time_ns(), socket.gethostname()
+        self._owner = Owner(me, now, part.start, part.stop, host)
         self._lock = _lock(self._place)
-        self.locked = False
 
     @property
     def _place(self) -> Path:
@@ -207,10 +217,7 @@ class Folder:
 def occupied(out: Path, part: range = ALL) -> Iterator[Folder]:
     """Work in a folder, which is made if it is not there, and left as it was if that fails.
 
-    Parameters
-    ----------
-    out : the folder
-    part : what of the results is made; processes share a folder only if their parts differ
+    Processes share it only if the parts of the results that they make differ.
     """
     missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:

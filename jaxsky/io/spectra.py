@@ -3,17 +3,19 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
-from astropy.io import fits as pyfits
 from jaxtyping import Float
 
-from jaxsky.io.files import check_file
+from jaxsky.io.files import InputError, is_fits
 from jaxsky.io.quantities import unit_factor, unit_name
-from jaxsky.io.tables import InputError, open_fits
-from jaxsky.io.text import text_table
+from jaxsky.io.tables import TABLES, open_fits, select_hdu
+from jaxsky.io.text import read_text
 
 SPECTRA = ("TT", "EE", "BB", "TE")
+#: Multipoles of the rows of a table, and C_l of TT, EE, BB, TE [uK_CMB^2].
+Spectra: TypeAlias = tuple[Float[np.ndarray, " row"], Float[np.ndarray, "4 row"]]
 #: First columns of text files, by format.
 _ORDERS = {"planck": ("L", "TT", "TE", "EE", "BB"), "camb": ("L", "TT", "EE", "BB", "TE")}
 #: Names of columns, upper case -> the package's: HEALPix (IDL, Fortran, healpy), HEALPix C++.
@@ -29,40 +31,10 @@ _D_ELL = re.compile(r"(?<![a-z0-9])D_?(L|ELL)(?![a-z])|\bL\s*\*?\s*\(L\s*\+\s*1\
 _ROUNDING = 1 + 1e-5
 
 
-def is_fits(path: Path) -> bool:
-    """True for a FITS file, compressed or not; raises InputError if there is no file."""
-    check_file(path)
-    with path.open("rb") as stream:
-        start = stream.read(6)
-    return start == b"SIMPLE" or start.startswith(b"\x1f\x8b")
-
-
-def fits_table(
-    path: Path, hdus: pyfits.HDUList, hdu: int | str
-) -> pyfits.BinTableHDU | pyfits.TableHDU:
-    """The table `hdu` (number or name), binary or ASCII, of an open file."""
-    try:
-        found = hdus[hdu]
-    except (IndexError, KeyError):
-        names = ", ".join(f"{i} ({h.name})" for i, h in enumerate(hdus))
-        raise InputError(f"{path}: no HDU {hdu!r}; it has {names}.") from None
-    if not isinstance(found, pyfits.BinTableHDU | pyfits.TableHDU):
-        raise InputError(f"{path}: HDU {hdu!r} holds no table.")
-    return found
-
-
-def multipole_range(
+def _multipole_range(
     path: Path, ell: Float[np.ndarray, " row"], lmax: int, start: int
 ) -> tuple[int, int]:
-    """First multipole of a table, and number of its rows up to lmax.
-
-    Parameters
-    ----------
-    path : the file, for the messages
-    ell : multipole of each row
-    lmax : multipole that has to be reached
-    start : largest multipole with which the table may begin
-    """
+    """First multipole of a table, at most `start`, and number of its rows up to lmax."""
     if lmax < 0:
         raise ValueError(f"Argument `lmax` must not be negative, but is {lmax}.")
     if odd := int(np.sum(~(ell == np.round(ell)) | (ell < 0))):
@@ -129,16 +101,14 @@ def _text_order(
     return _ORDERS[format]
 
 
-def _spectra_of_text(path: Path, lmax: int, format: str | None) -> Float[np.ndarray, "4 ell"]:
-    header, table = text_table(path)
-    names = _text_order(path, header, table.shape[1], format)
+def _spectra_of_text(path: Path, format: str | None) -> Spectra:
+    text = read_text(path)
+    table = text.numbers()
+    names = _text_order(path, text.words(), text.width, format)
     at, *columns = _located(path, names, ("L", *SPECTRA))
-    start, rows = multipole_range(path, table[:, at], lmax, 2)
-    ell = np.arange(start, start + rows)
+    ell = table[:, at]
     factor = np.where(ell > 0, 2 * np.pi / np.maximum(ell * (ell + 1), 1), 0)
-    spectra = np.zeros((4, lmax + 1))
-    spectra[:, start:] = table[:rows, columns].T * factor
-    return spectra
+    return ell, table[:, columns].T * factor
 
 
 def _fits_factor(path: Path, name: str, found: str | None, given: str | None) -> float:
@@ -162,9 +132,9 @@ def _fits_factor(path: Path, name: str, found: str | None, given: str | None) ->
     return factors[0]
 
 
-def _spectra_of_fits(path: Path, lmax: int, unit: str | None) -> Float[np.ndarray, "4 ell"]:
+def _spectra_of_fits(path: Path, unit: str | None) -> Spectra:
     with open_fits(path) as hdus:
-        table = fits_table(path, hdus, 1)
+        table = select_hdu(path, hdus, 1, TABLES)
         if stated := _D_ELL.search(repr(table.header)):
             raise InputError(
                 f"{path}: the header says {stated[0]!r}; spectra in FITS files must be C_l."
@@ -177,10 +147,7 @@ def _spectra_of_fits(path: Path, lmax: int, unit: str | None) -> Float[np.ndarra
         ]
         values = np.array([np.ravel(table.data.field(c)) for c in columns], np.float64)
         ell = np.array(multipoles[0] if multipoles else np.arange(values.shape[1]), float).ravel()
-    start, rows = multipole_range(path, ell, lmax, 2)
-    spectra = np.zeros((4, lmax + 1))
-    spectra[:, start:] = values[:, :rows] * np.array(factors)[:, None]
-    return spectra
+    return ell, values * np.array(factors)[:, None]
 
 
 def _check(path: Path, spectra: Float[np.ndarray, "4 ell"]) -> None:
@@ -239,11 +206,14 @@ def read_spectra(
     if is_fits(path):
         if format is not None:
             raise InputError(f"{path}: argument `format` is for text files, this is FITS.")
-        spectra = _spectra_of_fits(path, lmax, unit)
+        ell, values = _spectra_of_fits(path, unit)
     else:
         if unit is not None:
             raise InputError(f"{path}: argument `unit` is for FITS files, text is in uK^2.")
-        spectra = _spectra_of_text(path, lmax, format)
+        ell, values = _spectra_of_text(path, format)
+    start, rows = _multipole_range(path, ell, lmax, 2)
+    spectra = np.zeros((4, lmax + 1))
+    spectra[:, start:] = values[:, :rows]
     _check(path, spectra)
     return spectra
 
@@ -254,13 +224,13 @@ _WINDOWS = ("TEMPERATURE", "INTENSITY", "T", "NOMINAL", "BL")
 
 def _windows(hdu: object) -> list[str]:
     """Names of a table's columns that hold windows; none for other HDUs."""
-    names = hdu.columns.names if isinstance(hdu, pyfits.BinTableHDU | pyfits.TableHDU) else []
+    names = hdu.columns.names if isinstance(hdu, TABLES) else []
     return [name for name in names if name.upper() in _WINDOWS]
 
 
 def _beam_of_fits(path: Path, hdu: int | str) -> tuple[np.ndarray, np.ndarray]:
     with open_fits(path) as hdus:
-        table = fits_table(path, hdus, hdu)
+        table = select_hdu(path, hdus, hdu, TABLES)
         names = _windows(table)
         if not names:
             others = [h.name for h in hdus if _windows(h)]
@@ -274,7 +244,7 @@ def _beam_of_fits(path: Path, hdu: int | str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _beam_of_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    _, table = text_table(path)
+    table = read_text(path).numbers()
     if table.shape[1] < 2:
         raise InputError(f"{path}: one column, but l and b_l are needed.")
     return table[:, 0], table[:, 1]
@@ -310,7 +280,7 @@ def read_beam(path: str | Path, lmax: int, *, hdu: int | str = 1) -> Float[np.nd
     """
     path = Path(path)
     ell, window = _beam_of_fits(path, hdu) if is_fits(path) else _beam_of_text(path)
-    _, rows = multipole_range(path, ell, lmax, 0)
+    _, rows = _multipole_range(path, ell, lmax, 0)
     window = window[:rows]
     if bad := int(np.sum(~np.isfinite(window))):
         raise InputError(f"{path}: {bad} of {rows} values of the window are not finite.")

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import healpy
 import numpy as np
@@ -37,6 +38,8 @@ KINDS = {
     **dict.fromkeys("PQ", "arrays of different lengths"),
 }
 LARGEST_NSIDE = 8192
+#: Binary tables, and those of text.
+TABLES = (pyfits.BinTableHDU, pyfits.TableHDU)
 
 #: What only files raise that are cut short or no FITS files at all.
 _DAMAGE = (EOFError, zlib.error, gzip.BadGzipFile, AstropyUserWarning)
@@ -85,17 +88,12 @@ def _is_cut(path: Path, hdus: pyfits.HDUList) -> bool:
         return True
 
 
-def _number(text: str) -> float | None:
-    """A number as headers have it, exponents with D included; None if it is none."""
+def _number(text: str) -> float:
+    """A number as headers have it, exponents with D included; NaN if it is none."""
     try:
         return float(text.strip("'\" ").upper().replace("D", "E"))
     except ValueError:
-        return None
-
-
-def _whole_number(text: str) -> int | None:
-    number = _number(text)
-    return int(number) if number is not None and number.is_integer() else None
+        return np.nan
 
 
 def equals(
@@ -106,8 +104,10 @@ def equals(
     return (values >= number - apart) & (values <= number + apart)
 
 
-def select_hdu(path: Path, hdus: pyfits.HDUList, hdu: int | str) -> pyfits.BinTableHDU:
-    """The table `hdu` (number or name) of an open file."""
+def select_hdu(
+    path: Path, hdus: pyfits.HDUList, hdu: int | str, kinds: Any = pyfits.BinTableHDU
+) -> pyfits.BinTableHDU:
+    """The table `hdu` (number or name) of an open file, binary unless `kinds` are `TABLES`."""
     try:
         if isinstance(hdu, bool):
             raise KeyError(hdu)  # True is no 1
@@ -117,10 +117,9 @@ def select_hdu(path: Path, hdus: pyfits.HDUList, hdu: int | str) -> pyfits.BinTa
         raise InputError(
             f"{path}: no HDU {hdu!r}; it has {names}, and is truncated if there should be more."
         ) from None
-    if not isinstance(found, pyfits.BinTableHDU):
-        raise InputError(
-            f"{path}: HDU {hdu!r} holds no binary table; HEALPix maps are columns of one."
-        )
+    if not isinstance(found, kinds):
+        kind = "table" if kinds is TABLES else "binary table"
+        raise InputError(f"{path}: HDU {hdu!r} holds no {kind}.")
     return found
 
 
@@ -131,17 +130,9 @@ def _nested(nside: int) -> Int[np.ndarray, " pix"]:
 
 
 class HealpixTable:
-    """The columns and the header of a HEALPix table in an open FITS file.
-
-    Parameters
-    ----------
-    path : the file, for the messages
-    hdus : the open file
-    hdu : number or name of the table
-    """
+    """The columns and the header of the HEALPix table `hdu` in an open FITS file."""
 
     def __init__(self, path: Path, hdus: pyfits.HDUList, hdu: int | str) -> None:
-        self.path = path
         self.where = f"{path}, HDU {hdu!r}"
         self._table = select_hdu(path, hdus, hdu)
         self._primary = hdus[0].header
@@ -193,13 +184,13 @@ class HealpixTable:
 
     def _nside(self, explicit: bool) -> int:
         text = self.keyword("NSIDE")
-        stated = None if text is None else _whole_number(text)
-        if text is not None and (stated is None or not 1 <= stated <= LARGEST_NSIDE):
+        stated = None if text is None else _number(text)
+        if stated is not None and not (1 <= stated <= LARGEST_NSIDE and stated.is_integer()):
             raise InputError(
                 f"{self.where}: NSIDE is {text}, but must be a whole number, 1 to {LARGEST_NSIDE}."
             )
         if explicit and stated is not None:
-            return stated
+            return int(stated)
         first = next((i for i, kind in enumerate(self._kinds) if kind in NUMBERS), 0)
         npix = 0 if not self.names else self._table.data.field(first).size
         if not npix or not healpy.isnpixok(npix):
@@ -210,7 +201,7 @@ class HealpixTable:
         nside = healpy.npix2nside(npix)
         if stated is not None and stated != nside:
             raise InputError(
-                f"{self.where}: NSIDE is {stated}, but its columns have {npix} pixels "
+                f"{self.where}: NSIDE is {stated:.0f}, but its columns have {npix} pixels "
                 f"(nside {nside})."
             )
         return nside
@@ -269,10 +260,9 @@ class HealpixTable:
         """TNULL of a column: a stored integer, before it is scaled."""
         key = f"TNULL{index + 1}"
         text = str(self._table.header.get(key, "")).strip()
-        found = _whole_number(text)
-        if text and found is None:
+        if text and not (found := _number(text)).is_integer():
             raise InputError(f"{self.where}: {key} is {text}, which is not a whole number.")
-        return found
+        return int(found) if text else None
 
     def lowest(self, index: int) -> float | None:
         """What the lowest integer stands for that a column can store; None for other types."""
@@ -286,16 +276,10 @@ class HealpixTable:
     def values(
         self, index: int, ordering: str, *, logical: bool = False
     ) -> Float[np.ndarray, " pix"]:
-        """A column over the full sky in RING order, float64.
+        """A column over the full sky in RING order, float64; `ordering` is that of the file.
 
         NaN where it has no value: pixels that are not listed, UNSEEN, BAD_DATA and TNULL of the
-        header, NaN and infinity.
-
-        Parameters
-        ----------
-        index : number of the column
-        ordering : "RING" or "NESTED", that of the file
-        logical : columns of true and false are 1 and 0 rather than refused
+        header, NaN and infinity. If `logical`, columns of true and false are 1 and 0.
         """
         if ordering == "NESTED" and not healpy.isnsideok(self.nside, nest=True):
             raise InputError(
@@ -323,9 +307,8 @@ class HealpixTable:
         """A column of real numbers, NaN where it has none."""
         column = self._stored(index, np.float64)
         bad = ~np.isfinite(column) | equals(column, healpy.UNSEEN, 1e-5)
-        if (text := self.keyword("BAD_DATA")) is not None and text != "UNSEEN":
-            stated = _number(text)
-            if stated is None:
+        if (text := self.keyword("BAD_DATA")) not in (None, "UNSEEN", "NAN"):
+            if np.isnan(stated := _number(str(text))):
                 raise InputError(f"{self.where}: BAD_DATA is {text}, which is not a number.")
             bad |= equals(column, stated, 1e-5)
         if (null := self._null(index)) is not None:
@@ -344,14 +327,10 @@ class HealpixTable:
         spellings: dict[str, str],
         default: str | None = None,
     ) -> str:
-        """What a header says, or the argument that stands in for it.
+        """What a header says by some keywords, or the argument that stands in for it.
 
-        Parameters
-        ----------
-        argument, given : name and value of the argument
-        keywords : header keywords that say the same
-        spellings : upper-case spelling -> the package's
-        default : value if neither says anything; None to make that an error
+        `spellings` give the package's for those in upper case. Unless there is a default, it is an
+        error if neither says anything.
         """
         choices = ", ".join(dict.fromkeys(spellings.values()))
         if given is not None:

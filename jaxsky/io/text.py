@@ -2,13 +2,14 @@
 
 import codecs
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxsky.io.tables import InputError
+from jaxsky.io.files import InputError
 
 COMMENTS = ("#", ";", "%", "!", "\\", "|", "//", "*")
 _TRAILING = re.compile(r"\s(?:[#!%\\]|//).*")
@@ -27,23 +28,51 @@ class Row(NamedTuple):
     cells: list[str]
 
 
+def _words(line: str) -> list[str]:
+    return re.split(r"[\s,;|]+", line.strip(" ,;|"))
+
+
 class TextTable(NamedTuple):
     """Lines of a text file: comments and names of columns, the bars of an IPAC header, rows."""
 
+    path: Path
     header: list[str]
     bars: list[str]
     rows: list[Row]
 
-    def names(self, columns: int) -> list[str]:
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return len(self.rows[0].cells)
+
+    def words(self) -> list[list[str]]:
+        """The lines above the rows, split into words."""
+        return [_words(line) for line in [*self.bars, *self.header]]
+
+    def names(self) -> list[str]:
         """Names of the columns: those of the last line of the header with so many words."""
-        lines = [
-            re.split(r"[\s,;|]+", re.sub(r"[(\[].*?[)\]]", "", h).strip(" ,;|"))
-            for h in [*self.bars[:1], *self.header]
-        ]
-        return next((words for words in reversed(lines) if len(words) == columns), [])
+        lines = [re.sub(r"[(\[].*?[)\]]", "", line) for line in [*self.bars[:1], *self.header]]
+        named = (words for words in map(_words, reversed(lines)) if len(words) == self.width)
+        return next(named, [])
+
+    def numbers(self, columns: Sequence[int] | None = None) -> Float[np.ndarray, "row column"]:
+        """The numbers of some columns; without, of all, of which each row must have as many."""
+        table = []
+        for line, text, cells in self.rows:
+            wanted = range(len(cells)) if columns is None else columns
+            values = [_number(cells[c]) if c < len(cells) else None for c in wanted]
+            if None in values:
+                raise InputError(f"{self.path}, line {line}: not a row of numbers: {text!r}.")
+            if columns is None and len(values) != self.width:
+                raise InputError(
+                    f"{self.path}, line {line}: {len(values)} numbers, but {self.width} in the "
+                    "lines above."
+                )
+            table.append(values)
+        return np.array(table, np.float64)
 
 
-def number(cell: str) -> float | None:
+def _number(cell: str) -> float | None:
     """The value of a field, exponents of Fortran (1.0D+01) included; None if it is no number."""
     if not _NUMBER.fullmatch(cell):
         return None
@@ -69,7 +98,7 @@ def _cells(path: Path, line: int, text: str) -> list[str]:
         return [cell.strip().replace(",", ".") for cell in text.strip(" ;").split(";")]
     words = [word.strip(",") for word in text.split()]
     for word in words if len(words) > 1 else ():
-        if "," in word and all(number(part) is not None for part in word.split(",")):
+        if "," in word and all(_number(part) is not None for part in word.split(",")):
             raise InputError(
                 f"{path}, line {line}: {word!r} is two numbers or one with a decimal comma; write "
                 "decimal points, or semicolons between the columns."
@@ -84,7 +113,7 @@ def read_text(path: Path) -> TextTable:
     A line before the first row is a header if none of its fields is a number, and they do not all
     begin with a digit.
     """
-    table = TextTable([], [], [])
+    table = TextTable(path, [], [], [])
     for line, whole in enumerate(_lines(path), start=1):
         text = whole.strip()
         if not text:
@@ -98,7 +127,7 @@ def read_text(path: Path) -> TextTable:
                 table.header.append(text.lstrip("".join(COMMENTS)).strip())
             continue
         cells = _cells(path, line, _TRAILING.sub("", text))
-        if not table.rows and all(number(cell) is None for cell in cells):
+        if not table.rows and all(_number(cell) is None for cell in cells):
             if all(_DAMAGED.match(cell) for cell in cells):
                 raise InputError(f"{path}, line {line}: not a row of numbers: {text!r}.")
             table.header.append(text)
@@ -120,21 +149,3 @@ def _check_commas(path: Path, rows: list[Row]) -> None:
             f"{path}, line {rows[0].line}: {rows[0].text!r} may have decimal commas; write decimal "
             "points, or semicolons between the columns."
         )
-
-
-def text_table(path: Path) -> tuple[list[list[str]], Float[np.ndarray, "row column"]]:
-    """Lines before the numbers of a text table, split into words, and the numbers."""
-    found = read_text(path)
-    width = len(found.rows[0].cells)
-    table = []
-    for line, text, cells in found.rows:
-        values = [value for cell in cells if (value := number(cell)) is not None]
-        if len(values) < len(cells):
-            raise InputError(f"{path}, line {line}: not a row of numbers: {text!r}.")
-        if len(values) != width:
-            raise InputError(
-                f"{path}, line {line}: {len(values)} numbers, but {width} in the lines above."
-            )
-        table.append(values)
-    words = [re.split(r"[\s,;|]+", line.strip(" ,;|")) for line in [*found.bars, *found.header]]
-    return words, np.array(table)

@@ -16,8 +16,8 @@ import scipy.stats
 from jaxtyping import Array, Bool, Float
 
 from fits.common import CommonMaps
+from fits.discs import EDGES
 from fits.full_sky import LMIN, BandSpectra, compare_spectra, polarization_alms
-from fits.patches import EDGES
 from fits.pseudo_cl import bin_edges
 from fits.realisations import realisations
 from fits.record import fingerprint, probability

@@ -9,7 +9,7 @@ import scipy.stats
 from jaxtyping import Array, Float
 
 from fits.common import CommonMaps
-from fits.pseudo_cl import bin_edges
+from fits.pseudo_cl import bin_centers, bin_edges
 from jaxsky.checks import Numeric
 from jaxsky.harmonics import analysis, power_spectrum
 
@@ -58,8 +58,7 @@ class BandSpectra(NamedTuple):
     @property
     def centers(self) -> Float[np.ndarray, " bin"]:
         """Middle multipole of each bin."""
-        edges = np.array(self.edges)
-        return (edges[:-1] + edges[1:] - 1) / 2
+        return bin_centers(self.edges)
 
     @property
     def chi2_bins(self) -> Float[np.ndarray, "2 bin"]:

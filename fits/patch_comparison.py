@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits.common import CommonMaps, common_maps
-from fits.discs import paper_patches
+from fits.discs import PreparedPatches, paper_patches, prepare_patches
 from fits.inputs import Band, Inputs
-from fits.patches import PatchFits, PreparedPatches, fit_patches, prepare_patches
+from fits.patches import PatchFits, fit_patches
 from jaxsky.harmonics import average_pixels, beam_ratio, gaussian_beam, pixel_window
 from jaxsky.keys import realisation_key, stream
 from jaxsky.settings import Experiment

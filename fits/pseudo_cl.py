@@ -19,9 +19,7 @@ from ducc0.misc import wigner3j_int
 from ducc0.misc.experimental import coupling_matrix_rect
 from jaxtyping import Array, Float
 
-from fits.discs import zonal, zonal_products
 from jaxsky.checks import check_finite, is_concrete
-from jaxsky.cmb import gaussian_fields
 from jaxsky.harmonics import analysis, expand, lmax_of, power_spectrum, synthesis
 
 #: Fewest modes of a field in a bin that a mean power can be taken of.
@@ -55,8 +53,12 @@ class MaskedSpectra(NamedTuple):
     @property
     def centers(self) -> Float[np.ndarray, " bin"]:
         """Middle multipole of each bin."""
-        edges = np.array(self.edges)
-        return (edges[:-1] + edges[1:] - 1) / 2
+        return bin_centers(self.edges)
+
+
+def bin_centers(edges: Sequence[int]) -> Float[np.ndarray, " bin"]:
+    """Middle multipole of each bin."""
+    return (np.array(edges[:-1]) + np.array(edges[1:]) - 1) / 2
 
 
 def bin_edges(lmin: int, lmax: int, width: int) -> tuple[int, ...]:
@@ -84,7 +86,7 @@ def coupling_matrices(
     return matrices * (2 * np.arange(lmax + 1) + 1)
 
 
-def _pure_factors(lmax: int) -> Float[np.ndarray, "3 ell"]:
+def pure_factors(lmax: int) -> Float[np.ndarray, "3 ell"]:
     """Factors of the three terms of a purified harmonic."""
     ell = np.maximum(np.arange(lmax + 1), 2.0)
     return np.stack(
@@ -96,7 +98,7 @@ def _pure_factors(lmax: int) -> Float[np.ndarray, "3 ell"]:
     )
 
 
-def _rises(count: int) -> Float[np.ndarray, "3 ell"]:
+def derivative_factors(count: int) -> Float[np.ndarray, "3 ell"]:
     """sqrt((l + n)! / (l - n)!): a scalar's n-th derivative in harmonics of spin n = 0, 1, 2."""
     ell = np.arange(count, dtype=float)
     second = (ell - 1) * ell * (ell + 1) * (ell + 2)
@@ -119,7 +121,7 @@ def pure_coupling_matrices(
     """
     count = min(len(power), 2 * lmax + 1)
     weights = power[:count] * (2 * np.arange(count) + 1) / (4 * math.pi)
-    factors, rises = _pure_factors(lmax), _rises(count)
+    factors, rises = pure_factors(lmax), derivative_factors(count)
     matrices = np.zeros((2, lmax + 1, lmax + 1))
     degree = np.arange(count)
     for ell in range(2, lmax + 1):
@@ -238,7 +240,7 @@ def sky_fraction(mask: Float[np.ndarray, " pix"]) -> float:
 
 def _derivatives(alm: Float[Array, "1 alm"], nside: int) -> Float[np.ndarray, "4 pix"]:
     """First and second derivative of a mask, as fields of spin 1 and 2."""
-    rises = _rises(lmax_of(alm) + 1)
+    rises = derivative_factors(lmax_of(alm) + 1)
     zero = jnp.zeros_like(alm[0])
     first, second = (jnp.stack([alm[0] * expand(jnp.asarray(rise)), zero]) for rise in rises[1:])
     return np.concatenate([synthesis(first, nside, spin=1), synthesis(second, nside)])
@@ -261,7 +263,7 @@ def _masked_alm(
         # part, as Q and U are of E + iB.
         once = analysis(-_turned_back(Q, U, *first), lmax, 0, spin=1)[1]
         twice = -analysis(-_turned_back(Q, U, *second)[1:], lmax, 0)[0]
-        _, of_once, of_twice = jnp.asarray(_pure_factors(lmax))
+        _, of_once, of_twice = jnp.asarray(pure_factors(lmax))
         B = B + expand(of_once) * once + expand(of_twice) * twice
     return jnp.stack([E, B])
 
@@ -296,84 +298,3 @@ def band_powers(
         for m in (maps, maps if other is None else other)
     ]
     return np.einsum("ibjl,jl->ib", spectra.inverse, power_spectrum(*alms))
-
-
-def band_covariance(
-    spectra: MaskedSpectra,
-    EE: Float[np.ndarray, " ell"],
-    BB: Float[np.ndarray, " ell"],
-    *,
-    simulations: int = 0,
-    key: Array | None = None,
-) -> Float[np.ndarray, "2 bin 2 bin"]:
-    """Covariance of band powers of a Gaussian field.
-
-    Exact for masks that do not depend on longitude about their middle, purified or not. For others
-    it is an approximation (`covariance_terms`), good to some 10 % but for purified B: in the lowest
-    bands, of the size of the mask, its errors are up to 50 % larger, which simulations correct.
-
-    Parameters
-    ----------
-    spectra : from `masked_spectra`
-    EE, BB : spectra C_l of the maps, window and noise included, up to `spectra.lmax` at least
-    simulations : number of Gaussian skies from which the standard deviations are taken, while the
-        correlations stay; 200 measure them to 5 %. By default none
-    key : of jax.random, for the simulations
-    """
-    covariance = 2 * covariance_terms(spectra, np.stack([EE, BB])[None])[0, 0]
-    if not simulations:
-        return covariance
-    if simulations < 2 or key is None:
-        raise ValueError(
-            "Argument `simulations` must be 0, or 2 and more with a `key` of jax.random; "
-            f"it is {simulations}, with key = {key}."
-        )
-    nside, zero = healpy.npix2nside(spectra.mask.size), np.zeros(spectra.lmax + 1)
-    rows = [np.asarray(row)[: spectra.lmax + 1] for row in (EE, BB)]
-    matrix = jnp.array([[rows[0], zero], [zero, rows[1]]])
-    powers = [
-        band_powers(spectra, synthesis(gaussian_fields(one, matrix), nside))
-        for one in jax.random.split(key, simulations)
-    ]
-    scale = np.std(powers, axis=0, ddof=1) / np.sqrt(np.einsum("ibib->ib", covariance))
-    return covariance * scale[..., None, None] * scale
-
-
-def covariance_terms(
-    spectra: MaskedSpectra, fields: Float[np.ndarray, "field 2 ell"]
-) -> Float[np.ndarray, "field field 2 bin 2 bin"]:
-    """Half the covariance of band powers of independent Gaussian fields, for each pair of them.
-
-    The covariance of the sum of fields with p_i times the spectra is 2 sum_ij p_i p_j terms[i, j].
-    Exact for symmetric masks (`zonal`). For others pseudo-spectra are correlated as modes of the
-    squared mask, and the spectra taken to vary little over the width of the mask's own spectrum
-    (Efstathiou 2004; Challinor & Chon 2005).
-
-    Parameters
-    ----------
-    spectra : from `masked_spectra`
-    fields : spectra EE, BB of each, window included, up to `spectra.lmax` at least
-    """
-    given = np.asarray(fields, float)[..., : spectra.lmax + 1]
-    reach = min(2 * spectra.lmax, 2 * healpy.npix2nside(spectra.mask.size))
-    profile = zonal(np.asarray(analysis(jnp.asarray(spectra.mask)[None], reach)[0]))
-    if profile is None:
-        blocks = _narrow_products(spectra, given)
-    else:
-        factors = None if spectra.derivatives is None else _pure_factors(spectra.lmax)
-        blocks = zonal_products(profile * _rises(len(profile)), given, factors)
-    inverse = spectra.inverse
-    return np.einsum("ibjl,xyjlkm,nckm->xyibnc", inverse, blocks, inverse, optimize=True)
-
-
-def _narrow_products(
-    spectra: MaskedSpectra, given: Float[np.ndarray, "field 2 ell"]
-) -> Float[np.ndarray, "field field 2 ell 2 ell"]:
-    """`zonal_products` of any mask, for spectra that vary little over the width of its own."""
-    # What leaks from E adds to the variance of B.
-    total = spectra.mixing.sum(axis=(1, 3))
-    seen = np.einsum("ijlm,xjm->xil", spectra.mixing, given) / np.where(total > 0, total, 1.0)
-    root = np.sqrt(seen[:, None] * seen)
-    same, cross = spectra.spread
-    pairs = np.array([[same, cross], [cross, same]])
-    return np.einsum("xyjl,jklm,xykm->xyjlkm", root, pairs, root)

@@ -13,7 +13,8 @@ import numpy as np
 import scipy.special
 from jaxtyping import Float
 
-from fits.pseudo_cl import MaskedSpectra, covariance_terms
+from fits.power_covariance import covariance_terms
+from fits.pseudo_cl import MaskedSpectra
 
 #: Steps of the search, and the change in standard deviations at which it ends.
 STEPS, CLOSE = 50, 1e-6

@@ -10,10 +10,10 @@ import pytest
 
 from fits.commands.compare_pictures import plot_patches, plot_template_patches
 from fits.common import common_maps
-from fits.discs import paper_patches
+from fits.discs import paper_patches, prepare_patches
 from fits.inputs import inputs_of
 from fits.patch_comparison import _noise, compare_patches, template_patches
-from fits.patches import fit_patches, prepare_patches
+from fits.patches import fit_patches
 from fits.pseudo_cl import band_powers
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.settings import Experiment

@@ -11,7 +11,8 @@ from commands import jaxsky, one_sentence
 from fits.b_modes import BandLaw, band_correlation, equal_r, fit_law, foreground_powers, to_D
 from fits.commands.forecast import forecast, forecast_warnings
 from fits.commands.run import DEFAULTS
-from fits.pseudo_cl import band_covariance, bin_edges, masked_spectra, sky_fraction
+from fits.power_covariance import band_covariance
+from fits.pseudo_cl import bin_edges, masked_spectra, sky_fraction
 from fits.regions import apodize
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe_band
 from jaxsky.harmonics import alm_ell, gaussian_beam, power_spectrum, synthesis

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fits.discs import Patch, bicep2_mask, disc_centers, disc_mask
-from fits.patches import EDGES, fit_patches, prepare_patches
-from fits.patches.bands import Bands, decorrelate, minimise
+from fits.discs import EDGES, Patch, bicep2_mask, disc_centers, disc_mask, prepare_patches
+from fits.patches import Bands, decorrelate, fit_patches, minimise
 from jaxsky.cmb import gaussian_fields
 from jaxsky.harmonics import gaussian_beam, synthesis
 

@@ -12,12 +12,11 @@ import pytest
 from ducc0.misc import wigner3j_int
 
 from fits.discs import disc_mask
+from fits.power_covariance import band_covariance, covariance_terms
 from fits.pseudo_cl import (
-    band_covariance,
     band_powers,
     bin_edges,
     coupling_matrices,
-    covariance_terms,
     masked_spectra,
     pure_coupling_matrices,
 )

@@ -1,25 +1,34 @@
-"""A and alpha of EE and BB on patches, from maps.
+"""Power laws D_l = A (l/80)^(alpha + 2) of EE and BB on small patches of the sky, from maps.
 
 On a patch of 400 square degrees a band has the power of ten modes or fewer. Its error grows with
 the power itself, and errors taken from the measured one would favour whatever is low: here the
-variance follows the model (`bands`). Neighbouring bands of a small patch are correlated by -0.4;
-combinations without correlation take their place.
+variance follows the law. The equations that A and alpha solve are linear in the powers: their mean
+is zero at the true values, whatever the distribution of the powers (Wedderburn 1974). For one band
+without noise that is the likelihood of a chi^2-distributed power. Neighbouring bands of a small
+patch are correlated by -0.4; combinations without correlation take their place.
 """
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+import optimistix as optx
+import scipy.stats
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from fits.patches.bands import Bands, decorrelate, law, minimise, sandwich, variances
-from fits.patches.prepare import PreparedPatches
-from fits.pseudo_cl import band_powers, covariance_terms
+from fits.discs import PreparedPatches
+from fits.power_covariance import covariance_terms
+from fits.pseudo_cl import band_powers
 from jaxsky.harmonics import analysis, power_spectrum
 
+PIVOT = 80.0
+#: The root of the variance of a power never falls below this part of what it is expected to be:
+#: where a law predicts nothing in a band, that band alone would decide.
+FLOOR = 0.3
 #: Mean and standard deviation of the Gaussian prior of alpha. Dust has -2.4 (Planck intermediate
 #: results 30, 2016).
 SLOPE = (-2.4, 3.0)
@@ -117,7 +126,7 @@ def fit_patches(
             for one, row in zip(patches.spectra, noises, strict=True)
         ]
         powers = powers - np.stack(bias)
-    return fit_powers(powers, noises, patches, other is not None, slope)
+    return _fit_powers(powers, noises, patches, other is not None, slope)
 
 
 def _checked(name: str, maps: Float[Array, "2 pix"], patches: PreparedPatches) -> Array:
@@ -161,7 +170,7 @@ def _noise_spectra(
     return np.broadcast_to(values[..., : lmax + 1], shape)
 
 
-def fit_powers(
+def _fit_powers(
     powers: Float[np.ndarray, "patch 2 bin"],
     noises: Float[np.ndarray, "patch 2 ell"],
     patches: PreparedPatches,
@@ -169,8 +178,6 @@ def fit_powers(
     slope: tuple[float, float],
 ) -> PatchFits:
     """The fit to band powers from which the noise is subtracted."""
-    from scipy.stats import chi2
-
     first, (mean, spread) = patches.spectra[0], slope
     ell, ends = np.arange(first.lmax + 1), (first.edges[0], first.edges[-1] - 1)
     form, level = _covariance_terms(patches, noises, cross, mean)
@@ -180,7 +187,7 @@ def fit_powers(
         return np.einsum("pixybc,px,py->pibc", form, amplitudes, amplitudes), amplitudes
 
     windows = np.stack([one.windows for one in patches.spectra]) * _to_C(ell)
-    means = windows @ np.asarray(law(ell, ends, mean, mean))  # (p, i, b, of j)
+    means = windows @ np.asarray(_law(ell, ends, mean, mean))  # (p, i, b, of j)
     own = np.einsum("pibi->pib", means)
     # A first amplitude, with the mean slope and the errors of signal without noise.
     signal = np.stack([form[:, i, i, i] for i in (0, 1)], axis=1)
@@ -197,7 +204,7 @@ def fit_powers(
     leaked = np.einsum("pibj,pj->pib", means, A) - own * A[..., None]
     forms = np.einsum("pibc,pixycd,pibd->pibxy", turn, form, turn)
     parts = [
-        variances(forms[:, i][..., order, :][..., order], amplitudes[:, order], seen[:, i])
+        _variances(forms[:, i][..., order, :][..., order], amplitudes[:, order], seen[:, i])
         for i, order in enumerate(([0, 1, 2], [1, 0, 2]))
     ]
     nu, offset, width = np.stack(parts, axis=2)
@@ -215,7 +222,7 @@ def fit_powers(
     errors, amplitudes = covariance(straight)
     d, slopes = seen * amplitudes[:, :2, None], slopes * amplitudes[:, :2, None]
     spreads = turn @ errors @ np.swapaxes(turn, -1, -2)
-    parameters = sandwich(
+    parameters = _sandwich(
         derivatives=np.stack([seen, slopes], axis=-1),
         variance=2 / nu * ((offset + d) ** 2 + width**2),
         covariance=spreads,
@@ -229,7 +236,7 @@ def fit_powers(
         alpha=alpha,
         covariance=parameters,
         chi2=value,
-        pte=chi2.sf(value, len(first.edges) - 3),
+        pte=scipy.stats.chi2.sf(value, len(first.edges) - 3),
         detected=DETECTION * np.sqrt(parameters[..., 0, 0]) < A,
         converged=converged,
         powers=powers,
@@ -241,19 +248,16 @@ def fit_powers(
 def _covariance_terms(
     patches: PreparedPatches, noises: np.ndarray, cross: bool, mean: float
 ) -> tuple[Float[np.ndarray, "patch 2 3 3 bin bin"], Float[np.ndarray, " patch"]]:
-    """Covariance of bands as a quadratic form of the amplitudes of EE, BB and noise.
+    """Covariance of bands, EE and BB, as a quadratic form of the amplitudes of EE, BB and noise.
 
-    The signal has the mean slope, the noise one spectrum for all patches with a level for each.
-
-    Returns
-    -------
-    The form, for the bands of EE and those of BB, and the level of the noise on each patch.
+    The signal has the mean slope, the noise one spectrum for all patches with a level for each,
+    which is returned, too.
     """
     first = patches.spectra[0]
     ell, ends = np.arange(first.lmax + 1), (first.edges[0], first.edges[-1] - 1)
     level = noises[..., ends[0] : ends[1] + 1].mean(axis=(1, 2))
     shape = (noises / np.where(level > 0, level, 1.0)[:, None, None]).mean(axis=0)
-    power = _to_C(ell) * np.asarray(law(ell, ends, mean, mean)) * patches.window**2
+    power = _to_C(ell) * np.asarray(_law(ell, ends, mean, mean)) * patches.window**2
     fields = np.array([[power, 0 * power], [0 * power, power], shape])
     of_shape = {i: covariance_terms(patches.spectra[i], fields) for i in set(patches.shapes)}
     terms = 2 * np.stack([np.einsum("xyibic->ixybc", of_shape[i]) for i in patches.shapes])
@@ -265,3 +269,110 @@ def _covariance_terms(
 
 def _to_C(ell: Int[np.ndarray, " ell"]) -> Float[np.ndarray, " ell"]:
     return np.where(ell > 1, 2 * math.pi / np.maximum(ell * (ell + 1), 1), 0.0)
+
+
+def _law(ell: ArrayLike, ends: tuple[int, int], mean: ArrayLike, alpha: ArrayLike) -> Array:
+    """D_l for A = 1; beyond the bins, where nothing is measured, it goes on with the mean slope."""
+    inside = jnp.clip(ell, *ends)
+    return (inside / PIVOT) ** (alpha + 2) * (jnp.maximum(ell, 2) / inside) ** (mean + 2)
+
+
+def decorrelate(
+    covariance: Float[np.ndarray, "... bin bin"], expected: Float[np.ndarray, "... bin"]
+) -> Float[np.ndarray, "... bin bin"]:
+    """Symmetric combinations of bands without correlation, with the expected powers as they are.
+
+    The inverse root of the covariance, after Hamilton & Tegmark (2000). Bands are left alone where
+    it would have to be multiplied by negative numbers.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    root = (vectors / np.sqrt(values)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    sums = np.einsum("...bc,...c->...b", root, expected)
+    good = (sums / expected > 0).all(axis=-1)[..., None, None]
+    with np.errstate(divide="ignore"):
+        return np.where(good, root * (expected / sums)[..., None], np.eye(root.shape[-1]))
+
+
+class Bands(NamedTuple):
+    """Combinations d of bands with variance (2 / nu) ((d + offset)^2 + width^2)."""
+
+    data: Float[Array, "... bin"]
+    nu: Float[Array, "... bin"]
+    offset: Float[Array, "... bin"]
+    width: Float[Array, "... bin"]
+    laws: Float[Array, "... bin ell"]  # d of D_l
+
+
+def _variances(
+    form: Float[np.ndarray, "patch bin x x"],
+    amplitudes: Float[np.ndarray, "patch x"],
+    seen: Float[np.ndarray, "patch bin"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """nu, offset and width (`Bands`) of one field, with the amplitudes of all others as given.
+
+    `form` has the variances of d as a quadratic form of the amplitudes, those of the field first;
+    d is `seen` for an amplitude of 1.
+    """
+    rest = amplitudes[:, 1:]
+    square = form[..., 0, 0]
+    offset = np.einsum("pbx,px->pb", form[..., 0, 1:], rest) / square * seen
+    constant = np.einsum("pbxy,px,py->pb", form[..., 1:, 1:], rest, rest) / square * seen**2
+    least = FLOOR * (offset + amplitudes[:, :1] * seen)
+    return 2 * seen**2 / square, offset, np.sqrt(np.maximum(constant - offset**2, least**2))
+
+
+def _sandwich(
+    derivatives: Float[np.ndarray, "... bin 2"],
+    variance: Float[np.ndarray, "... bin"],
+    covariance: Float[np.ndarray, "... bin bin"],
+    spread: float,
+) -> Float[np.ndarray, "... 2 2"]:
+    """Covariance of what solves G^T V^-1 (data - model) = 0, with a prior of the second number.
+
+    G are derivatives of the model by the two numbers, V the variance that the equations were
+    weighted with, whatever the covariance of the data; `spread` is the prior's.
+    """
+    prior = np.diag([0, spread**-2])
+    weights = np.swapaxes(derivatives / variance[..., None], -1, -2)
+    inverse = np.linalg.inv(weights @ derivatives + prior)
+    return inverse @ (weights @ covariance @ np.swapaxes(weights, -1, -2) + prior) @ inverse
+
+
+def _model(theta, bands, slope, ends):
+    """d for A and for alpha in standard deviations of its prior."""
+    ell = jnp.arange(bands.laws.shape[-1])
+    return theta[0] * (bands.laws @ _law(ell, ends, slope[0], slope[0] + slope[1] * theta[1]))
+
+
+@partial(jax.jit, static_argnames="ends")
+def minimise(bands: Bands, slope: Array, ends: tuple[int, int]) -> tuple[Array, ...]:
+    """The fit to each row of bands, powers of order one, with the prior of alpha.
+
+    Returns A and alpha, the best A with the mean slope, d, its derivative by alpha for A = 1 and
+    the mean slope, and whether a minimum was found.
+    """
+    solver: optx.AbstractMinimiser = optx.BFGS(1e-8, 1e-8)
+
+    def deviance(theta, row):
+        """-2 ln of the quasi-likelihood, 2 int (d - data) / variance dd, and of the prior."""
+        power = _model(theta, row, slope, ends) + row.offset
+        terms = jnp.log(power**2 + row.width**2) / 2
+        terms = terms - (row.data + row.offset) / row.width * jnp.arctan(power / row.width)
+        return jnp.sum(row.nu * terms) + theta[1] ** 2
+
+    def minimum(function, start, row):
+        found: optx.Solution = optx.minimise(
+            function, solver, start, args=row, max_steps=500, throw=False
+        )
+        good = jnp.isfinite(function(found.value, row))
+        return jnp.where(good, found.value, start), good & (found.result == optx.RESULTS.successful)
+
+    def fit(row):
+        flat, zero = jnp.mean(row.data), jnp.zeros(())
+        level, _ = minimum(lambda A, row: deviance(jnp.stack([A, zero]), row), flat, row)
+        theta, good = minimum(deviance, jnp.stack([level, zero]), row)
+        slopes = jax.jacfwd(_model)(jnp.array([1.0, 0.0]), row, slope, ends)[:, 1] / slope[1]
+        alpha = slope[0] + slope[1] * theta[1]
+        return theta[0], alpha, level, _model(theta, row, slope, ends), slopes, good
+
+    return jax.vmap(fit)(bands)

@@ -1,6 +1,18 @@
-"""Coefficients of full-sky maps, and the beams and noise of bands at each multipole."""
+"""Component separation of full-sky maps in multipoles, with a beam for each band.
 
-from collections.abc import Iterator, Sequence
+With b_l the beam and N_l the noise of a band, its coefficients without the beam are
+
+    d_lm / b_l = A s_lm + n_lm / b_l,    of noise N_l / b_l^2
+
+(Tegmark & Efstathiou 1996, MNRAS 281, 1297), the same for all m. So a multipole is what a region
+with uniform noise is among pixels: its 2l + 1 coefficients enter the spectral likelihood only
+through their covariance of bands, and as many vectors as there are bands take their place,
+exactly. Nothing is smoothed, so each band keeps the resolution it has. A rotation of Q + iU by
+the angle of a band turns E + iB in the same way.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import healpy
@@ -10,9 +22,19 @@ from jaxtyping import Array, Float
 
 from fits.amplitudes import Pixels
 from fits.compress import Layout
+from fits.mixing import spectral_names
 from fits.noise import bare
+from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
+from fits.template_likelihood import named_bands
+from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.checks import UNSEEN, Numeric, check_double, check_finite
-from jaxsky.harmonics import gaussian_beam, lmax_of, low_multipoles
+from jaxsky.harmonics import (
+    alm_ell,
+    gaussian_beam,
+    lmax_of,
+    low_multipoles,
+    resize,
+)
 
 #: A band is left out where its beam is below this: its weight would be lost in rounding.
 BEAM = 1e-5
@@ -99,41 +121,34 @@ def _check_full_sky(band: int, maps: np.ndarray) -> None:
 
 
 class Multipoles(NamedTuple):
-    """Beams and noise of the bands at l = lmin ... lmax.
+    """Beams and noise of the bands at l = 0 ... lmax.
 
     Parameters
     ----------
-    lmin, lmax : smallest and largest multipole
+    lmin : smallest multipole that is used
     inverse : 1 / b_l; 0 where a band is left out
     weights : b_l^2 / N_l, likewise
     """
 
     lmin: int
-    lmax: int
     inverse: Float[np.ndarray, "band ell"]
     weights: Float[np.ndarray, "band stokes ell"]
 
     @property
     def ell(self) -> np.ndarray:
-        """The multipoles."""
-        return np.arange(self.lmin, self.lmax + 1)
+        """Multipole of each packed coefficient."""
+        return alm_ell(self.inverse.shape[-1] - 1)
 
-    def dof(self, components: int) -> Float[np.ndarray, " ell"]:
-        """Number of coefficients that are used, less that of amplitudes."""
-        bands = (self.weights > 0).sum(axis=0) - components
-        return (2 * self.ell + 1.0) * bands.sum(axis=0)
+    @property
+    def sigma(self) -> Float[np.ndarray, "band stokes ell"]:
+        """Standard deviation of coefficients without their beam; infinite where left out."""
+        with np.errstate(divide="ignore"):
+            return 1 / np.sqrt(self.weights)
 
-    def coefficients(self, alm: np.ndarray) -> Iterator[Float[np.ndarray, "band stokes m"]]:
-        """Coefficients without their beam, for one multipole after the other."""
-        for i, ell in enumerate(self.ell):
-            yield alm[..., positions(ell, lmax_of(alm))] * self.inverse[:, None, i : i + 1]
-
-
-def positions(ell: int, lmax: int) -> np.ndarray:
-    """Where the 2l + 1 coefficients of a multipole are among packed ones."""
-    m = np.arange(1, ell + 1)
-    real = lmax + 1 + 2 * ((m - 1) * (lmax + 1) - m * (m - 1) // 2 + ell - m)
-    return np.concatenate([[ell], real, real + 1])
+    def without_beams(self, alm: np.ndarray) -> Float[np.ndarray, "band stokes alm"]:
+        """Coefficients without their beam, up to lmax."""
+        short = np.asarray(resize(jnp.asarray(alm), self.inverse.shape[-1] - 1))
+        return short * self.inverse[:, None, self.ell]
 
 
 def check_alm(alm: Numeric, bands: int) -> np.ndarray:
@@ -182,27 +197,27 @@ def _spectra(
 
 
 def multipoles_of(
-    shape: tuple[int, ...],
+    alm: Float[np.ndarray, "band stokes alm"],
     noise: Numeric,
     beams: Numeric,
     components: int,
     lmin: int,
     lmax: int | None,
 ) -> Multipoles:
-    """Checked beams and noise for coefficients of a shape."""
-    (bands, stokes), own = shape[:2], lmax_of(np.broadcast_to(0, shape))
+    """Checked beams and noise for coefficients."""
+    (bands, stokes), own = alm.shape[:2], lmax_of(alm)
     lmax = own if lmax is None else lmax
     if not 2 <= lmin <= lmax <= own:
         raise ValueError(
             f"Arguments `lmin` and `lmax` must obey 2 <= lmin <= lmax <= {own}, the last "
             f"multipole of `alm`, but are {lmin} and {lmax}."
         )
-    window = _windows(beams, bands, lmax)[:, lmin:]
+    window = _windows(beams, bands, lmax)
+    seen = (np.abs(window) > BEAM) & (np.arange(lmax + 1) >= lmin)
+    weights = np.zeros((bands, stokes, lmax + 1))
     spectra = _spectra(noise, bands, stokes, lmin, lmax)
-    seen = np.abs(window) > BEAM
-    weights = np.where(seen, window**2, 0.0)[:, None] / spectra
-    weights = np.broadcast_to(weights, (bands, stokes, weights.shape[-1]))
-    left = (weights > 0).sum(axis=0).min(axis=0)
+    weights[..., lmin:] = np.where(seen, window**2, 0.0)[:, None, lmin:] / spectra
+    left = (weights > 0).sum(axis=0).min(axis=0)[lmin:]
     if (left < components).any():
         first = int(np.argmax(left < components))
         raise ValueError(
@@ -210,26 +225,116 @@ def multipoles_of(
             f"components, the others having `beams` below {BEAM:g} or infinite `noise`; choose "
             f"another `lmin` or `lmax` than {lmin} and {lmax}."
         )
-    return Multipoles(lmin, lmax, np.where(seen, 1 / np.where(seen, window, 1), 0.0), weights)
+    return Multipoles(lmin, np.where(seen, 1 / np.where(seen, window, 1), 0.0), weights)
 
 
-def compressed(alm: np.ndarray, multipoles: Multipoles, layout: Layout) -> Pixels:
+def _compressed(rows: np.ndarray, multipoles: Multipoles, layout: Layout) -> Pixels:
     """Vectors with the same covariance of bands as the coefficients of each multipole.
 
     They are the triangular factor of the coefficients (QR), so squares are not formed: signals 1e8
     above the noise leave no trace in chi^2.
+
+    Parameters
+    ----------
+    rows : coefficients without beams (band, stokes, alm)
+    multipoles : their weights
+    layout : which Stokes parameters to correlate
     """
-    weights = np.moveaxis(layout.rows(multipoles.weights), -1, 0)[..., None]
+    lmin = multipoles.lmin
+    weights = np.moveaxis(layout.rows(multipoles.weights[..., lmin:]), -1, 0)[..., None]
     alike = bool(np.all(weights == weights[:, :1]))
     weights = weights[:, :1] if alike else weights
-    rows = weights.shape[2]
-    root = np.zeros((*weights.shape[:3], rows))
-    for i, values in enumerate(multipoles.coefficients(alm)):
-        x = layout.rows(values)
+    size = weights.shape[2]
+    root = np.zeros((*weights.shape[:3], size))
+    order, ends = np.argsort(multipoles.ell, kind="stable"), np.arange(lmin, lmin + len(root) + 1)
+    for i, own in enumerate(np.split(order, ends**2)[1:-1]):
+        x = layout.rows(rows[..., own])
         x = np.concatenate(list(x), axis=1)[None] if alike else x
         triangle = np.asarray(np.linalg.qr(x.swapaxes(1, 2), mode="r"))
         root[i, ..., : triangle.shape[1]] = triangle.swapaxes(1, 2)
-    if not np.isfinite(root).all():
+    return Pixels(jnp.asarray(root), jnp.asarray(weights))
+
+
+def _refuse_maps(sky: Sky, start: Mapping[str, Numeric]) -> None:
+    names = [name for name in spectral_names(sky) if name not in start]
+    for name, value in get_parameters(sky, names).items():
+        if jnp.ndim(value):
+            raise ValueError(
+                f"Parameter {name!r} is a map of {value.size} pixels, but in the harmonic domain "
+                "it must be a number: laws that vary over the sky mix multipoles."
+            )
+
+
+def harmonic_likelihood(
+    sky: Sky | Mapping[str, Component],
+    bands: Mapping[str, Bandpass] | Sequence[Bandpass],
+    alm: Numeric,
+    noise: Numeric,
+    start: Mapping[str, Numeric],
+    *,
+    beams: Numeric,
+    unit: str = "uK_RJ",
+    lmin: int = 2,
+    lmax: int | None = None,
+) -> SpectralLikelihood:
+    """The spectral likelihood of full-sky maps that each have their own beam.
+
+    -2 ln L = sum_lm [d^T W d - (A^T W d)^T (A^T W A)^-1 (A^T W d)] with d = d_lm / b_l and
+    W = b_l^2 / N_l: that of Stompor et al. (2009, MNRAS 392, 216) with multipoles in the place of
+    pixels. Where the beam of a band is below 1e-5, it is left out.
+
+    Parameters
+    ----------
+    sky : components by name. Their laws count, not their amplitudes; parameters that are not
+        free keep their values, which must be numbers.
+    bands : the bands by name, or as a list
+    alm : packed coefficients (band, stokes, alm) of the maps as observed, E, B or I, E, B; see
+        `harmonic_coefficients`
+    noise : N_l of the maps as observed [square of `unit` times sr], shape (band,), (band, stokes)
+        or (band, stokes, ell) from l = 0; infinite where a band is not to be used. See
+        `white_spectrum`.
+    start : start values of the free parameters by name, as for `spectral_likelihood`
+    beams : full widths at half maximum of Gaussian beams [arcmin], (band,), or tables b_l,
+        (band, ell) from l = 0, with the window of the pixels if the maps have one
+    unit : of the data, "uK_RJ", "K_CMB" or the like; amplitudes are uK in any case (CMB: uK_CMB)
+    lmin, lmax : smallest and largest multipole that is used; by default 2 and all there are
+
+    Returns
+    -------
+    The likelihood, for `fits.separation.fit_spectra`. Maps of the components come from
+    `fits.separated_maps.harmonic_component_maps`.
+
+    Raises
+    ------
+    RuntimeError
+        If JAX is not in double precision.
+    KeyError
+        For unknown parameters.
+    TypeError, ValueError
+        For shapes that do not match, units, noise that is not positive, coefficients that are not
+        finite, parameters that are maps, too few bands, or too few that resolve a multipole.
+    """
+    sky = sky if isinstance(sky, Sky) else Sky(sky)
+    bands = named_bands(bands)
+    alm = check_alm(alm, len(bands))
+    _refuse_maps(sky, start)
+    # The laws and their parameters, on a pixel without data.
+    nothing = np.zeros((len(bands), alm.shape[1], 1))
+    like = spectral_likelihood(
+        sky, bands, nothing, np.ones(len(bands)), start, unit=unit, compress=False
+    )
+    components = len(sky.components)
+    multipoles = multipoles_of(alm, noise, beams, components, lmin, lmax)
+    rows = multipoles.without_beams(alm)
+    if not np.isfinite(rows).all():
         bad = int(np.sum(~np.isfinite(alm)))
         raise ValueError(f"Argument `alm` has {bad} of {alm.size} values that are not finite.")
-    return Pixels(jnp.asarray(root), jnp.asarray(weights))
+    pixels = tuple(_compressed(rows, multipoles, layout) for layout in like.layout)
+    bands_used = (multipoles.weights > 0).sum(axis=0)[..., multipoles.ell]
+    values = bands_used - components * (multipoles.ell >= lmin)
+    return dataclasses.replace(
+        like,
+        pixels=pixels,
+        block_cell=jnp.zeros(len(pixels[0].data), int),
+        values=int(values.sum()),
+    )

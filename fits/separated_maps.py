@@ -4,18 +4,21 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import NamedTuple
 
+import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from fits import amplitudes
 from fits.amplitudes import Pixels
 from fits.compress import Layout, used_pixels
+from fits.multipoles import check_alm, multipoles_of
 from fits.noise import Noise, as_noise, bare, chunks
 from fits.profile_likelihood import SpectralLikelihood
-from jaxsky.checks import Numeric
+from jaxsky.checks import Numeric, as_array, check_finite
+from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
 
 
 class ComponentMaps(NamedTuple):
@@ -124,11 +127,6 @@ def _passes(like: SpectralLikelihood, params: Mapping[str, Numeric], npix: int) 
             yield layout, part, _of_pixel(like, matrix, part)
 
 
-def _checked(like: SpectralLikelihood, noise, shape) -> tuple[Noise, np.ndarray]:
-    noise = as_noise(noise, shape)
-    return noise, used_pixels(noise, shape[-1], len(like.sky.components))
-
-
 def _check_data(like: SpectralLikelihood, data: Numeric) -> np.ndarray:
     data = bare("data", data)
     wanted = (len(like.bands.names), len(like.bands.stokes))
@@ -163,9 +161,9 @@ def component_maps(
         For unknown parameters, and what `spectral_likelihood` refuses.
     """
     data = _check_data(like, data)
-    noise, used = _checked(like, noise, data.shape)
-    names = tuple(like.sky)
-    stokes, npix = data.shape[1:]
+    names, (_, stokes, npix) = tuple(like.sky), data.shape
+    noise = as_noise(noise, data.shape)
+    used = used_pixels(noise, npix, len(names))
     amplitude = np.full((len(names), stokes, npix), np.nan)
     square, count = np.zeros(npix), np.zeros(npix)
     uniform = noise.separable and noise.pixel_sigma is None and like.of_pixel is None
@@ -179,13 +177,13 @@ def component_maps(
         square[part] += squares
         count[part] += (noise.weights(part) > 0)[own].sum(axis=(0, 1)) - len(names) * len(own)
         if covariance and not (uniform and part.start):
+            # The weights are in the place of data, which do not count.
             inverse = np.asarray(_inverse(matrix, pixels._replace(data=pixels.weights)))
             where = slice(0, 1) if uniform else part
             for k, s in enumerate(own):
-                inner = inverse[0] if layout.joint else inverse[k]
-                first = k * len(names) if layout.joint else 0
+                group, first = (0, k * len(names)) if layout.joint else (k, 0)
                 rows = slice(first, first + len(names))
-                block = inner[rows, rows]
+                block = inverse[group, rows, rows]
                 blocks[:, :, s, where] = block if uniform else np.where(used[part], block, np.nan)
     square, count = np.where(used, square, np.nan), np.where(used, count, np.nan)
     return ComponentMaps(
@@ -196,6 +194,29 @@ def component_maps(
         count,
         scipy.special.chdtrc(count, square),
     )
+
+
+def emission_maps(
+    like: SpectralLikelihood,
+    params: Mapping[str, Numeric],
+    amplitude: Float[np.ndarray, "component stokes pix"],
+) -> Float[np.ndarray, "band stokes pix"]:
+    """What components show in the bands, in the unit of the data.
+
+    Parameters
+    ----------
+    like, params : as for `component_maps`
+    amplitude : maps of all components, or their coefficients
+    """
+    result = np.empty((len(like.bands.names), *amplitude.shape[1:]))
+    for layout, part, matrix in _passes(like, params, amplitude.shape[-1]):
+        rows = layout.rows(amplitude[..., part])
+        if len(matrix) == 1:
+            model = np.einsum("ru,kup->krp", np.asarray(matrix[0]), rows, optimize=True)
+        else:
+            model = np.einsum("pru,kup->krp", np.asarray(matrix), rows)
+        result[:, list(layout.stokes), part] = layout.maps(model)
+    return result
 
 
 def residual_maps(
@@ -212,17 +233,7 @@ def residual_maps(
     data : observed maps
     amplitude : from `component_maps`
     """
-    data = _check_data(like, data)
-    result = np.empty(data.shape)
-    for layout, part, matrix in _passes(like, params, data.shape[-1]):
-        own = list(layout.stokes)
-        rows = np.stack([np.concatenate([amplitude[:, s, part] for s in g]) for g in layout.groups])
-        if len(matrix) == 1:
-            model = np.einsum("ru,kup->krp", np.asarray(matrix[0]), rows, optimize=True)
-        else:
-            model = np.einsum("pru,kup->krp", np.asarray(matrix), rows)
-        result[:, own, part] = data[:, own, part] - layout.maps(model)
-    return result
+    return _check_data(like, data) - emission_maps(like, params, amplitude)
 
 
 def noise_degradation(
@@ -249,7 +260,8 @@ def noise_degradation(
     if component not in names:
         raise KeyError(f"Unknown component {component!r}; known are {', '.join(names)}.")
     c, stokes = names.index(component), len(like.bands.stokes)
-    noise, used = _checked(like, noise, (len(like.bands.names), stokes, npix))
+    noise = as_noise(noise, (len(like.bands.names), stokes, npix))
+    used = used_pixels(noise, npix, len(names))
     uniform = noise.separable and like.of_pixel is None
     result = np.full((stokes, 1 if uniform else npix), np.nan)
     for layout, part, matrix in _passes(like, params, npix):
@@ -265,3 +277,104 @@ def noise_degradation(
         flat = ratio.reshape(len(layout.stokes), -1)
         result[list(layout.stokes), where] = flat[:, :1] if uniform else flat
     return result if uniform else np.where(used, result, np.nan)
+
+
+class HarmonicMaps(ComponentMaps):
+    """Coefficients of the components, without any beam.
+
+    Attributes
+    ----------
+    components : their names
+    amplitude : generalised least-squares estimates, packed coefficients of E, B or I, E, B, uK at
+        the reference frequency of each law; CMB in uK_CMB. Zero where l < lmin.
+    covariance : of the components, for each Stokes parameter and multipole [uK^2 sr]: their noise
+        spectra; None if not asked for. NaN where l < lmin, as are the others.
+    chi2, dof : of each multipole: sum over bands, Stokes parameters and m of the weighted
+        residuals squared, and their number less that of amplitudes
+    probability : to exceed chi2, the spectral parameters taken as known
+    """
+
+    __slots__ = ()
+
+    def alm(self, name: str) -> Float[np.ndarray, "stokes alm"]:
+        """Coefficients of a component."""
+        return self.map(name)
+
+    def noise(self, name: str) -> Float[np.ndarray, "stokes ell"]:
+        """Spectrum N_l of the noise of a component [uK^2 sr]."""
+        return self.sigma(name) ** 2
+
+    def maps(self, nside: int, beam: ArrayLike) -> Float[np.ndarray, "component stokes pix"]:
+        """Maps of the components; their noise has the spectra `covariance` times b_l^2.
+
+        Parameters
+        ----------
+        nside : resolution; multipoles above 2 nside are cut
+        beam : of the maps: full width at half maximum [arcmin], or a table b_l from l = 0
+        """
+        if not healpy.isnsideok(nside, nest=True):
+            raise ValueError(f"Argument `nside` must be a power of 2, but is {nside}.")
+        check_finite("beam", as_array("beam", beam))
+        lmax = min(lmax_of(self.amplitude), 2 * nside)
+        window = expand(beam_ratio(beam, 0.0, lmax))
+        maps = [synthesis(resize(alm, lmax) * window, nside) for alm in self.amplitude]
+        return np.stack([np.asarray(each) for each in maps])
+
+
+def harmonic_component_maps(
+    like: SpectralLikelihood,
+    params: Mapping[str, Numeric],
+    alm: Numeric,
+    noise: Numeric,
+    *,
+    beams: Numeric,
+    lmin: int = 2,
+    lmax: int | None = None,
+    covariance: bool = True,
+) -> HarmonicMaps:
+    """Coefficients of the components for spectral parameters that are known.
+
+    s_lm = (A^T W A)^-1 A^T W d, with d = d_lm / b_l and W = b_l^2 / N_l: the linear combination of
+    bands with the smallest noise at each multipole that has unit response to the component and
+    none to the others, each band contributing where it has the resolution.
+
+    Parameters
+    ----------
+    like : for its laws and bands: from `harmonic_likelihood`, or `spectral_likelihood` without
+        regions
+    params : spectral parameters, such as `SpectralFit.best_fit`
+    alm, noise, beams, lmin, lmax : as for `harmonic_likelihood`; the multipoles need not be those
+        that were fitted
+    covariance : whether to make the covariance of the amplitudes
+    """
+    if len(like.index) != 1:
+        raise ValueError(
+            f"Argument `like` has regions, {len(like.index)} in all, but in the harmonic domain "
+            "parameters are the same on all of the sky."
+        )
+    names, alm = tuple(like.sky), check_alm(alm, len(like.bands.names))
+    if alm.shape[1] != len(like.bands.stokes):
+        raise ValueError(
+            f"Argument `alm` must have {len(like.bands.stokes)} rows a band like the data of "
+            f"`like`, but has {alm.shape[1]}."
+        )
+    multipoles = multipoles_of(alm, noise, beams, len(names), lmin, lmax)
+    ell, sigma = multipoles.ell, multipoles.sigma
+    of_alm = Noise(sigma[..., ell])
+    found = component_maps(like, params, multipoles.without_beams(alm), of_alm, covariance=False)
+    if covariance:
+        nothing = np.zeros(sigma.shape)
+        blocks = component_maps(like, params, nothing, Noise(sigma)).covariance
+    used = np.arange(ell.max() + 1) >= lmin
+    square, count = (
+        np.where(used, np.bincount(ell, np.nan_to_num(each)), np.nan)
+        for each in (found.chi2, found.dof)
+    )
+    return HarmonicMaps(
+        names,
+        np.where(ell >= lmin, found.amplitude, 0.0),
+        blocks if covariance else None,
+        square,
+        count,
+        np.where(count > 0, scipy.special.chdtrc(count, square), np.nan),
+    )

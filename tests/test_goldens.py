@@ -15,9 +15,9 @@ import pytest
 
 import systems
 from fits.covariance import Fluctuations
+from fits.multipoles import harmonic_likelihood
 from fits.pseudo_cl import masked_spectra
 from fits.separation import hessian, spectral_likelihood
-from fits.separation.harmonic import harmonic_likelihood
 from fits.template_likelihood import chi2, likelihood
 from jaxsky import Bandpass, Sky, get_parameters, observe, parameter_names, set_parameters
 from jaxsky.cmb import realisation

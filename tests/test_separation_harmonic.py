@@ -8,14 +8,10 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from fits.multipoles import harmonic_coefficients, harmonic_likelihood, white_spectrum
 from fits.priors import Gaussian
+from fits.separated_maps import harmonic_component_maps
 from fits.separation import fisher, fit_spectra, hessian, spectral_likelihood
-from fits.separation.harmonic import (
-    harmonic_coefficients,
-    harmonic_component_maps,
-    harmonic_likelihood,
-    white_spectrum,
-)
 from fits.template_likelihood import chi2
 from jaxsky import Dust
 from jaxsky.harmonics import (

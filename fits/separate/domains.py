@@ -12,18 +12,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fits.covariance import Fluctuations
+from fits.multipoles import harmonic_likelihood, multipoles_of
 from fits.noise import Noise
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.separated_maps import (
     ComponentMaps,
+    HarmonicMaps,
     component_maps,
+    emission_maps,
+    harmonic_component_maps,
     noise_degradation,
     residual_maps,
-)
-from fits.separation.harmonic import (
-    HarmonicMaps,
-    harmonic_component_maps,
-    harmonic_likelihood,
 )
 from jaxsky import Bandpass, Sky
 from jaxsky.harmonics import analysis, expand, gaussian_beam, lmax_of, synthesis
@@ -86,9 +85,7 @@ class PixelDomain(NamedTuple):
 
     def emission(self, like: SpectralLikelihood, params: Mapping, amplitude):
         """What components show in the bands; zero in masked pixels."""
-        nothing = np.zeros((len(self.bands), *amplitude.shape[1:]))
-        filled = np.where(self.used, amplitude, 0.0)
-        return -residual_maps(like, params, nothing, filled)
+        return emission_maps(like, params, np.where(self.used, amplitude, 0.0))
 
 
 class HarmonicDomain(NamedTuple):
@@ -140,25 +137,19 @@ class HarmonicDomain(NamedTuple):
             bands.append(np.asarray(alm + white * expand(jnp.sqrt(jnp.asarray(spectrum)))))
         return np.stack(bands)
 
-    def components(self, like: SpectralLikelihood, params: Mapping, data, **_):
+    def components(self, like: SpectralLikelihood, params: Mapping, data, **options):
         """Amplitudes of the components with all that is known of them."""
-        return harmonic_component_maps(like, params, data, self.noise, beams=self.fwhms)
+        return harmonic_component_maps(like, params, data, self.noise, beams=self.fwhms, **options)
 
     def maps(self, found: HarmonicMaps) -> Float[np.ndarray, "component stokes pix"]:
         """Amplitudes as maps."""
         return found.maps(self.nside, self.fwhm)
 
-    def _windows(self, lmax: int) -> Float[np.ndarray, "band ell"]:
-        return np.stack([np.asarray(gaussian_beam(fwhm, lmax)) for fwhm in self.fwhms])
-
     def degradation(self, like: SpectralLikelihood, params: Mapping, component: str):
         """Noise of a component over that of a sky without others, (stokes, ell)."""
         nothing = np.zeros((*self.noise.shape[:2], (self.lmax + 1) ** 2))
-        found = self.components(like, params, nothing)
-        own = _matrices(like, like.check(params))[0][0][: len(self.bands)]
-        law = np.asarray(own)[:, tuple(like.sky).index(component)]
-        weights = self._windows(self.lmax)[:, None] ** 2 / self.noise
-        return np.sqrt(found.noise(component) * np.einsum("b,bsl->sl", law**2, weights))
+        known = multipoles_of(nothing, self.noise, self.fwhms, len(like.sky.components), 2, None)
+        return noise_degradation(like, params, Noise(known.sigma), self.lmax + 1, component)
 
     def residuals(self, like: SpectralLikelihood, params: Mapping, data, found: HarmonicMaps):
         """Maps (band, stokes, pix) of the data less the components, each with its own beam."""
@@ -167,18 +158,8 @@ class HarmonicDomain(NamedTuple):
 
     def emission(self, like: SpectralLikelihood, params: Mapping, amplitude):
         """What components show in the bands, with their beams."""
-        matrices = _matrices(like, like.check(params))
-        shown = np.empty((len(self.bands), *amplitude.shape[1:]))
-        for layout, matrix in zip(like.layout, matrices, strict=True):
-            rows = np.einsum("ru,kun->krn", np.asarray(matrix[0]), layout.rows(amplitude))
-            shown[:, list(layout.stokes)] = layout.maps(rows)
-        windows = expand(jnp.asarray(self._windows(lmax_of(amplitude))))
-        return shown * np.asarray(windows)[:, None]
+        windows = jnp.stack([gaussian_beam(f, lmax_of(amplitude)) for f in self.fwhms])
+        return emission_maps(like, params, amplitude) * np.asarray(expand(windows))[:, None]
 
 
 Domain = PixelDomain | HarmonicDomain
-
-
-@jax.jit
-def _matrices(like, params):
-    return like.matrices(like.flat(params)[like.index])

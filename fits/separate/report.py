@@ -10,7 +10,7 @@ from fits.posterior_plots import plot_chains
 from fits.record import leaks, probability, with_error, write_json, write_log
 from fits.separate import plots
 from fits.separate.separate import SAMPLED, Separation
-from fits.separated_maps import ComponentMaps
+from fits.separated_maps import HarmonicMaps
 from jaxsky.inputs import parameter_unit
 from jaxsky.io import write_maps
 from jaxsky.settings import Experiment
@@ -25,7 +25,7 @@ LISTED, DRAWN = 12, 8
 
 def _pixel_probability(found: Separation) -> dict[str, float] | None:
     """How many pixels have a chi^2 that is too large."""
-    if not isinstance(found.found, ComponentMaps):
+    if isinstance(found.found, HarmonicMaps):
         return None
     values = found.found.probability[np.isfinite(found.found.probability)]
     return {f"below_{p:g}": float(np.mean(values < p)) for p in (0.05, 0.01, 0.001)}
@@ -180,12 +180,12 @@ def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path
             names.append(f"{name.upper()}_{stokes}")
             units.append(unit)
             columns.append(values)
-        if isinstance(found.found, ComponentMaps):
+        if not isinstance(found.found, HarmonicMaps):
             for stokes, values in zip("QU", found.found.sigma(name)[-2:], strict=True):
                 names.append(f"{name.upper()}_SIGMA_{stokes}")
                 units.append(unit)
                 columns.append(np.broadcast_to(values, mask.shape))
-    if isinstance(found.found, ComponentMaps):
+    if not isinstance(found.found, HarmonicMaps):
         names += ["CHI2", "PROBABILITY"]
         units += ["", ""]
         columns += [found.found.chi2, found.found.probability]

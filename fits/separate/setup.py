@@ -12,10 +12,10 @@ from fits.common import common_maps
 from fits.covariance import uniform_level
 from fits.inputs import Band, Inputs, inputs_of
 from fits.mixing import NOMINAL
+from fits.multipoles import harmonic_coefficients
 from fits.noise import Noise, as_noise
 from fits.regions import apodize, clusters, latitude_bands, region_mask, superpixels
 from fits.separate.domains import Domain, HarmonicDomain, PixelDomain
-from fits.separation.harmonic import harmonic_coefficients
 from jaxsky import Component, Sky, set_parameters
 from jaxsky.components import component_class
 from jaxsky.harmonics import Preparation

@@ -6,17 +6,17 @@ from typing import Any
 #: name -> module that has it; imported when it is asked for
 _WHERE = {
     "fits.separation.fit": ("fisher", "fit_spectra", "hessian"),
-    "fits.separation.harmonic": (
-        "HarmonicMaps",
+    "fits.multipoles": (
         "harmonic_coefficients",
-        "harmonic_component_maps",
         "harmonic_likelihood",
         "white_spectrum",
     ),
     "fits.profile_likelihood": ("SpectralLikelihood", "spectral_likelihood"),
     "fits.separated_maps": (
         "ComponentMaps",
+        "HarmonicMaps",
         "component_maps",
+        "harmonic_component_maps",
         "noise_degradation",
         "residual_maps",
     ),

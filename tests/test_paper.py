@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 import commands
+from fits.commands.paper import NUMBERS, STEPS, Make, labels_of, make_figures
 from fits.commands.run import DEFAULTS
-from fits.paper import STEPS, Impossible, Item, Number, Sources, Step, experiment, run
-from fits.paper.experiment import _observation, _prepared, figure_patch
-from fits.paper.item import NUMBERS
-from fits.paper.run import labels_of
+from fits.paper import figures_model
+from fits.paper.figures_model import core_observation, figure_patch, prepared_templates
+from fits.paper.items import Impossible, Item, Number, picture_of
+from fits.paper.sources import Sources
 from jaxsky.harmonics import gaussian_beam, power_spectrum
 from jaxsky.io import read_maps
 from jaxsky.observation import Source, prepare
@@ -72,7 +73,7 @@ def small() -> Experiment:
 @pytest.fixture(scope="module")
 def made(small, tmp_path_factory) -> tuple[Path, dict[str, Item]]:
     out = tmp_path_factory.mktemp("paper") / "embedded"
-    return out, {item.label: item for item in run(small, out, LABELS)}
+    return out, {item.label: item for item in make_figures(small, out, LABELS)}
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +118,7 @@ def check_slopes(settings: Experiment, items: dict[str, Item]) -> None:
         alms = healpy.map2alm(full, lmax=lmax, iter=10, use_weights=True)[1:]
         for kind, alm in zip(("EE", "BB"), alms, strict=True):
             spectrum = healpy.alm2cl(alm) / np.asarray(gaussian_beam(layer.fwhm, lmax)) ** 2
-            law = fit_power_law(jax.numpy.asarray(spectrum), *getattr(layer.small, kind))
+            law = fit_power_law(jax.numpy.asarray(spectrum), *getattr(layer.small_scales, kind))
             shown = value(numbers[f"slope of {name} {kind}"])
             assert shown == pytest.approx(float(law.slope), abs=0.01)
 
@@ -147,7 +148,7 @@ def test_embedded_sky(small, made):
 
 @pytest.mark.slow
 def test_real_sky(real, data_dir, tmp_path):
-    items = {item.label: item for item in run(real, tmp_path, LABELS)}
+    items = {item.label: item for item in make_figures(real, tmp_path, LABELS)}
     check_items(tmp_path, items)
     check_slopes(real, items)
     check_correlations(real, items)
@@ -169,12 +170,10 @@ def test_real_sky(real, data_dir, tmp_path):
 def test_patch_shows_the_small_scales_of_the_spectra(small):
     """Those that are there already are the ones that `prepare` makes."""
     sources = Sources(small)
-    observation = _observation(small, sources)
-    layers = {name: sources.template(name) for name in ("dust", "synchrotron")}
-    given = {
-        name: Source(layer.component, layer.fwhm, layer.small) for name, layer in layers.items()
-    }
-    expected, found = prepare(sources.key, given, observation), _prepared(sources, observation)
+    observation = core_observation(sources)
+    given = {name: Source(*sources.template(name)) for name in ("dust", "synchrotron")}
+    expected = prepare(sources.key, given, observation)
+    found = prepared_templates(sources, observation)
     for name, one in expected.items():
         np.testing.assert_allclose(found[name].alms[0], one.alms[0], rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(found[name].weights, one.weights)
@@ -212,112 +211,100 @@ def test_page(made):
     assert "not data" in (out / "index.html").read_text()
 
 
-def step(label: str, made: list[str], stop: type[BaseException] | None = None) -> Step:
-    """A figure that is quickly drawn."""
+def drawn(
+    made: list[str], stop: type[BaseException] | None = None, stopped: str = "Figure 2"
+) -> dict[str, Make]:
+    """Two figures that are quickly drawn, one of which may stop."""
 
-    def make(settings, sources, out):
-        made.append(label)
-        if stop is not None:
-            raise stop("it takes a <map>.")
-        (out / f"{label}.png").write_text("picture")
-        return Item(label, "a & b", "c", "d", f"{label}.png", numbers=(Number("x", "1", "2"),))
+    def step(label: str) -> Make:
+        def make(sources, picture):
+            made.append(label)
+            if stop is not None and label == stopped:
+                raise stop("it takes a <map>.")
+            picture.write_bytes(b"picture")
+            return Item(label, "a & b", "c", "d", picture.name, numbers=(Number("x", "1", "2"),))
 
-    return Step(label, make)
+        return make
+
+    return {label: step(label) for label in ("Figure 1", "Figure 2")}
 
 
 def test_a_stopped_run_goes_on(small, tmp_path):
     made = []
     with pytest.raises(KeyboardInterrupt):
-        run(
-            small,
-            tmp_path,
-            steps=[step("Figure 1", made), step("Figure 2", made, KeyboardInterrupt)],
-        )
+        make_figures(small, tmp_path, steps=drawn(made, KeyboardInterrupt))
     assert Page(tmp_path / "index.html").headings[0] == "Figure 1: a & b"
-    two = [step("Figure 1", made), step("Figure 2", made)]
-    items = run(small, tmp_path, resume=True, steps=two)
+    two = drawn(made)
+    items = make_figures(small, tmp_path, steps=two)
     assert made == ["Figure 1", "Figure 2", "Figure 2"]
     assert [item.label for item in items] == ["Figure 1", "Figure 2", NUMBERS]
-    (tmp_path / "Figure 1.png").unlink()
-    run(small, tmp_path, resume=True, steps=two)
+    (tmp_path / picture_of("Figure 1")).unlink()
+    make_figures(small, tmp_path, steps=two)
     assert made[3:] == ["Figure 1"]
-    run(small, tmp_path, ["2"], overwrite=True, steps=two)
+    make_figures(small, tmp_path, ["2"], overwrite=True, steps=two)
     assert made[4:] == ["Figure 2"]
-    assert len(json.loads((tmp_path / "items.json").read_text())["items"]) == 2
+    kept = json.loads((tmp_path / "items.json").read_text())
+    assert [item["numbers"][0]["what"] for item in kept["items"]] == ["x", "x"]
 
 
 def test_real_figures_are_not_made_again(small, made):
     out, items = made
     before = {path: path.stat().st_mtime_ns for path in out.glob("*.png")}
-    assert run(small, out, LABELS, resume=True) == list(items.values())
+    assert make_figures(small, out, LABELS) == list(items.values())
     assert {path: path.stat().st_mtime_ns for path in out.glob("*.png")} == before
 
 
 def test_a_figure_that_cannot_be_made_is_said_and_left_out(small, tmp_path):
     made = []
-    steps = [step("Figure 1", made, Impossible), step("Figure 2", made)]
-    items = run(small, tmp_path, steps=steps)
+    steps = drawn(made, Impossible, "Figure 1")
+    items = make_figures(small, tmp_path, steps=steps)
     assert items[0].differs == "Not made: it takes a <map>."
     assert "it takes a &lt;map&gt;." in (tmp_path / "index.html").read_text()
-    assert items[1].picture == "Figure 2.png"
-    run(small, tmp_path, resume=True, steps=steps)
+    assert items[1].picture == "figure_02.png"
+    make_figures(small, tmp_path, steps=steps)
     assert made == ["Figure 1", "Figure 2", "Figure 1"]
 
 
 def test_other_settings_are_refused_or_replaced(small, tmp_path):
-    made = []
-    steps = [step("Figure 1", made), step("Figure 2", made)]
-    run(small, tmp_path, steps=steps)
+    steps = drawn([])
+    make_figures(small, tmp_path, steps=steps)
     other = small.model_copy(update={"title": "another sky"})
-    with pytest.raises(ValueError, match="holds figures already; go on with --resume"):
-        run(small, tmp_path, steps=steps)
     with pytest.raises(ValueError, match="holds figures of other settings"):
-        run(other, tmp_path, resume=True, steps=steps)
-    items = run(other, tmp_path, ["1"], overwrite=True, steps=steps)
+        make_figures(other, tmp_path, steps=steps)
+    items = make_figures(other, tmp_path, ["1"], overwrite=True, steps=steps)
     assert [item.label for item in items] == ["Figure 1", NUMBERS]
-    assert not (tmp_path / "Figure 2.png").exists()
-    (tmp_path / "items.json").write_text("{")
-    with pytest.raises(ValueError, match="is damaged"):
-        run(other, tmp_path, resume=True, steps=steps)
+    assert [path.name for path in tmp_path.glob("*.png")] == ["figure_01.png"]
+    for damaged in ("{", "{}", '{"settings": {}, "items": [{"label": "Figure 1"}]}'):
+        (tmp_path / "items.json").write_text(damaged)
+        with pytest.raises(ValueError, match="is damaged"):
+            make_figures(other, tmp_path, steps=steps)
+    make_figures(other, tmp_path, overwrite=True, steps=steps)
 
 
 def test_what_fails_removes_nothing(small, tmp_path):
     """Of other settings, figures go when the first new one is there, and not before."""
-
-    def item(label):
-        def make(settings, sources, out):
-            (out / f"{label}.png").write_bytes(b"picture")
-            return Item(label, label, "", "", f"{label}.png")
-
-        return make
-
-    def fail(settings, sources, out):
-        raise ValueError("no such file")
-
-    out = tmp_path / "out"
-    steps = [Step("Figure 1", item("Figure 1")), Step("Figure 2", item("Figure 2"))]
-    run(small, out, steps=steps)
+    out, both = tmp_path / "out", ["figure_01.png", "figure_02.png"]
+    make_figures(small, out, steps=drawn([]))
     held = (out / "items.json").read_text()
     other = small.model_copy(update={"title": "another"})
-    with pytest.raises(ValueError, match="no such file"):
-        run(other, out, steps=[Step("Figure 1", fail), steps[1]], overwrite=True)
+    fails = drawn([], OSError, "Figure 1")
+    with pytest.raises(OSError, match="it takes a <map>"):
+        make_figures(other, out, steps=fails, overwrite=True)
     assert (out / "items.json").read_text() == held
-    assert {p.stem for p in out.glob("*.png")} == {"Figure 1", "Figure 2"}
-    items = run(other, out, ["2"], steps=steps, overwrite=True)
-    assert [i.label for i in items] == ["Figure 2"]
-    assert {p.stem for p in out.glob("*.png")} == {"Figure 2"}
+    assert sorted(path.name for path in out.glob("*.png")) == both
+    items = make_figures(other, out, ["2"], steps=fails, overwrite=True)
+    assert [item.label for item in items] == ["Figure 2", NUMBERS]
+    assert [path.name for path in out.glob("*.png")] == both[1:]
     # A first run that fails leaves nothing that has to be overwritten.
-    with pytest.raises(ValueError, match="no such file"):
-        run(small, tmp_path / "new", steps=[Step("Figure 1", fail)])
-    run(small, tmp_path / "new", steps=steps[:1])
+    with pytest.raises(OSError, match="it takes a <map>"):
+        make_figures(small, tmp_path / "new", steps=fails)
+    assert not list((tmp_path / "new").iterdir())
 
 
 def test_labels():
-    assert labels_of([]) == [step.label for step in STEPS]
+    assert labels_of([]) == list(STEPS)
     assert labels_of(["14", "Table  1", "figure 2"]) == ["Figure 2", "Table 1", "Figure 14"]
-    order = [step.label for step in STEPS]
-    assert [label for label in order if label in LABELS] == LABELS
-    assert len(set(order)) == len(order)
+    assert [label for label in STEPS if label in LABELS] == LABELS
 
 
 def test_example_is_valid():
@@ -338,8 +325,8 @@ def test_command_line(monkeypatch, capsys, tmp_path):
     page = Page(tmp_path / "out" / "index.html")
     assert page.headings[0] == "Table 1: COrE"
     for arguments, sentence in {
-        ("--only", "15"): "there is no '15'; there are Figure 1,",
-        ("--only", "table 1"): "holds figures already",
+        ("--only", "15", "--resume"): "there is no '15'; there are Figure 1,",
+        ("--only", "table 1"): "holds results already",
         ("--resume", "--overwrite"): "exclude each other",
         ("absent.toml",): "cannot be read",
     }.items():
@@ -366,12 +353,12 @@ def test_settings_that_cannot_work(real):
 
 
 def test_the_cmb_of_figure_13_is_that_of_the_settings(real, monkeypatch, tmp_path):
-    spectra = experiment.cmb_spectra(real, 100)
+    spectra = figures_model.cmb_spectra(real, 100)
     asked = []
-    monkeypatch.setattr(experiment, "_prepared", lambda *a: {})
+    monkeypatch.setattr(figures_model, "prepared_templates", lambda *a: {})
     monkeypatch.setattr(
-        experiment, "cmb_spectra", lambda s, lmax: asked.append(s) or spectra[:, :10]
+        figures_model, "cmb_spectra", lambda s, lmax: asked.append(s) or spectra[:, :10]
     )
     with pytest.raises(ValueError, match=r"spectra of the CMB end at l = 9"):
-        figure_patch(real, Sources(real), tmp_path)
+        figure_patch(Sources(real), tmp_path)
     assert asked == [real]

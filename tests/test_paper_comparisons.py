@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 
 from fits.commands.forecast import forecast
+from fits.commands.paper import STEPS, make_figures
 from fits.commands.run import DEFAULTS
 from fits.common import common_maps
 from fits.comparison import compare
 from fits.inputs import inputs_of
-from fits.paper import STEPS, run
-from fits.paper.forecasts import _settings
+from fits.paper.figures_model import forecast_settings
 from fits.paper.sources import Sources
 from fits.record import with_error
 from fits.regions import region_masks
@@ -35,7 +35,7 @@ def small() -> Experiment:
 @pytest.fixture(scope="module")
 def made(small, tmp_path_factory):
     out = tmp_path_factory.mktemp("paper") / "out"
-    return out, {item.label: item for item in run(small, out, LABELS)}
+    return out, {item.label: item for item in make_figures(small, out, LABELS)}
 
 
 def numbers(items):
@@ -82,7 +82,7 @@ def test_indices_agree_with_the_truth(made):
 
 @pytest.mark.slow
 def test_b_modes_are_those_of_the_forecast(small, made):
-    found = forecast(_settings(small, Sources(small)))
+    found = forecast(forecast_settings(Sources(small)))
     shown = numbers(made[1])
     for band, equal in found.equal_r.items():
         assert shown[f"r with as much BB at l = 80, {band} GHz"].ours == f"{equal['l = 80']:.3g}"
@@ -95,7 +95,8 @@ def test_without_bands_of_the_paper(data_dir, monkeypatch, tmp_path):
     settings = load(EXAMPLE)
     how = settings.compare.model_copy(update={"nsims": 30})
     settings = settings.model_copy(update={"compare": how})
-    items = {i.label: i for i in run(settings, tmp_path / "out", [str(n) for n in range(5, 13)])}
+    figures = make_figures(settings, tmp_path / "out", [str(n) for n in range(5, 13)])
+    items = {item.label: item for item in figures}
     assert items["Figure 7"].differs.startswith("Not made: None of the bands 30, 44, 70, 353")
     assert items["Figure 9"].differs.startswith("Not made: No band has a map of leakage")
     shown = numbers(items)
@@ -105,6 +106,6 @@ def test_without_bands_of_the_paper(data_dir, monkeypatch, tmp_path):
 
 
 def test_all_figures_have_a_step():
-    figures = [step.label for step in STEPS if step.label.startswith("Figure")]
+    figures = [label for label in STEPS if label.startswith("Figure")]
     assert figures == [f"Figure {n}" for n in range(1, 15)]
-    assert [step.label for step in STEPS].index("Table 1") == 13
+    assert list(STEPS).index("Table 1") == 13

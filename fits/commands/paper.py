@@ -1,27 +1,212 @@
-"""`jaxsky paper`, from settings to a page."""
+"""`jaxsky paper`: all figures and tables of the paper in order, and the page that shows them."""
 
-from collections.abc import Sequence
+import gc
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
+import jax
+from pydantic import TypeAdapter, ValidationError
+
+from fits.commands.page import Section, Table, write_page
 from fits.commands.run import PAGE, Command, Report, Run
-from fits.paper.run import run as make
+from fits.paper import figures_data, figures_model
+from fits.paper.items import Impossible, Item, described, picture_of
+from fits.paper.sources import Sources
+from fits.record import write_log
+from jaxsky.io import write_text
+from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import Experiment
+
+#: Figures that are made, kept so that a stopped run goes on.
+KEPT = "items.json"
+#: Label of the table that is collected from all items.
+NUMBERS = "Numbers of the text"
+PAPER = (
+    "Hervías-Caimapo, Bonaldi & Brown (2016), “A new model of the microwave polarized sky for CMB "
+    "experiments”"
+)
+#: From what is shared between figures and the file of the picture, which is written whole, to an
+#: item; raises `Impossible` where the settings do not allow the figure.
+Make = Callable[[Sources, Path], Item]
+#: In the order of the paper.
+STEPS: dict[str, Make] = {
+    "Figure 1": figures_model.figure_templates,
+    "Figure 2": figures_model.figure_spectra,
+    "Figure 3": figures_model.figure_indices,
+    "Figure 4": figures_model.figure_ame,
+    "Figure 5": figures_data.figure_scatter,
+    "Figure 6": figures_data.figure_maps,
+    "Figure 7": figures_data.figure_planck,
+    "Figure 8": figures_data.figure_wmap,
+    "Figure 9": figures_data.figure_leakage,
+    "Figure 10": figures_data.figure_patches,
+    "Figure 11": figures_data.figure_probability,
+    "Figure 12": figures_model.figure_b_modes,
+    "Figure 13": figures_model.figure_patch,
+    "Table 1": figures_model.table_core,
+    "Figure 14": figures_model.figure_randomised,
+}
+
+
+@dataclass(frozen=True)
+class Figures:
+    """The items in a folder, and the settings that they are of."""
+
+    settings: dict[str, Any]
+    items: list[Item]
+
+
+def labels_of(words: Iterable[str], known: Iterable[str] = STEPS) -> list[str]:
+    """Labels of items by number or label, in order; all without any.
+
+    Examples
+    --------
+    >>> labels_of(["2", "table 1"])
+    ['Figure 2', 'Table 1']
+    """
+    labels, wanted = {label.lower(): label for label in known}, set()
+    for word in words:
+        name = " ".join(word.lower().split())
+        name = f"figure {name}" if name.isdigit() else name
+        if name not in labels:
+            raise ValueError(
+                f"--only: there is no {word!r}; there are {', '.join(labels.values())}."
+            )
+        wanted.add(labels[name])
+    return [label for label in labels.values() if not wanted or label in wanted]
+
+
+def make_figures(
+    settings: Experiment,
+    out: Path,
+    only: Iterable[str] = (),
+    *,
+    overwrite: bool = False,
+    begin: Callable[[], None] = lambda: None,
+    progress: Progress = QUIET,
+    steps: Mapping[str, Make] = STEPS,
+) -> list[Item]:
+    """Make the figures and tables that are missing, and `index.html`, which shows all there are.
+
+    Parameters
+    ----------
+    settings : of the sky
+    out : folder of the results
+    only : numbers of figures or labels (`labels_of`); by default all
+    overwrite : make again what is wanted; what else is in the folder is kept if it is of these
+        settings, and removed when the first new figure is there if not
+    begin : called when nothing is wrong with what is wanted, before anything is written
+    progress : told of each item
+    steps : what makes each item, by label
+
+    Returns
+    -------
+    The items of the page, those that were there already among them.
+    """
+    started = time.perf_counter()
+    wanted = labels_of(only, steps)
+    mark = settings.model_dump(mode="json", exclude_none=True)
+    items, other = _kept(out, mark, overwrite)
+    begin()
+    out.mkdir(parents=True, exist_ok=True)
+    sources = Sources(settings)
+    todo = [label for label in wanted if overwrite or not _is_made(out, items.get(label))]
+    for done, label in enumerate(todo):
+        progress.step(label)
+        progress.advance(done, len(todo))
+        start, picture = time.perf_counter(), out / picture_of(label)
+        try:
+            item = steps[label](sources, picture)
+        except Impossible as reason:
+            item = Item(label, "not made", "", f"Not made: {reason}")
+        for name in other - {item.picture}:
+            (out / name).unlink(missing_ok=True)
+        other = set()
+        items[label] = replace(item, seconds=round(time.perf_counter() - start, 1))
+        kept = Figures(mark, list(items.values()))
+        write_text(out / KEPT, TypeAdapter(Figures).dump_json(kept, indent=2).decode())
+        _write_page(sources, out, [items[each] for each in steps if each in items])
+        # No two figures have programs in common, and what these hold adds up.
+        jax.clear_caches()
+        gc.collect()
+    shown = _write_page(sources, out, [items[each] for each in steps if each in items])
+    write_log(out / "log.json", settings, time.perf_counter() - started)
+    return shown
+
+
+def _kept(out: Path, settings: dict[str, Any], overwrite: bool) -> tuple[dict[str, Item], set[str]]:
+    """Items of these settings that are in a folder, and the pictures of items of others."""
+    path = out / KEPT
+    if not path.exists():
+        return {}, set()
+    try:
+        found = TypeAdapter(Figures).validate_json(path.read_bytes())
+    except ValidationError:
+        if overwrite:
+            return {}, set()
+        raise ValueError(f"{path}: is damaged; start again with --overwrite.") from None
+    if found.settings == settings:
+        return {item.label: item for item in found.items}, set()
+    if not overwrite:
+        raise ValueError(
+            f"{out}: holds figures of other settings; choose another --out, or start again with "
+            "--overwrite."
+        )
+    return {}, {item.picture for item in found.items if item.picture is not None}
+
+
+def _is_made(out: Path, item: Item | None) -> bool:
+    """True if an item could be made, and its picture is there."""
+    if item is None or (item.picture is None and item.table is None):
+        return False
+    return item.picture is None or (out / item.picture).is_file()
+
+
+def _write_page(sources: Sources, out: Path, items: list[Item]) -> list[Item]:
+    """Write the page of some items and the table of their numbers; returns all of these."""
+    rows = tuple(
+        (number.what, number.paper, number.ours, number.note, item.label)
+        for item in items
+        for number in item.numbers
+    )
+    if rows:
+        table = Table(("quantity", "paper", "here", "about it", "see"), rows)
+        items = [*items, described(NUMBERS, None, {}, table=table)]
+    seconds = sum(item.seconds or 0 for item in items)
+    write_page(
+        out / PAGE,
+        f"A model of the microwave polarized sky: {sources.settings.title}",
+        [sources.description, f"Figures and tables of {PAPER}, made again and numbered as there."],
+        [_section(item) for item in items],
+        f"Written by `jaxsky paper` in {seconds:.0f} s,",
+    )
+    return items
+
+
+def _section(item: Item) -> Section:
+    note = item.differs if item.label == NUMBERS else f"Differs from the paper: {item.differs}"
+    title = f"{item.label}: {item.title}"
+    return Section(title, item.caption, item.picture, item.table, note)
 
 
 def figures(only: Sequence[str]) -> Command:
-    """The command that makes some figures, or all; each sees to what is kept of it."""
+    """The command that makes some figures, or all."""
 
     def work(settings: Experiment, command: Run) -> Report:
-        items = make(
+        items = make_figures(
             settings,
             command.out,
             only,
-            resume=command.options.resume,
             overwrite=command.options.overwrite,
-            begin=command.begin,
+            # What is replaced is seen to figure by figure.
+            begin=lambda: command.steps.keep(command.log),
             progress=command.steps,
         )
         missing = [f"{i.label}: {i.differs}" for i in items if not (i.picture or i.table)]
         remark = f"{len(items)} figures and tables ({command.steps.seconds:.1f} s)."
         return Report("", (), missing, [command.out / PAGE], remark, page=False)
 
-    return Command("paper", work)
+    return Command("paper", work, (KEPT,))

@@ -1,24 +1,47 @@
 """What the figures are drawn from: templates, AME, maps of indices; each made once, when needed."""
 
 import dataclasses
-from collections.abc import Callable, Iterable
+import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import healpy
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.paper.indices import Index, drawn_index, held_index, read_index
-from fits.paper.item import Impossible
+from fits.common import common_maps
+from fits.comparison import Comparison, compare
+from fits.inputs import Inputs, inputs_of
+from fits.paper.items import TEXTS, Impossible, filled, listed
+from fits.regions import region_masks
 from jaxsky import AME, Dust, Synchrotron
 from jaxsky.galaxy import EmbeddedSky
-from jaxsky.inputs import Template, default_galaxy, embedded_galaxy, read, read_sky, uK_RJ_per
+from jaxsky.harmonics import expand, gaussian_beam, synthesis
+from jaxsky.inputs import (
+    Template,
+    default_galaxy,
+    embedded_galaxy,
+    parameter_map,
+    read,
+    read_sky,
+    uK_RJ_per,
+)
+from jaxsky.io import InputError
 from jaxsky.keys import realisation_key, stream
-from jaxsky.settings import ComponentTable, Experiment, IndexFile, SettingsError, SmallScalesTable
+from jaxsky.presets import from_pysm_beta
+from jaxsky.settings import (
+    ComponentTable,
+    Experiment,
+    IndexFile,
+    SettingsError,
+    SmallScalesTable,
+    find_file,
+)
 from jaxsky.small_scales import Continued, SmallScales, continue_templates
-from jaxsky.templates import dust_index, polarization_template
+from jaxsky.templates import dust_index, polarization_template, steepening
 
 #: Beams of the paper's templates [arcmin].
 PAPER_FWHM = {"dust": 10.0, "synchrotron": 60.0}
@@ -29,15 +52,21 @@ NU_AME, AME_FWHM, NSIDE = 23.0, 60.0, 64
 KNOWN = 15 / 8
 #: A map resolves beams of 1.5 pixels, and of 1.45 still well.
 PIXELS = 1.45
+#: Resolution of the paper's maps of indices [arcmin], and by how much that of its synchrotron is
+#: made steeper.
+FWHM = {"beta_dust": 180.0, "beta_syn": 600.0}
+STEEPENING = 0.13
+#: Names as they are shown.
+SYMBOLS = {"beta_dust": "β_dust", "beta_syn": "β_syn"}
+#: What a map has that is drawn: the paper's mean; its scatter, of which the paper gives that of
+#: the synchrotron only; and the exponent of its spectrum.
+MEAN = {"beta_dust": 1.53, "beta_syn": 2.9}
+SCATTER = {"beta_dust": 0.04, "beta_syn": 0.1}
+SLOPE = -2.0
 
-#: What the embedded sky is.
-MODEL = (
-    "The sky is a model of the Galaxy, not data: emission is integrated along the line of sight "
-    "through a spiral magnetic field with Gaussian turbulence, and scaled to the polarized rms of "
-    "the real sky."
-)
+WORDS = TEXTS["sky"]
 
-T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 class Layer(NamedTuple):
@@ -47,14 +76,12 @@ class Layer(NamedTuple):
     ----------
     component : template and law
     fwhm : beam of the template [arcmin]
-    small : how it is continued to small scales
-    clipped : if the ranges of the fits had to be moved to lower multipoles
+    small_scales : how it is continued
     """
 
     component: Dust | Synchrotron
     fwhm: float
-    small: SmallScales
-    clipped: bool
+    small_scales: SmallScales
 
     @property
     def maps(self) -> Float[Array, "2 pix"]:
@@ -84,6 +111,36 @@ class Ame(NamedTuple):
     origin: str
 
 
+class Index(NamedTuple):
+    """A map of a spectral index.
+
+    Parameters
+    ----------
+    values : the index, T ~ nu^-beta_syn for the synchrotron
+    fwhm : resolution [arcmin]
+    steepening : by how much it was made steeper; None if it is what was drawn
+    origin : where it is from, to be part of a sentence
+    """
+
+    values: Float[Array, " pix"]
+    fwhm: float
+    steepening: float | None
+    origin: str
+
+
+def once(method: F) -> F:
+    """A method of `Sources` whose results are made at the first call and kept."""
+
+    @functools.wraps(method)
+    def kept(self: "Sources", *names: str) -> Any:
+        key = (method.__name__, *names)
+        if key not in self._made:
+            self._made[key] = method(self, *names)
+        return self._made[key]
+
+    return kept  # type: ignore[return-value]
+
+
 class Sources:
     """What is shared by the figures of one set of settings.
 
@@ -96,13 +153,7 @@ class Sources:
         self.settings = settings
         self.folder = Path(settings.data_dir)
         self.key = realisation_key(settings.seed)
-        self._made: dict[str, Any] = {}
-
-    def once(self, name: str, make: Callable[[], T]) -> T:
-        """What `make` returns, made at the first call with this name and kept."""
-        if name not in self._made:
-            self._made[name] = make()
-        return self._made[name]
+        self._made: dict[tuple[str, ...], Any] = {}
 
     @property
     def embedded(self) -> bool:
@@ -122,32 +173,46 @@ class Sources:
     def description(self) -> str:
         """What the sky is, in a sentence."""
         if self.embedded:
-            return MODEL
+            return filled(WORDS["model"])
         tables = self.settings.sky.components.items()
-        files = ", ".join(f"{name} {one.label}" for name, one in tables if one.file is not None)
-        return f"Templates from files: {files}."
+        files = [f"{name} {one.label}" for name, one in tables if one.file is not None]
+        return filled(WORDS["files"], files=", ".join(files))
 
     @property
     def sky_differs(self) -> str:
         """The part of a line that says what the sky is, for an item that shows it."""
-        if self.embedded:
-            assert self.settings.sky.embedded is not None
-            return (
-                "No maps are given: the sky is the embedded model of the Galaxy at nside "
-                f"{self.settings.sky.embedded.nside} rather than Planck's Commander maps."
-            )
-        files = (
+        embedded = self.settings.sky.embedded
+        if self.embedded and embedded is not None:
+            return filled(WORDS["differs"]["model"], nside=embedded.nside)
+        files = [
             f"{law} from {self._spec(law)[1].label} (nside {self.template(law).nside})"
             for law in PAPER_FWHM
-        )
-        return f"The templates are those that are given: {listed(files)}."
+        ]
+        return filled(WORDS["differs"]["files"], files=listed(files))
 
     @property
+    def maps_differ(self) -> str:
+        """The same for an item that shows observed maps."""
+        return filled(WORDS["differs"]["simulated"]) if self.simulated else self.sky_differs
+
+    @once
     def galaxy(self) -> EmbeddedSky:
         """The embedded model; where templates come from files, at low resolution."""
         if self.settings.sky.embedded is not None:
-            return self.once("galaxy", lambda: embedded_galaxy(self.settings))
-        return self.once("galaxy", lambda: default_galaxy(NSIDE))
+            return embedded_galaxy(self.settings)
+        return default_galaxy(NSIDE)
+
+    @once
+    def inputs(self) -> Inputs:
+        """Templates and maps of the bands."""
+        return inputs_of(self.settings, galaxy=self.galaxy() if self.embedded else None)
+
+    @once
+    def comparison(self) -> Comparison:
+        """The maps against the model, at the common resolution."""
+        common, regions = self.settings.common, self.settings.compare.regions
+        prepared = common_maps(self.inputs(), common.nside, common.fwhm)
+        return compare(self.settings, prepared, region_masks(self.settings, regions))
 
     def _spec(self, law: str) -> tuple[str, ComponentTable]:
         found = [(n, spec) for n, spec in self.settings.sky.components.items() if spec.law == law]
@@ -157,18 +222,20 @@ class Sources:
             )
         return found[0]
 
+    @once
     def _templates(self) -> dict[str, Template]:
         names = {law: self._spec(law)[0] for law in PAPER_FWHM}
-        galaxy = None if self.settings.sky.embedded is None else self.galaxy
+        galaxy = None if self.settings.sky.embedded is None else self.galaxy()
         templates, _ = read_sky(self.settings, names=list(names.values()), galaxy=galaxy)
         return {law: templates[name] for law, name in names.items()}
 
+    @once
     def template(self, name: str) -> Layer:
-        """The dust or the synchrotron."""
-        return self.once(name, lambda: self._layer(name))
+        """The dust or the synchrotron at the resolution of the paper's, as far as its map has it.
 
-    def _layer(self, name: str) -> Layer:
-        own = self.once("templates", self._templates)[name]
+        Ranges of power laws that are beyond the multipoles of the map keep their ratio of ends.
+        """
+        own = self._templates()[name]
         if missing := int(np.sum(~own.used)):
             raise SettingsError(
                 f"sky.{name}: {missing} pixels have no value; the figures of the paper take "
@@ -177,11 +244,23 @@ class Sources:
         fwhm = max(own.fwhm, PAPER_FWHM[name])
         nside = healpy.npix2nside(own.used.size)
         maps = polarization_template(own.component.template, own.fwhm, fwhm, nside)
-        table: SmallScalesTable = getattr(self.settings.paper, name)
-        small, clipped = _small_scales(table, nside)
+        numbers = self.small_scales_table(name).model_dump(exclude={"correlated_with"})
+        last = int(KNOWN * nside)
+        for kind in ("EE", "BB"):
+            first, end = numbers[kind]
+            if end > last:
+                numbers[kind] = max(2, round(first * last / end)), last
+        try:
+            small = SmallScales(**numbers)
+        except ValueError as error:
+            raise SettingsError(f"paper: {error}") from None
         assert isinstance(own.component, Dust | Synchrotron)  # by its law
-        component = dataclasses.replace(own.component, amplitude=maps)
-        return Layer(component, fwhm, small, clipped)
+        return Layer(dataclasses.replace(own.component, amplitude=maps), fwhm, small)
+
+    def small_scales_table(self, name: str) -> SmallScalesTable:
+        """What the settings say of the small scales of a template."""
+        table: SmallScalesTable = getattr(self.settings.paper, name)
+        return table
 
     @property
     def nside_fine(self) -> int:
@@ -191,30 +270,24 @@ class Sources:
             nside *= 2
         return nside
 
+    def with_small_scales(self, layer: Layer, key: Array) -> Continued:
+        """A template with its small scales drawn with a key."""
+        return continue_templates(
+            key, [layer.maps], [layer.fwhm], [layer.small_scales], self.nside_fine
+        )
+
+    @once
+    def continued(self, name: str) -> Continued:
+        """The dust or the synchrotron with small scales, the same in all figures."""
+        return self.with_small_scales(self.template(name), self.small_scales_key(name))
+
     def small_scales_key(self, name: str) -> Array:
-        """The key of the small scales of a template, the same in all figures."""
+        """The key of these."""
         return stream(self.key, "small scales", name)
 
-    def continued(self, name: str) -> Continued:
-        """The dust or the synchrotron with small scales."""
-
-        def make() -> Continued:
-            layer = self.template(name)
-            return continue_templates(
-                self.small_scales_key(name),
-                [layer.maps],
-                [layer.fwhm],
-                [layer.small],
-                self.nside_fine,
-            )
-
-        return self.once(f"continued {name}", make)
-
+    @once
     def ame(self) -> Ame:
         """AME at 1 degree, 1 % polarized along the dust."""
-        return self.once("ame", self._ame)
-
-    def _ame(self) -> Ame:
         dust, spec = self.template("dust"), self.settings.paper.ame
         nu_ref, own = NU_AME, 0.0
         if spec is not None:
@@ -231,7 +304,7 @@ class Sources:
             origin = f"the intensity of AME is {spec.label}"
             origin += f", from {nu_ref:g} to 23 GHz by the paper's law" * (nu_ref != NU_AME)
         else:
-            intensity = self.galaxy.dust[0] / 2
+            intensity = self.galaxy().dust[0] / 2
             origin = (
                 "there is no intensity of AME, and half of that of the embedded model's dust at "
                 "353 GHz takes its place"
@@ -248,46 +321,59 @@ class Sources:
         ame = AME.from_dust_angles(intensity, polarized, nu_ref=nu_ref)
         return Ame(ame.template * ame.sed(NU_AME), polarized, resolution, origin)
 
+    @once
     def index(self, name: str) -> Index:
-        """The map of beta_dust or beta_syn."""
-        return self.once(name, lambda: self._index(name))
-
-    def _index(self, name: str) -> Index:
+        """The map of beta_dust or beta_syn: of a file, of the template, or drawn."""
         layer = self.template("dust" if name == "beta_dust" else "synchrotron")
         held = getattr(layer.component, name)
         spec: IndexFile | None = getattr(self.settings.paper, name)
         if spec is not None:
-            return read_index(self.folder, name, spec)
+            return _read_index(self.folder, name, spec)
         if not isinstance(held, tuple) and held.ndim == 1:
-            return held_index(name, held)
-        return drawn_index(stream(self.key, "index", name), name, min(NSIDE, layer.nside))
+            smooth = dust_index(held, 0.0, FWHM[name], layer.nside)
+            return Index(smooth, FWHM[name], 0.0, f"{SYMBOLS[name]} is that of the template")
+        return _drawn_index(stream(self.key, "index", name), name, min(NSIDE, layer.nside))
 
 
-def _small_scales(table: SmallScalesTable, nside: int) -> tuple[SmallScales, bool]:
-    """How a template is continued; ranges beyond its multipoles keep their ratio of ends."""
-    last = int(KNOWN * nside)
+def _drawn_index(key: Array, name: str, nside: int) -> Index:
+    """A Gaussian field with the mean and the scatter of the paper's map."""
+    lmax, fwhm = 2 * nside, FWHM[name]
+    ell = jnp.arange(lmax + 1)
+    root = jnp.where(ell < 1, 0.0, jnp.maximum(ell, 1) ** (SLOPE / 2))
+    white = jax.random.normal(key, (1, (lmax + 1) ** 2))
+    field = synthesis(white * expand(root * gaussian_beam(fwhm, lmax)), nside)[0]
+    values = MEAN[name] + SCATTER[name] * (field - field.mean()) / field.std()
+    origin = (
+        f"{SYMBOLS[name]} is a Gaussian field of mean {MEAN[name]:g} and scatter {SCATTER[name]:g}"
+    )
+    return Index(values, fwhm, None, origin)
 
-    def clip(ends: tuple[int, int]) -> tuple[int, int]:
-        if ends[1] <= last:
-            return ends
-        return max(2, round(ends[0] * last / ends[1])), last
 
-    numbers = table.model_dump(exclude={"correlated_with"})
-    ranges = {kind: clip(numbers[kind]) for kind in ("EE", "BB")}
-    clipped = any(ranges[kind] != tuple(numbers[kind]) for kind in ranges)
+def _read_index(folder: Path, name: str, spec: IndexFile) -> Index:
+    """The index of a file, smoothed; that of the synchrotron made steeper, if so wished."""
+    pure = spec if spec.unit is not None else spec.model_copy(update={"unit": ""})
+    where, found = f"paper.{name}", read(folder, pure, stokes="", zeros_are_data=True)
+    origin, fwhm, by = f"{SYMBOLS[name]} is that of {spec.label}", max(FWHM[name], spec.fwhm), 0.0
+    if name == "beta_syn" and bool(np.all(found.maps[:, found.mask] < 0)):
+        found = dataclasses.replace(found, maps=np.asarray(from_pysm_beta(found.maps)))
+        origin = f"{origin} with the other sign"
+    stated = spec.missing is not None
+    values, used = parameter_map(found, name, found.nside, where, stated=stated)
+    smooth = dust_index(values, spec.fwhm, fwhm, found.nside, None if used.all() else used)
+    if name == "beta_syn":
+        given = spec.steepening
+        by = _of_spectrum(folder, given) if isinstance(given, str) else given
+        origin += f", made steeper by {by:.2f}" if by else ", not made steeper"
+    return Index(smooth + by, fwhm, by, origin)
+
+
+def _of_spectrum(folder: Path, file: str) -> float:
+    """By how much a spectrum in a file steepens."""
     try:
-        return SmallScales(**numbers | ranges), clipped
-    except ValueError as error:
-        raise SettingsError(f"paper: {error}") from None
-
-
-def listed(words: Iterable[str]) -> str:
-    """Words as a list in a sentence.
-
-    Examples
-    --------
-    >>> listed(["a", "b", "c"])
-    'a, b and c'
-    """
-    first = list(words)
-    return " and ".join(filter(None, (", ".join(first[:-1]), *first[-1:])))
+        path = find_file(folder, file)
+        nu, temperature = np.loadtxt(path, unpack=True, usecols=(0, 1))
+        return float(steepening(nu, temperature))
+    except InputError as error:
+        raise SettingsError(f"paper.beta_syn.steepening: {error}") from None
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"paper.beta_syn.steepening: {path}: {error}") from None

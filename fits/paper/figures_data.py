@@ -1,0 +1,228 @@
+"""Figures of the model against observed maps: pixels, maps, spectra, patches, spectral indices."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fits.commands import compare_pictures as pictures
+from fits.common import common_maps
+from fits.comparison import Comparison
+from fits.paper.items import TEXTS, Impossible, Item, Number, described, filled, listed
+from fits.paper.sources import Sources
+from fits.patch_comparison import compare_patches, template_patches
+from fits.posterior_plots import plot_grids
+from fits.record import probability, with_error
+from fits.regions import region_masks, region_words
+from fits.report import known_truth, with_errors
+from fits.spectral_index import run
+from jaxsky.settings import SettingsError
+
+PLANCK, WMAP = ("30", "44", "70", "353"), ("K", "Ka", "Q", "V", "W")
+#: Bands of the paper's figures 5 and 6, and 11.
+SHOWN, FITTED = ("30", "44", "70", "353", "K", "W"), ("44", "70")
+
+
+def _chosen(comparison: Comparison) -> list[str]:
+    """The bands of the paper; all that there are if one of those is missing."""
+    bands = list(comparison.prepared.bands)
+    return list(SHOWN) if set(SHOWN) <= set(bands) else bands
+
+
+def _beam(sources: Sources) -> str:
+    fwhm = sources.settings.common.fwhm
+    return f"smoothed to {fwhm:g} arcmin" if fwhm else "averaged, not smoothed"
+
+
+def _here(
+    sources: Sources, nside: str, bands: Sequence[str], wanted: Sequence[str], *more: str
+) -> str:
+    """What of the comparison is not as in the paper, in a sentence; or nothing."""
+    found = [nside] if nside else []
+    if set(wanted) - set(bands):
+        found.append(f"the bands are {listed(bands)}")
+    if sources.settings.common.fwhm != 60:
+        found.append(f"maps are {_beam(sources)} (the paper: to 60 arcmin)")
+    found += more
+    return f"Here, {listed(found)}." if found else ""
+
+
+def _pixels_here(sources: Sources, bands: Sequence[str]) -> str:
+    nside = sources.settings.common.nside
+    return _here(sources, f"nside is {nside} rather than 64" * (nside != 64), bands, SHOWN)
+
+
+def figure_scatter(sources: Sources, picture: Path) -> Item:
+    """Figure 5: observed against modelled pixels along the plane."""
+    settings, found = sources.settings, sources.comparison()
+    bands = _chosen(found)
+    region = "strip" if "strip" in found.regions else next(iter(found.regions))
+    pictures.plot_scatter(picture, found, region, bands, settings.title)
+    numbers = []
+    for band in bands:
+        scatter = found.scatter(band, region, "QU")
+        slope = with_error(scatter.slope, scatter.error)
+        note = f"r = {scatter.correlation:.3f}, PTE {scatter.pte_text}"
+        numbers.append(Number(f"slope, {band}, Q and U", slope, note))
+    words = {
+        "nside": settings.common.nside,
+        "region": region_words(settings, region),
+        "beam": _beam(sources),
+        "maps": sources.maps_differ,
+        "here": _pixels_here(sources, bands),
+    }
+    return described("Figure 5", picture, words, numbers)
+
+
+def figure_maps(sources: Sources, picture: Path) -> Item:
+    """Figure 6: observed maps next to the model."""
+    settings, found = sources.settings, sources.comparison()
+    nside = min(settings.compare.panel_nside, settings.common.nside)
+    pictures.plot_model_maps(picture, found, "QU", _chosen(found), nside, settings.title)
+    here = _pixels_here(sources, list(found.prepared.bands))
+    words = {"nside": nside, "maps": sources.maps_differ, "here": here}
+    return described("Figure 6", picture, words)
+
+
+def figure_planck(sources: Sources, picture: Path) -> Item:
+    """Figure 7: spectra of the Planck bands."""
+    return _spectra(sources, picture, "Figure 7", "Planck", PLANCK, "70")
+
+
+def figure_wmap(sources: Sources, picture: Path) -> Item:
+    """Figure 8: spectra of the WMAP bands."""
+    return _spectra(sources, picture, "Figure 8", "WMAP", WMAP, "V")
+
+
+def _spectra(
+    sources: Sources,
+    picture: Path,
+    label: str,
+    experiment: str,
+    wanted: Sequence[str],
+    largest: str,
+) -> Item:
+    """Spectra of the wanted bands; of the `largest` the paper gives the largest error."""
+    settings, found = sources.settings, sources.comparison()
+    spectra = [s for s in found.spectra if s.band in wanted]
+    if not found.spectra:
+        raise Impossible("Spectra of the full sky take maps without missing pixels.")
+    if not spectra:
+        raise Impossible(f"None of the bands {', '.join(wanted)} is there.")
+    pictures.plot_full_sky(picture, spectra, settings.title)
+    numbers = []
+    for s in spectra:
+        EE, BB = (probability(p) for p in s.pte)
+        numbers.append(Number(f"PTE of the spectra, {s.band}", f"EE {EE}, BB {BB}"))
+    for s in spectra:
+        if s.band == largest:
+            EE, BB = (f"{100 * error:.0f} %" for error in s.largest_error)
+            what = f"largest error of a spectrum, {s.band}"
+            numbers.append(Number(what, f"EE {EE}, BB {BB}"))
+    nside, lmax, r = settings.common.nside, settings.compare.lmax, settings.cmb.r
+    more = [f"they end at l = {lmax} rather than 100"] if lmax != 100 else []
+    if not settings.cmb.include:
+        more.append("there is no CMB")
+    elif r != 0.1:
+        more.append(f"r is {r:g} rather than 0.1")
+    first = f"the spectra are of maps of nside {nside} rather than 256"
+    words = {
+        "experiment": experiment,
+        "lmax": lmax,
+        "nsims": settings.compare.nsims,
+        "maps": sources.maps_differ,
+        "here": _here(sources, first, [s.band for s in spectra], wanted, *more),
+    }
+    return described(label, picture, words, numbers, texts="Figures 7 and 8")
+
+
+def figure_leakage(sources: Sources, picture: Path) -> Item:
+    """Figure 9: BB at 70 GHz before and after leakage is subtracted."""
+    settings, texts, numbers = sources.settings, TEXTS["Figure 9"], []
+    leaky = [s for s in sources.comparison().spectra if s.uncorrected is not None]
+    if not leaky:
+        raise Impossible("No band has a map of leakage to subtract.")
+    pictures.plot_leakage(picture, leaky, settings.title)
+    for s in leaky:
+        if s.pte_uncorrected is not None:
+            before, after = probability(s.pte_uncorrected[1]), probability(s.pte[1])
+            numbers.append(Number(f"PTE of BB, {s.band}", f"before {before}, after {after}"))
+    leakage = sources.sky_differs
+    if sources.simulated:
+        fractions = listed(
+            filled(texts["fraction"], percent=100 * fraction, name=name)
+            for name, fraction in settings.simulate.leakage.items()
+        )
+        leakage = filled(texts["simulated"], fractions=fractions)
+    return described("Figure 9", picture, {"leakage": leakage}, numbers)
+
+
+def figure_patches(sources: Sources, picture: Path) -> Item:
+    """Figure 10: power laws on small patches."""
+    settings, numbers = sources.settings, []
+    if settings.compare.patches is None:
+        return _template_patches(sources, picture)
+    found = compare_patches(settings, sources.inputs())
+    pictures.plot_patches(picture, found, settings.title)
+    for i, name in enumerate(("EE", "BB")):
+        A, alpha = found.correlation(i)
+        ratio, difference = with_error(*found.ratio(i)), with_error(*found.slope_difference(i))
+        numbers += [
+            Number(f"A observed / model, {name}", ratio, f"correlation {A:.2f}"),
+            Number(f"alpha observed - model, {name}", difference, f"correlation {alpha:.2f}"),
+        ]
+    words = {"band": found.band, "maps": sources.maps_differ}
+    return described("Figure 10", picture, words, numbers)
+
+
+def _template_patches(sources: Sources, picture: Path) -> Item:
+    """Figure 10 without a band to compare with: BB against EE of the dust."""
+    dust = sources.template("dust")
+    found = template_patches(dust.maps, dust.fwhm)
+    pictures.plot_template_patches(picture, found, sources.settings.title)
+    both = found.detected.all(axis=1)
+    slopes = ", ".join(f"{slope:.2f}" for slope in np.median(found.alpha[both], axis=0))
+    ratio = np.median(found.A[both, 1] / found.A[both, 0])
+    numbers = [
+        Number("median A of BB / EE", f"{ratio:.2f}"),
+        Number("median alpha, EE, BB", slopes),
+    ]
+    words = {"sky": sources.sky_differs}
+    return described("Figure 10", picture, words, numbers, texts="Figure 10 of the template")
+
+
+def figure_probability(sources: Sources, picture: Path) -> Item:
+    """Figure 11: the probability of beta_dust and beta_syn on a grid, from Q and from U."""
+    settings, inputs, common = sources.settings, sources.inputs(), sources.settings.common
+    bands = {name: inputs.bands[name] for name in FITTED if name in inputs.bands} or inputs.bands
+    if len(settings.free_in("fit")) != 2:
+        raise Impossible("A grid takes two free parameters, in the table `free`.")
+    spec = settings.fit.model_copy(
+        update={"methods": ["grid"], "stokes": ["Q", "U", "QU"], "regions": ["strip", "full"]}
+    )
+    chosen = settings.model_copy(update={"fit": spec})
+    prepared = common_maps(inputs._replace(bands=bands), common.nside, common.fwhm)
+    try:
+        fits = run(chosen, prepared, region_masks(chosen, spec.regions))
+    except SettingsError as error:
+        raise Impossible(str(error)) from None
+    plot_grids(picture, fits, known_truth(inputs, fits), settings.title)
+    numbers, truth = [], inputs.truth or {}
+    for fit in fits:
+        result = fit.results["grid"]
+        numbers += [
+            Number(
+                f"{name}, {fit.region}, Q and U",
+                with_errors(result.best_fit[name], *result.interval_68[name]),
+                f"truth {truth[name]:g}" if name in truth else "",
+            )
+            for name in result.free
+            if fit.stokes == "QU"
+        ]
+    simulated = TEXTS["Figure 11"]["simulated"]
+    words = {
+        "bands": listed(bands),
+        "region": region_words(settings, "strip"),
+        "maps": simulated if sources.simulated else sources.sky_differs,
+    }
+    return described("Figure 11", picture, words, numbers)

@@ -1,0 +1,378 @@
+"""Figures of the model: templates, indices, AME, small scales, B modes, and a sky seen by COrE."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+import healpy
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from fits.b_modes import PIVOT
+from fits.commands.forecast import forecast
+from fits.commands.forecast_pictures import plot_b_modes
+from fits.commands.page import Table
+from fits.paper.items import TEXTS, Impossible, Item, Number, described, filled, listed
+from fits.paper.sources import NSIDE, PAPER_FWHM, SYMBOLS, Index, Sources
+from fits.plots import (
+    COLORS,
+    COLUMN,
+    UNITS,
+    MapPanel,
+    color_limit,
+    draw_panels,
+    draw_patch,
+    draw_spectra,
+    plot_maps,
+    with_powers,
+)
+from fits.pseudo_cl import sky_fraction
+from fits.record import with_error
+from fits.regions import region_words
+from jaxsky.experiment import cmb_spectra
+from jaxsky.harmonics import analysis, expand, gaussian_beam, lmax_of, power_spectrum, synthesis
+from jaxsky.instrument import band_tables, load_instrument
+from jaxsky.interpolation import term_weights
+from jaxsky.io import InputError
+from jaxsky.keys import stream
+from jaxsky.observation import Observation, ObservedBand, Prepared, Source, plan, prepare
+from jaxsky.presets import preset
+from jaxsky.settings import BandTable, Experiment
+from jaxsky.simulation import observe_bands
+from jaxsky.small_scales import DUST, SYNCHROTRON
+from jaxsky.templates import coarse_pixels, correlation, polarization_template, steepening
+
+NAMES = ("synchrotron", "dust")
+#: Blocks of the honest jackknife: pixels of 15 degrees.
+NSIDE_BLOCKS = 4
+#: The paper's ranges of the fits of power laws.
+RANGES = {"synchrotron": SYNCHROTRON, "dust": DUST}
+#: By how much the steeper spectrum is steeper; the paper does not say.
+TILT = -1.0
+#: Sizes of the patches of figures 13 and 14 [deg].
+SIZE_CORE, SIZE = 30.0, 5.0
+#: The paper's bands of COrE [GHz].
+BANDS = ("45", "105", "315")
+#: Resolution of the embedded model in a forecast, and the largest multipole.
+NSIDE_FORECAST, LMAX = 128, 250
+
+
+def figure_templates(sources: Sources, picture: Path) -> Item:
+    """Figure 1: Q of both templates."""
+    rows, beams = [], {}
+    for name in ("dust", "synchrotron"):
+        layer = sources.template(name)
+        beams[name] = layer.fwhm
+        title = f"{name}, $Q$, {float(layer.component.nu_ref):g} GHz"
+        Q = np.asarray(layer.maps[0])
+        rows.append([MapPanel(title, Q, color_limit(Q), UNITS["uK_RJ"])])
+    plot_maps(picture, rows)
+    return described("Figure 1", picture, beams | {"sky": sources.sky_differs})
+
+
+def figure_indices(sources: Sources, picture: Path) -> Item:
+    """Figure 3: maps of both spectral indices."""
+    rows, origins, numbers = [], [], []
+    for name, word, symbol in (("beta_dust", "dust", "d"), ("beta_syn", "synchrotron", "s")):
+        index = sources.index(name)
+        values = np.asarray(index.values)
+        mean, spread = float(values.mean()), float(values.std())
+        middle, title = round(mean, 2), f"{word}, {index.fwhm / 60:g}° beam"
+        limit, label = color_limit(values - middle), rf"$\beta_{{\rm {symbol}}}$"
+        rows.append([MapPanel(title, values, limit, label, middle)])
+        origins.append(index.origin)
+        note = "by construction" if index.steepening is None else ""
+        numbers += [
+            Number(f"mean of {SYMBOLS[name]}", f"{mean:.3f}", note),
+            Number(f"scatter of {SYMBOLS[name]}", f"{spread:.3f}", note),
+        ]
+    numbers.append(_steepening(sources.index("beta_syn")))
+    plot_maps(picture, rows)
+    return described("Figure 3", picture, {"origins": " and ".join(origins)}, numbers)
+
+
+def _steepening(index: Index) -> Number:
+    """How much steeper the index was made, and what a published curved law would say."""
+    curved, text = preset("s3", np.zeros((2, 12)), beta_syn=3.0), TEXTS["Figure 3"]
+    nu = jnp.geomspace(0.4, 40.0, 200)
+    said = filled(text["steepening"], curved=float(steepening(nu, curved.sed(nu))))
+    return Number(
+        "steepening of β_syn from 0.49 ... 2.12 to 20 ... 30 GHz",
+        f"{index.steepening:.2f}" if index.steepening else "none",
+        (text["drawn"] if index.steepening is None else "") + said,
+    )
+
+
+def figure_ame(sources: Sources, picture: Path) -> Item:
+    """Figure 4: Q of AME, and Pearson's correlation with the dust, with jackknife errors."""
+    ame = sources.ame()
+    Q = np.asarray(ame.maps[0])
+    title = "AME, $Q$, 23 GHz, 1 % polarized"
+    plot_maps(picture, [[MapPanel(title, Q, color_limit(Q), UNITS["uK_RJ"])]])
+    own = healpy.npix2nside(Q.size)
+    nside = min(NSIDE, own)
+    maps = [
+        each if nside == own else polarization_template(each, 0.0, 0.0, nside)
+        for each in (ame.dust, ame.maps)
+    ]
+    blocks, numbers = coarse_pixels(nside, NSIDE_BLOCKS), []
+    for stokes, x, y in zip("QU", *maps, strict=True):
+        r, error = correlation(x, y)
+        wide = correlation(x, y, blocks).error
+        note = f"jackknife over pixels of nside {nside}; over blocks of 15° the error is "
+        numbers.append(
+            Number(
+                f"correlation of dust and AME, {stokes}",
+                with_error(float(r), float(error)),
+                f"{note}{float(wide):.2g}",
+            )
+        )
+    words = {
+        "sky": sources.sky_differs,
+        "origin": ame.origin[:1].upper() + ame.origin[1:],
+        "resolution": ame.resolution,
+    }
+    return described("Figure 4", picture, words, numbers)
+
+
+def figure_spectra(sources: Sources, picture: Path) -> Item:
+    """Figure 2: EE of both templates, of what continues them, and of both together."""
+    fwhm, numbers = sources.settings.paper.fwhm, []
+    with draw_panels(picture, "", (COLUMN, 5.2), 2, sharex=True) as panels:
+        for axes, name in zip(panels[:, 0], NAMES, strict=True):
+            layer, continued = sources.template(name), sources.continued(name)
+            (alm,), (part,), small = continued.alms, continued.parts, layer.small_scales
+            (start, join), lmax = small.EE, lmax_of(alm)
+            original = analysis(layer.maps, part.measured.shape[-1] - 1)
+            law = np.where(np.arange(lmax + 1) < start, np.nan, part.target[0])
+            final = np.asarray(power_spectrum(alm[:1])[0] * gaussian_beam(fwhm, lmax) ** 2)
+            for label, spectrum, color, lw, ls in (
+                (f"with small scales, {fwhm:g}'", final, COLORS[1], 0.9, "-"),
+                (f"template, {layer.fwhm:g}'", power_spectrum(original)[0], COLORS[2], 1.8, "-"),
+                ("power law, no beam", law, COLORS[0], 1.4, "--"),
+            ):
+                draw_spectra(axes, {label: spectrum}, "uK_RJ", color=color, lw=lw, ls=ls)
+            axes.axvline(join, color="0.4", ls=":", lw=1)
+            shown = with_powers(final)[1]
+            axes.set_ylim(shown[-1] * 1e-2, shown.max() * 2)
+            axes.set_title(f"{name} $EE$, {float(layer.component.nu_ref):g} GHz")
+            axes.legend(frameon=False, loc="lower left", handlelength=1.4)
+            for i, kind in enumerate(("EE", "BB")):
+                slope, error = part.laws[i].slope, jnp.sqrt(part.laws[i].covariance[1, 1])
+                used, paper = getattr(small, kind), getattr(RANGES[name], kind)
+                note = f"l = {used[0]} to {used[1]}"
+                note += "" if used == paper else f"; the paper: {paper[0]} to {paper[1]}"
+                ours = with_error(float(slope), float(error))
+                numbers.append(Number(f"slope of {name} {kind}", ours, note))
+        panels[0, 0].set_xlabel("")
+    words = {"fwhm": fwhm, "sky": sources.sky_differs, "ranges": _ranges(sources)}
+    return described("Figure 2", picture, words, numbers)
+
+
+def _ranges(sources: Sources) -> str:
+    """What is to be said about the ranges of the fits."""
+    texts = TEXTS["Figure 2"]["ranges"]
+    used, wanted = (
+        [(tuple(one.EE), tuple(one.BB)) for one in each]
+        for each in (
+            [sources.template(name).small_scales for name in NAMES],
+            [sources.small_scales_table(name) for name in NAMES],
+        )
+    )
+    if used != wanted:
+        ends = sorted({sources.template(name).nside for name in NAMES})
+        return filled(texts["clipped"], ends=listed(f"l = {2 * n}" for n in ends))
+    if used == [(RANGES[name].EE, RANGES[name].BB) for name in NAMES]:
+        return filled(texts["paper"])
+    return filled(texts["model" if sources.embedded else "other"])
+
+
+def _disc(
+    values: Float[np.ndarray, " pix"], center: tuple[float, float], size: float
+) -> Float[np.ndarray, " inside"]:
+    """The pixels in a disc about (l, b), `size` wide, all in degrees."""
+    nside, vector = healpy.npix2nside(values.size), healpy.ang2vec(*center, lonlat=True)
+    return values[healpy.query_disc(nside, vector, np.radians(size / 2))]
+
+
+def _draw_patches(
+    path: Path,
+    panels: Mapping[str, tuple[Float[np.ndarray, " pix"], float, str]],
+    center: tuple[float, float],
+    size: float,
+) -> None:
+    """Four square patches of the sky: title, map, limit of the colours and unit of each."""
+    with draw_panels(path, "", (5.4, 4.4), 2, 2) as grid:
+        for axes, (title, (values, limit, unit)) in zip(grid.flat, panels.items(), strict=True):
+            draw_patch(axes, values, center, size, limit, UNITS[unit])
+            axes.set_title(title)
+            axes.label_outer()
+
+
+def figure_randomised(sources: Sources, picture: Path) -> Item:
+    """Figure 14: a patch of the synchrotron, its small scales, and two others."""
+    layer, nside = sources.template("synchrotron"), sources.nside_fine
+    fwhm, center = sources.settings.paper.fwhm, sources.settings.paper.center
+    small = layer.small_scales
+    steeper = dataclasses.replace(small, tilt=small.tilt + TILT)
+    other = stream(sources.key, "other small scales", "synchrotron")
+    own = sources.small_scales_key("synchrotron")
+    drawn = {
+        f"with small scales, {fwhm:g}'": sources.continued("synchrotron"),
+        "another realisation": sources.with_small_scales(layer, other),
+        f"steeper by {-TILT:g}": sources.with_small_scales(
+            layer._replace(small_scales=steeper), own
+        ),
+    }
+    wide = polarization_template(layer.maps, layer.fwhm, layer.fwhm, nside)
+    panels = {f"template, {layer.fwhm / 60:.2g}°": np.asarray(wide[0])}
+    for title, continued in drawn.items():
+        (alm,) = continued.alms
+        beam = gaussian_beam(fwhm, lmax_of(alm))
+        panels[title] = np.asarray(synthesis(alm * expand(beam), nside)[0])
+    template, *rest = [_disc(values, center, SIZE) for values in panels.values()]
+    middle = float(template.mean())
+    limit = color_limit(rest[0] - middle, 0.995)
+    shifted = {title: (values - middle, limit, "uK_RJ") for title, values in panels.items()}
+    _draw_patches(picture, shifted, center, SIZE)
+    words = {
+        "size": SIZE,
+        "l": center[0],
+        "b": center[1],
+        "mean": middle,
+        "fwhm": fwhm,
+        "steeper": -TILT,
+        "rms": listed(f"{float((values - template).std()):.2f}" for values in rest),
+        "sky": sources.sky_differs,
+    }
+    return described("Figure 14", picture, words)
+
+
+def forecast_settings(sources: Sources) -> Experiment:
+    """Those of a forecast with COrE and the sky of the figures."""
+    settings, lmax = sources.settings, LMAX
+    sky = settings.sky
+    if sky.embedded is not None:
+        embedded = sky.embedded.model_copy(update={"nside": NSIDE_FORECAST})
+        sky = sky.model_copy(update={"embedded": embedded})
+    if not sources.embedded:
+        lmax = min(LMAX, 2 * min(sources.template(name).nside for name in NAMES) - 8)
+    fit = (20, min(200, lmax - 10))
+    spec = settings.forecast.model_copy(update={"bands": list(BANDS), "lmax": lmax, "fit": fit})
+    bands = [BandTable.model_validate(band) for band in band_tables("core")]
+    cmb = settings.cmb.model_copy(update={"include": True, "spectra": None})
+    changes = {"sky": sky, "bands": bands, "cmb": cmb, "free": {}, "forecast": spec}
+    return settings.model_copy(update=changes)
+
+
+def figure_b_modes(sources: Sources, picture: Path) -> Item:
+    """Figure 12: BB of the foregrounds in three bands of COrE, and of gravitational waves."""
+    try:
+        settings = forecast_settings(sources)
+        found = forecast(settings)
+    except InputError:
+        raise
+    except ValueError as reason:
+        raise Impossible(str(reason)) from None
+    plot_b_modes(picture, found, settings)
+    where, sky = f"l = {PIVOT}", sources.sky_differs
+    if sources.embedded:
+        sky = filled(TEXTS["Figure 12"]["model"], nside=NSIDE_FORECAST)
+    numbers = [
+        Number(f"r with as much BB at {where}, {name} GHz", f"{equal[where]:.3g}")
+        for name, equal in found.equal_r.items()
+    ]
+    words = {
+        "region": region_words(settings, settings.forecast.region),
+        "percent": 100 * sky_fraction(found.inputs.mask),
+        "sky": sky,
+    }
+    return described("Figure 12", picture, words, numbers)
+
+
+def core_observation(sources: Sources) -> Observation:
+    """Three of COrE's bands; beams are COrE's, or that of the small scales if it is wider."""
+    fwhm = sources.settings.paper.fwhm
+    channels = {
+        name: ObservedBand(one.band, max(float(one.beam), fwhm), noise=one.noise)
+        for name, one in load_instrument("core").select(BANDS).observed().items()
+    }
+    return Observation(channels, sources.nside_fine, finest=fwhm, precision="single")
+
+
+def prepared_templates(sources: Sources, observation: Observation) -> dict[str, Prepared]:
+    """Both foregrounds; where their laws are constant, with the small scales that there are."""
+    given = {name: Source(*sources.template(name)) for name in PAPER_FWHM}
+    terms = plan(given, observation)
+    constant = {name: one for name, one in terms.items() if one is not None and not one.counts}
+    if len(constant) < len(terms):
+        return prepare(sources.key, given, observation, terms)
+    return {
+        name: Prepared(
+            tuple(alm.astype(observation.dtype) for alm in sources.continued(name).alms),
+            term_weights(given[name].component, observation.bands, one),
+            None,
+            None,
+            0.0,
+        )
+        for name, one in constant.items()
+    }
+
+
+def figure_patch(sources: Sources, picture: Path) -> Item:
+    """Figure 13: Q of the CMB and of three bands in a patch."""
+    settings, center = sources.settings, sources.settings.paper.center
+    observation = core_observation(sources)
+    prepared = prepared_templates(sources, observation)
+    cmb = jnp.asarray(cmb_spectra(settings, observation.lmax))
+    panels, numbers = {}, []
+    for name, maps in observe_bands(sources.key, prepared, observation, cmb, components=True):
+        channel = observation.channels[name]
+        Q = {which: np.asarray(values[0]) for which, values in maps.items()}
+        inside = {which: _disc(values, center, SIZE_CORE) for which, values in Q.items()}
+        numbers.append(_brightest(name, inside))
+        limit, beam = color_limit(inside["total"]), f"{float(channel.beam):g}'"
+        panels[f"{name} GHz, {beam}"] = Q["total"], limit, "uK_RJ"
+        if name == observation.names[-1]:
+            to_cmb = float(channel.band.conversion("uK_RJ", "uK_CMB"))
+            limit = color_limit(inside["cmb"] * to_cmb)
+            panels = {f"CMB, {beam}": (Q["cmb"] * to_cmb, limit, "uK_CMB"), **panels}
+    _draw_patches(picture, panels, center, SIZE_CORE)
+    spectra = settings.cmb.spectra
+    words = {
+        "size": SIZE_CORE,
+        "l": center[0],
+        "b": center[1],
+        "cmb": f"r = {settings.cmb.r:g}" if spectra is None else f"spectra of {spectra}",
+        "sky": sources.sky_differs,
+        "fwhm": settings.paper.fwhm,
+        "nside": observation.nside,
+    }
+    return described("Figure 13", picture, words, numbers)
+
+
+def _brightest(band: str, inside: Mapping[str, Float[np.ndarray, " inside"]]) -> Number:
+    """What dominates a band in the patch, by its rms, mean included."""
+    rms = {which: float(np.sqrt(np.mean(values**2))) for which, values in inside.items()}
+    parts = [which for which in rms if which not in ("total", "noise")]
+    order = sorted(parts, key=rms.__getitem__, reverse=True)
+    words = {name: "CMB" if name == "cmb" else name for name in order}
+    listed_rms = ", ".join(f"{words[name]} {rms[name]:.2g}" for name in order)
+    return Number(
+        f"brightest in the patch at {band} GHz",
+        words[order[0]],
+        f"rms of Q [µK_RJ]: {listed_rms}, noise {rms['noise']:.2g} a pixel",
+    )
+
+
+def table_core(sources: Sources, picture: Path) -> Item:
+    """Table 1: COrE."""
+    channels = list(load_instrument("core"))
+    header = ("Band [GHz]", *(f"{float(channel.center):g}" for channel in channels))
+    rows = (
+        ("Beam FWHM [arcmin]", *(f"{float(channel.fwhm):.1f}" for channel in channels)),
+        ("Noise [µK_RJ arcmin]", *(f"{float(channel.noise):.2f}" for channel in channels)),
+        ("Width [GHz]", *(f"{float(channel.width):.3g}" for channel in channels)),
+    )
+    return described("Table 1", None, {}, table=Table(header, rows))

@@ -15,9 +15,10 @@ from benchmarks.timing import interleave, seconds
 from fits.chains import ChainFile
 from fits.compress import gram
 from fits.grid import _log_posterior
+from fits.posterior import Likelihood
 from fits.priors import Uniform
 from fits.sampling import sample
-from fits.template_likelihood import Likelihood, likelihood
+from fits.template_likelihood import likelihood
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.constants import H_OVER_K
 

@@ -30,7 +30,8 @@ from benchmarks.separation_runs import (
 from benchmarks.table import Row, time_text
 from benchmarks.timing import Usage, interleave, seconds, usage
 from fits.priors import Uniform
-from fits.separation import SpectralLikelihood, sample_spectra, spectral_likelihood
+from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
+from fits.sampling import sample
 from jaxsky import Bandpass, observe
 from jaxsky.sed import cmb_derivative
 
@@ -312,7 +313,7 @@ def samples(quick: bool) -> list[Row]:
 
         def call(sampler=sampler, options=options, results=results):
             options = {"priors": PRIORS, "sampler": sampler, "progress": False, **options}
-            results.append(sample_spectra(like, throw=False, **options))
+            results.append(sample(like, throw=False, **options))
 
         first = seconds(call)
         time = median(seconds(call) for _ in range(1 if quick else 3))

@@ -17,8 +17,9 @@ import numpy as np
 from astropy.io import fits as pyfits
 
 from benchmarks.timing import seconds
+from fits.optimize import best_fit
+from fits.profile_likelihood import spectral_likelihood
 from fits.regions import superpixels
-from fits.separation import fit_spectra, spectral_likelihood
 from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe, observe_components
 from jaxsky.instrument import load_instrument
 
@@ -100,7 +101,7 @@ def _constant(nside: int) -> Callable[[], dict[str, Any]]:
     laws = white_sky(1, np.random.default_rng(0))
 
     def run() -> dict[str, Any]:
-        fit = fit_spectra(spectral_likelihood(laws, bands, maps, sigma, START, unit=UNIT))
+        fit = best_fit(spectral_likelihood(laws, bands, maps, sigma, START, unit=UNIT))
         off = [(fit.best_fit[name] - TRUTH[name]) / fit.sigma[name] for name in NAMES]
         return {"steps": fit.details["steps"], "deviation": float(np.max(np.abs(off)))}
 
@@ -137,7 +138,7 @@ def _regions(nside: int) -> Callable[[], dict[str, Any]]:
 
     def run() -> dict[str, Any]:
         like = spectral_likelihood(laws, bands, maps, sigma, START, labels=labels, unit=UNIT)
-        fit = fit_spectra(like)
+        fit = best_fit(like)
         return {"steps": fit.details["steps"], "parameters": len(fit.labels)}
 
     return run
@@ -159,7 +160,7 @@ def _simulations(nside: int) -> Callable[[], dict[str, Any]]:
             noise *= wide
             noise += signal
             like = spectral_likelihood(laws, bands, noise, sigma, START, unit=UNIT)
-            fit = fit_spectra(like)
+            fit = best_fit(like)
             found.append([fit.best_fit[name] for name in NAMES])
             steps += fit.details["steps"]
         claimed = [fit.sigma[name] for name in NAMES]

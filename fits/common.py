@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from fits.covariance import Fluctuations, uniform_level
 from fits.inputs import Inputs
 from fits.record import fingerprint
-from fits.template_likelihood import CovarianceOf, Likelihood, likelihood
+from fits.template_likelihood import CovarianceOf, SkyLikelihood, likelihood
 from fits.template_noise import prepared_variance
 from jaxsky import Bandpass, Sky, observe
 from jaxsky.checks import Numeric
@@ -55,7 +55,7 @@ class CommonMaps(NamedTuple):
         stokes: str = "QU",
         region: Bool[np.ndarray, " pix"] | None = None,
         kind: str = "exact",
-    ) -> Likelihood:
+    ) -> SkyLikelihood:
         """The likelihood of the parameters in `start`; see `fits.template_likelihood.likelihood`.
 
         Parameters

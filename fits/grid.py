@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fits.posterior import Likelihood
 from fits.priors import Prior, bounds, check_priors, log_prior
 from fits.results import FitResult
-from fits.template_likelihood import Likelihood, PixelLikelihood, chi2
+from fits.template_likelihood import PixelLikelihood
 from jaxsky.checks import Numeric
 
 #: The grid is narrowed to where the posterior exceeds exp(-NARROW/2) of its maximum (6 sigma).
@@ -30,7 +31,7 @@ def _log_posterior(like, axes, priors):
 
     def point(*values):
         params = dict(zip(names, values, strict=True))
-        value = chi2(like, params)
+        value = like.total(jnp.stack(values)[None])
         return -value / 2 + log_prior(params, priors), value
 
     if isinstance(like, PixelLikelihood):
@@ -79,7 +80,7 @@ def grid_is_possible(free: Iterable[str], priors: Mapping[str, Prior]) -> bool:
 
 def grid_fit(
     like: Likelihood,
-    start: Mapping[str, Numeric],
+    start: Mapping[str, Numeric] | None = None,
     *,
     priors: Mapping[str, Prior],
     points: int = 200,
@@ -107,12 +108,13 @@ def grid_fit(
     KeyError, ValueError
         For unknown parameters, more than two of them, or one without a uniform prior.
     """
-    params = like.check(start)
-    free = tuple(sorted(params))
+    like = like.at(start)
+    free = like.free
     priors = check_priors(priors, free)
-    if len(free) > 2:
+    number = sum(value.size for value in like.start.values())
+    if number > 2:
         raise ValueError(
-            f"A grid takes one or two free parameters, not {len(free)} ({', '.join(free)}); "
+            f"A grid takes one or two free parameters, not {number} ({', '.join(free)}); "
             "use the gradient fit or MCMC."
         )
     ranges = {name: bounds(name, priors) for name in free}
@@ -133,8 +135,8 @@ def grid_fit(
         if min(shrunk) > 0.8:
             break
         ranges = narrowed
-    result = _summary(free, axes, log_posterior, chi2s, limits)
-    return result.judged(result.chi2, like.dof(len(free)), params)
+    result = _summary(free, axes, log_posterior, chi2s, limits, like.dof(len(free)))
+    return result.judged(result.chi2, result.dof, like.start)
 
 
 def _summary(
@@ -143,6 +145,7 @@ def _summary(
     log_posterior: np.ndarray,
     chi2s: np.ndarray,
     limits: dict[str, tuple[float, float]],
+    dof: int,
 ) -> FitResult:
     values = list(axes.values())
     density = np.exp(log_posterior)
@@ -165,13 +168,16 @@ def _summary(
     values_at_best = {name: float(mesh[i, best]) for i, name in enumerate(free)}
     flat = log_posterior.min() > -FLAT
     edges = [name for name, value in values_at_best.items() if value in limits[name]]
+    covariance = np.atleast_2d(np.cov(mesh, aweights=weights / weights.sum(), ddof=0))
     return FitResult(
         method="grid",
-        free=free,
         best_fit=values_at_best,
+        sigma=dict(zip(free, np.sqrt(np.diagonal(covariance)).tolist(), strict=True)),
         interval_68=intervals,
-        covariance=np.atleast_2d(np.cov(mesh, aweights=weights / weights.sum(), ddof=0)),
+        labels=free,
+        covariance=covariance,
         chi2=float(chi2s.ravel()[best]),
+        dof=dof,
         converged=not edges and not flat,
         message=(
             f"The posterior is flat: the data do not constrain {', '.join(free)}."

@@ -1,37 +1,145 @@
-"""The spectral posterior as a function of a vector, with derivatives of first and second order.
+"""A likelihood as a function of a vector of parameters, and its posterior, with derivatives.
 
-A cell depends on a few parameters only, so its second derivatives are a small matrix; those of
-all parameters are put together from them.
+Parameters are numbers, or arrays with a value for each region. A cell, an intersection of regions,
+depends on a few of them only, so its second derivatives are a small matrix; those of all
+parameters are put together from them. A likelihood without regions is a single cell.
 """
 
+import dataclasses
 from collections.abc import Mapping
-from typing import TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from fits.amplitudes import Derivatives
-from fits.priors import Gaussian, Prior, Uniform, at_edge, bounds
-from fits.profile_likelihood import SpectralLikelihood
+from fits.priors import Gaussian, Prior, Uniform, at_edge, bounds, to_unbounded
 from fits.systems import assembled
+from jaxsky.checks import Numeric, as_array
 
 #: Dense, or sparse for many parameters.
 Matrix: TypeAlias = np.ndarray | scipy.sparse.csc_matrix
 
 
+class Likelihood(eqx.Module):
+    """Base class: -2 log L is the sum of squares of `residuals(params)`, up to a constant.
+
+    A subclass defines `residuals`, `check` and a field `values`, the number of data; `total` and
+    `derivatives` if it has them in closed form.
+
+    Parameters
+    ----------
+    start : values of the free parameters by name
+    """
+
+    start: dict[str, Array]
+    #: Whether amplitudes are fitted in each pixel: then the inverse curvature alone is too small
+    #: for errors where signals are near the noise of a pixel.
+    profiled: ClassVar[bool] = False
+
+    def residuals(self, params: Mapping[str, Numeric]) -> Float[Array, " row"]:
+        """Residuals at values of any of the parameters by name; the others keep theirs."""
+        raise TypeError(f"{type(self).__name__} must define `residuals`.")
+
+    def check(self, params: Mapping[str, Numeric]) -> dict[str, Array]:
+        """The free parameters as arrays, once they are known to be parameters."""
+        raise TypeError(f"{type(self).__name__} must define `check`.")
+
+    def dof(self, free: int) -> int:
+        """Degrees of freedom of chi^2: data with weight, less amplitudes and free parameters."""
+        return int(self.values) - free  # type: ignore[attr-defined]  # a field of each
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the free parameters, in the order of the vector of all."""
+        return tuple(sorted(self.start))
+
+    def at(self, start: Mapping[str, Numeric] | None) -> "Likelihood":
+        """With other start values; the same if there are none."""
+        start = self.check(self.start if start is None else start)
+        return dataclasses.replace(self, start=start)
+
+    def flat(self, params: Mapping[str, Numeric]) -> Float[Array, " par"]:
+        """The vector of all free parameters; those not given are at their start."""
+        rows = [
+            jnp.broadcast_to(params.get(name, self.start[name]), self.start[name].shape).ravel()
+            for name in self.free
+        ]
+        return jnp.concatenate(rows) if rows else jnp.zeros(0)
+
+    def named(self, theta: Float[Array, " par"]) -> dict[str, Array]:
+        """The inverse of `flat`."""
+        ends = np.cumsum([self.start[name].size for name in self.free])
+        parts = jnp.split(jnp.asarray(theta), ends[:-1]) if len(ends) else []
+        shapes = [self.start[name].shape for name in self.free]
+        return {n: p.reshape(s) for n, p, s in zip(self.free, parts, shapes, strict=True)}
+
+    def cells(self) -> Int[Array | np.ndarray, "cell free"]:
+        """Position of each free parameter of each cell in the vector of all."""
+        return np.arange(len(self.free))[None]
+
+    def total(self, local: Float[Array, "cell free"]) -> Float[Array, ""]:
+        """-2 ln L for parameters of each cell."""
+        return jnp.sum(self.residuals(self.named(local[0])) ** 2)
+
+    def derivatives(self, local: Float[Array, "cell free"]) -> Derivatives:
+        """-ln L of each cell, and its derivatives in the parameters of the cell."""
+
+        def gradient(theta):
+            value, slope = jax.value_and_grad(lambda t: self.total(t[None]) / 2)(theta)
+            return slope, (value, slope)
+
+        hessian, (value, slope) = jax.jacfwd(gradient, has_aux=True)(local[0])
+        rows = jax.jacfwd(lambda theta: self.residuals(self.named(theta)))(local[0])
+        return jax.tree.map(lambda x: x[None], Derivatives(value, slope, hessian, rows.T @ rows))
+
+
+def chi2(like: Likelihood, params: Mapping[str, Numeric]) -> Float[Array, ""]:
+    """Sum of squares of the residuals: chi^2, or -2 log L up to a constant."""
+    # All of one type, or it would be compiled again for Python's numbers.
+    values = {name: as_array(name, value).astype(float) for name, value in params.items()}
+    return _chi2(like, values)
+
+
+@jax.jit
+def _chi2(like, params):
+    return jnp.sum(like.residuals(params) ** 2)
+
+
 @jax.jit
 def value_and_gradient(like, theta):
     """-ln L and its gradient."""
-    return jax.value_and_grad(lambda t: like.total(t[like.index]) / 2)(theta)
+    return jax.value_and_grad(lambda t: like.total(t[like.cells()]) / 2)(theta)
 
 
 @jax.jit
-def cell_derivatives(like, theta) -> Derivatives:
-    """-ln L of each cell and its derivatives in the parameters of the cell."""
-    return like.derivatives(theta[like.index])
+def _cell_derivatives(like, theta) -> Derivatives:
+    return like.derivatives(theta[like.cells()])
+
+
+def hessian(like: Likelihood, params: Mapping[str, Numeric]) -> Float[np.ndarray, "par par"]:
+    """Second derivatives of -ln L in all parameters, regions one after the other."""
+    return _dense("hessian", like, params)
+
+
+def fisher(like: Likelihood, params: Mapping[str, Numeric]) -> Float[np.ndarray, "par par"]:
+    """Fisher matrix of the parameters, amplitudes marginalised at their best values.
+
+    sum_p s^T A_i^T [N^-1 - N^-1 A (A^T N^-1 A)^-1 A^T N^-1] A_j s with A_i the derivative of the
+    mixing matrix (Errard, Stivoli & Stompor 2011, PRD 84, 063005).
+    """
+    return _dense("fisher", like, params)
+
+
+def _dense(which, like, params):
+    theta = like.flat(like.check(params))
+    local = np.asarray(getattr(_cell_derivatives(like, theta), which))
+    matrix = assembled(local, np.asarray(like.cells()), len(theta), np.zeros(len(theta)))
+    return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
 
 
 @jax.jit
@@ -47,7 +155,7 @@ def prior_terms(theta, priors):
     return value, first, second
 
 
-class Problem:
+class Posterior:
     """-log posterior of the parameters that any cell has, within bounds.
 
     Parameters
@@ -57,20 +165,23 @@ class Problem:
 
     Attributes
     ----------
+    start : the vector to start from
     names, labels : of each parameter: its name, and name and region ("dust.beta_dust[3]")
     present : True for parameters of regions with pixels
     low, high : bounds of each parameter
     priors : the others, with the parameters that they are for
     """
 
-    def __init__(self, like: SpectralLikelihood, priors: Mapping[str, Prior]) -> None:
+    def __init__(self, like: Likelihood, priors: Mapping[str, Prior]) -> None:
+        to_unbounded(like.start, priors)  # the start is inside
         self.like = like
+        self.start = np.array(like.flat({}))
         #: The last vector that derivatives were asked for, and what they are.
         self._last: tuple[bytes, Derivatives] | None = None
         sizes = {name: like.start[name].size for name in like.free}
         self.owner = np.repeat(np.arange(len(sizes)), list(sizes.values()))
         self.names = tuple(like.free[i] for i in self.owner)
-        self.index = np.asarray(like.index)
+        self.index = np.asarray(like.cells())
         self.present = np.zeros(len(self.owner), bool)
         self.present[self.index] = True
         limits = np.array([bounds(name, priors) for name in like.free]).reshape(-1, 2)
@@ -80,6 +191,14 @@ class Problem:
             for name, prior in priors.items()
             if not isinstance(prior, Uniform)
         ]
+
+    def named(self, theta: Float[np.ndarray, " par"]) -> dict[str, Any]:
+        """Values by name, numbers or arrays; NaN for regions without pixels."""
+        theta = np.where(self.present, theta, np.nan)
+        shaped = {
+            name: np.asarray(value) for name, value in self.like.named(jnp.asarray(theta)).items()
+        }
+        return {name: float(v) if v.ndim == 0 else v for name, v in shaped.items()}
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -94,8 +213,8 @@ class Problem:
     def where(self, bad: Bool[np.ndarray, " par"]) -> str:
         """Names of parameters, with the regions and pixels that they are of."""
         of_cell = np.zeros(len(self.index), int)
-        if self.like.of_pixel is not None:
-            of_pixel = np.asarray(self.like.of_pixel)
+        if (of_pixel := getattr(self.like, "of_pixel", None)) is not None:
+            of_pixel = np.asarray(of_pixel)
             of_cell = np.bincount(of_pixel[of_pixel >= 0], minlength=len(self.index))
         pixels = np.zeros(len(self.owner), int)
         np.add.at(pixels, self.index, of_cell[:, None])
@@ -114,7 +233,7 @@ class Problem:
         """-ln L of each cell and its derivatives, as arrays of numpy; priors left out."""
         key = theta.tobytes()
         if self._last is None or self._last[0] != key:
-            found = cell_derivatives(self.like, jnp.asarray(theta))
+            found = _cell_derivatives(self.like, jnp.asarray(theta))
             self._last = (key, jax.tree.map(np.asarray, found))
         return self._last[1]
 

@@ -6,13 +6,11 @@ from pathlib import Path
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-from getdist import MCSamples, chains, plots
+from getdist import plots
 
 from fits.plots import COLORS, STYLE, draw_panels, draw_title, label, legend_below, plain, save
 from fits.results import FitResult
 from fits.spectral_index import Fit, all_free
-
-chains.print_load_details = False  # getdist otherwise prints about burn-in
 
 STOKES_COLORS = {"Q": COLORS[0], "U": COLORS[1], "QU": COLORS[6]}
 TRUTH = {"color": COLORS[3], "linewidth": 1.6}
@@ -66,7 +64,7 @@ def plot_grids(
 def _drawable(fits: Sequence[Fit], name: str) -> list[Fit]:
     """Fits that have a parameter, with a finite error."""
     firsts = [(fit, next(iter(fit.results.values()))) for fit in fits]
-    return [fit for fit, r in firsts if name in r.free and np.isfinite(r.sigma(name))]
+    return [fit for fit, r in firsts if name in r.free and np.isfinite(r.sigma[name])]
 
 
 def _limits(fits: Sequence[Fit], name: str) -> tuple[float, float] | None:
@@ -74,8 +72,8 @@ def _limits(fits: Sequence[Fit], name: str) -> tuple[float, float] | None:
     results = [next(iter(fit.results.values())) for fit in _drawable(fits, name)]
     if not results:
         return None
-    low = min(r.best_fit[name] - 4 * r.sigma(name) for r in results)
-    high = max(r.best_fit[name] + 4 * r.sigma(name) for r in results)
+    low = min(r.best_fit[name] - 4 * r.sigma[name] for r in results)
+    high = max(r.best_fit[name] + 4 * r.sigma[name] for r in results)
     return low, high
 
 
@@ -97,17 +95,6 @@ def _grid_panel(axes: plt.Axes, result: FitResult, truth: Mapping[str, float] | 
     axes.spines[:].set_visible(True)
 
 
-def _samples(result: FitResult, name: str) -> MCSamples:
-    details = result.details
-    chain = details["chain"][details["discard"] :: details["thin"]]
-    return MCSamples(
-        samples=chain.reshape(-1, len(result.free)),
-        names=list(result.free),
-        labels=[label(n) for n in result.free],
-        label=plain(name),
-    )
-
-
 def _density(fit: Fit, name: str) -> tuple[np.ndarray, np.ndarray, FitResult]:
     """A marginal distribution from the best method there is: grid, chain or Gaussian."""
     if "grid" in fit.results:
@@ -115,10 +102,10 @@ def _density(fit: Fit, name: str) -> tuple[np.ndarray, np.ndarray, FitResult]:
         return result.details["axes"][name], result.details["marginals"][name], result
     if "mcmc" in fit.results:
         result = fit.results["mcmc"]
-        density = _samples(result, fit.stokes).get1DDensity(name)
+        density = result.to_getdist(fit.stokes, label).get1DDensity(name)
         return density.x, density.P, result
     result = fit.results["gradient"]
-    sigma = result.sigma(name)
+    sigma = result.sigma[name]
     x = result.best_fit[name] + sigma * np.linspace(-5, 5, 201)
     return x, np.exp(-0.5 * ((x - result.best_fit[name]) / sigma) ** 2), result
 
@@ -175,25 +162,25 @@ def plot_chains(
     path: Path, results: Mapping[str, FitResult], truth: Mapping[str, float] | None, title: str
 ) -> None:
     """The posterior of chains of the same parameters by what they are of, a colour for each."""
-    samples = [_samples(result, name) for name, result in results.items()]
-    free = next(iter(results.values())).free
-    plotter = plots.get_subplot_plotter(width_inch=max(4.0, 1.6 * len(free)))
+    samples = [result.to_getdist(plain(name), label) for name, result in results.items()]
+    rows = next(iter(results.values())).labels
+    plotter = plots.get_subplot_plotter(width_inch=max(4.0, 1.6 * len(rows)))
     plotter.settings.axes_fontsize = 9
     plotter.settings.axes_labelsize = 11
     plotter.settings.legend_fontsize = 9
     plotter.settings.title_limit_fontsize = 9
     plotter.triangle_plot(
         samples,
-        list(free),
+        list(rows),
         filled=True,
         contour_colors=list(COLORS[: len(samples)]),
         title_limit=1 if len(samples) == 1 else 0,
-        markers={n: v for n, v in (truth or {}).items() if n in free},
+        markers={n: v for n, v in (truth or {}).items() if n in rows},
         marker_args={"color": TRUTH["color"], "lw": TRUTH["linewidth"], "ls": "-"},
     )
-    for i, name in enumerate(free):
+    for i, name in enumerate(rows):
         for result, color in zip(results.values(), COLORS, strict=False):
-            interval = result.interval_68[name]
+            interval = result.of_row(result.interval_68, name)
             plotter.subplots[i, i].axvspan(*interval, color=color, alpha=0.15, linewidth=0)
     draw_title(plotter.fig, f"{title}; 68 % shaded", fontsize=8, y=1.03)
     with mpl.rc_context(STYLE | {"savefig.dpi": 200}):

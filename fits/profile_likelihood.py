@@ -24,8 +24,9 @@ from fits.amplitudes import Pixels
 from fits.compress import Layout, compressed, gathered, layouts, used_pixels
 from fits.mixing import Mixing, SpectralBands, spectral_names
 from fits.noise import Noise, as_noise, bare
+from fits.posterior import Likelihood
 from fits.regions import Cells, check_labels, intersections
-from fits.template_likelihood import Likelihood, named_bands
+from fits.template_likelihood import named_bands
 from jaxsky import Bandpass, Component, Sky, get_parameters, set_parameters
 from jaxsky.bandpass import Samples, stack_bands
 from jaxsky.checks import Numeric, as_array, check_double, check_finite
@@ -41,9 +42,9 @@ class SpectralLikelihood(Likelihood):
 
     Parameters
     ----------
+    start : values of the free parameters
     sky : the laws, on a single pixel
     bands, samples : the bands, and their frequencies and weights
-    start : values of the free parameters
     fixed : parameters that are maps and not free, in each cell
     index : position of each free parameter of each cell in the vector of all
     pixels : data and weights, for each of `layout`
@@ -55,8 +56,9 @@ class SpectralLikelihood(Likelihood):
     weightless : bands that add nothing to what the others tell, and are not counted
     """
 
+    sky: Sky
+    bands: SpectralBands
     samples: Samples
-    start: dict[str, Array]
     fixed: dict[str, Float[Array, " cell"]]
     index: Int[Array, "cell free"]
     pixels: tuple[Pixels, ...]
@@ -67,15 +69,12 @@ class SpectralLikelihood(Likelihood):
     values: int = eqx.field(static=True)
     weightless: tuple[str, ...] = eqx.field(static=True)
 
-    @property
-    def free(self) -> tuple[str, ...]:
-        """Names of the free parameters, in the order of the vector of all."""
-        return tuple(sorted(self.start))
+    profiled = True
 
     @property
     def mixing(self) -> Mixing:
         """The mixing matrix as a function of parameters."""
-        return Mixing(self.sky, self.bands, self.samples, self.unit)  # type: ignore[arg-type]
+        return Mixing(self.sky, self.bands, self.samples, self.unit)
 
     def check(self, params):
         known = (*spectral_names(self.sky), *self.bands.parameter_names())
@@ -105,20 +104,8 @@ class SpectralLikelihood(Likelihood):
             check_finite(name, result[name])
         return result
 
-    def flat(self, params: Mapping[str, Numeric]) -> Float[Array, " par"]:
-        """The vector of all free parameters; those not given are at their start."""
-        rows = [
-            jnp.broadcast_to(params.get(name, self.start[name]), self.start[name].shape).ravel()
-            for name in self.free
-        ]
-        return jnp.concatenate(rows) if rows else jnp.zeros(0)
-
-    def named(self, theta: Float[Array, " par"]) -> dict[str, Array]:
-        """The inverse of `flat`."""
-        ends = np.cumsum([self.start[name].size for name in self.free])
-        parts = jnp.split(jnp.asarray(theta), ends[:-1]) if len(ends) else []
-        shapes = [self.start[name].shape for name in self.free]
-        return {n: p.reshape(s) for n, p, s in zip(self.free, parts, shapes, strict=True)}
+    def cells(self):
+        return self.index
 
     def matrices(self, local: Float[Array, "cell free"]) -> tuple[Array, ...]:
         """Mixing matrices (cell, row, unknown), for each of `layout`."""
@@ -259,7 +246,7 @@ def spectral_likelihood(
     bands : the bands by name, or as a list
     data : observed maps, shape (band, stokes, pix) with Stokes Q, U or I, Q, U
     noise : standard deviations or covariances in the unit of the data; see
-        `fits.separation.as_noise`
+        `fits.noise.as_noise`
     start : start values of the free parameters by name: of the laws ("dust.beta_dust"), or of
         bands ("shift.<band>", "width.<band>", "gain.<band>", "angle.<band>"; see
         `fits.mixing`)
@@ -271,7 +258,7 @@ def spectral_likelihood(
 
     Returns
     -------
-    The likelihood, for `fits.separation.fit_spectra`.
+    The likelihood, for `best_fit`, `grid_fit` and `sample`.
 
     Raises
     ------
@@ -284,7 +271,7 @@ def spectral_likelihood(
         finite, too few bands, components that cannot be told apart, and labels that are no
         labels.
     """
-    check_double("fits.separation")
+    check_double("fits")
     sky = sky if isinstance(sky, Sky) else Sky(sky)
     bands = named_bands(bands)
     data = bare("data", data)
@@ -322,10 +309,10 @@ def spectral_likelihood(
     first = _first_pixels(cells, used)
     angles = any(name.startswith("angle.") for name in start)
     like = SpectralLikelihood(
+        values,
         unit_sky,
         own,
         stack_bands(own.bandpasses),
-        values,
         {name: jnp.asarray(value[first]) for name, value in fixed.items()},
         _index(values, cells),
         (),

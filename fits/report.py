@@ -21,16 +21,9 @@ UNLIKELY = 0.01
 
 def _result(fit: Fit, method: str) -> dict[str, Any]:
     result = fit.results[method]
-    numbers = {
-        "free": list(result.free),
-        "best_fit": result.best_fit,
-        "interval_68": {name: list(pair) for name, pair in result.interval_68.items()},
-        "covariance": result.covariance.tolist(),
-        "chi2": fit.chi2[method],
-        "dof": fit.dof,
-        "converged": result.converged,
-        "message": result.message,
-    }
+    kept = ("free", "best_fit", "interval_68", "covariance", "converged", "message")
+    numbers = {key: result.to_dict()[key] for key in kept}
+    numbers |= {"chi2": fit.chi2[method], "dof": fit.dof}
     if fit.dof_amplitudes is not None:
         numbers |= {
             "chi2_amplitudes": result.chi2,
@@ -156,7 +149,7 @@ def _attenuated(fit: Fit) -> str | None:
     result = next(iter(fit.results.values()))
     shifts = ", ".join(
         f"{name} by {lost.shifts[name]:+.2g} ({lost.shifts[name] / error:+.1f} sigma)"
-        for name, error in zip(result.free, np.sqrt(np.diag(result.covariance)), strict=True)
+        for name, error in result.sigma.items()
     )
     return f"{sentence}, which moves {shifts}, to first order; the fit is not corrected for it."
 

@@ -1,12 +1,16 @@
 """What fits return, as values: numbers by parameter name, and how good they are."""
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fits.record import with_error
 from jaxsky.checks import Numeric
+
+if TYPE_CHECKING:
+    from getdist import MCSamples
 
 #: A chi^2 above so many times the degrees of freedom, taken as `FEW` if they are fewer, is that of
 #: no fit. Real skies, with laws that vary, errors that are too small and bright planes, have
@@ -33,21 +37,13 @@ def misfit(chi2: float, dof: int, expected: float = 1.0) -> str | None:
     )
 
 
-def astray(
-    name: str,
-    value: Float[np.ndarray, "*shape"],
-    sigma: Float[np.ndarray, "*shape"],
-    start: Float[np.ndarray, "*shape"],
-) -> Bool[np.ndarray, "*shape"]:
+def _astray(name: str, value: Numeric, sigma: Numeric, start: Numeric) -> Bool[np.ndarray, "..."]:
     """Whether the data do not hold a parameter: it ran away, or its error is absurd.
 
-    Parameters
-    ----------
-    name : offsets, which have units of maps, are never astray
-    value, sigma, start : best fit, standard deviation, start
+    Offsets, which have units of maps, are never astray.
     """
     limit = np.inf if name.startswith("offset.") else LOST * np.maximum(np.abs(start), 1.0)
-    return (np.abs(value) > limit) | (np.asarray(sigma) > limit)
+    return np.asarray((np.abs(value) > limit) | (np.asarray(sigma) > limit))
 
 
 def help_by_prior(names: tuple[str, ...]) -> str:
@@ -64,35 +60,121 @@ class FitError(RuntimeError):
 
 
 class FitResult(NamedTuple):
-    """Parameters of a fit by one method.
+    """Parameters of a fit by one method: numbers, or arrays with a value for each region.
 
     Attributes
     ----------
     method : "gradient", "grid", "mcmc" or "nuts"
-    free : names of the free parameters, in the order of the covariance
-    best_fit : most probable values
+    best_fit : most probable values by name; NaN for regions without a pixel
+    sigma : their standard deviations, likewise; NaN where they were not determined
     interval_68 : (low, high) of the central 68.27 % of each marginal distribution
-    covariance : of the parameters, shape (par, par)
+    labels : name, and region if there are several, of each row of the covariance
+        ("dust.beta_dust[3]")
+    covariance : of the estimates, shape (par, par); None for too many parameters
     chi2 : smallest value of -2 log L, priors left out; for the exact likelihood that of the
         template amplitudes
+    dof : number of data with weight less that of amplitudes and free parameters
     converged, message : whether the numbers can be relied on, and in words
     details : what only this method has
     """
 
     method: str
-    free: tuple[str, ...]
-    best_fit: dict[str, float]
-    interval_68: dict[str, tuple[float, float]]
-    covariance: np.ndarray
+    best_fit: dict[str, Any]
+    sigma: dict[str, Any]
+    interval_68: dict[str, tuple[Any, Any]]
+    labels: tuple[str, ...]
+    covariance: Float[np.ndarray, "par par"] | None
     chi2: float
+    dof: int
     converged: bool
     message: str
     details: dict[str, Any]
 
-    def sigma(self, name: str) -> float:
-        """Standard deviation of a parameter."""
-        i = self.free.index(name)
-        return float(np.sqrt(self.covariance[i, i]))
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+        return tuple(self.best_fit)
+
+    def __str__(self) -> str:
+        lines = []
+        for name, value in self.best_fit.items():
+            known = np.isfinite(value)
+            shown = with_error(
+                *(float(np.median(np.asarray(x)[known])) for x in (value, self.sigma[name]))
+            )
+            regions = f", median of {known.sum()} regions" if np.ndim(value) else ""
+            lines.append(f"{name} = {shown}{regions}")
+        state = "" if self.converged else f"not converged: {self.message}"
+        return "\n".join(
+            [*lines, f"chi2 = {self.chi2:.1f} for {self.dof} degrees of freedom", state]
+        )
+
+    def of_row(self, values: Mapping[str, Any], label: str) -> Any:
+        """The entry of values by name that a row of the covariance is of."""
+        name, _, region = label.partition("[")
+        return np.asarray(values[name])[..., int(region[:-1])] if region else values[name]
+
+    def with_chain(self, chain: Float[np.ndarray, "step walker par"]) -> "FitResult":
+        """With these samples, and what follows from those that are not discarded."""
+        flat = chain[self.details["discard"] :].reshape(-1, len(self.labels))
+        low, high = map(self._named, np.percentile(flat, [15.865525, 84.134475], axis=0))
+        return self._replace(
+            sigma=self._named(flat.std(axis=0, ddof=1)),
+            interval_68={name: (low[name], high[name]) for name in low},
+            covariance=np.atleast_2d(np.cov(flat.T)),
+            details=self.details | {"chain": chain},
+        )
+
+    def _named(self, rows: Float[np.ndarray, " par"]) -> dict[str, Any]:
+        """Values by name from those of the rows of the covariance; NaN for other regions."""
+        values = {name: np.full(np.shape(value), np.nan) for name, value in self.best_fit.items()}
+        for label, row in zip(self.labels, rows, strict=True):
+            name, _, region = label.partition("[")
+            values[name][int(region[:-1]) if region else ()] = row
+        return {name: v if v.ndim else float(v) for name, v in values.items()}
+
+    def correlation(self, first: str, second: str) -> float:
+        """Correlation coefficient of two entries of `labels`."""
+        if self.covariance is None:
+            raise ValueError("The covariance of so many parameters was not computed.")
+        i, j = self.labels.index(first), self.labels.index(second)
+        scale = np.sqrt(self.covariance[i, i] * self.covariance[j, j])
+        return float(self.covariance[i, j] / scale)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All numbers but the details by name, for files."""
+        numbers = self._asdict()
+        del numbers["details"]
+        return {"free": self.free} | numbers
+
+    def to_getdist(
+        self, title: str | None = None, symbol: Callable[[str], str] | None = None
+    ) -> "MCSamples":
+        """The samples of a chain for getdist.
+
+        Parameters
+        ----------
+        title : what legends call them
+        symbol : TeX without dollar signs of an entry of `labels`; by default the entry itself
+
+        Raises
+        ------
+        ValueError
+            If the result is not that of a chain.
+        """
+        from getdist import MCSamples, chains
+
+        if "chain" not in self.details:
+            raise ValueError(f"A fit by the method {self.method!r} has no samples.")
+        chains.print_load_details = False  # getdist otherwise prints about burn-in
+        details = self.details
+        chain = details["chain"][details["discard"] :: details["thin"]]
+        return MCSamples(
+            samples=chain.reshape(-1, len(self.labels)),
+            names=list(self.labels),
+            labels=[symbol(n) if symbol else n for n in self.labels],
+            label=title,
+        )
 
     def judged(
         self, chi2: float, dof: int, start: Mapping[str, Numeric], expected: float = 1.0
@@ -106,14 +188,14 @@ class FitResult(NamedTuple):
         expected : see `misfit`
         """
         failures = [] if self.converged else [self.message]
-        sigma = np.sqrt(np.diagonal(self.covariance))
-        for name, error in zip(self.free, sigma, strict=True):
-            value, begun = self.best_fit[name], float(start[name])
-            if self.converged and astray(name, np.array(value), error, np.array(begun)):
-                failures.append(
-                    f"The data do not constrain {name!r}: from {begun:g} it went to "
-                    f"{value:.3g} +- {error:.2g}; {help_by_prior((name,))}."
-                )
+        for name, value in self.best_fit.items():
+            lost = _astray(name, value, self.sigma[name], start[name])
+            if not (self.converged and lost.any()):
+                continue
+            where = f" in {lost.sum()} of {np.isfinite(value).sum()} regions"
+            if not lost.ndim:
+                where = f": from {start[name]:g} it went to {value:.3g} +- {self.sigma[name]:.2g}"
+            failures.append(f"The data do not constrain {name!r}{where}; {help_by_prior((name,))}.")
         if (wrong := misfit(chi2, dof, expected)) and wrong not in self.message:
             failures.insert(0, wrong)
         if not failures:

@@ -1,101 +1,109 @@
-"""Posterior samples with emcee: vectorised, stored in HDF5, resumable."""
+"""Samples of a posterior: emcee's ensemble, kept in a file, or the no-U-turn sampler of blackjax.
+
+The no-U-turn sampler (Hoffman & Gelman 2014, JMLR 15, 1593) follows the gradient, so it takes a
+few evaluations for a sample that does not depend on the last one, however many parameters there
+are. It moves in the numbers of `fits.unbounded`, in which walkers start, too.
+"""
 
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+import blackjax
 import emcee
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from blackjax.adaptation.step_size import dual_averaging_adaptation
+from blackjax.diagnostics import ess_bulk, rhat
+from jaxtyping import Array, Float
+from tqdm import tqdm
 
 from fits.chains import ChainFile
 from fits.optimize import best_fit
-from fits.priors import Prior, bounds, check_priors, log_prior
+from fits.posterior import Likelihood, Posterior
+from fits.priors import Prior, check_priors
 from fits.results import FitResult
-from fits.template_likelihood import Likelihood, chi2
+from fits.unbounded import Unbounded, unbounded_posterior
 from jaxsky.checks import Numeric, check_seed
 
-#: A chain shorter than this many autocorrelation times is reported as too short.
+#: What each sampler takes, with the values if they are not given, and what its results are called.
+OPTIONS: dict[str, dict[str, Any]] = {
+    "emcee": {"nsteps": 5000, "nwalkers": 32, "backend": None},
+    "nuts": {"nsteps": 1000, "nwarmup": 300, "nchains": 4},
+}
+METHODS = {"emcee": "mcmc", "nuts": "nuts"}
+#: A chain of emcee shorter than this many autocorrelation times is reported as too short.
 ENOUGH = 50
+#: Mean acceptance that the step size of the no-U-turn sampler is tuned to.
+ACCEPTANCE = 0.9
+#: Width of the start positions of its chains, in standard deviations.
+SPREAD = 2.0
+#: Its steps in one call of a program: what progress is counted in.
+BLOCK = 50
+#: R-hat of chains that agree, and effective samples that each of them needs, after Vehtari et al.
+#: (2021, Bayesian Analysis 16, 667).
+AGREEMENT, EFFECTIVE = 1.01, 100
+#: Share of divergent steps that does no harm: far out in the tail of a cut posterior.
+RARE = 1e-3
 
 
-@partial(jax.jit, static_argnames=("structure", "free"))
-def _log_probs(theta, leaves, structure, free):
-    like, priors = jax.tree.unflatten(structure, leaves)
+@partial(jax.jit, static_argnames="structure")
+def _log_probs(positions, leaves, structure):
+    unbounded = jax.tree.unflatten(structure, leaves)
 
-    def one(values):
-        params = dict(zip(free, values, strict=True))
-        prior = log_prior(params, priors)
+    def one(x):
+        inside = (x >= unbounded.low) & (x <= unbounded.high) | ~unbounded.bounded
+        value = unbounded.log_prob(x)
         # Outside the prior the model may not even be finite.
-        value = -chi2(like, params) / 2 + prior
-        return jnp.where(jnp.isfinite(prior) & jnp.isfinite(value), value, -jnp.inf)
+        return jnp.where(inside.all() & jnp.isfinite(value), value, -jnp.inf)
 
-    return jax.vmap(one)(theta)
-
-
-def _walkers(result: FitResult, priors: Mapping[str, Prior], nwalkers: int, rng) -> np.ndarray:
-    """Start positions drawn around the best fit, inside the uniform priors."""
-    center = np.array([result.best_fit[name] for name in result.free])
-    limits = np.array([bounds(name, priors) for name in result.free])
-    covariance = np.asarray(result.covariance)
-    if not np.isfinite(covariance).all():
-        width = np.where(np.isfinite(limits).all(axis=1), np.ptp(limits, axis=1) / 10, 1e-2)
-        covariance = np.diag(width**2)
-    theta = rng.multivariate_normal(center, covariance, size=nwalkers)
-    for _ in range(100):
-        outside = ((theta <= limits[:, 0]) | (theta >= limits[:, 1])).any(axis=1)
-        if not outside.any():
-            return theta
-        theta[outside] = rng.multivariate_normal(center, covariance, size=outside.sum())
-    # A narrow corner of the prior: spread evenly there instead.
-    low = np.where(np.isfinite(limits[:, 0]), limits[:, 0], center - 1)
-    high = np.where(np.isfinite(limits[:, 1]), limits[:, 1], center + 1)
-    theta[outside] = rng.uniform(low, high, size=(outside.sum(), len(center)))
-    return theta
+    return jax.vmap(one)(positions)
 
 
-def ensemble(
-    log_probs: Callable[[np.ndarray], np.ndarray],
-    initial: Callable[[np.random.Generator], np.ndarray],
-    size: int,
+@jax.jit
+def _values(unbounded, z):
+    return jax.vmap(unbounded.values)(z)[0]
+
+
+def _ensemble(
+    unbounded: Unbounded,
     *,
-    nwalkers: int,
-    nsteps: int,
     seed: int,
-    backend: ChainFile | None = None,
-    progress: bool | Callable[[int, int], None] = True,
-) -> emcee.EnsembleSampler:
-    """Steps of emcee's ensemble; those that a file already holds are not made again.
-
-    Parameters
-    ----------
-    log_probs : log posterior of positions (walker, par)
-    initial : start positions (walker, par) from a generator of random numbers
-    size : number of parameters
-    nwalkers, nsteps, seed, backend, progress : see `sample`
-    """
-    check_seed("seed", seed)
+    nsteps: int,
+    nwalkers: int,
+    backend: ChainFile | None,
+    progress: bool | Callable[[int, int], None],
+) -> dict[str, Any]:
+    """Steps of emcee's ensemble; those that a file already holds are not made again."""
+    size = unbounded.center.size
     if nwalkers < 2 * size or nsteps < 1:
         raise ValueError(
             f"MCMC needs at least {2 * size} walkers and a step for {size} parameters, "
             f"not nwalkers={nwalkers}, nsteps={nsteps}."
         )
+    # Taken apart once rather than at each step, where it takes a third of the time.
+    leaves, structure = jax.tree.flatten(unbounded)
+
+    def log_probs(theta: np.ndarray) -> np.ndarray:
+        # At the start, too, in the halves that emcee moves: one program instead of two.
+        parts = np.split(theta, 2) if len(theta) == nwalkers and nwalkers % 2 == 0 else [theta]
+        return np.concatenate([_log_probs(part, leaves, structure) for part in parts])
+
     rng = np.random.default_rng(seed)
     sampler = emcee.EnsembleSampler(nwalkers, size, log_probs, vectorize=True, backend=backend)
     # emcee's own wrapper prints a traceback when it is interrupted.
     sampler.log_prob_fn = sampler.log_prob_fn.f
     done = sampler.iteration
-    state = None
-    if not done:
-        state = emcee.State(
-            initial(rng),
-            random_state=np.random.RandomState(rng.integers(2**32)).get_state(),
-        )
+    if done:
+        state = sampler.get_last_sample()
+    else:
+        positions = np.asarray(_values(unbounded, rng.normal(size=(nwalkers, size))))
+        random_state = np.random.RandomState(rng.integers(2**32)).get_state()
+        state = emcee.State(positions, random_state=random_state)
     try:
         steps = sampler.sample(
-            sampler.get_last_sample() if state is None else state,
+            state,
             iterations=max(0, nsteps - done),
             progress=progress is True,
             progress_kwargs={"leave": False},
@@ -106,155 +114,276 @@ def ensemble(
     finally:
         if backend is not None:
             backend.flush()
-    return sampler
-
-
-def sample(
-    like: Likelihood,
-    start: Mapping[str, Numeric],
-    *,
-    priors: Mapping[str, Prior] | None = None,
-    nwalkers: int = 32,
-    nsteps: int = 5000,
-    seed: int = 0,
-    backend: ChainFile | None = None,
-    progress: bool | Callable[[int, int], None] = True,
-    throw: bool = True,
-) -> FitResult:
-    """Samples of the posterior by emcee's affine-invariant ensemble.
-
-    Parameters
-    ----------
-    like : from `fits.template_likelihood`
-    start : start values of the free parameters by name; the walkers start around the best fit
-    priors : priors by name
-    nwalkers, nsteps : size of the ensemble, and its steps in all
-    seed : of the start positions and the proposals
-    backend : file of the chain; one that already holds steps is gone on with up to `nsteps`,
-        with the very steps an uninterrupted run would have made
-    progress : show a progress bar, or call a function with the steps done and those in all
-    throw : raise if the chain is shorter than 50 autocorrelation times
-
-    Returns
-    -------
-    Result with the most probable sample, central intervals and covariance of the samples after
-    two autocorrelation times. `details` holds "chain" (step, walker, par), "log_prob", "tau"
-    by name, "acceptance", "discard" and "thin".
-
-    Raises
-    ------
-    KeyError, ValueError
-        For unknown parameters, start values outside their prior, or fewer than twice as many
-        walkers as parameters.
-    FitError
-        If the chain is too short, chi^2 is that of no fit, or the data do not constrain a
-        parameter (`fits.results`), unless throw=False; the result is in its `.result`.
-    """
-    check_seed("seed", seed)
-    params = like.check(start)
-    free = tuple(sorted(params))
-    priors = check_priors(priors, free)
-    # Taken apart once rather than at each step, where it takes a third of the time.
-    leaves, structure = jax.tree.flatten((like, priors))
-
-    def log_probs(theta: np.ndarray) -> np.ndarray:
-        # At the start, too, in the halves that emcee moves: one program instead of two.
-        parts = np.split(theta, 2) if len(theta) == nwalkers and nwalkers % 2 == 0 else [theta]
-        return np.concatenate([_log_probs(part, leaves, structure, free) for part in parts])
-
-    sampler = ensemble(
-        log_probs,
-        lambda rng: _walkers(
-            best_fit(like, start, priors=priors, throw=False), priors, nwalkers, rng
-        ),
-        len(free),
-        nwalkers=nwalkers,
-        nsteps=nsteps,
-        seed=seed,
-        backend=backend,
-        progress=progress,
-    )
-    result = ensemble_summary(sampler, free, lambda values: float(chi2(like, values)))
-    return result.judged(result.chi2, like.dof(len(free)), params).checked(throw)
-
-
-def ensemble_summary(
-    sampler: emcee.EnsembleSampler,
-    free: tuple[str, ...],
-    chi2_of: Callable[[dict[str, float]], float],
-) -> FitResult:
-    """The result of an ensemble, which has to be 50 autocorrelation times long.
-
-    Parameters
-    ----------
-    sampler : after its steps
-    free : names of the parameters
-    chi2_of : chi^2 of parameters by name
-    """
     chain = sampler.get_chain()
     tau = emcee.autocorr.integrated_time(chain, tol=0)
     worst = float(np.nanmax(tau)) if np.isfinite(tau).any() else float(len(chain))
     enough = len(chain) >= ENOUGH * worst
     message = f"{len(chain)} steps are {len(chain) / worst:.0f} autocorrelation times ({worst:.0f})"
-    return summary(
-        "mcmc",
-        free,
-        chain,
-        sampler.get_log_prob(),
-        chi2_of,
-        tau=tau,
-        discard=min(int(np.ceil(2 * worst)), len(chain) // 2),
-        converged=enough,
-        message=message + ("" if enough else f", of which at least {ENOUGH} are needed") + ".",
-        thin=max(1, int(worst / 2)),
-        details={"acceptance": float(np.mean(sampler.acceptance_fraction))},
-    )
+    return {
+        "converged": enough,
+        "message": message + ("" if enough else f", of which at least {ENOUGH} are needed") + ".",
+        "chain": chain,
+        "log_prob": sampler.get_log_prob(),
+        "tau": tau,
+        "discard": min(int(np.ceil(2 * worst)), len(chain) // 2),
+        "thin": max(1, int(worst / 2)),
+        "acceptance": float(np.mean(sampler.acceptance_fraction)),
+    }
 
 
-def summary(
-    method: str,
-    free: tuple[str, ...],
-    chain: Float[np.ndarray, "step walker par"],
-    log_prob: Float[np.ndarray, "step walker"],
-    chi2_of: Callable[[dict[str, float]], float],
+@jax.jit
+def agreement(
+    chain: Float[Array, "step chain par"],
+) -> tuple[Float[Array, " par"], Float[Array, " par"]]:
+    """R-hat and effective number of samples of each parameter; R-hat is NaN if it never moves.
+
+    Of both, the worse of two: of ranks, and of ranks of distances from the median, which say how
+    well widths are known (Vehtari et al. 2021, Bayesian Analysis 16, 667).
+    """
+    chain = jnp.swapaxes(chain, 0, 1)
+    distances = jnp.abs(chain - jnp.median(chain, axis=(0, 1)))
+    effective = jnp.minimum(ess_bulk(chain), ess_bulk(distances))
+    return jnp.atleast_1d(rhat(chain)), jnp.atleast_1d(effective)
+
+
+@jax.jit
+def _begun(unbounded, z):
+    return jax.vmap(lambda x: blackjax.nuts.init(x, unbounded.density))(z)
+
+
+@partial(jax.jit, static_argnames="steps")
+def _advanced(unbounded, begun, key, first, nwarmup, steps):
+    """Some steps of all chains, from the number `first` on: where they end, and their course."""
+    kernel = blackjax.nuts.build_kernel()
+    metric = jnp.ones(unbounded.center.size)
+    _, tuned, _ = dual_averaging_adaptation(ACCEPTANCE)
+
+    def step(state, number):
+        chains, tuning = state
+        warming = number < nwarmup
+        size = jnp.exp(jnp.where(warming, tuning.log_step_size, tuning.log_step_size_avg))
+        keys = jax.random.split(jax.random.fold_in(key, number), len(chains.logdensity))
+        chains, info = jax.vmap(lambda k, c: kernel(k, c, unbounded.density, size, metric))(
+            keys, chains
+        )
+        new = tuned(tuning, jnp.mean(jnp.nan_to_num(info.acceptance_rate)))
+        tuning = jax.tree.map(partial(jnp.where, warming), new, tuning)
+        values, jacobian = jax.vmap(unbounded.values)(chains.position)
+        course = {
+            "chain": values,
+            "log_prob": chains.logdensity - jacobian,
+            "acceptance": info.acceptance_rate,
+            "diverged": info.is_divergent,
+            "gradients": info.num_integration_steps,
+            "step_size": size,
+        }
+        return (chains, tuning), course
+
+    return jax.lax.scan(step, begun, first + jnp.arange(steps))
+
+
+def _course(unbounded, z, key, first, last, nwarmup, advance) -> dict[str, np.ndarray]:
+    """The steps first ... last - 1 of chains that begin at z, in which the step size is tuned."""
+    for _ in range(30):
+        chains = _begun(unbounded, z)
+        bad = ~np.isfinite(np.asarray(chains.logdensity))
+        if not bad.any():
+            break
+        # Far out the laws may not be finite.
+        z = np.where(bad[:, None], z / 2, z)
+    begin, _, _ = dual_averaging_adaptation(ACCEPTANCE)
+    # Of one type from the first call on, so that there is one program.
+    tuning = jax.tree.map(lambda x: jnp.asarray(x, float), begin(z.shape[1] ** -0.25))
+    state, courses = (chains, tuning), []
+    for number in range(first, last, BLOCK):
+        state, course = _advanced(unbounded, state, key, number, nwarmup, BLOCK)
+        courses.append(jax.tree.map(np.asarray, course))
+        advance(min(number + BLOCK, last))
+    return {k: np.concatenate([c[k] for c in courses])[: last - first] for k in courses[0]}
+
+
+def _no_u_turn(
+    unbounded: Unbounded,
+    labels: tuple[str, ...],
     *,
-    tau: Float[np.ndarray, " par"],
-    discard: int,
-    thin: int,
-    converged: bool,
-    message: str,
-    details: dict[str, Any],
+    seed: int,
+    nsteps: int,
+    nwarmup: int,
+    nchains: int,
+    progress: bool | Callable[[int, int], None],
+) -> dict[str, Any]:
+    """Chains of the no-U-turn sampler."""
+    z = SPREAD * np.random.default_rng(seed).normal(size=(nchains, len(labels)))
+    key, total = jax.random.key(seed), nwarmup + nsteps
+    pilot = nwarmup // 2 // BLOCK * BLOCK
+    with tqdm(total=total, disable=progress is not True, delay=2, leave=False) as bar:
+
+        def advance(done: int) -> None:
+            bar.update(done - bar.n)
+            if callable(progress):
+                progress(done, total)
+
+        if pilot and unbounded.root.ndim == 2:
+            chain = _course(unbounded, z, key, 0, pilot, pilot, advance)["chain"]
+            unbounded = unbounded.adapted(chain[pilot // 3 :].reshape(-1, len(labels)))
+            z = unbounded.coordinates(chain[-1])
+        else:
+            pilot = 0
+        course = _course(unbounded, z, key, pilot, total, nwarmup, advance)
+    course = {name: values[nwarmup - pilot :] for name, values in course.items()}
+    ratio, effective = map(np.asarray, agreement(course["chain"]))
+    worst, least = int(np.argmax(ratio)), float(np.min(effective))
+    diverged = int(course["diverged"].sum())
+    message = (
+        f"{nchains} chains of {nsteps} steps: R-hat {ratio[worst]:.3f} of {labels[worst]!r}, at "
+        f"least {least:.0f} effective samples, {diverged} divergent steps"
+    )
+    failed = []
+    if not ratio[worst] < AGREEMENT:
+        failed.append(f"an R-hat below {AGREEMENT}")
+    if not least >= EFFECTIVE * nchains:
+        failed.append(f"{EFFECTIVE * nchains} effective samples")
+    if diverged > RARE * nsteps * nchains:
+        failed.append(f"at most {RARE * nsteps * nchains:.0f} divergent ones")
+    with np.errstate(divide="ignore"):
+        tau = nsteps * nchains / effective
+    return {
+        "converged": not failed,
+        "message": message + (f"; needed are {', '.join(failed)}." if failed else "."),
+        "chain": course["chain"],
+        "log_prob": course["log_prob"],
+        "tau": tau,
+        "discard": 0,
+        "thin": 1,
+        "acceptance": float(np.mean(course["acceptance"])),
+        "divergences": diverged,
+        "rhat": dict(zip(labels, ratio.tolist(), strict=True)),
+        "ess": dict(zip(labels, effective.tolist(), strict=True)),
+        "gradients": float(np.mean(course["gradients"])),
+        "step_size": float(course["step_size"][-1]),
+    }
+
+
+def _options(sampler: str, given: dict[str, Any]) -> dict[str, Any]:
+    """What the sampler is called with."""
+    if sampler not in OPTIONS:
+        names = " or ".join(map(repr, OPTIONS))
+        raise ValueError(f"Argument `sampler` must be {names}, not {sampler!r}.")
+    known = OPTIONS[sampler]
+    given = {name: value for name, value in given.items() if value is not None}
+    for name in given:
+        if name not in known:
+            raise ValueError(f"Argument `{name}` is not one of the sampler {sampler!r}.")
+    options = known | given
+    if sampler == "nuts" and (
+        options["nsteps"] < 4 or options["nwarmup"] < 0 or options["nchains"] < 1
+    ):
+        shown = ", ".join(f"{name}={value}" for name, value in options.items())
+        raise ValueError(f"The sampler 'nuts' needs at least 4 steps and a chain, not {shown}.")
+    return options
+
+
+def sample(
+    like: Likelihood,
+    start: Mapping[str, Numeric] | None = None,
+    *,
+    priors: Mapping[str, Prior] | None = None,
+    sampler: str = "emcee",
+    nsteps: int | None = None,
+    nwarmup: int | None = None,
+    nchains: int | None = None,
+    nwalkers: int | None = None,
+    seed: int = 0,
+    backend: ChainFile | None = None,
+    progress: bool | Callable[[int, int], None] = True,
+    throw: bool = True,
 ) -> FitResult:
-    """The result of a chain.
+    """Samples of the posterior.
+
+    The posterior is the likelihood times the priors. Where signals are near the noise of a pixel,
+    a spectral likelihood is narrower than the scatter of its maximum, and so are its samples: see
+    the covariance of `best_fit`.
 
     Parameters
     ----------
-    method, free, converged, message : see `FitResult`
-    chain, log_prob : all steps
-    chi2_of : chi^2 of parameters by name
-    tau : autocorrelation time of each parameter
-    discard, thin : steps at the beginning that are not used, and of which one is enough
-    details : what not all chains have
+    like : from `fits.likelihood` or `fits.spectral_likelihood`
+    start : start values of the free parameters by name, by default those of the likelihood; chains
+        and walkers start around the best fit
+    priors : priors by name, the same in each region
+    sampler : "emcee", the affine-invariant ensemble, or "nuts", the no-U-turn sampler of blackjax.
+        For a few parameters the second takes seconds, nearly all of them to compile, and gives ten
+        times as many independent samples a second afterwards; for hundreds of regions, where the
+        first fails, minutes. The first can be resumed, the second cannot.
+    nsteps : steps of each walker (5000) in all, or of each chain (1000) that are kept
+    nwarmup : "nuts": steps before that (300): half of them to see how parameters vary together,
+        if they are few, and all to tune the step size
+    nchains : "nuts": number of chains (4)
+    nwalkers : "emcee": size of the ensemble (32)
+    seed : of the start positions and the moves
+    backend : "emcee": file of the chain; one that already holds steps is resumed up to `nsteps`,
+        with the very steps an uninterrupted run would have made
+    progress : show a progress bar, or call a function with the steps done and those in all
+    throw : raise if the chains are too short or do not agree
+
+    Returns
+    -------
+    Result of method "mcmc" or "nuts", with the most probable sample, central intervals and
+    covariance of the samples, of emcee after two autocorrelation times. Regions without a pixel
+    have no row in it. `details` holds "chain" (step, walker or chain, row), "log_prob", "tau" by
+    label, "acceptance", "discard" and "thin"; of "nuts" also "divergences", their number, "rhat"
+    and "ess", the number of effective samples, by label, "gradients", their mean number for a
+    step, and "step_size".
+
+    Raises
+    ------
+    KeyError, ValueError
+        For unknown parameters, start values outside their prior, an unknown sampler, arguments of
+        the other one, and fewer than twice as many walkers as parameters.
+    FitError
+        If data and priors do not determine the parameters, a chain of emcee is shorter than 50
+        autocorrelation times, or, with "nuts", R-hat is 1.01 or more, there are fewer than 100
+        effective samples for each chain, or more than one in a thousand steps diverged. If chi^2
+        is that of no fit, or a parameter is left open (`fits.results`). Not if throw=False; the
+        result is in its `.result`.
     """
-    flat = chain[discard:].reshape(-1, len(free))
-    best = np.unravel_index(np.argmax(log_prob), log_prob.shape)
-    values = {name: float(v) for name, v in zip(free, chain[best], strict=True)}
-    low, high = np.percentile(flat, [15.865525, 84.134475], axis=0)
-    return FitResult(
-        method=method,
-        free=free,
-        best_fit=values,
-        interval_68={n: (float(low[i]), float(high[i])) for i, n in enumerate(free)},
-        covariance=np.atleast_2d(np.cov(flat.T)),
-        chi2=chi2_of(values),
-        converged=converged,
-        message=message,
-        details={
-            "chain": chain,
-            "log_prob": log_prob,
-            "tau": {name: float(t) for name, t in zip(free, tau, strict=True)},
-            "discard": discard,
-            "thin": thin,
-        }
-        | details,
-    )
+    check_seed("seed", seed)
+    given = {"nsteps": nsteps, "nwarmup": nwarmup, "nchains": nchains}
+    options = _options(sampler, given | {"nwalkers": nwalkers, "backend": backend})
+    like = like.at(start)
+    posterior = Posterior(like, check_priors(priors, like.free))
+    fit = best_fit(like, priors=priors, throw=False)
+    center = np.array(like.flat(like.check(fit.best_fit)))
+    unbounded, unknown = unbounded_posterior(posterior, center)
+    labels = tuple(np.array(posterior.labels)[posterior.present].tolist())
+    if unknown:
+        shown = ", ".join(unknown[:6]) + (f" and {len(unknown) - 6} more" if unknown[6:] else "")
+        nothing = posterior.named(np.full(posterior.start.size, np.nan))
+        return fit._replace(
+            method=METHODS[sampler],
+            best_fit=nothing,
+            sigma=nothing,
+            interval_68={name: (value, value) for name, value in nothing.items()},
+            labels=labels,
+            covariance=np.full((len(labels), len(labels)), np.nan),
+            converged=False,
+            message=f"Data and priors do not determine {shown}: there is nothing to draw from.",
+            details={},
+        ).checked(throw)
+    if sampler == "emcee":
+        details = _ensemble(unbounded, seed=seed, progress=progress, **options)
+    else:
+        details = _no_u_turn(unbounded, labels, seed=seed, progress=progress, **options)
+    details["tau"] = dict(zip(labels, details["tau"].tolist(), strict=True))
+    best = np.unravel_index(np.argmax(details["log_prob"]), details["log_prob"].shape)
+    theta = np.array(unbounded.theta)
+    theta[posterior.present] = details["chain"][best]
+    result = fit._replace(
+        method=METHODS[sampler],
+        best_fit=posterior.named(theta),
+        labels=labels,
+        chi2=2 * float(posterior.derivatives(theta).value.sum()),
+        converged=details.pop("converged"),
+        message=details.pop("message"),
+        details=details,
+    ).with_chain(details["chain"])
+    return result.judged(result.chi2, result.dof, like.start).checked(throw)

@@ -151,7 +151,7 @@ def component_maps(
     Parameters
     ----------
     like : from `spectral_likelihood`, for its laws, bands and regions
-    params : spectral parameters, such as `SpectralFit.best_fit`
+    params : spectral parameters, such as `FitResult.best_fit`
     data, noise : as they were given to `spectral_likelihood`
     covariance : whether to make the covariance of the amplitudes
 

@@ -16,11 +16,11 @@ from fits.chains import kept_chain
 from fits.common import CommonMaps
 from fits.grid import grid_fit, grid_is_possible
 from fits.optimize import best_fit
+from fits.posterior import chi2
 from fits.priors import priors_of
 from fits.record import fingerprint
 from fits.results import FitResult
 from fits.sampling import sample
-from fits.template_likelihood import chi2
 from fits.template_noise import Attenuation, attenuation
 from jaxsky import observe_components, parameter_names, set_parameters
 from jaxsky.progress import QUIET, Progress

@@ -28,6 +28,7 @@ import scipy.linalg
 from jaxtyping import Array, Float, Int
 
 from fits.compress import gram, square_root
+from fits.posterior import Likelihood
 from jaxsky import Bandpass, Sky, observe_components, parameter_names, set_parameters
 from jaxsky.checks import UNSEEN, Numeric, as_array, check_double
 from jaxsky.interpolation import NodeCounts, Nodes
@@ -65,30 +66,13 @@ class Bands(eqx.Module):
         return {name: value for name, value in params.items() if name not in own}
 
 
-class Likelihood(eqx.Module):
-    """Base class: -2 log L is the sum of squares of `residuals(params)`, up to a constant."""
+class SkyLikelihood(Likelihood):
+    """Base class of those whose amplitudes are the templates'."""
 
     sky: Sky
     bands: Bands
 
-    def residuals(self, params: Mapping[str, Numeric]) -> Float[Array, " row"]:
-        """Residuals at values of any of the parameters by name; the others keep theirs."""
-        raise TypeError(f"{type(self).__name__} must define `residuals`.")
-
-    def dof(self, free: int) -> int:
-        """Degrees of freedom of chi^2: data with weight, less amplitudes and free parameters."""
-        return int(self.values) - free  # type: ignore[attr-defined]  # a field of each
-
-    def check(self, params: Mapping[str, Numeric]) -> dict[str, Array]:
-        """The parameters as numbers.
-
-        Raises
-        ------
-        KeyError
-            If a name is unknown; the message lists the known ones.
-        ValueError
-            If a value is not a number, or there is none.
-        """
+    def check(self, params):
         known = (*parameter_names(self.sky), *self.bands.parameter_names())
         if not params:
             raise ValueError("Argument `start` must name at least one free parameter.")
@@ -100,22 +84,10 @@ class Likelihood(eqx.Module):
                 raise unknown_parameter(name, [k for k in known if not k.endswith(".amplitude")])
             if jnp.shape(value) != ():
                 raise ValueError(f"Free parameter {name!r} must be a number, not a map.")
-        return {name: as_array(name, value) for name, value in params.items()}
+        return {name: as_array(name, value).astype(float) for name, value in params.items()}
 
 
-def chi2(like: Likelihood, params: Mapping[str, Numeric]) -> Float[Array, ""]:
-    """Sum of squares of the residuals: chi^2, or -2 log L up to a constant."""
-    # All of one type, or it would be compiled again for Python's numbers.
-    values = {name: as_array(name, value).astype(float) for name, value in params.items()}
-    return _chi2(like, values)
-
-
-@jax.jit
-def _chi2(like, params):
-    return jnp.sum(like.residuals(params) ** 2)
-
-
-class TemplateLikelihood(Likelihood):
+class TemplateLikelihood(SkyLikelihood):
     """Likelihood on inner products; for spectral parameters that are constant over the region.
 
     `sky` has unit amplitudes on a single pixel: what a component shows in a band is then the
@@ -141,7 +113,7 @@ class TemplateLikelihood(Likelihood):
         return self.matrix @ vector.ravel()
 
 
-class PixelLikelihood(Likelihood):
+class PixelLikelihood(SkyLikelihood):
     """Likelihood pixel by pixel; for spectral parameters that are maps."""
 
     data: Float[Array, "band stokes pix"]
@@ -221,7 +193,7 @@ def likelihood(
     stokes: str | None = None,
     covariance_of: CovarianceOf | None = None,
     pixelwise: bool = False,
-) -> Likelihood:
+) -> SkyLikelihood:
     """The likelihood of maps as a function of the parameters named in `start`.
 
     Parameters
@@ -263,7 +235,7 @@ def likelihood(
         raise ValueError(f"Argument `stokes` must be among {labels!r}, not {stokes!r}.")
     keep = np.array([labels.index(s) for s in stokes])
     own = Bands(tuple(bands.values()), tuple(bands), labels)
-    params = Likelihood(sky, own).check(start)
+    params = SkyLikelihood({}, sky, own).check(start)
     offsets = [name for name in params if name.startswith("offset.")]
     for name in offsets:
         if name[-1] not in stokes:
@@ -275,7 +247,7 @@ def likelihood(
     if not is_uniform(sky) or pixelwise:
         at_start = set_parameters(sky, shifts)
         return _pixel_likelihood(
-            at_start, sky, own, data, weights, keep, covariance_of, bool(offsets)
+            params, at_start, sky, own, data, weights, keep, covariance_of, bool(offsets)
         )
 
     templates = jnp.stack([c.amplitude for c in sky.components.values()])
@@ -284,14 +256,14 @@ def likelihood(
     if covariance_of is None:
         root = square_root(products)
         matrix = _matrix(None, root, keep, len(labels))
-        return TemplateLikelihood(_unit_sky(sky), own, matrix, values)
+        return TemplateLikelihood(params, _unit_sky(sky), own, matrix, values)
     used = slice(1, None if offsets else -1)  # a constant row tells offsets from templates
     if offsets:
         templates = jnp.concatenate([templates, jnp.ones_like(templates[:1])])
     rows = _weighted_templates(templates, weights)
     whitening = _whitening(_covariance(covariance_of, rows, keep))
     matrix = _matrix(whitening, products[:, :, used], keep, len(labels))
-    return TemplateLikelihood(_unit_sky(sky), own, matrix, jnp.array(len(whitening)))
+    return TemplateLikelihood(params, _unit_sky(sky), own, matrix, jnp.array(len(whitening)))
 
 
 @jax.jit
@@ -356,7 +328,7 @@ def _whitening(covariance: Float[np.ndarray, "row row"]) -> Float[Array, "row ro
     return jnp.asarray(scipy.linalg.solve_triangular(root, np.diag(1 / scale), lower=True))
 
 
-def _pixel_likelihood(at_start, sky, bands, data, weights, keep, covariance_of, constant):
+def _pixel_likelihood(start, at_start, sky, bands, data, weights, keep, covariance_of, constant):
     every = weights
     weights = jnp.zeros_like(weights).at[:, keep].set(weights[:, keep])
     data = jnp.where(weights > 0, data, 0)
@@ -373,4 +345,5 @@ def _pixel_likelihood(at_start, sky, bands, data, weights, keep, covariance_of, 
         kept = (keep[:, None] * len(maps) + np.arange(len(maps))).ravel()
         rows = _one_stokes_each(whole)[:, kept]
         values = jnp.array(len(whitening))
-    return PixelLikelihood(sky, bands, data, jnp.sqrt(weights), nodes, rows, whitening, values)
+    root = jnp.sqrt(weights)
+    return PixelLikelihood(start, sky, bands, data, root, nodes, rows, whitening, values)

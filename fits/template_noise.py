@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fits.compress import gram
+from fits.posterior import Likelihood
 from fits.results import FitResult
-from fits.template_likelihood import Likelihood, TemplateLikelihood
+from fits.template_likelihood import TemplateLikelihood
 from jaxsky import Sky
 from jaxsky.harmonics import Preparation, gaussian_beam, pixel_window
 from jaxsky.inputs import Template
@@ -143,7 +144,10 @@ def attenuation(
     moved = like.matrix @ vector.at[:, keep, 1:].set(-lacking).ravel()
     gradient = jax.vjp(like.residuals, params)[1](moved)[0]
     slope = np.array([float(gradient[name]) for name in result.free])
-    shifts = -np.asarray(result.covariance) @ slope
+    # A parameter at the edge of its prior has no error, and stays there.
+    covariance = np.asarray(result.covariance)
+    shifts = -np.nan_to_num(covariance) @ slope
+    shifts[np.isnan(np.diagonal(covariance))] = np.nan
     return Attenuation(shares, dict(zip(result.free, shifts.tolist(), strict=True)))
 
 

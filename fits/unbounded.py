@@ -15,9 +15,8 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Bool, Float, Int
 
-from fits.posterior import Problem, prior_terms
+from fits.posterior import Likelihood, Posterior, prior_terms
 from fits.priors import Prior
-from fits.profile_likelihood import SpectralLikelihood
 from fits.systems import degenerate
 
 #: Samples for each parameter, from which on they tell more than the curvature at the best fit.
@@ -28,7 +27,7 @@ ENOUGH = 30
 NEAR = 0.25
 
 
-class Posterior(NamedTuple):
+class Unbounded(NamedTuple):
     """The posterior of the parameters of regions with pixels, and numbers to move in.
 
     Parameters
@@ -41,7 +40,7 @@ class Posterior(NamedTuple):
         added to the numbers of the others for each unit of distance from there
     """
 
-    like: SpectralLikelihood
+    like: Likelihood
     priors: list[tuple[Prior, Array]]
     theta: Float[Array, " all"]
     present: Int[Array, " par"]
@@ -58,7 +57,7 @@ class Posterior(NamedTuple):
         """Log posterior of parameters within their uniform priors, without constants."""
         theta = self.theta.at[self.present].set(values)
         value = prior_terms(theta, self.priors)[0]
-        return -self.like.total(theta[self.like.index]) / 2 - value
+        return -self.like.total(theta[self.like.cells()]) / 2 - value
 
     def values(self, z: Float[Array, " par"]) -> tuple[Float[Array, " par"], Float[Array, ""]]:
         """Parameters, and the log of the Jacobian of the logistic map."""
@@ -90,7 +89,7 @@ class Posterior(NamedTuple):
         # At an edge to rounding, the number is not infinite.
         return np.where(self.bounded, scipy.special.logit(np.clip(unit, 1e-15, 1 - 1e-15)), values)
 
-    def adapted(self, values: Float[np.ndarray, "sample par"]) -> "Posterior":
+    def adapted(self, values: Float[np.ndarray, "sample par"]) -> "Unbounded":
         """With the covariance of samples; the same if they are too few, or do not move."""
         if self.root.ndim == 1 or len(values) < ENOUGH * values.shape[1]:
             return self
@@ -123,23 +122,23 @@ class Posterior(NamedTuple):
         )
 
 
-def scaled_posterior(problem: Problem, theta: np.ndarray) -> tuple[Posterior, list[str]]:
+def unbounded_posterior(posterior: Posterior, theta: np.ndarray) -> tuple[Unbounded, list[str]]:
     """The posterior, scaled by its curvature near the best fit; parameters it does not determine.
 
     Parameters
     ----------
-    problem : the function
+    posterior : the function
     theta : the best fit
     """
-    present = np.flatnonzero(problem.present)
-    bounded = np.isfinite(problem.low[present])
-    low = np.where(bounded, problem.low[present], 0.0)
-    high = np.where(bounded, problem.high[present], 1.0)
+    present = np.flatnonzero(posterior.present)
+    bounded = np.isfinite(posterior.low[present])
+    low = np.where(bounded, posterior.low[present], 0.0)
+    high = np.where(bounded, posterior.high[present], 1.0)
     width = high - low
 
     def derivatives(theta):
-        local = problem.convex(theta, problem.exact(theta))
-        return problem.curvature(theta, local, present), problem.value(theta)[1][present]
+        local = posterior.convex(theta, posterior.exact(theta))
+        return posterior.curvature(theta, local, present), posterior.value(theta)[1][present]
 
     # Away from the edges by what the density falls over there.
     matrix, slope = derivatives(theta)
@@ -159,20 +158,20 @@ def scaled_posterior(problem: Problem, theta: np.ndarray) -> tuple[Posterior, li
     if isinstance(matrix, np.ndarray):
         matrix = matrix * jacobian * jacobian[:, None]
         np.fill_diagonal(matrix, diagonal)
-        unknown = degenerate(matrix, [problem.labels[i] for i in present])
+        unknown = degenerate(matrix, [posterior.labels[i] for i in present])
     elif (flat := ~(diagonal > 0)).any():
-        unknown = [problem.labels[i] for i in present[flat]]
+        unknown = [posterior.labels[i] for i in present[flat]]
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     root, cut, lean = scale, np.zeros(len(present), bool), np.zeros(0)
     if isinstance(matrix, np.ndarray) and not unknown:
         root, cut, lean = _straightened(matrix * scale * scale[:, None], bounded, scale, jacobian)
     center = np.where(bounded, np.log(unit / (1 - unit)), theta[present])
     numbers = (theta, present, bounded, low, high, center, root, cut, theta[present], lean)
-    return Posterior(problem.like, problem.priors, *map(jnp.asarray, numbers)), unknown
+    return Unbounded(posterior.like, posterior.priors, *map(jnp.asarray, numbers)), unknown
 
 
 def _straightened(matrix, bounded, scale, jacobian):
-    """Root, cut parameters, and lean of others on these; see `Posterior`.
+    """Root, cut parameters, and lean of others on these; see `Unbounded`.
 
     Parameters
     ----------

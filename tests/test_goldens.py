@@ -16,9 +16,10 @@ import pytest
 import systems
 from fits.covariance import Fluctuations
 from fits.multipoles import harmonic_likelihood
+from fits.posterior import chi2, hessian
+from fits.profile_likelihood import spectral_likelihood
 from fits.pseudo_cl import masked_spectra
-from fits.separation import hessian, spectral_likelihood
-from fits.template_likelihood import chi2, likelihood
+from fits.template_likelihood import likelihood
 from jaxsky import Bandpass, Sky, get_parameters, observe, parameter_names, set_parameters
 from jaxsky.cmb import realisation
 from jaxsky.components import FreeFree

@@ -16,7 +16,8 @@ import systems
 from fits.compress import gram, square_root
 from fits.covariance import Fluctuations
 from fits.optimize import best_fit
-from fits.template_likelihood import chi2, likelihood
+from fits.posterior import chi2
+from fits.template_likelihood import likelihood
 from jaxsky import AME, Bandpass, Dust, Sky, Synchrotron, observe, parameter_names, set_parameters
 from jaxsky.cmb import camb_spectra
 from jaxsky.harmonics import Preparation, adjoint_synthesis, alm_ell, gaussian_beam

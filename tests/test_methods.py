@@ -10,7 +10,7 @@ from fits.chains import ChainFile
 from fits.grid import grid_fit
 from fits.optimize import best_fit
 from fits.priors import Gaussian, Uniform, from_unbounded, log_prior, to_unbounded
-from fits.results import FitError, FitResult, misfit
+from fits.results import FitError, misfit
 from fits.sampling import sample
 from fits.template_likelihood import likelihood
 from jaxsky import Dust, Sky, observe, set_parameters
@@ -38,10 +38,10 @@ def test_the_three_methods_agree(like):
     mcmc = sample(like, START, priors=PRIORS, nsteps=4000, progress=False)
     assert gradient.free == grid.free == mcmc.free == tuple(sorted(START))
     for name in START:
-        sigma = gradient.sigma(name)
+        sigma = gradient.sigma[name]
         for other in (grid, mcmc):
             assert abs(other.best_fit[name] - gradient.best_fit[name]) < 0.1 * sigma
-            assert other.sigma(name) == pytest.approx(sigma, rel=0.05)
+            assert other.sigma[name] == pytest.approx(sigma, rel=0.05)
             for a, b in zip(other.interval_68[name], gradient.interval_68[name], strict=True):
                 assert abs(a - b) < 0.1 * sigma
     assert grid.chi2 == pytest.approx(gradient.chi2, abs=0.02)
@@ -88,10 +88,10 @@ def test_a_gaussian_prior_pulls_by_its_weight():
     name = "calibration.44"
     like = likelihood(sky, BANDS, data, sigma, {name: 1.0})
     free = best_fit(like, {name: 1.0})
-    prior = Gaussian(free.best_fit[name] + 1.0, free.sigma(name))
+    prior = Gaussian(free.best_fit[name] + 1.0, free.sigma[name])
     pulled = best_fit(like, {name: 1.0}, priors={name: prior})
     assert pulled.best_fit[name] == pytest.approx(free.best_fit[name] + 0.5, abs=1e-6)
-    assert pulled.sigma(name) == pytest.approx(free.sigma(name) / np.sqrt(2), rel=1e-6)
+    assert pulled.sigma[name] == pytest.approx(free.sigma[name] / np.sqrt(2), rel=1e-6)
 
 
 def test_more_free_parameters_by_name():
@@ -103,7 +103,7 @@ def test_more_free_parameters_by_name():
     }
     found = best_fit(likelihood(sky, BANDS, data, sigma, start), start, priors=priors)
     for name, value in (("dust.beta_dust", 1.53), ("offset.44.Q", 0.0), ("dust.T_dust", 21.0)):
-        assert abs(found.best_fit[name] - value) < 4 * found.sigma(name)
+        assert abs(found.best_fit[name] - value) < 4 * found.sigma[name]
 
 
 def test_unbounded_numbers_and_ranges_are_inverse():
@@ -155,7 +155,7 @@ def test_a_parameter_without_effect_is_reported():
     sky, data, sigma = problem(sky=Sky({"dust": Dust(problem()[0]["dust"].amplitude)}))
     start = {"dust.nu_ref": 353.0, "calibration.44": 1.0, "calibration.70": 1.0}
     like = likelihood(sky, BANDS, data, sigma, start)
-    with pytest.raises(FitError, match=r"do not constrain|solver stopped"):
+    with pytest.raises(FitError, match=r"do not determine .*dust.nu_ref: parameters are degen"):
         best_fit(like, start)
 
 
@@ -165,7 +165,7 @@ def test_too_few_steps_are_reported_by_the_solver():
     slow = optx.GradientDescent(learning_rate=1e-9, rtol=1e-12, atol=1e-12)
     result = best_fit(like, START, solver=slow, throw=False)
     assert not result.converged
-    assert "solver stopped" in result.message
+    assert "The search stopped after 500 steps" in result.message
 
 
 def test_a_grid_needs_one_or_two_parameters_with_ranges(like):
@@ -179,7 +179,7 @@ def test_a_grid_of_one_parameter(like):
     start = {"dust.beta_dust": 1.6}
     priors = {"dust.beta_dust": PRIORS["dust.beta_dust"]}
     grid, gradient = grid_fit(like, start, priors=priors), best_fit(like, start, priors=priors)
-    assert grid.sigma("dust.beta_dust") == pytest.approx(gradient.sigma("dust.beta_dust"), rel=0.03)
+    assert grid.sigma["dust.beta_dust"] == pytest.approx(gradient.sigma["dust.beta_dust"], rel=0.03)
 
 
 def test_a_short_chain_is_reported(like):
@@ -314,6 +314,7 @@ def test_a_parameter_that_runs_away_is_no_fit():
     away = result._replace(converged=True, best_fit={"dust.T_dust": 1e12})
     judged = away.judged(1.0, 10, {"dust.T_dust": 19.6})
     assert "do not constrain 'dust.T_dust': from 19.6 it went to 1e+12" in judged.message
-    offset = FitResult("gradient", ("offset.44.Q",), {"offset.44.Q": 900.0}, {}, np.eye(1), 1.0,
-                       True, "converged", {})  # fmt: skip
+    offset = result._replace(
+        converged=True, best_fit={"offset.44.Q": 900.0}, sigma={"offset.44.Q": 1.0}
+    )
     assert offset.judged(1.0, 10, {"offset.44.Q": 0.0}).converged

@@ -53,11 +53,13 @@ def test_chains_of_any_name_are_drawn(tmp_path):
     chain = np.random.default_rng(0).normal(size=(200, 8, 2))
     result = FitResult(
         "mcmc",
-        free,
         dict.fromkeys(free, 0.0),
+        dict.fromkeys(free, 1.0),
         dict.fromkeys(free, (-1.0, 1.0)),
+        free,
         np.eye(2),
         1.0,
+        10,
         True,
         "",
         {"chain": chain, "discard": 0, "thin": 1},

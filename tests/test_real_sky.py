@@ -73,6 +73,6 @@ def test_a_map_of_the_dust_index_shifts_as_a_whole(wmap):
     # The index map's mean over the strip, weighted by the dust, is 1.52 ... 1.56.
     shifted = 1.54 + by_map.best_fit["dust.beta_dust.offset"]
     assert shifted == pytest.approx(by_number.best_fit["dust.beta_dust"], abs=0.05)
-    assert by_map.sigma("dust.beta_dust.offset") == pytest.approx(
-        by_number.sigma("dust.beta_dust"), rel=0.1
+    assert by_map.sigma["dust.beta_dust.offset"] == pytest.approx(
+        by_number.sigma["dust.beta_dust"], rel=0.1
     )

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from fits.commands.run import DEFAULTS
+from fits.optimize import best_fit
 from fits.priors import priors_of
 from fits.pseudo_cl import band_powers
 from fits.separate import report
@@ -16,7 +17,6 @@ from fits.separate import separate as module
 from fits.separate.report import tables, warnings
 from fits.separate.separate import separate
 from fits.separate.setup import build
-from fits.separation import fit_spectra
 from fits.separation.response import Response, widened
 from fits.tensor_ratio import fit_tensors
 from jaxsky.cmb import camb_spectra, realisation
@@ -82,7 +82,7 @@ def test_pulls_of_laws_and_r():
         prior = priors_of(how, "separate")
         mean = 21.0 + 2.0 * float(jax.random.normal(jax.random.fold_in(key, 2)))
         prior["dust.T_dust"] = type(prior["dust.T_dust"])(mean, 2.0)
-        fit = fit_spectra(like, found.fit.best_fit, priors=prior)
+        fit = best_fit(like, found.fit.best_fit, priors=prior)
         pulls.append([(fit.best_fit[n] - setup.truth[n]) / found.sigma[n] for n in fit.free])
         maps = domain.components(like, fit.best_fit, data, covariance=False).amplitude
         powers = band_powers(found.spectra, maps[found.components.index("cmb")])[1]
@@ -164,7 +164,7 @@ def test_regions_have_values_of_their_own():
     found = separate(how, setup)
     assert np.shape(found.fit.best_fit["dust.beta_dust"]) == (2,)
     assert np.shape(found.sigma["synchrotron.beta_syn"]) == (3,)
-    assert found.chain.free == found.fit.labels
+    assert found.chain.labels == found.fit.labels
     for name in found.fit.free:
         off = np.abs(np.asarray(found.fit.best_fit[name]) - setup.truth[name])
         assert np.all(off < 4.5 * np.asarray(found.sigma[name]))
@@ -184,7 +184,7 @@ def test_the_response_is_that_of_a_new_fit():
     noise = 0.1 * domain.noise_realisation(jax.random.key(8))
     like = domain.likelihood(data + noise)
     moved = response.moved(like, jax.random.key(0))
-    again = fit_spectra(like, found.fit.best_fit)
+    again = best_fit(like, found.fit.best_fit)
     change = like.flat(again.best_fit) - response.theta
     np.testing.assert_allclose(moved - response.theta, change, rtol=0.05, atol=1e-6)
     silent = domain.likelihood(data)
@@ -193,7 +193,7 @@ def test_the_response_is_that_of_a_new_fit():
     scatter = np.cov((np.array(steps) - with_priors.theta).T)
     # H^-1 P H^-1, with P the inverse variance of the prior's mean.
     at = found.fit.labels.index("dust.T_dust")
-    inverse = np.linalg.inv(found.fit.hessian)
+    inverse = np.linalg.inv(found.fit.details["hessian"])
     expected = inverse[at, at] / 2.0
     assert np.sqrt(scatter[at, at]) == pytest.approx(expected, rel=0.15)
 
@@ -203,11 +203,11 @@ def test_widened_samples_have_the_errors_of_simulations():
     _, _, found = separated("pixel", 20, "nuts")
     chain = found.chain
     assert chain.converged
-    at = [found.fit.labels.index(name) for name in chain.free]
+    at = [found.fit.labels.index(name) for name in chain.labels]
     sigma = np.sqrt(np.diagonal(chain.covariance))
     expected = found.simulated.theta[:, at].std(axis=0, ddof=1)
     np.testing.assert_allclose(sigma, expected, rtol=0.1)
-    for name, s in zip(chain.free, sigma, strict=True):
+    for name, s in zip(chain.labels, sigma, strict=True):
         low, high = chain.interval_68[name]
         assert high - low == pytest.approx(2 * s, rel=0.1)
     # With too few simulations for a covariance, each by itself.

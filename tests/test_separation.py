@@ -10,11 +10,11 @@ import scipy.optimize
 from fits.grid import grid_fit
 from fits.noise import as_noise
 from fits.optimize import best_fit
+from fits.posterior import chi2, fisher, hessian
 from fits.priors import Gaussian, Uniform
+from fits.profile_likelihood import spectral_likelihood
 from fits.results import FitError
 from fits.separated_maps import component_maps, noise_degradation, residual_maps
-from fits.separation import fisher, fit_spectra, hessian, spectral_likelihood
-from fits.template_likelihood import chi2
 from jaxsky import AME, CMB, Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.constants import H_OVER_K, T_CMB
 
@@ -172,7 +172,7 @@ def test_value_amplitudes_and_fisher_are_the_dense_ones(kind, stokes, params):
 def test_the_maximum_is_that_of_the_dense_likelihood(kind):
     _, data, given, covariance = problem(kind)
     like = spectral_likelihood(random_sky(), BANDS, data, given, START)
-    fit = fit_spectra(like)
+    fit = best_fit(like)
 
     def objective(theta):
         return dense(data, covariance, dict(zip(sorted(START), theta, strict=True)))[0]
@@ -289,14 +289,14 @@ def test_derivatives_in_data_and_weights():
 @pytest.mark.parametrize("kind", ["band", "full"])
 def test_order_of_pixels_bands_and_components_does_not_matter(kind):
     sky, data, given, _ = problem(kind)
-    fit = fit_spectra(spectral_likelihood(sky, BANDS, data, given, START))
+    fit = best_fit(spectral_likelihood(sky, BANDS, data, given, START))
     rng = np.random.default_rng(4)
     pixels, order = rng.permutation(NPIX), rng.permutation(len(BANDS))
     noise = given[order] if kind == "band" else given[order][..., pixels]
     bands = {list(BANDS)[i]: BANDS[list(BANDS)[i]] for i in order}
     renamed = {"z": sky["cmb"], "b": sky["synchrotron"], "a": sky["dust"]}
     start = {"a.beta_dust": 1.5, "a.T_dust": 21.0, "b.beta_syn": 3.0}
-    again = fit_spectra(spectral_likelihood(renamed, bands, data[order][..., pixels], noise, start))
+    again = best_fit(spectral_likelihood(renamed, bands, data[order][..., pixels], noise, start))
     for one, other in zip(fit.free, ("a.T_dust", "a.beta_dust", "b.beta_syn"), strict=True):
         assert again.best_fit[other] == pytest.approx(fit.best_fit[one], rel=1e-8)
         assert again.sigma[other] == pytest.approx(fit.sigma[one], rel=1e-6)
@@ -305,11 +305,11 @@ def test_order_of_pixels_bands_and_components_does_not_matter(kind):
 @pytest.mark.parametrize("unit", ["K_RJ", "mK_CMB"])
 def test_units_of_the_maps_do_not_matter(unit):
     sky, data, given, _ = problem()
-    fit = fit_spectra(spectral_likelihood(sky, BANDS, data, given, START))
+    fit = best_fit(spectral_likelihood(sky, BANDS, data, given, START))
     factors = np.array([float(b.conversion("uK_RJ", unit)) for b in BANDS.values()])
     data, given = data * factors[:, None, None], given * factors
     like = spectral_likelihood(sky, BANDS, data, given, START, unit=unit)
-    again = fit_spectra(like)
+    again = best_fit(like)
     np.testing.assert_allclose(like.flat(again.best_fit), like.flat(fit.best_fit), rtol=1e-8)
     np.testing.assert_allclose(again.covariance, fit.covariance, rtol=1e-6, atol=1e-12)
     maps = component_maps(like, again.best_fit, data, given)
@@ -334,14 +334,14 @@ def test_other_ways_to_fit_give_the_same():
     sky, data, given, _ = problem()
     like = spectral_likelihood(sky, BANDS, data, given, START)
     priors = {"dust.T_dust": Gaussian(19.6, 0.05)}
-    fit = fit_spectra(like, priors=priors)
+    fit = best_fit(like, priors=priors)
     other = best_fit(like, START, priors=priors)
     np.testing.assert_allclose(like.flat(other.best_fit), like.flat(fit.best_fit), rtol=1e-7)
     # The curvature of residuals with the noise of the amplitudes is that of the sum.
-    np.testing.assert_allclose(other.covariance, np.linalg.inv(fit.hessian), rtol=1e-6)
+    np.testing.assert_allclose(other.covariance, np.linalg.inv(fit.details["hessian"]), rtol=1e-6)
     one = spectral_likelihood(sky, BANDS, data, given, {"dust.beta_dust": 1.5})
     grid = grid_fit(one, {"dust.beta_dust": 1.5}, priors={"dust.beta_dust": Uniform(1.0, 2.0)})
-    fit = fit_spectra(one, priors={"dust.beta_dust": Uniform(1.0, 2.0)})
+    fit = best_fit(one, priors={"dust.beta_dust": Uniform(1.0, 2.0)})
     assert grid.best_fit["dust.beta_dust"] == pytest.approx(
         fit.best_fit["dust.beta_dust"], abs=0.1 * fit.sigma["dust.beta_dust"]
     )
@@ -350,21 +350,21 @@ def test_other_ways_to_fit_give_the_same():
 def test_uniform_priors_bound_the_fit_and_edges_are_reported():
     sky, data, given, _ = problem()
     like = spectral_likelihood(sky, BANDS, data, given, START)
-    T = fit_spectra(like).best_fit["dust.T_dust"]
-    wide = fit_spectra(like, priors={"dust.T_dust": Uniform(10.0, 40.0)})
+    T = best_fit(like).best_fit["dust.T_dust"]
+    wide = best_fit(like, priors={"dust.T_dust": Uniform(10.0, 40.0)})
     assert wide.best_fit["dust.T_dust"] == pytest.approx(T, rel=1e-8)
     above_start = {"dust.T_dust": T + 2}
     above = {"dust.T_dust": Uniform(T + 0.05, 40.0)}
     with pytest.raises(FitError, match=r"'dust.T_dust' lies at the edge of its uniform prior"):
-        fit_spectra(like, above_start, priors=above)
-    kept = fit_spectra(like, above_start, priors=above, throw=False)
+        best_fit(like, above_start, priors=above)
+    kept = best_fit(like, above_start, priors=above, throw=False)
     assert kept.best_fit["dust.T_dust"] == pytest.approx(T + 0.05, rel=1e-12)
     cold = {name: sky[name] for name in sky} | {"dust": Dust(sky["dust"].amplitude, 1.5, T + 0.05)}
     free = {n: START[n] for n in ("dust.beta_dust", "synchrotron.beta_syn")}
-    fixed = fit_spectra(spectral_likelihood(cold, BANDS, data, given, free))
+    fixed = best_fit(spectral_likelihood(cold, BANDS, data, given, free))
     assert kept.best_fit["dust.beta_dust"] == pytest.approx(
         fixed.best_fit["dust.beta_dust"], rel=1e-8
     )
     assert kept.sigma["dust.beta_dust"] == pytest.approx(fixed.sigma["dust.beta_dust"], rel=1e-6)
     with pytest.raises(ValueError, match=r"Start value 21 of 'dust.T_dust' is not inside"):
-        fit_spectra(like, priors={"dust.T_dust": Uniform(30.0, 40.0)})
+        best_fit(like, priors={"dust.T_dust": Uniform(30.0, 40.0)})

@@ -9,10 +9,11 @@ import pytest
 import scipy.stats
 
 from fits.multipoles import harmonic_coefficients, harmonic_likelihood, white_spectrum
+from fits.optimize import best_fit
+from fits.posterior import chi2, fisher, hessian
 from fits.priors import Gaussian
+from fits.profile_likelihood import spectral_likelihood
 from fits.separated_maps import harmonic_component_maps
-from fits.separation import fisher, fit_spectra, hessian, spectral_likelihood
-from fits.template_likelihood import chi2
 from jaxsky import Dust
 from jaxsky.harmonics import (
     alm_ell,
@@ -177,7 +178,7 @@ def test_without_beams_it_is_the_likelihood_of_the_pixels():
         moved = {name: value + shift for name, value in TRUTH.items()}
         ratio = float(total(pixels, moved)) / float(total(harmonic, moved))
         assert ratio == pytest.approx(1, abs=2e-3)
-    one, other = fit_spectra(pixels), fit_spectra(harmonic)
+    one, other = best_fit(pixels), best_fit(harmonic)
     for name in one.free:
         assert abs(one.best_fit[name] - other.best_fit[name]) < 0.03 * one.sigma[name]
         assert other.sigma[name] == pytest.approx(one.sigma[name], rel=2e-3)
@@ -196,7 +197,7 @@ def test_beams_of_the_bands_are_taken_out():
     given = LEVELS
     for data, tolerance in ((alm, 1e-9), (coefficients, 1e-6)):
         like = harmonic_likelihood(SKY[2], BANDS, data, given, START, beams=WIDE)
-        fit = fit_spectra(like)
+        fit = best_fit(like)
         for name, value in TRUTH.items():
             assert fit.best_fit[name] == pytest.approx(value, rel=tolerance)
     made = harmonic_component_maps(like, fit.best_fit, data, given, beams=WIDE)
@@ -208,7 +209,7 @@ def test_beams_of_the_bands_are_taken_out():
             np.testing.assert_allclose(one, expected, atol=1e-5 * expected.std())
     # As if all had the same beam, the law of the bands with the widest is off by 180 sigma.
     same = harmonic_likelihood(SKY[2], BANDS, alm, given, START, beams=0 * WIDE)
-    ignored = fit_spectra(same, throw=False)
+    ignored = best_fit(same, throw=False)
     assert not ignored.converged
     assert "does not describe the data" in ignored.message
     name = "synchrotron.beta_syn"
@@ -220,7 +221,7 @@ def test_parameters_of_bands_are_found():
     alm = observed(components(3), WIDE, truth)
     noise = np.broadcast_to(LEVELS[:, None, None], (8, 3, LMAX + 1))
     like = harmonic_likelihood(SKY[3], BANDS, alm, noise, TURNED, beams=WIDE)
-    fit = fit_spectra(like, priors={"synchrotron.beta_syn": Gaussian(3.05, 0.1)})
+    fit = best_fit(like, priors={"synchrotron.beta_syn": Gaussian(3.05, 0.1)})
     for name, value in truth.items():
         assert fit.best_fit[name] == pytest.approx(value, rel=1e-8, abs=1e-8)
 
@@ -234,7 +235,7 @@ def test_estimates_scatter_as_they_say():
     for seed in range(number):
         data = signal + draw(jax.random.split(jax.random.key(seed), 8), LEVEL)
         like = harmonic_likelihood(SKY[2], BANDS, data, given, START, beams=FWHM)
-        fit = fit_spectra(like, TRUTH)
+        fit = best_fit(like, TRUTH)
         pulls.append([(fit.best_fit[n] - TRUTH[n]) / fit.sigma[n] for n in fit.free])
         made = harmonic_component_maps(like, TRUTH, data, given, beams=FWHM)
         power = power + np.asarray(power_spectrum(made.alm("cmb") - truth[0]))

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from fits.noise import as_noise
+from fits.optimize import best_fit
 from fits.priors import Gaussian
+from fits.profile_likelihood import spectral_likelihood
 from fits.pseudo_cl import band_powers, bin_edges, masked_spectra
 from fits.regions import apodize, superpixels
 from fits.separated_maps import component_maps
-from fits.separation import fit_spectra, spectral_likelihood
 from fits.tensor_ratio import fit_tensors, power_model
 from jaxsky import CMB, Dust, Sky, Synchrotron, observe
 from jaxsky.cmb import camb_spectra, tensor_spectra
@@ -104,7 +105,7 @@ def fits(maps):
         like = spectral_likelihood(
             LAWS, BANDS, data, noise_of(scale), START, labels=labels, unit=UNIT
         )
-        fit = fit_spectra(like, priors=PRIORS if regions else None)
+        fit = best_fit(like, priors=PRIORS if regions else None)
         found[regions, scale, noisy] = like, fit
     return found
 
@@ -133,11 +134,11 @@ def rms(values):
 
 def scatter_of_noise(like, fit):
     """Standard deviations by name from noise alone: `sigma` has that of the priors' means, too."""
-    keep = np.isfinite(np.diagonal(fit.hessian))
+    keep = np.isfinite(np.diagonal(fit.details["hessian"]))
     names = [label.partition("[")[0] for label, k in zip(fit.labels, keep, strict=True) if k]
     prior = np.array([1 / PRIORS[name].sigma ** 2 for name in names])
-    inverse = np.linalg.inv(fit.hessian[np.ix_(keep, keep)])
-    scatter = fit.fisher[np.ix_(keep, keep)] - np.diag(prior)
+    inverse = np.linalg.inv(fit.details["hessian"][np.ix_(keep, keep)])
+    scatter = fit.details["fisher"][np.ix_(keep, keep)] - np.diag(prior)
     total = np.full(len(keep), np.nan)
     total[keep] = np.sqrt(np.einsum("ij,jk,ki->i", inverse, scatter, inverse))
     return {name: np.asarray(values) for name, values in like.named(total).items()}
@@ -214,7 +215,7 @@ def test_finer_regions_converge_to_the_truth(sky, maps, patch):
         like = spectral_likelihood(
             LAWS, BANDS, data, SIGMA, START, labels=dict.fromkeys(START, labels), unit=UNIT
         )
-        fit = fit_spectra(like)
+        fit = best_fit(like)
         cleaned = component_maps(like, fit.best_fit, data, SIGMA, covariance=False).map("cmb")
         row = [rms(cleaned)]
         for name in START:

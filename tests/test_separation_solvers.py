@@ -6,10 +6,11 @@ import numpy as np
 import optimistix as optx
 import pytest
 
+from fits.newton import Newton
+from fits.optimize import best_fit
 from fits.priors import Gaussian, Prior, Uniform, at_edge, prior_residuals, to_unbounded
+from fits.profile_likelihood import spectral_likelihood
 from fits.results import FitError
-from fits.separation import fit as fit_module
-from fits.separation import fit_spectra, spectral_likelihood
 from test_separation import BANDS, NPIX, START, problem, random_sky
 from test_separation_regions import LABELS
 
@@ -56,9 +57,9 @@ def deviation(fit, reference) -> float:
 )
 def test_every_solver_finds_the_same_optimum(make, start, priors, solver):
     like = make()
-    default = fit_spectra(like, start, priors=priors)
+    default = best_fit(like, start, priors=priors)
     assert default.details["solver"] == "Newton"
-    fit = fit_spectra(like, start, priors=priors, solver=SOLVERS[solver])
+    fit = best_fit(like, start, priors=priors, solver=SOLVERS[solver])
     assert fit.details["solver"] == solver
     # The least-squares solvers square their last step; BFGS stops at the tolerance.
     assert deviation(fit, default) < 1e-6
@@ -70,7 +71,7 @@ def test_every_solver_finds_the_same_optimum(make, start, priors, solver):
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_units_of_the_maps_do_not_matter(solver):
-    small, large = (fit_spectra(constant(s), FAR, solver=SOLVERS[solver]) for s in (1e6, 1.0))
+    small, large = (best_fit(constant(s), FAR, solver=SOLVERS[solver]) for s in (1e6, 1.0))
     assert deviation(small, large) < 1e-6
     # Rounding differs, and with it where BFGS turns.
     assert small.details["steps"] == pytest.approx(large.details["steps"], abs=20)
@@ -81,18 +82,18 @@ def test_units_of_parameters_do_not_matter():
     _, data, given, _ = problem()
     start = {"dust.beta_dust": 1.5, "shift.220": 0.0, "gain.145": 1.0}
     like = spectral_likelihood(random_sky(), BANDS, data, given, start)
-    fit = fit_spectra(like, solver=SOLVERS["BFGS"])
-    assert deviation(fit, fit_spectra(like)) < 1e-6
+    fit = best_fit(like, solver=SOLVERS["BFGS"])
+    assert deviation(fit, best_fit(like)) < 1e-6
 
 
 def test_an_optimum_at_an_edge_is_reported_by_all():
     like = constant()
-    T = fit_spectra(like).best_fit["dust.T_dust"]
+    T = best_fit(like).best_fit["dust.T_dust"]
     start = {"dust.T_dust": T + 2}
     priors = {"dust.T_dust": Uniform(T + 0.05, 40.0)}
-    default = fit_spectra(like, start, priors=priors, throw=False)
+    default = best_fit(like, start, priors=priors, throw=False)
     for solver in ("LevenbergMarquardt", "BFGS"):
-        fit = fit_spectra(like, start, priors=priors, solver=SOLVERS[solver], throw=False)
+        fit = best_fit(like, start, priors=priors, solver=SOLVERS[solver], throw=False)
         assert fit.message == default.message
         assert "'dust.T_dust' lies at the edge" in fit.message
         # Flat there, and residuals say nothing of how it curves.
@@ -145,25 +146,23 @@ class Flat(Prior):
 )
 def test_failures_say_what_they_are(options, error, words):
     with pytest.raises(error, match=words) as caught:
-        fit_spectra(constant(), **options)
+        best_fit(constant(), **options)
     if error is FitError:
         result = caught.value.result
         assert not result.converged
-        assert fit_spectra(constant(), throw=False, **options).message == result.message
+        assert best_fit(constant(), throw=False, **options).message == result.message
 
 
 def test_a_search_that_leaves_the_finite_numbers_says_so(monkeypatch):
-    monkeypatch.setattr(
-        fit_module.newton, "minimise", lambda problem, theta, _: (theta * np.nan, 7)
-    )
+    monkeypatch.setattr(Newton, "minimise", lambda _, posterior, __: (posterior.start * np.nan, 7))
     with pytest.raises(FitError, match="left the finite numbers within 7 steps"):
-        fit_spectra(constant())
+        best_fit(constant())
 
 
 def test_a_minimiser_takes_any_prior():
     priors = {"synchrotron.beta_syn": Wide()}
-    fit = fit_spectra(constant(), priors=priors, solver=SOLVERS["BFGS"])
-    assert deviation(fit, fit_spectra(constant(), priors=priors)) < 1e-6
+    fit = best_fit(constant(), priors=priors, solver=SOLVERS["BFGS"])
+    assert deviation(fit, best_fit(constant(), priors=priors)) < 1e-6
 
 
 def test_pieces_of_priors_take_arrays():

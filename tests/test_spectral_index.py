@@ -199,7 +199,7 @@ def test_missing_pixels_do_not_bias():
     start = {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}
     fit = best_fit(common_maps(inputs, 16, 200.0).likelihood(start), start)
     for name, truth in (("dust.beta_dust", 1.53), ("synchrotron.beta_syn", 3.1)):
-        assert abs(fit.best_fit[name] - truth) < 0.05 * fit.sigma(name)
+        assert abs(fit.best_fit[name] - truth) < 0.05 * fit.sigma[name]
 
 
 def test_both_ways_of_preparing_reproduce_the_sky():
@@ -250,11 +250,11 @@ def test_embedded_run_recovers_the_truth(quick_settings, tmp_path):
         assert fit.chi2["gradient"] / fit.dof < 1.5
         assert fit.probability_to_exceed("gradient") > 1e-3
         for name, truth in free.items():
-            sigma = results["gradient"].sigma(name)
+            sigma = results["gradient"].sigma[name]
             for r in results.values():
                 assert abs(r.best_fit[name] - truth) < 4 * sigma
                 assert abs(r.best_fit[name] - results["gradient"].best_fit[name]) < 0.1 * sigma
-                assert r.sigma(name) == pytest.approx(sigma, rel=0.05)
+                assert r.sigma[name] == pytest.approx(sigma, rel=0.05)
 
 
 def test_what_a_band_shows_does_not_depend_on_the_others(quick_settings):
@@ -370,7 +370,7 @@ def pulls():
                 )
                 fit = best_fit(like, start)
                 for name, value in truth.items():
-                    pull = (fit.best_fit[name] - value) / fit.sigma(name)
+                    pull = (fit.best_fit[name] - value) / fit.sigma[name]
                     values.setdefault((kind, stokes, name), []).append(pull)
     return {key: np.array(pull) for key, pull in values.items()}
 

@@ -58,7 +58,7 @@ def test_pulls_over_fifty_skies(maker, settings, monkeypatch):
         row = []
         for inside in region_masks(settings, settings.fit.regions).values():
             fit = best_fit(prepared.likelihood(start, region=inside), start)
-            row.append([(fit.best_fit[n] - truth) / fit.sigma(n) for n, truth in TRUTH.items()])
+            row.append([(fit.best_fit[n] - truth) / fit.sigma[n] for n, truth in TRUTH.items()])
         pulls.append(row)
     means, deviations = np.mean(pulls, axis=0), np.std(pulls, axis=0, ddof=1)
     print(

@@ -23,7 +23,7 @@ def pulls():
         inputs = inputs_of(settings.model_copy(update={"seed": seed}), galaxy=galaxy)
         found = best_fit(common_maps(inputs, 16, 300.0).likelihood(start), start)
         rows.append(
-            [(found.best_fit[name] - inputs.truth[name]) / found.sigma(name) for name in found.free]
+            [(found.best_fit[name] - inputs.truth[name]) / found.sigma[name] for name in found.free]
         )
     return np.array(rows)
 

@@ -3,11 +3,11 @@
 import jax
 import numpy as np
 
+from fits.optimize import best_fit
 from fits.priors import priors_of
 from fits.pseudo_cl import band_powers
 from fits.separate.separate import separate
 from fits.separate.setup import build
-from fits.separation import fit_spectra
 from fits.tensor_ratio import fit_tensors
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.harmonics import expand, gaussian_beam, synthesis
@@ -53,7 +53,7 @@ def test_r_comes_back():
         noise = domain.noise_realisation(jax.random.fold_in(key, 1))
         data = np.where(domain.used, setup.foregrounds + np.asarray(cmb(key)) + noise, 0.0)
         like = domain.likelihood(data)
-        fit = fit_spectra(like, found.fit.best_fit, priors=priors_of(how, "separate"))
+        fit = best_fit(like, found.fit.best_fit, priors=priors_of(how, "separate"))
         maps = domain.components(like, fit.best_fit, data, covariance=False).amplitude
         powers = band_powers(found.spectra, maps[found.components.index("cmb")])[1]
         pulls.append((fit_tensors(model, powers).r - R) / sigma)

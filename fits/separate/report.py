@@ -56,7 +56,7 @@ def result_json(found: Separation, settings: Experiment) -> dict[str, Any]:
         "dof": fit.dof,
         "converged": fit.converged,
         "message": fit.message,
-        "solver": fit.details,
+        "solver": {key: fit.details[key] for key in ("solver", "steps", "distance")},
         "pixels_with_small_probability": _pixel_probability(found),
         "cmb_noise_degradation": _mean(found.degradation),
         "residual_rms": dict(zip(bands, np.nanstd(found.residuals, axis=(1, 2)), strict=True)),
@@ -88,7 +88,9 @@ def result_json(found: Separation, settings: Experiment) -> dict[str, Any]:
         chain = found.chain
         results["posterior"] = {
             "sampler": chain.method,
-            "interval_68": {name: list(pair) for name, pair in chain.interval_68.items()},
+            "interval_68": {
+                label: chain.of_row(chain.interval_68, label) for label in chain.labels
+            },
             "converged": chain.converged,
             "message": chain.message,
         }

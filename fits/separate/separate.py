@@ -9,19 +9,18 @@ import numpy as np
 from jaxtyping import Float
 
 from fits.chains import kept_chain
+from fits.optimize import best_fit
 from fits.priors import priors_of
 from fits.profile_likelihood import SpectralLikelihood
 from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra
 from fits.realisations import realisations
 from fits.record import fingerprint
 from fits.results import FitResult, misfit
+from fits.sampling import sample
 from fits.separate.domains import PixelDomain
 from fits.separate.setup import Setup
 from fits.separate.simulations import Realisation, Simulated
-from fits.separation.fit import fit_spectra
 from fits.separation.response import Response, widened
-from fits.separation.results import SpectralFit
-from fits.separation.sample import sample_spectra
 from fits.tensor_ratio import TensorFit, fit_tensors, power_model
 from jaxsky.checks import check_double
 from jaxsky.cmb import tensor_spectra
@@ -62,7 +61,7 @@ class Separation(NamedTuple):
 
     setup: Setup
     like: SpectralLikelihood
-    fit: SpectralFit
+    fit: FitResult
     sigma: dict[str, Any]
     covariance: Float[np.ndarray, "par par"] | None
     found: Any
@@ -107,7 +106,7 @@ def separate(
     progress.step("spectral parameters")
     with at_key("free"):
         like = domain.likelihood(setup.data)
-    fit = fit_spectra(like, priors=priors, throw=False)
+    fit = best_fit(like, priors=priors, throw=False)
     # What no law describes is separated nevertheless, and said.
     fit.checked(throw=fit.message != misfit(fit.chi2, fit.dof))
     response = Response(like, fit.best_fit, priors)
@@ -240,7 +239,7 @@ def _chain(settings, setup, like, fit, simulated, out, progress):
     backend = None
     if spec.sampler == "emcee" and out is not None:
         backend = kept_chain(out / "chain.h5", "mcmc", (nwalkers, size), _mark(settings, setup))
-    samples = sample_spectra(
+    samples = sample(
         like,
         fit.best_fit,
         priors=priors_of(settings, "separate"),
@@ -254,6 +253,6 @@ def _chain(settings, setup, like, fit, simulated, out, progress):
     )
     if spec.domain == "harmonic" or not samples.details:
         return samples
-    at = [fit.labels.index(name) for name in samples.free]
+    at = [fit.labels.index(label) for label in samples.labels]
     center = np.asarray(like.flat(fit.best_fit))[at]
-    return widened(samples, center, fit.hessian[np.ix_(at, at)], simulated.theta[:, at])
+    return widened(samples, center, fit.details["hessian"][np.ix_(at, at)], simulated.theta[:, at])

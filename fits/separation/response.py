@@ -6,9 +6,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.posterior import Problem, value_and_gradient
+from fits.posterior import Likelihood, Posterior, value_and_gradient
 from fits.priors import Gaussian, Prior
-from fits.profile_likelihood import SpectralLikelihood
 from fits.results import FitResult
 from fits.systems import Factor
 from jaxsky.checks import Numeric
@@ -30,19 +29,19 @@ class Response:
 
     def __init__(
         self,
-        like: SpectralLikelihood,
+        like: Likelihood,
         params: Mapping[str, Numeric],
         priors: Mapping[str, Prior] | None = None,
     ) -> None:
-        self._problem = problem = Problem(like, priors or {})
+        self._posterior = posterior = Posterior(like, priors or {})
         self.theta = np.array(like.flat(like.check(params)))
-        self._keep = np.flatnonzero(problem.present & ~problem.edges(self.theta))
-        curvature = problem.curvature(self.theta, problem.exact(self.theta), self._keep)
+        self._keep = np.flatnonzero(posterior.present & ~posterior.edges(self.theta))
+        curvature = posterior.curvature(self.theta, posterior.exact(self.theta), self._keep)
         self._factor = Factor(curvature)
         if not self._factor.positive:
             raise ValueError("The best fit is no maximum of the posterior.")
 
-    def moved(self, like: SpectralLikelihood, key: Array) -> Float[np.ndarray, " par"]:
+    def moved(self, like: Likelihood, key: Array) -> Float[np.ndarray, " par"]:
         """The best fit to other data, within the bounds of uniform priors.
 
         The means of Gaussian priors are drawn anew, too, since they were measured like the data.
@@ -54,12 +53,12 @@ class Response:
         """
         gradient = np.array(value_and_gradient(like, self.theta)[1])
         draws = np.asarray(jax.random.normal(key, gradient.shape))
-        for prior, where in self._problem.priors:
+        for prior, where in self._posterior.priors:
             assert isinstance(prior, Gaussian)  # the only one that is not a bound
             gradient += np.where(where, draws / prior.sigma, 0.0)
         theta = self.theta.copy()
         theta[self._keep] -= self._factor.solve(gradient[self._keep])
-        return np.clip(theta, self._problem.low, self._problem.high)
+        return np.clip(theta, self._posterior.low, self._posterior.high)
 
 
 def widened(
@@ -87,13 +86,4 @@ def widened(
         turn = np.linalg.cholesky(wanted) @ np.linalg.inv(np.linalg.cholesky(inverse))
     else:
         turn = np.diag(errors.std(axis=0, ddof=1) / np.sqrt(np.diagonal(inverse)))
-    details = dict(samples.details)
-    details["chain"] = center + (details["chain"] - center) @ turn.T
-    flat = details["chain"][details["discard"] :].reshape(-1, len(center))
-    low, high = np.percentile(flat, [15.865525, 84.134475], axis=0)
-    ends = zip(low.tolist(), high.tolist(), strict=True)
-    return samples._replace(
-        interval_68=dict(zip(samples.free, ends, strict=True)),
-        covariance=np.atleast_2d(np.cov(flat.T)),
-        details=details,
-    )
+    return samples.with_chain(center + (samples.details["chain"] - center) @ turn.T)

@@ -188,7 +188,7 @@ def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
         ({'beta_syn"': 'beta"'}, "Unknown parameter 'synchrotron.beta'"),
         (
             {"uniform = [2.0, 4.5]": "uniform = [3.05, 4.5]"},
-            "lies at the edge of its uniform prior",
+            "of its uniform prior",
         ),
         ({"width = 4\n": "width = 40\n"}, "no bin of 40 multipoles"),
         ({"start = 3.1, uniform = [2.0, 4.5]": "start = nan"}, "finite number"),

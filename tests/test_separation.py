@@ -355,7 +355,7 @@ def test_uniform_priors_bound_the_fit_and_edges_are_reported():
     assert wide.best_fit["dust.T_dust"] == pytest.approx(T, rel=1e-8)
     above_start = {"dust.T_dust": T + 2}
     above = {"dust.T_dust": Uniform(T + 0.05, 40.0)}
-    with pytest.raises(FitError, match=r"'dust.T_dust' lies at the edge of its uniform prior"):
+    with pytest.raises(FitError, match=r"'dust.T_dust' lies at the edge .* of its uniform prior"):
         best_fit(like, above_start, priors=above)
     kept = best_fit(like, above_start, priors=above, throw=False)
     assert kept.best_fit["dust.T_dust"] == pytest.approx(T + 0.05, rel=1e-12)

@@ -1,4 +1,4 @@
-"""The spectral likelihood of FURAX: the peer of `fits.separation`.
+"""The spectral likelihood of FURAX: the peer of `fits.profile_likelihood`.
 
 FURAX (github.com/CMBSciPol/furax) writes A^T N^-1 A as an operator on maps and inverts it by
 conjugate gradients. Its bands are monochromatic. What its own benchmarks do is call

@@ -81,7 +81,7 @@ def harmonic_coefficients(
     TypeError, ValueError
         For units, shapes that are no maps, an lmax above 2 nside, and masked pixels.
     """
-    check_double("fits.separation")
+    check_double("fits")
     rows = [bare("maps", each) for each in maps]
     shapes = {each.shape for each in rows}
     if len({shape[:-1] for shape in shapes}) != 1 or not all(map(_is_map, shapes)):
@@ -301,7 +301,7 @@ def harmonic_likelihood(
 
     Returns
     -------
-    The likelihood, for `fits.separation.fit_spectra`. Maps of the components come from
+    The likelihood, for `best_fit`, `grid_fit` and `sample`. Maps of the components come from
     `fits.separated_maps.harmonic_component_maps`.
 
     Raises

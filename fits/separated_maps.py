@@ -342,7 +342,7 @@ def harmonic_component_maps(
     ----------
     like : for its laws and bands: from `harmonic_likelihood`, or `spectral_likelihood` without
         regions
-    params : spectral parameters, such as `SpectralFit.best_fit`
+    params : spectral parameters, such as `FitResult.best_fit`
     alm, noise, beams, lmin, lmax : as for `harmonic_likelihood`; the multipoles need not be those
         that were fitted
     covariance : whether to make the covariance of the amplitudes

@@ -12,12 +12,12 @@ from fits.commands.run import DEFAULTS
 from fits.optimize import best_fit
 from fits.priors import priors_of
 from fits.pseudo_cl import band_powers
+from fits.response import Response, widened
 from fits.separate import report
 from fits.separate import separate as module
 from fits.separate.report import tables, warnings
 from fits.separate.separate import separate
 from fits.separate.setup import build
-from fits.separation.response import Response, widened
 from fits.tensor_ratio import fit_tensors
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis

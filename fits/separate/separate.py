@@ -15,12 +15,12 @@ from fits.profile_likelihood import SpectralLikelihood
 from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra
 from fits.realisations import realisations
 from fits.record import fingerprint
+from fits.response import Response, widened
 from fits.results import FitResult, misfit
 from fits.sampling import sample
 from fits.separate.domains import PixelDomain
 from fits.separate.setup import Setup
 from fits.separate.simulations import Realisation, Simulated
-from fits.separation.response import Response, widened
 from fits.tensor_ratio import TensorFit, fit_tensors, power_model
 from jaxsky.checks import check_double
 from jaxsky.cmb import tensor_spectra

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 
 from fits.profile_likelihood import SpectralLikelihood
 from fits.pseudo_cl import MaskedSpectra, band_powers
+from fits.response import Response
 from fits.separate.domains import Domain
-from fits.separation.response import Response
 from jaxsky.cmb import realisation
 from jaxsky.harmonics import analysis, expand, power_spectrum, synthesis
 from jaxsky.keys import stream

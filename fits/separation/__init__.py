@@ -1,1 +1,0 @@
-"""The response of fits to noise."""

@@ -61,6 +61,16 @@ def check_positive(name: str, value: Array | np.ndarray) -> None:
         )
 
 
+@takes_quantities
+def as_number(name: str, value: object, positive: bool = False) -> Float[Array, ""]:
+    """`value` as an array without axes, finite or positive."""
+    number = as_array(name, value)
+    if number.shape:
+        raise ValueError(f"Argument `{name}` must be a number, but has shape {number.shape}.")
+    (check_positive if positive else check_finite)(name, number)
+    return number
+
+
 def check_seed(name: str, value: object) -> None:
     """Raise TypeError if a seed is no integer, ValueError if it is not within 0 and 2^32 - 1.
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array
 
 from jaxsky.bandpass import Bandpass
-from jaxsky.checks import as_array, check_positive, is_concrete
+from jaxsky.checks import Parameter, as_number, check_positive, is_concrete
 from jaxsky.observation import ObservedBand
 from jaxsky.units import parse_unit
 
@@ -30,40 +30,19 @@ class Channel(eqx.Module):
     """
 
     name: str = eqx.field(static=True)
-    center: Float[Array, ""]
-    width: Float[Array, ""]
-    fwhm: Float[Array, ""]
-    noise: Float[Array, ""]
-    noise_unit: str = eqx.field(static=True)
+    center: Parameter
+    width: Parameter
+    fwhm: Parameter
+    noise: Parameter
+    noise_unit: str = eqx.field(static=True, default="uK_CMB")
 
-    def __init__(
-        self,
-        name: str,
-        center: ArrayLike,
-        width: ArrayLike,
-        fwhm: ArrayLike,
-        noise: ArrayLike,
-        noise_unit: str = "uK_CMB",
-    ) -> None:
-        self.name = name
-        self.center = self._number("center", center)
-        self.width = self._number("width", width)
-        self.fwhm = self._number("fwhm", fwhm)
-        self.noise = self._number("noise", noise)
+    def __post_init__(self) -> None:
+        for name in ("center", "width", "fwhm", "noise"):
+            setattr(self, name, as_number(name, getattr(self, name), positive=True))
         if is_concrete(self.center) and is_concrete(self.width):
-            check_positive(
-                "center - width / 2", np.asarray(self.center) - np.asarray(self.width) / 2
-            )
-        parse_unit(noise_unit)
-        self.noise_unit = noise_unit
-
-    @staticmethod
-    def _number(name: str, value: ArrayLike) -> Array:
-        array = as_array(name, value)
-        if array.shape != ():
-            raise ValueError(f"Argument `{name}` must be a number, but has shape {array.shape}.")
-        check_positive(name, array)
-        return array
+            lowest = np.asarray(self.center) - np.asarray(self.width) / 2
+            check_positive("center - width / 2", lowest)
+        parse_unit(self.noise_unit)
 
     def band(self, samples: int = 51, convention: str = "RJ") -> Bandpass:
         """The top-hat band; see `Bandpass.top_hat`."""
@@ -148,13 +127,10 @@ class Instrument(eqx.Module):
         """
         bands = self.bands(samples)
         return {
-            channel.name: ObservedBand(
-                band,
-                channel.fwhm,
-                target,
-                channel.noise * band.conversion(channel.noise_unit, "uK_RJ"),
+            c.name: ObservedBand(
+                band, c.fwhm, target, c.noise * band.conversion(c.noise_unit, "uK_RJ")
             )
-            for channel, band in zip(self.channels, bands.values(), strict=True)
+            for c, band in zip(self.channels, bands.values(), strict=True)
         }
 
 
@@ -189,20 +165,17 @@ def load_instrument(name: str) -> Instrument:
     presets = _presets()
     if name not in presets:
         raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(presets)}.")
-    return Instrument(
-        presets[name]["title"],
-        [
-            Channel(
-                band["name"],
-                band["bandpass"]["center"],
-                band["bandpass"]["width"],
-                band["fwhm"],
-                band["noise"]["level"],
-                band["noise"].get("unit", "uK_CMB"),
-            )
-            for band in presets[name]["bands"]
-        ],
-    )
+    channels = [
+        Channel(
+            band["name"],
+            **band["bandpass"],
+            fwhm=band["fwhm"],
+            noise=band["noise"]["level"],
+            noise_unit=band["noise"].get("unit", "uK_CMB"),
+        )
+        for band in presets[name]["bands"]
+    ]
+    return Instrument(presets[name]["title"], channels)
 
 
 def band_tables(
@@ -215,9 +188,9 @@ def band_tables(
     name : one of `instrument_names()`, or a file with a list `bands`, relative to `folder`
     channels : names of the bands wanted, by default all
     """
-    path = folder / name
-    if name in _presets():
-        bands = _presets()[name]["bands"]
+    presets, path = _presets(), folder / name
+    if name in presets:
+        bands = presets[name]["bands"]
     elif path.is_file():
         try:
             bands = tomllib.loads(path.read_text())["bands"]
@@ -229,8 +202,7 @@ def band_tables(
                 f"{path}: is no TOML file with a list of bands that have different names ({error})"
             ) from None
     else:
-        presets = ", ".join(_presets())
-        raise KeyError(f"Unknown instrument {name!r}; known are {presets}, or a file.")
+        raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(presets)}, or a file.")
     known = {str(band["name"]): band for band in bands}
     for channel in channels or ():
         if channel not in known:

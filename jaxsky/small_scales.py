@@ -19,30 +19,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from jaxsky.checks import as_array, check_finite, check_positive, is_concrete
+from jaxsky.checks import as_array, as_number, check_finite, check_positive, is_concrete
 from jaxsky.cmb import gaussian_fields, repair
 from jaxsky.harmonics import (
     analysis,
     expand,
     gaussian_beam,
     lmax_of,
-    needed_lmax,
     power_spectrum,
     resample,
     resize,
+    shortened,
     synthesis,
 )
 from jaxsky.harmonics.windows import NEGLIGIBLE
-
-
-def _numbers(name: str, value: ArrayLike, count: int = 1) -> Array:
-    """A finite number, or `count` of them."""
-    array = as_array(name, value)
-    if array.shape not in ((), (count,))[:count]:
-        known = "a number" if count == 1 else f"a number or {count} numbers"
-        raise ValueError(f"Argument `{name}` must be {known}, but has shape {array.shape}.")
-    check_finite(name, array)
-    return array
 
 
 class SmallScales(eqx.Module):
@@ -83,11 +73,17 @@ class SmallScales(eqx.Module):
             if [type(end) for end in ends] != [int, int]:
                 raise TypeError(f"Argument `{name}` must be two integers, but is {ends!r}.")
         self.EE, self.BB = (EE[0], EE[1]), (BB[0], BB[1])
-        self.slope = None if slope is None else jnp.broadcast_to(_numbers("slope", slope, 2), 2)
-        self.tilt = _numbers("tilt", tilt)
-        self.amplitude = _numbers("amplitude", amplitude)
-        self.modulation_fwhm = _numbers("modulation_fwhm", modulation_fwhm)
-        check_positive("modulation_fwhm", self.modulation_fwhm)
+        if slope is not None:
+            slope = as_array("slope", slope)
+            if slope.shape not in ((), (2,)):
+                raise ValueError(
+                    f"Argument `slope` must be a number or 2 numbers, but has shape {slope.shape}."
+                )
+            check_finite("slope", slope)
+        self.slope = None if slope is None else jnp.broadcast_to(slope, 2)
+        self.tilt = as_number("tilt", tilt)
+        self.amplitude = as_number("amplitude", amplitude)
+        self.modulation_fwhm = as_number("modulation_fwhm", modulation_fwhm, positive=True)
         if is_concrete(self.amplitude) and self.amplitude < 0:
             raise ValueError(
                 f"Argument `amplitude` must not be negative, but is {self.amplitude:g}."
@@ -203,10 +199,7 @@ def modulation(maps: Float[Array, "2 pix"], fwhm: ArrayLike, nside: int) -> Floa
     """
     squared = jnp.sum(maps**2, axis=0)
     intensity = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
-    own = healpy.npix2nside(maps.shape[-1])
-    window = gaussian_beam(fwhm, 2 * own)
-    if is_concrete(window):
-        window = window[: needed_lmax(window) + 1]
+    window = shortened(gaussian_beam(fwhm, 2 * healpy.npix2nside(maps.shape[-1])))
     return resample(intensity[None], window, nside)[0] / intensity.mean()
 
 
@@ -249,15 +242,8 @@ def _correlated_parts(
     part proportional to the first: of T_ij / T_ii times its coefficients, T being the spectra
     wanted, as much as is known of i (in power) and missing of j (in amplitude).
 
-    Parameters
-    ----------
-    alms : coefficients that stay, without their beams
-    parts : spectra of each template
-    ranges : of the fits, one a field
-
-    Returns
-    -------
-    Those parts, and the spectra of what is still missing, to be drawn.
+    Of `alms`, the coefficients that stay, without their beams, with the spectra in `parts` and one
+    range of fit a field. Returns those parts, and the spectra of what is missing, to be drawn.
     """
     law = jnp.concatenate([part.target for part in parts])
     n, ell = len(alms), jnp.arange(law.shape[-1])
@@ -359,9 +345,7 @@ def continue_templates(
 
 def _known(maps: Float[Array, "2 pix"], own: ArrayLike) -> int:
     """Largest multipole of a template that its pixels and its beam let through."""
-    lmax = 2 * healpy.npix2nside(maps.shape[-1])
-    beam = gaussian_beam(own, lmax)
-    return needed_lmax(beam) if is_concrete(beam) else lmax
+    return shortened(gaussian_beam(own, 2 * healpy.npix2nside(maps.shape[-1]))).size - 1
 
 
 def add_small_scales(

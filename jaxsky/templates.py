@@ -19,8 +19,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxsky.checks import Numeric, as_array, check_finite, check_positive, is_concrete
-from jaxsky.harmonics import analysis, beam_ratio, expand, needed_lmax, resize, synthesis
-from jaxsky.harmonics.resolution import MARGIN
+from jaxsky.harmonics import beam_ratio, resample, shortened
 
 #: First and last frequency of an interval [GHz].
 Interval: TypeAlias = tuple[ArrayLike, ArrayLike] | Float[Array, "2"]
@@ -55,19 +54,6 @@ def _check_nside(nside: int) -> None:
         raise ValueError(f"Argument `nside` must be a power of 2, but is {nside}.")
 
 
-def _at_resolution(
-    maps: Array, own_fwhm: Numeric, fwhm: Numeric, nside: int, lmax: int, what: str
-) -> Array:
-    """Maps from one Gaussian beam to another, at another nside, in one transform."""
-    window = beam_ratio(fwhm, own_fwhm, lmax, what)
-    if is_concrete(window):
-        lmax = needed_lmax(window)
-    # What is not analysed leaks into what is, so more multipoles are analysed than kept.
-    wide = min(2 * healpy.npix2nside(maps.shape[-1]), MARGIN * lmax)
-    alm = resize(analysis(maps, wide, iterations=ITERATIONS), lmax)
-    return synthesis(alm * expand(window[: lmax + 1]), nside)
-
-
 def polarization_template(
     maps: ArrayLike, own_fwhm: Numeric, fwhm: Numeric, nside: int
 ) -> Float[Array, "stokes pix"]:
@@ -88,7 +74,8 @@ def polarization_template(
     maps, nside_in = _healpix("maps", maps, rows=(2, 3))
     check_finite("maps", maps)
     _check_nside(nside)
-    return _at_resolution(maps, own_fwhm, fwhm, nside, 2 * min(nside_in, nside), "the template")
+    window = beam_ratio(fwhm, own_fwhm, 2 * min(nside_in, nside), "the template")
+    return resample(maps, shortened(window), nside, ITERATIONS)
 
 
 def dust_index(
@@ -122,19 +109,17 @@ def dust_index(
         beta = jnp.where(mask, beta, 0.0)
     check_finite("beta", beta)
 
-    def smooth(values: Array) -> Array:
-        what = "the map of indices"
-        return _at_resolution(values[None], own_fwhm, fwhm, nside, 2 * nside_in, what)[0]
-
+    window = shortened(beam_ratio(fwhm, own_fwhm, 2 * nside_in, "the map of indices"))
+    smoothed = resample(beta[None], window, nside, ITERATIONS)[0]
     if mask is None:
-        return smooth(beta)
-    weight = smooth(jnp.asarray(mask, beta.dtype))
+        return smoothed
+    weight = resample(jnp.asarray(mask, beta.dtype)[None], window, nside, ITERATIONS)[0]
     if is_concrete(weight) and (empty := int(jnp.sum(weight < LEAST_WEIGHT))):
         raise ValueError(
             f"Argument `mask` leaves {empty} of {weight.size} pixels of the result without "
             f"used pixels within a beam of {float(fwhm):g} arcmin."
         )
-    return smooth(beta) / weight
+    return smoothed / weight
 
 
 def steepening(

@@ -15,7 +15,6 @@ from jaxsky.galaxy import (
     STEPS,
     SYNCHROTRON_RMS,
     GalaxyModel,
-    _geometry,
     _turbulence,
     embedded_sky,
     line_of_sight,
@@ -138,7 +137,7 @@ def test_one_seed_is_one_sky_at_every_resolution(galaxy, fine_galaxy):
 def turbulence(nside, slope=-2.4):
     """Cartesian turbulent field, without the projection on the lines of sight."""
     basis = jnp.broadcast_to(jnp.eye(3)[..., None], (3, 3, healpy.nside2npix(nside)))
-    return _turbulence(jax.random.key(5), slope, _geometry(nside), basis)
+    return _turbulence(jax.random.key(5), slope, basis)
 
 
 @pytest.mark.slow

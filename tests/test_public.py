@@ -29,7 +29,8 @@ NUMERIC = re.compile(
     r"\b(int|float|complex|Array|ArrayLike|Numeric|Parameter|Float|Int|Bool|ndarray|Any|object)\b"
 )
 #: They convert quantities, or refuse them under a name that they are given.
-BY_THEMSELVES = {"from_quantity", "unit_factor", "Maps.to", "refuse_unit", "as_array", "noise.bare"}
+BY_THEMSELVES = {"from_quantity", "unit_factor", "Maps.to", "refuse_unit", "noise.bare"}
+BY_THEMSELVES |= {"as_array", "as_number"}
 
 
 def modules():

@@ -11,6 +11,7 @@ from jaxsky.harmonics.packing import (
     alm_ell,
     alm_from_healpy,
     alm_to_healpy,
+    degrees,
     expand,
     lmax_of,
     power_spectrum,
@@ -25,4 +26,10 @@ from jaxsky.harmonics.resolution import (
     smooth,
 )
 from jaxsky.harmonics.transforms import ENGINES, adjoint_synthesis, analysis, rotate, synthesis
-from jaxsky.harmonics.windows import beam_ratio, gaussian_beam, needed_lmax, pixel_window
+from jaxsky.harmonics.windows import (
+    beam_ratio,
+    gaussian_beam,
+    needed_lmax,
+    pixel_window,
+    shortened,
+)

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxsky.checks import check_finite, is_concrete
+from jaxsky.checks import check_finite
 from jaxsky.harmonics.packing import expand, resize
 from jaxsky.harmonics.transforms import analysis, synthesis
-from jaxsky.harmonics.windows import beam_ratio, needed_lmax
+from jaxsky.harmonics.windows import beam_ratio, shortened
 
-#: Multipoles analysed by `low_multipoles`, in units of those kept, as far as the map resolves them.
+#: Multipoles analysed in units of those kept, as far as the map resolves them.
 MARGIN = 3
 #: Up to this fraction of nside the quadrature of an analysis is good without steps or margin: what
 #: a multipole adds to another, up to three times as high, is some 1e-6 of it at nside 128, and the
@@ -25,7 +25,10 @@ FINE, FINE_VARIANCE = 0.25, 0.375
 
 
 def low_multipoles(
-    maps: Float[Array, "stokes pix"], lmax: int, iterations: int | None = None
+    maps: Float[Array, "stokes pix"],
+    lmax: int,
+    iterations: int | None = None,
+    margin: int = MARGIN,
 ) -> Float[Array, "stokes alm"]:
     """Packed coefficients up to lmax of maps that have higher multipoles, too.
 
@@ -36,14 +39,19 @@ def low_multipoles(
     maps : shape (stokes, pix), RING; one row is I, two are Q, U, three are I, Q, U
     lmax : largest multipole kept; above 2 nside of the maps coefficients are zero
     iterations : of `analysis`
+    margin : multipoles analysed, in units of those kept
     """
     resolved = 2 * healpy.npix2nside(maps.shape[-1])
-    return resize(analysis(maps, min(resolved, MARGIN * lmax), iterations), lmax)
+    return resize(analysis(maps, min(resolved, margin * lmax), iterations), lmax)
 
 
-@partial(jax.jit, static_argnames="nside")
+@partial(jax.jit, static_argnames=("nside", "iterations", "margin"))
 def resample(
-    maps: Float[Array, "stokes pix"], window: Float[Array, " ell"], nside: int
+    maps: Float[Array, "stokes pix"],
+    window: Float[Array, " ell"],
+    nside: int,
+    iterations: int | None = None,
+    margin: int = MARGIN,
 ) -> Float[Array, "stokes pix"]:
     """Maps times a window in l, at another resolution: smoothing and degrading in one.
 
@@ -55,8 +63,11 @@ def resample(
     maps : shape (stokes, pix), RING; one row is I, two are Q, U, three are I, Q, U
     window : factor for each multipole 0 ... lmax; above 2 nside of the input nothing is left
     nside : resolution of the result
+    iterations, margin : of `low_multipoles`; with (0, 1) it takes a fraction of the time, and is
+        good where the window ends far below the multipoles that the pixels resolve
     """
-    return synthesis(low_multipoles(maps, len(window) - 1) * expand(window), nside)
+    alm = low_multipoles(maps, len(window) - 1, iterations, margin)
+    return synthesis(alm * expand(window), nside)
 
 
 def smooth(
@@ -81,9 +92,7 @@ def smooth(
     check_finite("maps", maps)
     nside = healpy.npix2nside(maps.shape[-1])
     window = beam_ratio(fwhm, own, 2 * nside if lmax is None else lmax)
-    if lmax is None and is_concrete(window):
-        window = window[: needed_lmax(window) + 1]
-    return resample(maps, window, nside)
+    return resample(maps, shortened(window) if lmax is None else window, nside)
 
 
 @cache

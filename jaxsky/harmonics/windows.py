@@ -85,6 +85,11 @@ def needed_lmax(window: Float[Array, " ell"]) -> int:
     return int(np.flatnonzero(np.abs(np.asarray(window)) > NEGLIGIBLE).max(initial=0))
 
 
+def shortened(window: Float[Array, " ell"]) -> Float[Array, " ell"]:
+    """A window without the multipoles beyond which it is negligible, unless it is being traced."""
+    return window[: needed_lmax(window) + 1] if is_concrete(window) else window
+
+
 def pixel_window(nside: int, lmax: int) -> Float[np.ndarray, " ell"]:
     """Window of averaging over pixels, that of a disc of the pixel's area, 2 J_1(x)/x.
 

@@ -37,6 +37,12 @@ def as_array(name: str, value: object) -> Array:
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
 
 
+def check_shape(name: str, array: Array | np.ndarray, good: bool, form: str) -> None:
+    """Raise ValueError, with the form that an array must have, unless its shape is good."""
+    if not good:
+        raise ValueError(f"Argument `{name}` must {form}, but has shape {array.shape}.")
+
+
 #: Values below this are HEALPix's mark for missing pixels, -1.6375e30.
 UNSEEN = -1.6e30
 
@@ -65,8 +71,7 @@ def check_positive(name: str, value: Array | np.ndarray) -> None:
 def as_number(name: str, value: object, positive: bool = False) -> Float[Array, ""]:
     """`value` as an array without axes, finite or positive."""
     number = as_array(name, value)
-    if number.shape:
-        raise ValueError(f"Argument `{name}` must be a number, but has shape {number.shape}.")
+    check_shape(name, number, not number.shape, "be a number")
     (check_positive if positive else check_finite)(name, number)
     return number
 

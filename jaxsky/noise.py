@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxsky.checks import Numeric, as_array, check_finite, is_concrete
-from jaxsky.harmonics import alm_ell, analysis, children, expand
+from jaxsky.checks import Numeric, as_array, check_finite, check_shape, is_concrete
+from jaxsky.harmonics import analysis, children, expand, power_spectrum
 from jaxsky.keys import stokes_noise
 
 #: Pixels that are checked at once.
@@ -52,6 +52,7 @@ def uniform_map(
     return sigma * stokes_noise(key, stokes, healpy.nside2npix(nside), sigma.dtype)
 
 
+@partial(jax.jit, static_argnames=("lmax", "stokes"))
 def uniform_alm(
     key: Array, noise: ArrayLike, lmax: int, stokes: int = 2
 ) -> Float[Array, "stokes alm"]:
@@ -66,19 +67,11 @@ def uniform_alm(
     """
     if stokes not in (1, 2, 3):
         raise ValueError(f"Argument `stokes` must be 1, 2 or 3, not {stokes!r}.")
-    return _uniform_alm(key, as_array("noise", noise), lmax, stokes)
-
-
-@partial(jax.jit, static_argnames=("lmax", "stokes"))
-def _uniform_alm(key, noise, lmax, stokes):
+    noise = as_array("noise", noise)
     spins = jnp.array({1: [0], 2: [2, 2], 3: [0, 2, 2]}[stokes])
     there = jnp.arange(lmax + 1) >= spins[:, None]
     levels = jnp.where(there, noise * (math.pi / 180 / 60), 0)
     return stokes_noise(key, stokes, (lmax + 1) ** 2, noise.dtype) * expand(levels)
-
-
-def _diagonal(variance: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:
-    return jnp.eye(len(variance), dtype=variance.dtype)[..., None] * variance
 
 
 def rms_covariance(rms: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:
@@ -89,10 +82,7 @@ def rms_covariance(rms: Float[Array, "stokes pix"]) -> Float[Array, "stokes stok
     rms : standard deviation of each Stokes parameter in each pixel, shape (stokes, pix)
     """
     rms = as_array("rms", rms)
-    if rms.ndim != 2:
-        raise ValueError(
-            f"Argument `rms` must have shape (stokes, pix), but has shape {rms.shape}."
-        )
+    check_shape("rms", rms, rms.ndim == 2, "have shape (stokes, pix)")
     check_finite("rms", rms)
     if is_concrete(rms) and (bad := int(jnp.sum(rms < 0))):
         raise ValueError(f"Argument `rms` has {bad} of {rms.size} values that are negative.")
@@ -111,19 +101,12 @@ def hits_covariance(
     hits : number of observations of each pixel
     stokes : number of Stokes parameters
     """
-    sigma0, hits = as_array("sigma0", sigma0), as_array("hits", hits)
-    if sigma0.shape not in ((), (stokes,)):
-        raise ValueError(
-            f"Argument `sigma0` must be a number or have shape ({stokes},), "
-            f"but has shape {sigma0.shape}."
-        )
-    if hits.ndim != 1:
-        raise ValueError(f"Argument `hits` must have shape (pix,), but has shape {hits.shape}.")
-    check_finite("sigma0", sigma0)
+    sigma0, hits = _each(sigma0, stokes), as_array("hits", hits)
+    check_shape("hits", hits, hits.ndim == 1, "have shape (pix,)")
     check_finite("hits", hits)
     if is_concrete(hits) and (bad := int(jnp.sum(hits <= 0))):
         raise ValueError(f"Argument `hits` is not positive in {bad} of {hits.size} pixels.")
-    return _diagonal(jnp.broadcast_to(sigma0, (stokes,))[:, None] ** 2 / hits)
+    return _diagonal(sigma0[:, None] ** 2 / hits)
 
 
 def weights_covariance(
@@ -139,18 +122,24 @@ def weights_covariance(
     sigma0 : noise of one observation of Q or U, a number or one for each
     weights : elements QQ, QU, UU; a pixel whose weights have no inverse gets no finite covariance
     """
-    sigma0, weights = as_array("sigma0", sigma0), as_array("weights", weights)
-    if sigma0.shape not in ((), (2,)):
-        raise ValueError(
-            f"Argument `sigma0` must be a number or have shape (2,), but has shape {sigma0.shape}."
-        )
-    if weights.ndim != 2 or len(weights) != 3:
-        raise ValueError(
-            f"Argument `weights` must have shape (3, pix), but has shape {weights.shape}."
-        )
+    sigma0, weights = _each(sigma0, 2), as_array("weights", weights)
+    check_shape("weights", weights, weights.shape[:-1] == (3,), "have shape (3, pix)")
     QQ, QU, UU = weights
     inverse = jnp.stack([jnp.stack([UU, -QU]), jnp.stack([-QU, QQ])]) / (QQ * UU - QU**2)
-    return jnp.outer(scale := jnp.broadcast_to(sigma0, (2,)), scale)[..., None] * inverse
+    return jnp.outer(sigma0, sigma0)[..., None] * inverse
+
+
+def _each(sigma0: ArrayLike, stokes: int) -> Float[Array, " stokes"]:
+    """The noise of one observation in each Stokes parameter."""
+    sigma0 = as_array("sigma0", sigma0)
+    good = sigma0.shape in ((), (stokes,))
+    check_shape("sigma0", sigma0, good, f"be a number or have shape ({stokes},)")
+    check_finite("sigma0", sigma0)
+    return jnp.broadcast_to(sigma0, (stokes,))
+
+
+def _diagonal(variance: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:
+    return jnp.eye(len(variance), dtype=variance.dtype)[..., None] * variance
 
 
 def covariance_from_columns(
@@ -165,11 +154,8 @@ def covariance_from_columns(
         QU, UU or II, IQ, IU, QQ, QU, UU
     """
     columns = as_array("columns", columns)
-    if columns.ndim != 2 or len(columns) not in _COLUMNS:
-        raise ValueError(
-            "Argument `columns` must have shape (3, pix) or (6, pix), "
-            f"but has shape {columns.shape}."
-        )
+    good = columns.ndim == 2 and len(columns) in _COLUMNS
+    check_shape("columns", columns, good, "have shape (3, pix) or (6, pix)")
     expected = _COLUMNS[len(columns)]
     given = list(expected if names is None else names)
     pairs = ["".join(sorted(name[:2].upper().replace("T", "I"))) for name in given]
@@ -217,11 +203,8 @@ def check_covariance(name: str, covariance: Float[Array, "stokes stokes pix"]) -
     name : of the argument, for the message
     covariance : of the Stokes parameters in each pixel
     """
-    if covariance.ndim != 3 or covariance.shape[0] != covariance.shape[1]:
-        raise ValueError(
-            f"Argument `{name}` must have shape (stokes, stokes, pix), "
-            f"but has shape {covariance.shape}."
-        )
+    good = covariance.ndim == 3 and covariance.shape[0] == covariance.shape[1]
+    check_shape(name, covariance, good, "have shape (stokes, stokes, pix)")
     if not is_concrete(covariance):
         return
     npix = covariance.shape[-1]
@@ -320,12 +303,10 @@ def fit_knee(
     fraction = float(np.mean(used))
     if not fraction:
         raise ValueError("Estimating the noise needs pixels, but none is left.")
-    alm = np.asarray(analysis(jnp.where(used, maps, 0.0), lmax))
+    spectra = power_spectrum(analysis(jnp.where(used, maps, 0.0), lmax))
     import optimistix as optx  # takes longer to import than many simulations take
 
-    degree = alm_ell(lmax)
-    power = np.bincount(degree, (alm**2).sum(axis=0)) / (2 * (2 * np.arange(lmax + 1) + 1))
-    measured = jnp.asarray(power[2:] / fraction)
+    measured = spectra.mean(axis=0)[2:] / fraction
     modes = 2 * (2 * jnp.arange(2, lmax + 1) + 1) * fraction
     level = jnp.median(measured[-lmax // 4 :])
     start = jnp.log(jnp.array([1.0, 10.0, 1.5]))

@@ -19,7 +19,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from jaxsky.checks import as_array, as_number, check_finite, check_positive, is_concrete
+from jaxsky.checks import (
+    as_array,
+    as_number,
+    check_finite,
+    check_positive,
+    check_shape,
+    is_concrete,
+)
 from jaxsky.cmb import gaussian_fields, repair
 from jaxsky.harmonics import (
     analysis,
@@ -75,10 +82,7 @@ class SmallScales(eqx.Module):
         self.EE, self.BB = (EE[0], EE[1]), (BB[0], BB[1])
         if slope is not None:
             slope = as_array("slope", slope)
-            if slope.shape not in ((), (2,)):
-                raise ValueError(
-                    f"Argument `slope` must be a number or 2 numbers, but has shape {slope.shape}."
-                )
+            check_shape("slope", slope, slope.shape in ((), (2,)), "be a number or 2 numbers")
             check_finite("slope", slope)
         self.slope = None if slope is None else jnp.broadcast_to(slope, 2)
         self.tilt = as_number("tilt", tilt)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxsky.checks import Numeric, as_array, check_finite, check_positive, is_concrete
+from jaxsky.checks import Numeric, as_array, check_finite, check_positive, check_shape, is_concrete
 from jaxsky.harmonics import beam_ratio, resample, shortened
 
 #: First and last frequency of an interval [GHz].
@@ -40,12 +40,10 @@ def _healpix(name: str, values: ArrayLike, rows: tuple[int, ...] = ()) -> tuple[
     npix = array.shape[-1] if array.ndim else 0
     nside = math.isqrt(npix // 12)
     valid = nside > 1 and 12 * nside**2 == npix and healpy.isnsideok(nside, nest=True)
-    if array.ndim != (2 if rows else 1) or (rows and len(array) not in rows) or not valid:
-        form = f"({' or '.join(map(str, rows))}, pix)" if rows else "(pix,)"
-        raise ValueError(
-            f"Argument `{name}` must have shape {form} with 12 nside^2 pixels, nside 2, 4, 8, ..., "
-            f"but has shape {array.shape}."
-        )
+    good = valid and (array.ndim == 2 and len(array) in rows if rows else array.ndim == 1)
+    form = f"({' or '.join(map(str, rows))}, pix)" if rows else "(pix,)"
+    pixels = "12 nside^2 pixels, nside 2, 4, 8, ..."
+    check_shape(name, array, good, f"have shape {form} with {pixels}")
     return array, nside
 
 
@@ -101,11 +99,8 @@ def dust_index(
     beta, nside_in = _healpix("beta", beta)
     _check_nside(nside)
     if mask is not None:
-        if np.shape(mask) != beta.shape:
-            raise ValueError(
-                f"Argument `mask` must have shape {beta.shape} like `beta`, "
-                f"but has shape {np.shape(mask)}."
-            )
+        good = np.shape(mask) == beta.shape
+        check_shape("mask", np.asarray(mask), good, f"have shape {beta.shape} like `beta`")
         beta = jnp.where(mask, beta, 0.0)
     check_finite("beta", beta)
 
@@ -157,10 +152,7 @@ def steepening(
 
     def index(name: str, interval: Interval) -> Array:
         ends = as_array(name, interval)
-        if ends.shape != (2,):
-            raise ValueError(
-                f"Argument `{name}` must be two frequencies [GHz], but has shape {ends.shape}."
-            )
+        check_shape(name, ends, ends.shape == (2,), "be two frequencies [GHz]")
         if is_concrete(ends) and not 0 < ends[0] < ends[1]:
             raise ValueError(
                 f"Argument `{name}` must be two increasing frequencies [GHz], "

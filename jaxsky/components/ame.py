@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky import sed
-from jaxsky.checks import Parameter, as_array, is_concrete
+from jaxsky.checks import Parameter, as_array, check_shape, is_concrete
 from jaxsky.components.base import Component, parameter, reference, template
 
 
@@ -52,11 +52,8 @@ class AME(Component, law="ame"):
         **parameters : further parameters of `AME`
         """
         intensity, dust = as_array("intensity", intensity), as_array("dust", dust)
-        if intensity.shape != dust.shape[1:]:
-            raise ValueError(
-                f"Argument `intensity` must have shape {dust.shape[1:]} like a map of `dust`, "
-                f"but has shape {intensity.shape}."
-            )
+        form = f"have shape {dust.shape[1:]} like a map of `dust`"
+        check_shape("intensity", intensity, intensity.shape == dust.shape[1:], form)
         Q, U = dust[-2:]
         P = jnp.hypot(Q, U)
         polarized = intensity * dust[-2:] / jnp.where(P > 0, P, 1.0)

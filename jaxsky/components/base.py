@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxsky.checks import as_array, check_finite, check_positive, is_concrete
+from jaxsky.checks import as_array, check_finite, check_positive, check_shape, is_concrete
 
 #: Components by the name of their law, or module and class, from the moment a class is defined.
 _LAWS: dict[str, type["Component"]] = {}
@@ -140,11 +140,9 @@ class Component(eqx.Module):
 
     def __check_init__(self) -> None:
         amplitude = as_array("amplitude", self.amplitude)
-        if amplitude.ndim != 2 or amplitude.shape[0] not in (2, 3):
-            raise ValueError(
-                "Argument `amplitude` must have shape (stokes, pix) with Stokes Q, U or I, Q, U, "
-                f"but has shape {amplitude.shape}."
-            )
+        good = amplitude.ndim == 2 and len(amplitude) in (2, 3)
+        form = "have shape (stokes, pix) with Stokes Q, U or I, Q, U"
+        check_shape("amplitude", amplitude, good, form)
         if len(amplitude) == 2 and not self.polarized:
             raise ValueError(
                 f"{type(self).__name__} is not polarized: it takes part in I, Q, U only, and has "
@@ -164,11 +162,8 @@ class Component(eqx.Module):
 
 def _check(name: str, value: object, npix: int, metadata: Any) -> None:
     array = as_array(name, value)
-    if array.shape not in ((), (npix,)):
-        raise ValueError(
-            f"Argument `{name}` must be a number or a map of shape ({npix},), "
-            f"but has shape {array.shape}."
-        )
+    good = array.shape in ((), (npix,))
+    check_shape(name, array, good, f"be a number or a map of shape ({npix},)")
     if "positive" not in metadata:
         raise TypeError(f"Field `{name}` must be declared with jaxsky.components.parameter.")
     _check_value(name, array, metadata)

@@ -30,7 +30,7 @@ from jaxsky.io.observations import Observed, read_observed
 from jaxsky.keys import realisation_key
 from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum, uniform_covariance
 from jaxsky.noise_inputs import read_noise
-from jaxsky.observation import Observation, ObservedBand, prepare
+from jaxsky.observation import Observation, ObservedBand, harmonic_sources
 from jaxsky.settings import BandTable, Experiment, SettingsError, at_key, find_file
 from jaxsky.simulation import observe_bands
 
@@ -148,7 +148,7 @@ def _simulated(
 ) -> tuple[dict[str, Band], dict[str, Array] | None]:
     """Bands as the first realisation of `jaxsky simulate` has them, and their foregrounds."""
     observation, key = setup.observation, realisation_key(settings.seed)
-    sky = prepare(setup.small_scales_key(key), setup.sources, observation)
+    sky = harmonic_sources(setup.small_scales_key(key), setup.sources, observation)
     used = np.ones(healpy.nside2npix(observation.nside), bool)
     bands = {}
     for name, maps in observe_bands(key, sky, observation, setup.cmb):

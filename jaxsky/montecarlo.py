@@ -3,7 +3,7 @@
 import json
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
@@ -21,7 +21,7 @@ from jaxsky.io.files import check_guards
 from jaxsky.io.folders import alone
 from jaxsky.io.observations import observed_tables
 from jaxsky.keys import realisation_key
-from jaxsky.observation import Prepared, plan, prepare
+from jaxsky.observation import harmonic_sources, plan_terms
 from jaxsky.settings import Experiment, found_files
 from jaxsky.simulation import observe_bands
 
@@ -34,10 +34,8 @@ CONTENT = {"seed", "sky", "bands", "cmb", "fixed", "truth", "simulate"}
 
 
 class Written(NamedTuple):
-    """A file of a realisation: where, and the seconds since the one before it; None if skipped."""
+    """A file of a realisation, and the seconds since the one before it; None if it was there."""
 
-    sim: int
-    band: str
     path: Path
     seconds: float | None
 
@@ -132,19 +130,14 @@ def _claim(out: Path, settings: Experiment, overwrite: bool) -> None:
             # Another process may have left it since the folder was checked.
             check_folder(out, settings, resume=True, overwrite=False)
             return
-        _write_log(out, settings)
-
-
-def _write_log(out: Path, settings: Experiment) -> None:
-    versions = {name: version(name) for name in PACKAGES}
-    content = {
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "python": platform.python_version(),
-        "versions": versions,
-        "settings": _content(settings),
-        "files": found_files(settings),
-    }
-    write_text(out / LOG, json.dumps(content, indent=2) + "\n")
+        content = {
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "python": platform.python_version(),
+            "versions": {name: version(name) for name in PACKAGES},
+            "settings": _content(settings),
+            "files": found_files(settings),
+        }
+        write_text(out / LOG, json.dumps(content, indent=2) + "\n")
 
 
 def _header(settings: Experiment, setup: Setup, name: str, index: int) -> dict[str, Any]:
@@ -194,14 +187,7 @@ def _columns(
     return names, columns
 
 
-def _write(
-    path: Path,
-    names: list[str],
-    columns: Float[np.ndarray, "column pix"],
-    settings: Experiment,
-    header: Mapping[str, Any],
-    tables: Sequence[Any],
-) -> None:
+def _write(path: Path, columns: Float[np.ndarray, "column pix"], **options: Any) -> None:
     check_guards()
     log = path.parents[1] / LOG
     if not log.exists():
@@ -209,35 +195,24 @@ def _write(
             f"{log}: was removed while the simulation ran; start again with --overwrite."
         )
     path.parent.mkdir(exist_ok=True)
-    write_maps(
-        path,
-        columns,
-        names=names,
-        unit=settings.simulate.unit,
-        overwrite=True,
-        extra_header=header,
-        single=settings.simulate.precision == "single",
-        tables=tables,
-    )
+    write_maps(path, columns, overwrite=True, **options)
 
 
-def _write_behind(
-    jobs: Iterator[tuple[str, Callable[[], None]]],
-) -> Iterator[tuple[str, float]]:
-    """Do each job while the next one is being made; names and seconds, as they are done."""
+def _write_behind(jobs: Iterator[tuple[Path, Callable[[], None]]]) -> Iterator[Written]:
+    """Do each job while the next one is being made; the files, as they are done."""
     start = time.perf_counter()
-    doing: list[tuple[str, Future[None]]] = []
+    doing: list[tuple[Path, Future[None]]] = []
 
-    def done() -> tuple[str, float]:
+    def done() -> Written:
         nonlocal start
-        name, future = doing.pop(0)
+        path, future = doing.pop(0)
         future.result()
         start, before = time.perf_counter(), start
-        return name, start - before
+        return Written(path, start - before)
 
     with ThreadPoolExecutor(1) as thread:
-        for name, job in jobs:
-            doing.append((name, thread.submit(job)))
+        for path, job in jobs:
+            doing.append((path, thread.submit(job)))
             del job  # and its maps with it, when it is done
             if len(doing) > 1:
                 yield done()
@@ -252,20 +227,28 @@ def _jobs(
     files: Mapping[str, Path],
     index: int,
     claim: Callable[[], None],
-) -> Iterator[tuple[str, Callable[[], None]]]:
-    """What writes each band of a realisation; `claim` is called when a map is ready."""
+) -> Iterator[tuple[Path, Callable[[], None]]]:
+    """The file of each band of a realisation, and what writes it; `claim` is called when a map is ready."""
     spec = settings.simulate
     for name, maps in seen:
         band = setup.observation.channels[name].band
         if (leaked := setup.leakage.get(name)) is not None:
             maps = {**maps, "total": maps["total"].at[-2:].add(leaked)}
-        columns = _columns(maps, spec.stokes, float(band.conversion("uK_RJ", spec.unit)))
+        factor = float(band.conversion("uK_RJ", spec.unit))
+        names, columns = _columns(maps, spec.stokes, factor)
         claim()
-        header = _header(settings, setup, name, index)
-        tables = observed_tables(setup.observed(name))
-        job = partial(_write, files[name], *columns, settings, header, tables)
+        job = partial(
+            _write,
+            files[name],
+            columns,
+            names=names,
+            unit=spec.unit,
+            extra_header=_header(settings, setup, name, index),
+            single=spec.precision == "single",
+            tables=observed_tables(setup.observed(name)),
+        )
         del maps, columns  # or they would still be there when those of the next band are made
-        yield name, job
+        yield files[name], job
         del job
 
 
@@ -296,9 +279,8 @@ def run(
     -------
     The files, as they are written.
     """
-    spec, observation = settings.simulate, setup.observation
-    terms = None
-    prepared: dict[str, Prepared] | None = None
+    observation = setup.observation
+    terms = prepared = None
     # Templates without random small scales, or with the same for all, are prepared once.
     random = setup.small_scales_seed is None and any(
         source.small_scales is not None for source in setup.sources.values()
@@ -316,24 +298,23 @@ def run(
         files = paths(out, observation.names, index)
         stale = overwrite and not claimed
         missing = [name for name, path in files.items() if stale or not path.exists()]
-        yield from (Written(index, n, files[n], None) for n in files if n not in missing)
+        yield from (Written(files[n], None) for n in files if n not in missing)
         if not missing:
             continue
         key = realisation_key(settings.seed, index)
         if prepared is None or random:
-            terms = plan(setup.sources, observation) if terms is None else terms
+            terms = plan_terms(setup.sources, observation) if terms is None else terms
             small = key if random else setup.small_scales_key(key)
             correlated = [n for n, source in setup.sources.items() if source.correlated_with]
-            prepared = prepare(small, setup.sources, observation, terms, release=not random)
+            prepared = harmonic_sources(
+                small, setup.sources, observation, terms, release=not random
+            )
             for name in correlated:
                 if repaired := int(prepared[name].repaired):
                     note(
                         f"{name}: its extrapolated cross-spectra exceed what the auto-spectra "
                         f"allow at {repaired} multipoles; correlations were reduced there."
                     )
-        components = "components" in spec.outputs
-        seen = observe_bands(
-            key, prepared, observation, setup.cmb, components=components, names=missing
-        )
-        for name, seconds in _write_behind(_jobs(settings, setup, seen, files, index, claim)):
-            yield Written(index, name, files[name], seconds)
+        apart = "components" in settings.simulate.outputs
+        seen = observe_bands(key, prepared, observation, setup.cmb, components=apart, names=missing)
+        yield from _write_behind(_jobs(settings, setup, seen, files, index, claim))

@@ -138,8 +138,8 @@ class Observation(eqx.Module):
         return tuple(self.channels[name].band for name in self.names)
 
 
-class Prepared(NamedTuple):
-    """A component in harmonic space.
+class HarmonicSource(NamedTuple):
+    """A component in harmonic space, ready to be seen in any band.
 
     Parameters
     ----------
@@ -161,14 +161,14 @@ class Prepared(NamedTuple):
 
 def _continued(
     key: Array, sources: Mapping[str, Source], observation: Observation
-) -> dict[str, tuple[Float[Array, "2 alm"], Int[Array, ""] | int, Array | float]]:
-    """Coefficients of the sources that have small scales, how many repaired, and their beam: 0."""
+) -> dict[str, tuple[Float[Array, "2 alm"], Int[Array, ""]]]:
+    """Coefficients of the sources that have small scales, without beam, and how many repaired."""
     leaders = {
         name: source.correlated_with or name
         for name, source in sources.items()
         if source.small_scales is not None
     }
-    result: dict[str, tuple[Array, Array | int, Array | float]] = {}
+    result = {}
     for leader in sorted(set(leaders.values())):
         group = [leader, *sorted(n for n, first in leaders.items() if first == leader != n)]
         members = [sources[name] for name in group]
@@ -184,7 +184,7 @@ def _continued(
         except ValueError as error:
             raise ValueError(f"Small scales of {', '.join(group)}: {error}") from None
         for name, alm in zip(group, continued.alms, strict=True):
-            result[name] = alm, continued.repaired, 0.0
+            result[name] = alm, continued.repaired
     return result
 
 
@@ -207,10 +207,10 @@ def _law(component: Component) -> Component:
     )
 
 
-def plan(
+def plan_terms(
     sources: Mapping[str, Source], observation: Observation, tolerance: float = TOLERANCE
 ) -> dict[str, Terms | None]:
-    """Terms of each source for `prepare`, chosen from values that are not being traced.
+    """Terms of each source for `harmonic_sources`, chosen from values that are not being traced.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def plan(
     """
     # Terms are for the ranges of the maps as they are used.
     components = {n: _at(source.component, observation.nside) for n, source in sources.items()}
-    if any(_varies(component) for component in components.values()):
+    if any(leaf.ndim == 1 for leaf in jax.tree.leaves(components)):
         importance = _importance(components, stack_bands(observation.bands))
     else:
         importance = dict.fromkeys(components)
@@ -227,11 +227,6 @@ def plan(
         name: choose_terms(component, observation.bands, importance[name], tolerance)
         for name, component in components.items()
     }
-
-
-def _varies(component: Component) -> bool:
-    """True if a parameter is a map."""
-    return any(leaf.ndim == 1 for leaf in jax.tree.leaves(component))
 
 
 @jax.jit
@@ -264,14 +259,14 @@ def _iterations(size: float, nside: int, beam: Array | float) -> int:
     return min(needed, STEPS + (nside < 128))
 
 
-def prepare(
+def harmonic_sources(
     key: Array,
     sources: Mapping[str, Source],
     observation: Observation,
     terms: Mapping[str, Terms | None] | None = None,
     *,
     release: bool = False,
-) -> dict[str, Prepared]:
+) -> dict[str, HarmonicSource]:
     """Sources with their small scales, in harmonic space.
 
     Parameters
@@ -279,21 +274,22 @@ def prepare(
     key : of jax.random, for the small scales
     sources : by name
     observation : how they are observed
-    terms : from `plan`, by default made here; None for a source averages its bands one by one,
-        as is necessary where its parameters that are maps are being traced
+    terms : from `plan_terms`, by default made here; None for a source averages its bands one by
+        one, as is necessary where its parameters that are maps are being traced
     release : take each source out of `sources`, a dict, when it has served, to free its memory
     """
     _check_sources(sources, observation)
-    terms = plan(sources, observation) if terms is None else terms
+    terms = plan_terms(sources, observation) if terms is None else terms
     lmax, nside, dtype = observation.lmax, observation.nside, observation.dtype
     continued = _continued(key, sources, observation)
     result = {}
     for name in list(sources):
         chosen, component = terms[name], _law(_at(sources[name].component, nside))
+        repaired: Array | int = 0
+        fwhm = sources[name].fwhm
         if name in continued:
-            alm, repaired, fwhm = continued[name]
+            (alm, repaired), fwhm = continued[name], 0.0
         else:
-            repaired, fwhm = 0, sources[name].fwhm
             alm = _low_multipoles(sources[name].component.template.astype(dtype), observation)
         alm = alm.astype(dtype)
         if release:
@@ -301,14 +297,14 @@ def prepare(
             del sources[name]
         if chosen is not None and not chosen.counts:
             weights = term_weights(component, observation.bands, chosen)
-            result[name] = Prepared((alm,), weights, None, None, fwhm, repaired)
+            result[name] = HarmonicSource((alm,), weights, None, None, fwhm, repaired)
             continue
         if name in continued:
             fwhm = observation.finest
             alm = alm * expand(gaussian_beam(fwhm, lmax).astype(dtype))
         template = synthesis(alm, nside)
         if chosen is None:
-            result[name] = Prepared((), None, component, template, fwhm, repaired)
+            result[name] = HarmonicSource((), None, component, template, fwhm, repaired)
             continue
         alms = []
         for i, size in enumerate(chosen.sizes):
@@ -318,7 +314,7 @@ def prepare(
                 # JAX would make the maps of all terms ahead of their analysis.
                 alms[-1].block_until_ready()
         weights = term_weights(component, observation.bands, chosen)
-        result[name] = Prepared(tuple(alms), weights, None, None, fwhm, repaired)
+        result[name] = HarmonicSource(tuple(alms), weights, None, None, fwhm, repaired)
     return result
 
 

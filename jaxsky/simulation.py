@@ -19,7 +19,7 @@ from jaxsky.harmonics import analysis, beam_ratio, expand, resample, synthesis
 from jaxsky.interpolation import Terms, band_sed
 from jaxsky.keys import stream
 from jaxsky.noise import draw, uniform_alm, uniform_map
-from jaxsky.observation import Observation, ObservedBand, Prepared, Source, prepare
+from jaxsky.observation import HarmonicSource, Observation, ObservedBand, Source, harmonic_sources
 
 
 class _Part(NamedTuple):
@@ -65,7 +65,7 @@ def _noise(
 
 def observe_bands(
     key: Array,
-    prepared: Mapping[str, Prepared],
+    prepared: Mapping[str, HarmonicSource],
     observation: Observation,
     cmb: Float[Array | np.ndarray, "4 ell"] | None = None,
     *,
@@ -77,7 +77,7 @@ def observe_bands(
     Parameters
     ----------
     key : of jax.random, for CMB and noise
-    prepared : from `prepare`; may be empty
+    prepared : from `harmonic_sources`; may be empty
     observation : the experiment
     cmb : spectra TT, EE, BB, TE [uK_CMB^2] up to 2 nside at least, or None for no CMB
     components : give the map of each component, of "cmb" and "noise" as well as the "total"
@@ -143,7 +143,7 @@ def _maps(
 
 
 def _seen(
-    source: Prepared,
+    source: HarmonicSource,
     channel: ObservedBand,
     index: int,
     beam: Array | float,
@@ -170,7 +170,7 @@ def simulate(
     *,
     terms: Mapping[str, Terms | None] | None = None,
 ) -> Float[Array, "band stokes pix"]:
-    """Simulated maps of all channels [uK_RJ]: `prepare` and `observe_bands` in one.
+    """Simulated maps of all channels [uK_RJ]: `harmonic_sources` and `observe_bands` in one.
 
     Differentiable in sources and observation with a fixed key.
 
@@ -179,13 +179,13 @@ def simulate(
     key : of jax.random
     sources, observation : what is observed, and how
     cmb : spectra TT, EE, BB, TE [uK_CMB^2], or None
-    terms : see `prepare`
+    terms : see `harmonic_sources`
 
     Raises
     ------
     ValueError
         If a beam is finer than that of a component without small scales.
     """
-    prepared = prepare(key, sources, observation, terms)
+    prepared = harmonic_sources(key, sources, observation, terms)
     seen = observe_bands(key, prepared, observation, cmb)
     return jnp.stack([maps["total"] for _, maps in seen])

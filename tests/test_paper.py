@@ -18,7 +18,7 @@ from fits.paper.items import Impossible, Item, Number, picture_of
 from fits.paper.sources import Sources
 from jaxsky.harmonics import gaussian_beam, power_spectrum
 from jaxsky.io import read_maps
-from jaxsky.observation import Source, prepare
+from jaxsky.observation import Source, harmonic_sources
 from jaxsky.settings import Experiment, load
 from jaxsky.small_scales import fit_power_law
 
@@ -168,11 +168,11 @@ def test_real_sky(real, data_dir, tmp_path):
 
 
 def test_patch_shows_the_small_scales_of_the_spectra(small):
-    """Those that are there already are the ones that `prepare` makes."""
+    """Those that are there already are the ones that `harmonic_sources` makes."""
     sources = Sources(small)
     observation = core_observation(sources)
     given = {name: Source(*sources.template(name)) for name in ("dust", "synchrotron")}
-    expected = prepare(sources.key, given, observation)
+    expected = harmonic_sources(sources.key, given, observation)
     found = prepared_templates(sources, observation)
     for name, one in expected.items():
         np.testing.assert_allclose(found[name].alms[0], one.alms[0], rtol=1e-5, atol=1e-6)

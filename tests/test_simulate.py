@@ -22,7 +22,7 @@ from jaxsky.harmonics import (
     synthesis,
 )
 from jaxsky.keys import stream
-from jaxsky.observation import Observation, ObservedBand, Source, plan, prepare
+from jaxsky.observation import Observation, ObservedBand, Source, harmonic_sources, plan_terms
 from jaxsky.simulation import observe_bands, simulate
 from jaxsky.small_scales import SmallScales
 
@@ -75,7 +75,7 @@ def observation(
 
 def observed(key, there, how, cmb=None, terms=None):
     """Maps of all components by band and name."""
-    prepared = prepare(key, there, how, terms)
+    prepared = harmonic_sources(key, there, how, terms)
     return dict(observe_bands(key, prepared, how, cmb, components=True))
 
 
@@ -155,14 +155,14 @@ def test_terms_agree_with_bands_one_by_one():
     how = observation(
         bands={f"{nu}": Bandpass.delta(nu) for nu in (30.0, 60, 143, 353, 545, 700, 857)}
     )
-    terms = plan(there, how)
+    terms = plan_terms(there, how)
     assert 1 < len(terms["dust"].vectors) < 6
     summed = simulate(KEY, there, how, terms=terms)
     direct = simulate(KEY, there, how, terms={"dust": None})
     for one, other in zip(summed, direct, strict=True):
         assert rms(one - other) < 1e-7 * rms(other)
     # Asked for less, it is less.
-    rough = simulate(KEY, there, how, terms=plan(there, how, 1e-2))
+    rough = simulate(KEY, there, how, terms=plan_terms(there, how, 1e-2))
     assert rms(rough[0] - direct[0]) > 1e-6 * rms(direct[0])
 
 
@@ -245,7 +245,7 @@ def test_a_stream_does_not_depend_on_the_others():
         # which matter where small scales times the law reach beyond LMAX.
         error = rms(longer[name]["dust"] - reference[name]["dust"])
         assert error < 1e-5 * rms(reference[name]["dust"])
-    prepared = prepare(KEY, there, how)
+    prepared = harmonic_sources(KEY, there, how)
     only = dict(observe_bands(KEY, prepared, how, SPECTRA, names=["143"]))
     assert list(only) == ["143"]
     np.testing.assert_allclose(only["143"]["total"], reference["143"]["total"], rtol=1e-9)
@@ -259,7 +259,7 @@ def correlation(one, other):
 def test_streams_are_independent():
     there, how = sources(beta=1.54, small=SMALL), observation(noise=300.0)
     first, second = (observed(k, there, how, SPECTRA) for k in jax.random.split(KEY))
-    small = [prepare(k, there, how) for k in jax.random.split(KEY)]
+    small = [harmonic_sources(k, there, how) for k in jax.random.split(KEY)]
 
     def injected(prepared, name):
         # Above the joins, whatever the templates have there is the same for both keys.
@@ -488,7 +488,7 @@ def parametrised(p):
 def test_the_procedure_is_a_differentiable_function():
     """With a fixed key, each number of the whole procedure against finite differences."""
     theta = jnp.array(list(NUMBERS.values()))
-    terms = plan(*parametrised(NUMBERS)) | {"dust": None}
+    terms = plan_terms(*parametrised(NUMBERS)) | {"dust": None}
 
     def maps(theta):
         there, how = parametrised(dict(zip(NUMBERS, theta, strict=True)))

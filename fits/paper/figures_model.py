@@ -36,7 +36,14 @@ from jaxsky.instrument import band_tables, load_instrument
 from jaxsky.interpolation import term_weights
 from jaxsky.io import InputError
 from jaxsky.keys import stream
-from jaxsky.observation import Observation, ObservedBand, Prepared, Source, plan, prepare
+from jaxsky.observation import (
+    HarmonicSource,
+    Observation,
+    ObservedBand,
+    Source,
+    harmonic_sources,
+    plan_terms,
+)
 from jaxsky.presets import preset
 from jaxsky.settings import BandTable, Experiment
 from jaxsky.simulation import observe_bands
@@ -301,15 +308,15 @@ def core_observation(sources: Sources) -> Observation:
     return Observation(channels, sources.nside_fine, finest=fwhm, precision="single")
 
 
-def prepared_templates(sources: Sources, observation: Observation) -> dict[str, Prepared]:
+def prepared_templates(sources: Sources, observation: Observation) -> dict[str, HarmonicSource]:
     """Both foregrounds; where their laws are constant, with the small scales that there are."""
     given = {name: Source(*sources.template(name)) for name in PAPER_FWHM}
-    terms = plan(given, observation)
+    terms = plan_terms(given, observation)
     constant = {name: one for name, one in terms.items() if one is not None and not one.counts}
     if len(constant) < len(terms):
-        return prepare(sources.key, given, observation, terms)
+        return harmonic_sources(sources.key, given, observation, terms)
     return {
-        name: Prepared(
+        name: HarmonicSource(
             tuple(alm.astype(observation.dtype) for alm in sources.continued(name).alms),
             term_weights(given[name].component, observation.bands, one),
             None,

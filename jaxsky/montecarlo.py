@@ -228,7 +228,7 @@ def _jobs(
     index: int,
     claim: Callable[[], None],
 ) -> Iterator[tuple[Path, Callable[[], None]]]:
-    """The file of each band of a realisation, and what writes it; `claim` is called when a map is ready."""
+    """Each file of a realisation, and what writes it; `claim` is called when a map is ready."""
     spec = settings.simulate
     for name, maps in seen:
         band = setup.observation.channels[name].band

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import matplotlib as mpl
@@ -177,108 +177,87 @@ def plot_leakage(path: Path, spectra: Sequence[BandSpectra], title: str) -> None
         grid[0, 0].set_ylabel(POWER)
 
 
-def _patch_panel(
-    axes: Axes,
-    points: Sequence[tuple[str, str, np.ndarray, np.ndarray]],
-    star: np.ndarray,
-    logarithmic: bool,
-) -> None:
-    """Values with errors against each other, and the line of equals; a star where it is true.
+class _Series(NamedTuple):
+    """Patches in a picture: those shown, and what x and y are: a fit, and EE (0) or BB (1)."""
 
-    Parameters
-    ----------
-    axes : to draw on
-    points : of each series, name, colour, and for x and y values and errors, (2, 2, patch)
-    star : patches to mark, and the patches of each series that are shown in its third entry
-    logarithmic : both axes
-    """
-    every = []
-    for name, color, shown, values in points:
-        (x, dx), (y, dy) = values
-        for chosen, marker, size in ((shown & ~star, "x", 4), (shown & star, "*", 11)):
+    name: str
+    color: str
+    shown: np.ndarray
+    x: tuple[PatchFits, int]
+    y: tuple[PatchFits, int]
+
+
+def _patch_panel(axes: Axes, series: Sequence[_Series], what: str) -> None:
+    """A or alpha with errors, and the line of equals; the field of BICEP2 is a star."""
+    drawn: list[float] = []
+    for one in series:
+        star = np.array([name == "BICEP2" for name in one.x[0].names])
+        (x, dx), (y, dy) = (
+            (getattr(fit, what)[:, index], getattr(fit, f"{what}_error")[:, index])
+            for fit, index in (one.x, one.y)
+        )
+        for kept, marker, size in ((one.shown & ~star, "x", 4), (one.shown & star, "*", 11)):
             axes.errorbar(
-                x[chosen], y[chosen], yerr=dy[chosen], xerr=dx[chosen], fmt=marker, color=color,
+                x[kept], y[kept], yerr=dy[kept], xerr=dx[kept], fmt=marker, color=one.color,
                 ms=size, elinewidth=0.4, alpha=0.8, zorder=3,
             )  # fmt: skip
-        axes.plot([], [], "x", color=color, label=f"{name}: {shown.sum()} of {shown.size} patches")
-        every += [x[shown], y[shown]]
-    line = np.array([axes.get_xlim(), axes.get_ylim()])
-    if logarithmic:
+        label = f"{one.name}: {one.shown.sum()} of {star.size} patches"
+        axes.plot([], [], "x", color=one.color, label=label)
+        drawn += [*x[one.shown], *y[one.shown]]
+    line = [*axes.get_xlim(), *axes.get_ylim()]
+    if what == "A":
         axes.set(xscale="log", yscale="log")
         round_numbers(axes.xaxis)
         round_numbers(axes.yaxis)
-        if (found := np.concatenate(every)).size:
-            line = np.array([found.min() / 1.5, found.max() * 1.5])
-    ends = line.min(), line.max()
+        line = [min(drawn) / 1.5, max(drawn) * 1.5] if drawn else line
+    ends = min(line), max(line)
     axes.plot(ends, ends, color="k", lw=1)
     axes.set(xlim=ends, ylim=ends, aspect="equal")
     axes.plot([], [], "k*", ms=9, label="BICEP2")
 
 
-def _plot_patch_pairs(path, points, star, labels, heads, title):
+def _plot_patch_pairs(
+    path: Path,
+    series: Sequence[_Series],
+    labels: Sequence[str],
+    heads: Sequence[str],
+    title: str,
+) -> None:
     """A on the left and alpha on the right."""
     with draw_panels(path, title, (7.2, 4.0), 1, 2) as panels:
         for axes, what, symbol, head in zip(
             panels[0], ("A", "alpha"), (rf"$A$ [{UNIT}$^2$]", r"$\alpha$"), heads, strict=True
         ):
-            _patch_panel(axes, points(what), star, what == "A")
+            _patch_panel(axes, series, what)
             axes.set(xlabel=f"{symbol}, {labels[0]}", ylabel=f"{symbol}, {labels[1]}")
             axes.set_title(head, fontsize=8)
         legend_below(panels[0, 0])
 
 
-def _with_errors(fit: PatchFits, what: str, index: int) -> np.ndarray:
-    return np.array([getattr(fit, what)[:, index], getattr(fit, f"{what}_error")[:, index]])
-
-
 def plot_patches(path: Path, patches: PatchComparison, title: str) -> None:
     """A and alpha of the patches, model and observed (the paper's fig. 10)."""
-
-    def points(what):
-        return [
-            (
-                name,
-                COLORS[i],
-                patches.detected(i),
-                np.array([_with_errors(f, what, i) for f in (patches.model, patches.observed)]),
-            )
-            for i, name in enumerate(FIELDS)
-        ]
-
-    def head(what, numbers):
-        found = [f"{name} {with_error(*numbers(i))}" for i, name in enumerate(FIELDS)]
-        return f"{what}: {', '.join(found)}"
-
-    _plot_patch_pairs(
-        path,
-        points,
-        np.array([name == "BICEP2" for name in patches.model.names]),
-        ("model", "observed"),
-        (
-            head("observed / model", patches.ratio),
-            head("observed - model", patches.slope_difference),
-        ),
-        f"{title}\n{patches.band}: patches of 400 square degrees",
-    )
+    title = f"{title}\n{patches.band}: patches of 400 square degrees"
+    series = [
+        _Series(name, COLORS[i], patches.detected(i), (patches.model, i), (patches.observed, i))
+        for i, name in enumerate(FIELDS)
+    ]
+    heads = [
+        f"{what}: {', '.join(f'{name} {with_error(*of(i))}' for i, name in enumerate(FIELDS))}"
+        for what, of in (
+            ("observed / model", patches.ratio),
+            ("observed - model", patches.slope_difference),
+        )
+    ]
+    _plot_patch_pairs(path, series, ("model", "observed"), heads, title)
 
 
 def plot_template_patches(path: Path, fit: PatchFits, title: str) -> None:
     """A and alpha of the patches of one map, BB against EE."""
     both = fit.detected.all(axis=1)
-
-    def points(what):
-        values = np.array([_with_errors(fit, what, i) for i in (0, 1)])
-        return [("EE and BB", COLORS[0], both, values)]
-
-    medians = [np.median(getattr(fit, what)[both], axis=0) for what in ("A", "alpha")]
-    _plot_patch_pairs(
-        path,
-        points,
-        np.array([name == "BICEP2" for name in fit.names]),
-        FIELDS,
-        (
-            f"median BB / EE: {np.median(fit.A[both, 1] / fit.A[both, 0]):.2f}",
-            f"median: EE {medians[1][0]:.2f}, BB {medians[1][1]:.2f}",
-        ),
-        f"{title}\npatches of 400 square degrees",
-    )
+    EE, BB = np.median(fit.alpha[both], axis=0)
+    heads = [
+        f"median BB / EE: {np.median(fit.A[both, 1] / fit.A[both, 0]):.2f}",
+        f"median: EE {EE:.2f}, BB {BB:.2f}",
+    ]
+    series = [_Series("EE and BB", COLORS[0], np.asarray(both), (fit, 0), (fit, 1))]
+    _plot_patch_pairs(path, series, FIELDS, heads, f"{title}\npatches of 400 square degrees")

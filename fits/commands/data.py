@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fits.commands.console import console, print_tables
+from fits.commands.endings import interruptible
 
 data_commands = typer.Typer(
     help="Official data products: what there is, download, and checks.", no_args_is_help=True
@@ -28,7 +29,7 @@ Folder = Annotated[
 
 
 @data_commands.command("list")
-def list_products(products: Words = None, folder: Folder = None) -> None:
+def _list(products: Words = None, folder: Folder = None) -> None:
     """Name the products and sets of them, and say which are there."""
     from jaxsky.archive import cache_folder, find, product_sets, total_size
 
@@ -63,8 +64,8 @@ def list_products(products: Words = None, folder: Folder = None) -> None:
     print_tables([table], width=None if console.is_terminal else 200)
 
 
-@data_commands.command()
-def fetch(
+@data_commands.command("fetch")
+def _fetch(
     products: Annotated[
         list[str],
         typer.Argument(
@@ -87,13 +88,14 @@ def fetch(
     wanted = archive.find(products)
     if len(wanted) > 1:
         console.print(f"{len(wanted)} files, {archive.total_size(wanted)}.")
-    with Progress(
+    bar = Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         DownloadColumn(),
         TransferSpeedColumn(),
         console=console,
-    ) as progress:
+    )
+    with interruptible("; fetch it again to resume"), bar as progress:
         for product in wanted:
             task = progress.add_task(product.name, total=product.size)
 
@@ -103,21 +105,16 @@ def fetch(
             def waiting(name: str = product.name) -> None:
                 console.print(f"{name}: another process fetches it; waiting.")
 
-            try:
-                path = archive.fetch(
-                    product, folder, mirror=mirror, accept=accept, report=report, waiting=waiting
-                )
-            except KeyboardInterrupt:
-                progress.stop()
-                console.print("Stopped; fetch it again to resume.")
-                raise typer.Exit(130) from None
+            path = archive.fetch(
+                product, folder, mirror=mirror, accept=accept, report=report, waiting=waiting
+            )
             size = path.stat().st_size
             progress.update(task, completed=size, total=size)
     console.print(f"In {folder}: {len(wanted)} files.", soft_wrap=True)
 
 
-@data_commands.command()
-def verify(products: Words = None, folder: Folder = None) -> None:
+@data_commands.command("verify")
+def _verify(products: Words = None, folder: Folder = None) -> None:
     """Check files that are there: size, hash, columns, units, and that they are complete."""
     from jaxsky import archive
     from jaxsky.io import InputError

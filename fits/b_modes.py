@@ -25,12 +25,6 @@ class BandLaw(NamedTuple):
     slope: float
 
 
-def to_D(lmax: int) -> Float[np.ndarray, " ell"]:
-    """The factor l (l + 1) / 2 pi of D_l = l (l + 1) C_l / 2 pi, for l = 0 ... lmax."""
-    ell = np.arange(lmax + 1)
-    return ell * (ell + 1) / (2 * np.pi)
-
-
 def foreground_powers(
     sky: Sky, bands: Mapping[str, Bandpass], spectra: MaskedSpectra
 ) -> dict[str, Float[np.ndarray, "2 bin"]]:
@@ -142,7 +136,8 @@ def equal_r(
     law : fitted to BB
     tensors : spectra C_l of TT, EE, BB, TE for r = 1 [uK_CMB^2], up to `spectra.lmax` and 80
     """
-    found = {f"l = {PIVOT}": float(law.amplitude / (to_D(PIVOT)[-1] * tensors[2, PIVOT]))}
+    primordial = PIVOT * (PIVOT + 1) / (2 * np.pi) * tensors[2, PIVOT]
+    found = {f"l = {PIVOT}": float(law.amplitude / primordial)}
     low = spectra.centers <= REIONISATION
     if low.any():
         binned = np.einsum("bjl,jl->b", spectra.windows[1], tensors[1:3, : spectra.lmax + 1])

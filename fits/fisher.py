@@ -29,8 +29,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits.b_modes import PIVOT, BandLaw
+from fits.mixing import Mixing, SpectralBands
 from jaxsky import Bandpass, Sky, get_parameters, parameter_names, set_parameters
-from jaxsky.bandpass import Samples, average, stack_bands
+from jaxsky.bandpass import stack_bands
 from jaxsky.checks import check_double
 from jaxsky.sky import unknown_parameter
 
@@ -48,9 +49,7 @@ class ForecastModel(eqx.Module):
 
     Parameters
     ----------
-    sky : foregrounds of amplitude 1 in one pixel; see `unit_sky`
-    bands : frequencies and weights of bandpasses
-    to_cmb : factors from uK_RJ to uK_CMB in each band
+    mixing : of foregrounds of amplitude 1 in one pixel (`unit_sky`), in uK_CMB
     weights : b_l over the noise [1 / (uK_CMB rad)], shape (ell, band)
     tensors : C_l of tensors for r = 1 [uK_CMB^2], a row for each field, shape (field, ell)
     scalars : C_l of lensed scalars [uK_CMB^2], shape (field, ell)
@@ -59,9 +58,7 @@ class ForecastModel(eqx.Module):
     fields : "EE", "BB" or both
     """
 
-    sky: Sky
-    bands: Samples
-    to_cmb: Float[Array, " band"]
+    mixing: Mixing
     weights: Float[Array, "ell band"]
     tensors: Float[Array, "field ell"]
     scalars: Float[Array, "field ell"]
@@ -70,10 +67,15 @@ class ForecastModel(eqx.Module):
     fields: tuple[str, ...] = eqx.field(static=True)
 
     @classmethod
-    def of(cls, sky: Sky, bands: Sequence[Bandpass], *rest: Any) -> "ForecastModel":
-        """The model for bandpasses; the rest are the fields from `weights` on."""
-        factors = [band.conversion("uK_RJ", "uK_CMB") for band in bands]
-        return cls(sky, stack_bands(bands), jnp.stack(factors), *rest)
+    def of(cls, sky: Sky, bands: Mapping[str, Bandpass], *rest: Any) -> "ForecastModel":
+        """The model for bandpasses by name; the rest are the fields from `weights` on."""
+        seen, samples = tuple(bands.values()), stack_bands(list(bands.values()))
+        return cls(Mixing(sky, SpectralBands(seen, tuple(bands), "QU"), samples, "uK_CMB"), *rest)
+
+    @property
+    def sky(self) -> Sky:
+        """The foregrounds."""
+        return self.mixing.sky
 
 
 class Errors(NamedTuple):
@@ -191,12 +193,10 @@ def _check_correlations(
 def _laws(params: Mapping[str, Array], model: ForecastModel) -> Float[Array, "band component"]:
     """What each component shows in each band [uK_CMB], the CMB last."""
     known = parameter_names(model.sky)
-    sky = set_parameters(model.sky, {name: params[name] for name in params if name in known})
-    columns = [jnp.ones_like(model.to_cmb)]
-    for component in sky.components.values():
-        seen = jax.vmap(partial(average, component.sed))(model.bands)
-        columns.insert(-1, component.template[-1, 0] * seen * model.to_cmb)
-    return jnp.stack(columns, axis=-1)
+    own = {name: params[name] for name in params if name in known}
+    sky = set_parameters(model.sky, own)
+    polarized = jnp.stack([one.template[-1, 0] for one in sky.components.values()])
+    return jnp.pad(model.mixing.one(own) * polarized, ((0, 0), (0, 1)), constant_values=1.0)
 
 
 def _spectra(

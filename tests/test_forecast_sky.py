@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from commands import jaxsky, one_sentence
-from fits.b_modes import BandLaw, band_correlation, equal_r, fit_law, foreground_powers, to_D
+from fits.b_modes import BandLaw, band_correlation, equal_r, fit_law, foreground_powers
 from fits.commands.forecast import forecast, forecast_warnings
 from fits.commands.run import DEFAULTS
 from fits.power_covariance import band_covariance
@@ -24,6 +24,12 @@ NSIDE, LMAX = 32, 64
 #: D_l at l = 80 and slope of C_l, of EE and BB [uK_RJ^2].
 LAWS = {"dust": ((4.0, -2.4), (2.0, -2.6)), "synchrotron": ((30.0, -2.7), (10.0, -2.9))}
 RHO, FWHM = 0.6, {"dust": 60.0, "synchrotron": 120.0}
+
+
+def to_D(C: np.ndarray) -> np.ndarray:
+    """D_l = l (l + 1) C_l / 2 pi."""
+    ell = np.arange(len(C))
+    return ell * (ell + 1) / (2 * np.pi) * C
 
 
 def law(amplitude: float, slope: float) -> np.ndarray:
@@ -105,7 +111,7 @@ def test_powers_of_a_known_sky(sky):
     steepest, shallow = LAWS["dust"][1], expected(BANDS["315"])[1]
     assert BB.slope == pytest.approx(steepest[1], abs=0.05)
     at_30 = BB.amplitude * (30 / 80) ** (BB.slope + 2)
-    assert at_30 == pytest.approx((to_D(LMAX) * shallow)[30], rel=0.03)
+    assert at_30 == pytest.approx(to_D(shallow)[30], rel=0.03)
 
 
 def test_laws_in_closed_form():
@@ -240,7 +246,7 @@ def test_command_on_files(folder, tmp_path, monkeypatch, capsys):
     for field, row in (("EE", 0), ("BB", 1)):
         C = expected(Bandpass.top_hat(300.0, 80.0))[row]
         bins = zip(result["bins"]["first"], result["bins"]["last"], strict=True)
-        D = np.array([np.mean((to_D(LMAX) * C)[a : b + 1]) for a, b in bins])
+        D = np.array([np.mean(to_D(C)[a : b + 1]) for a, b in bins])
         ratio = np.array(result["foregrounds"]["300"][field]) / D
         assert np.average(ratio, weights=np.arange(ratio.size)) == pytest.approx(1, abs=0.12)
     values = result["parameters"]

@@ -15,6 +15,7 @@ from fits.b_modes import BandLaw
 from fits.commands.run import Command, Report, Run
 from fits.common import prepare_component
 from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors, foreground_names, unit_sky
+from fits.plots import spread
 from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra, sky_fraction
 from fits.record import write_json, write_log
 from fits.regions import apodize, region_mask
@@ -34,6 +35,8 @@ from jaxsky.sky import unknown_parameter
 #: What is in the folder of the results.
 RESULTS = ("forecast.json", "log.json", "bb.png", "fisher.png")
 FIELDS = ("EE", "BB")
+#: Spectra are taken in so many bands, if the settings name none.
+SHOWN = 5
 #: Spectra are corrected for beams down to this window.
 LEAST_WINDOW = 0.05
 
@@ -105,7 +108,7 @@ def forecast_inputs(settings: Experiment) -> ForecastInputs:
     for name, band in bands.items():
         if band.noise is None:
             raise SettingsError(f"bands.{name}.noise: is missing.")
-    shown = spec.bands or _few(tuple(bands))
+    shown = spec.bands or spread(tuple(bands), SHOWN)
     for name in shown:
         if name not in bands:
             raise SettingsError(f"forecast.bands: {name!r} is none of {', '.join(bands)}.")
@@ -120,12 +123,6 @@ def forecast_inputs(settings: Experiment) -> ForecastInputs:
     if not mask.any():
         raise SettingsError("forecast.region: leaves no pixel.")
     return ForecastInputs(sky, fwhm, mask, bands, tuple(shown), description)
-
-
-def _few(names: tuple[str, ...], most: int = 5) -> list[str]:
-    """The names, or a few of them that are evenly spread."""
-    at = np.linspace(0, len(names) - 1, min(most, len(names)))
-    return [names[i] for i in at.round().astype(int)]
 
 
 def _check_resolution(lmax: int, nside: int, fwhm: float) -> None:
@@ -219,12 +216,12 @@ def _model(
             correlations[field, first, second] = b_modes.band_correlation(
                 spectra, cross[row], auto[first][row], auto[second][row], spec.fit
             )
-    ell, bands = np.arange(spec.lmin, spec.fisher_lmax + 1), inputs.bands.values()
-    weights = [b_modes.noise_weights(band, spec.fisher_lmax)[ell] for band in bands]
+    ell, lmax = np.arange(spec.lmin, spec.fisher_lmax + 1), spec.fisher_lmax
+    weights = [b_modes.noise_weights(band, lmax)[ell] for band in inputs.bands.values()]
     cmb_rows = 1 + np.array(list(rows.values()))[:, None]
     model = ForecastModel.of(
         unit_sky(sky, inputs.mask),
-        [band.band for band in bands],
+        {name: band.band for name, band in inputs.bands.items()},
         jnp.asarray(np.stack(weights, axis=1)),
         jnp.asarray(tensors[cmb_rows, ell]),
         jnp.asarray(lensed[cmb_rows, ell]),

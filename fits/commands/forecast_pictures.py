@@ -6,10 +6,20 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 
-from fits.b_modes import noise_weights, to_D
+from fits.b_modes import noise_weights
 from fits.commands.forecast import Forecast
 from fits.fisher import Errors
-from fits.plots import COLORS, COLUMN, UNITS, draw_panels, label, legend_below, plain, round_numbers
+from fits.plots import (
+    COLORS,
+    COLUMN,
+    UNITS,
+    draw_panels,
+    label,
+    legend_below,
+    plain,
+    round_numbers,
+    with_powers,
+)
 from jaxsky.settings import Experiment
 
 #: Primordial spectra, from the largest r on.
@@ -20,18 +30,17 @@ LENSING = "#888888"
 def plot_b_modes(path: Path, found: Forecast, settings: Experiment) -> None:
     """BB of the foregrounds in some bands and their noise, against primordial BB."""
     lmax = settings.forecast.lmax
-    ell, D = np.arange(2, lmax + 1), to_D(lmax)[2:]
     with draw_panels(path, "", (COLUMN, 3.9)) as panels:
         axes = panels[0, 0]
         for (name, powers), color in zip(found.powers.items(), COLORS, strict=False):
             BB = np.where(powers[1] > 0, powers[1], np.nan)
             axes.loglog(found.spectra.centers, BB, color=color, lw=1.8, label=plain(_band(name)))
-            noise = noise_weights(found.inputs.bands[name], lmax)[2:] ** -2
-            axes.loglog(ell, D * noise, color=color, lw=0.7)
-        axes.loglog(ell, D * found.lensed[2, 2 : lmax + 1], color=LENSING, lw=1.2)
+            noise = noise_weights(found.inputs.bands[name], lmax) ** -2
+            axes.loglog(*with_powers(noise), color=color, lw=0.7)
+        axes.loglog(*with_powers(found.lensed[2, : lmax + 1]), color=LENSING, lw=1.2)
         bottom = 1.0
         for r, dashes in zip(sorted(settings.forecast.show_r, reverse=True), DASHES, strict=False):
-            primordial = r * D * found.tensors[2, 2 : lmax + 1]
+            ell, primordial = with_powers(r * found.tensors[2, : lmax + 1])
             axes.loglog(ell, primordial, color="k", ls=dashes, lw=1.1, label=f"$r = {r:g}$")
             bottom = min(bottom, primordial[: min(100, len(ell))].min())
         axes.plot([], [], color=LENSING, lw=1.2, label="lensing")

@@ -174,7 +174,7 @@ def _write_page(sources: Sources, out: Path, items: list[Item]) -> list[Item]:
     )
     if rows:
         table = Table(("quantity", "paper", "here", "about it", "see"), rows)
-        items = [*items, described(NUMBERS, None, {}, table=table)]
+        items = [*items, described(NUMBERS, None, table=table)]
     seconds = sum(item.seconds or 0 for item in items)
     write_page(
         out / PAGE,

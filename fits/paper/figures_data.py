@@ -64,14 +64,16 @@ def figure_scatter(sources: Sources, picture: Path) -> Item:
         slope = with_error(scatter.slope, scatter.error)
         note = f"r = {scatter.correlation:.3f}, PTE {scatter.pte_text}"
         numbers.append(Number(f"slope, {band}, Q and U", slope, note))
-    words = {
-        "nside": settings.common.nside,
-        "region": region_words(settings, region),
-        "beam": _beam(sources),
-        "maps": sources.maps_differ,
-        "here": _pixels_here(sources, bands),
-    }
-    return described("Figure 5", picture, words, numbers)
+    return described(
+        "Figure 5",
+        picture,
+        numbers,
+        nside=settings.common.nside,
+        region=region_words(settings, region),
+        beam=_beam(sources),
+        maps=sources.maps_differ,
+        here=_pixels_here(sources, bands),
+    )
 
 
 def figure_maps(sources: Sources, picture: Path) -> Item:
@@ -80,8 +82,7 @@ def figure_maps(sources: Sources, picture: Path) -> Item:
     nside = min(settings.compare.panel_nside, settings.common.nside)
     pictures.plot_model_maps(picture, found, "QU", _chosen(found), nside, settings.title)
     here = _pixels_here(sources, list(found.prepared.bands))
-    words = {"nside": nside, "maps": sources.maps_differ, "here": here}
-    return described("Figure 6", picture, words)
+    return described("Figure 6", picture, nside=nside, maps=sources.maps_differ, here=here)
 
 
 def figure_planck(sources: Sources, picture: Path) -> Item:
@@ -126,14 +127,17 @@ def _spectra(
     elif r != 0.1:
         more.append(f"r is {r:g} rather than 0.1")
     first = f"the spectra are of maps of nside {nside} rather than 256"
-    words = {
-        "experiment": experiment,
-        "lmax": lmax,
-        "nsims": settings.compare.nsims,
-        "maps": sources.maps_differ,
-        "here": _here(sources, first, [s.band for s in spectra], wanted, *more),
-    }
-    return described(label, picture, words, numbers, texts="Figures 7 and 8")
+    return described(
+        label,
+        picture,
+        numbers,
+        texts="Figures 7 and 8",
+        experiment=experiment,
+        lmax=lmax,
+        nsims=settings.compare.nsims,
+        maps=sources.maps_differ,
+        here=_here(sources, first, [s.band for s in spectra], wanted, *more),
+    )
 
 
 def figure_leakage(sources: Sources, picture: Path) -> Item:
@@ -154,7 +158,7 @@ def figure_leakage(sources: Sources, picture: Path) -> Item:
             for name, fraction in settings.simulate.leakage.items()
         )
         leakage = filled(texts["simulated"], fractions=fractions)
-    return described("Figure 9", picture, {"leakage": leakage}, numbers)
+    return described("Figure 9", picture, numbers, leakage=leakage)
 
 
 def figure_patches(sources: Sources, picture: Path) -> Item:
@@ -171,8 +175,7 @@ def figure_patches(sources: Sources, picture: Path) -> Item:
             Number(f"A observed / model, {name}", ratio, f"correlation {A:.2f}"),
             Number(f"alpha observed - model, {name}", difference, f"correlation {alpha:.2f}"),
         ]
-    words = {"band": found.band, "maps": sources.maps_differ}
-    return described("Figure 10", picture, words, numbers)
+    return described("Figure 10", picture, numbers, band=found.band, maps=sources.maps_differ)
 
 
 def _template_patches(sources: Sources, picture: Path) -> Item:
@@ -187,8 +190,8 @@ def _template_patches(sources: Sources, picture: Path) -> Item:
         Number("median A of BB / EE", f"{ratio:.2f}"),
         Number("median alpha, EE, BB", slopes),
     ]
-    words = {"sky": sources.sky_differs}
-    return described("Figure 10", picture, words, numbers, texts="Figure 10 of the template")
+    texts, sky = "Figure 10 of the template", sources.sky_differs
+    return described("Figure 10", picture, numbers, texts=texts, sky=sky)
 
 
 def figure_probability(sources: Sources, picture: Path) -> Item:
@@ -220,9 +223,11 @@ def figure_probability(sources: Sources, picture: Path) -> Item:
             if fit.stokes == "QU"
         ]
     simulated = TEXTS["Figure 11"]["simulated"]
-    words = {
-        "bands": listed(bands),
-        "region": region_words(settings, "strip"),
-        "maps": simulated if sources.simulated else sources.sky_differs,
-    }
-    return described("Figure 11", picture, words, numbers)
+    return described(
+        "Figure 11",
+        picture,
+        numbers,
+        bands=listed(bands),
+        region=region_words(settings, "strip"),
+        maps=simulated if sources.simulated else sources.sky_differs,
+    )

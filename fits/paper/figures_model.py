@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import healpy
 import jax.numpy as jnp
@@ -75,7 +76,8 @@ def figure_templates(sources: Sources, picture: Path) -> Item:
         Q = np.asarray(layer.maps[0])
         rows.append([MapPanel(title, Q, color_limit(Q), UNITS["uK_RJ"])])
     plot_maps(picture, rows)
-    return described("Figure 1", picture, beams | {"sky": sources.sky_differs})
+    words: dict[str, Any] = {"sky": sources.sky_differs, **beams}
+    return described("Figure 1", picture, **words)
 
 
 def figure_indices(sources: Sources, picture: Path) -> Item:
@@ -96,7 +98,7 @@ def figure_indices(sources: Sources, picture: Path) -> Item:
         ]
     numbers.append(_steepening(sources.index("beta_syn")))
     plot_maps(picture, rows)
-    return described("Figure 3", picture, {"origins": " and ".join(origins)}, numbers)
+    return described("Figure 3", picture, numbers, origins=" and ".join(origins))
 
 
 def _steepening(index: Index) -> Number:
@@ -135,12 +137,14 @@ def figure_ame(sources: Sources, picture: Path) -> Item:
                 f"{note}{float(wide):.2g}",
             )
         )
-    words = {
-        "sky": sources.sky_differs,
-        "origin": ame.origin[:1].upper() + ame.origin[1:],
-        "resolution": ame.resolution,
-    }
-    return described("Figure 4", picture, words, numbers)
+    return described(
+        "Figure 4",
+        picture,
+        numbers,
+        sky=sources.sky_differs,
+        origin=ame.origin[:1].upper() + ame.origin[1:],
+        resolution=ame.resolution,
+    )
 
 
 def figure_spectra(sources: Sources, picture: Path) -> Item:
@@ -173,8 +177,8 @@ def figure_spectra(sources: Sources, picture: Path) -> Item:
                 ours = with_error(float(slope), float(error))
                 numbers.append(Number(f"slope of {name} {kind}", ours, note))
         panels[0, 0].set_xlabel("")
-    words = {"fwhm": fwhm, "sky": sources.sky_differs, "ranges": _ranges(sources)}
-    return described("Figure 2", picture, words, numbers)
+    sky, ranges = sources.sky_differs, _ranges(sources)
+    return described("Figure 2", picture, numbers, fwhm=fwhm, sky=sky, ranges=ranges)
 
 
 def _ranges(sources: Sources) -> str:
@@ -184,7 +188,7 @@ def _ranges(sources: Sources) -> str:
         [(tuple(one.EE), tuple(one.BB)) for one in each]
         for each in (
             [sources.template(name).small_scales for name in NAMES],
-            [sources.small_scales_table(name) for name in NAMES],
+            [getattr(sources.settings.paper, name) for name in NAMES],
         )
     )
     if used != wanted:
@@ -243,17 +247,17 @@ def figure_randomised(sources: Sources, picture: Path) -> Item:
     limit = color_limit(rest[0] - middle, 0.995)
     shifted = {title: (values - middle, limit, "uK_RJ") for title, values in panels.items()}
     _draw_patches(picture, shifted, center, SIZE)
-    words = {
-        "size": SIZE,
-        "l": center[0],
-        "b": center[1],
-        "mean": middle,
-        "fwhm": fwhm,
-        "steeper": -TILT,
-        "rms": listed(f"{float((values - template).std()):.2f}" for values in rest),
-        "sky": sources.sky_differs,
-    }
-    return described("Figure 14", picture, words)
+    return described(
+        "Figure 14",
+        picture,
+        size=SIZE,
+        center=center,
+        mean=middle,
+        fwhm=fwhm,
+        steeper=-TILT,
+        rms=listed(f"{float((values - template).std()):.2f}" for values in rest),
+        sky=sources.sky_differs,
+    )
 
 
 def forecast_settings(sources: Sources) -> Experiment:
@@ -290,12 +294,9 @@ def figure_b_modes(sources: Sources, picture: Path) -> Item:
         Number(f"r with as much BB at {where}, {name} GHz", f"{equal[where]:.3g}")
         for name, equal in found.equal_r.items()
     ]
-    words = {
-        "region": region_words(settings, settings.forecast.region),
-        "percent": 100 * sky_fraction(found.inputs.mask),
-        "sky": sky,
-    }
-    return described("Figure 12", picture, words, numbers)
+    region, percent = settings.forecast.region, 100 * sky_fraction(found.inputs.mask)
+    words = region_words(settings, region)
+    return described("Figure 12", picture, numbers, region=words, percent=percent, sky=sky)
 
 
 def core_observation(sources: Sources) -> Observation:
@@ -347,16 +348,17 @@ def figure_patch(sources: Sources, picture: Path) -> Item:
             panels = {f"CMB, {beam}": (Q["cmb"] * to_cmb, limit, "uK_CMB"), **panels}
     _draw_patches(picture, panels, center, SIZE_CORE)
     spectra = settings.cmb.spectra
-    words = {
-        "size": SIZE_CORE,
-        "l": center[0],
-        "b": center[1],
-        "cmb": f"r = {settings.cmb.r:g}" if spectra is None else f"spectra of {spectra}",
-        "sky": sources.sky_differs,
-        "fwhm": settings.paper.fwhm,
-        "nside": observation.nside,
-    }
-    return described("Figure 13", picture, words, numbers)
+    return described(
+        "Figure 13",
+        picture,
+        numbers,
+        size=SIZE_CORE,
+        center=center,
+        cmb=f"r = {settings.cmb.r:g}" if spectra is None else f"spectra of {spectra}",
+        sky=sources.sky_differs,
+        fwhm=settings.paper.fwhm,
+        nside=observation.nside,
+    )
 
 
 def _brightest(band: str, inside: Mapping[str, Float[np.ndarray, " inside"]]) -> Number:
@@ -382,4 +384,4 @@ def table_core(sources: Sources, picture: Path) -> Item:
         ("Noise [µK_RJ arcmin]", *(f"{float(channel.noise):.2f}" for channel in channels)),
         ("Width [GHz]", *(f"{float(channel.width):.3g}" for channel in channels)),
     )
-    return described("Table 1", None, {}, table=Table(header, rows))
+    return described("Table 1", None, table=Table(header, rows))

@@ -63,11 +63,11 @@ def filled(text: str, **words: Any) -> str:
 def described(
     label: str,
     picture: Path | None,
-    words: dict[str, Any],
     numbers: Sequence[Number] = (),
     *,
     table: Table | None = None,
     texts: str | None = None,
+    **words: Any,
 ) -> Item:
     """An item with the words of `paper.toml`, and what the paper says of its numbers.
 
@@ -75,9 +75,9 @@ def described(
     ----------
     label : of the item
     picture : its file
-    words : what is filled in
     numbers, table : of the item
     texts : their heading in `paper.toml`, by default the label
+    words : what is filled in
     """
     own = TEXTS[texts or label]
     published, otherwise = own.get("published", {}), own.get("otherwise", "not given")

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import healpy
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -18,8 +17,9 @@ from fits.inputs import Inputs, inputs_of
 from fits.paper.items import TEXTS, Impossible, filled, listed
 from fits.regions import region_masks
 from jaxsky import AME, Dust, Synchrotron
+from jaxsky.cmb import gaussian_fields
 from jaxsky.galaxy import EmbeddedSky
-from jaxsky.harmonics import expand, gaussian_beam, synthesis
+from jaxsky.harmonics import gaussian_beam, synthesis
 from jaxsky.inputs import (
     Template,
     default_galaxy,
@@ -29,7 +29,7 @@ from jaxsky.inputs import (
     read_sky,
     uK_RJ_per,
 )
-from jaxsky.io import InputError
+from jaxsky.io.text import read_text
 from jaxsky.keys import realisation_key, stream
 from jaxsky.presets import from_pysm_beta
 from jaxsky.settings import (
@@ -37,7 +37,7 @@ from jaxsky.settings import (
     Experiment,
     IndexFile,
     SettingsError,
-    SmallScalesTable,
+    at_key,
     find_file,
 )
 from jaxsky.small_scales import Continued, SmallScales, continue_templates
@@ -244,23 +244,16 @@ class Sources:
         fwhm = max(own.fwhm, PAPER_FWHM[name])
         nside = healpy.npix2nside(own.used.size)
         maps = polarization_template(own.component.template, own.fwhm, fwhm, nside)
-        numbers = self.small_scales_table(name).model_dump(exclude={"correlated_with"})
+        numbers = getattr(self.settings.paper, name).model_dump(exclude={"correlated_with"})
         last = int(KNOWN * nside)
         for kind in ("EE", "BB"):
             first, end = numbers[kind]
             if end > last:
                 numbers[kind] = max(2, round(first * last / end)), last
-        try:
+        with at_key(f"paper.{name}"):
             small = SmallScales(**numbers)
-        except ValueError as error:
-            raise SettingsError(f"paper: {error}") from None
         assert isinstance(own.component, Dust | Synchrotron)  # by its law
         return Layer(dataclasses.replace(own.component, amplitude=maps), fwhm, small)
-
-    def small_scales_table(self, name: str) -> SmallScalesTable:
-        """What the settings say of the small scales of a template."""
-        table: SmallScalesTable = getattr(self.settings.paper, name)
-        return table
 
     @property
     def nside_fine(self) -> int:
@@ -339,9 +332,8 @@ def _drawn_index(key: Array, name: str, nside: int) -> Index:
     """A Gaussian field with the mean and the scatter of the paper's map."""
     lmax, fwhm = 2 * nside, FWHM[name]
     ell = jnp.arange(lmax + 1)
-    root = jnp.where(ell < 1, 0.0, jnp.maximum(ell, 1) ** (SLOPE / 2))
-    white = jax.random.normal(key, (1, (lmax + 1) ** 2))
-    field = synthesis(white * expand(root * gaussian_beam(fwhm, lmax)), nside)[0]
+    power = jnp.where(ell < 1, 0.0, jnp.maximum(ell, 1.0) ** SLOPE) * gaussian_beam(fwhm, lmax) ** 2
+    field = synthesis(gaussian_fields(key, power[None, None]), nside)[0]
     values = MEAN[name] + SCATTER[name] * (field - field.mean()) / field.std()
     origin = (
         f"{SYMBOLS[name]} is a Gaussian field of mean {MEAN[name]:g} and scatter {SCATTER[name]:g}"
@@ -368,12 +360,7 @@ def _read_index(folder: Path, name: str, spec: IndexFile) -> Index:
 
 
 def _of_spectrum(folder: Path, file: str) -> float:
-    """By how much a spectrum in a file steepens."""
-    try:
-        path = find_file(folder, file)
-        nu, temperature = np.loadtxt(path, unpack=True, usecols=(0, 1))
+    """By how much a spectrum in a file steepens: frequency [GHz] and antenna temperature."""
+    with at_key("paper.beta_syn.steepening"):
+        nu, temperature = read_text(find_file(folder, file)).numbers([0, 1]).T
         return float(steepening(nu, temperature))
-    except InputError as error:
-        raise SettingsError(f"paper.beta_syn.steepening: {error}") from None
-    except (OSError, ValueError) as error:
-        raise SettingsError(f"paper.beta_syn.steepening: {path}: {error}") from None

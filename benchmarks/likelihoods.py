@@ -12,9 +12,9 @@ import numpy as np
 
 from benchmarks.table import Row, time_text
 from benchmarks.timing import interleave, seconds
-from fits.chains import ChainFile
 from fits.compress import gram
 from fits.grid import _log_posterior
+from fits.kept import ChainFile
 from fits.posterior import Likelihood
 from fits.priors import Uniform
 from fits.sampling import sample

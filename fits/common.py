@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fits.covariance import Fluctuations, uniform_level
+from fits.fluctuations import Fluctuations, uniform_level
 from fits.inputs import Inputs
-from fits.record import fingerprint
+from fits.kept import fingerprint
 from fits.template_likelihood import CovarianceOf, SkyLikelihood, likelihood
 from fits.template_noise import prepared_variance
 from jaxsky import Bandpass, Sky, observe

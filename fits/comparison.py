@@ -18,9 +18,9 @@ from jaxtyping import Array, Bool, Float
 from fits.common import CommonMaps
 from fits.discs import EDGES
 from fits.full_sky import LMIN, BandSpectra, compare_spectra, polarization_alms
+from fits.kept import fingerprint, kept_realisations
 from fits.pseudo_cl import bin_edges
-from fits.realisations import realisations
-from fits.record import fingerprint, probability
+from fits.writing import probability
 from jaxsky.harmonics import power_spectrum
 from jaxsky.progress import QUIET
 from jaxsky.settings import Experiment, SettingsError
@@ -214,7 +214,7 @@ def simulated_fluctuations(
     model : foregrounds of each band [uK_RJ]
     regions : pixels of each region
     lmax : largest multipole of the spectra
-    nsims, seed, path, mark, report : see `fits.realisations.realisations`
+    nsims, seed, path, mark, report : see `fits.kept.kept_realisations`
     """
     foregrounds = polarization_alms(model, lmax)
     inside = jnp.asarray(np.stack(list(regions.values())))
@@ -228,7 +228,7 @@ def simulated_fluctuations(
         squares = _sums_of_squares(noise + cmb, inside)
         return chi2, squares, spectra, power_spectrum(noise_alms)
 
-    return Simulated(*realisations(make, Simulated._fields, nsims, seed, path, mark, report))
+    return Simulated(*kept_realisations(make, Simulated._fields, nsims, seed, path, mark, report))
 
 
 @jax.jit

@@ -10,7 +10,7 @@ from getdist import plots
 
 from fits.plots import COLORS, STYLE, draw_panels, draw_title, label, legend_below, plain, save
 from fits.results import FitResult
-from fits.spectral_index import Fit, all_free
+from fits.spectral_index import RegionFit, all_free
 
 STOKES_COLORS = {"Q": COLORS[0], "U": COLORS[1], "QU": COLORS[6]}
 TRUTH = {"color": COLORS[3], "linewidth": 1.6}
@@ -27,15 +27,15 @@ def _levels(log_posterior: np.ndarray) -> list[float]:
     return [float(np.log(density[np.searchsorted(held, p)])) for p in (0.9545, 0.6827)]
 
 
-def _by_region(fits: Sequence[Fit]) -> dict[str, list[Fit]]:
-    regions: dict[str, list[Fit]] = {}
+def _by_region(fits: Sequence[RegionFit]) -> dict[str, list[RegionFit]]:
+    regions: dict[str, list[RegionFit]] = {}
     for fit in fits:
         regions.setdefault(fit.region, []).append(fit)
     return regions
 
 
 def plot_grids(
-    path: Path, fits: Sequence[Fit], truth: Mapping[str, float] | None, title: str
+    path: Path, fits: Sequence[RegionFit], truth: Mapping[str, float] | None, title: str
 ) -> bool:
     """The probability on the grid, Q beside U, a row for each region: the paper's figure.
 
@@ -61,13 +61,13 @@ def plot_grids(
     return True
 
 
-def _drawable(fits: Sequence[Fit], name: str) -> list[Fit]:
+def _drawable(fits: Sequence[RegionFit], name: str) -> list[RegionFit]:
     """Fits that have a parameter, with a finite error."""
     firsts = [(fit, next(iter(fit.results.values()))) for fit in fits]
     return [fit for fit, r in firsts if name in r.free and np.isfinite(r.sigma[name])]
 
 
-def _limits(fits: Sequence[Fit], name: str) -> tuple[float, float] | None:
+def _limits(fits: Sequence[RegionFit], name: str) -> tuple[float, float] | None:
     """Range of a parameter that shows all fits to four standard deviations."""
     results = [next(iter(fit.results.values())) for fit in _drawable(fits, name)]
     if not results:
@@ -95,7 +95,7 @@ def _grid_panel(axes: plt.Axes, result: FitResult, truth: Mapping[str, float] | 
     axes.spines[:].set_visible(True)
 
 
-def _density(fit: Fit, name: str) -> tuple[np.ndarray, np.ndarray, FitResult]:
+def _density(fit: RegionFit, name: str) -> tuple[np.ndarray, np.ndarray, FitResult]:
     """A marginal distribution from the best method there is: grid, chain or Gaussian."""
     if "grid" in fit.results:
         result = fit.results["grid"]
@@ -111,7 +111,7 @@ def _density(fit: Fit, name: str) -> tuple[np.ndarray, np.ndarray, FitResult]:
 
 
 def plot_marginals(
-    path: Path, fits: Sequence[Fit], truth: Mapping[str, float] | None, title: str
+    path: Path, fits: Sequence[RegionFit], truth: Mapping[str, float] | None, title: str
 ) -> bool:
     """Marginal probability of each parameter, for Q, U and both, with 68 % intervals."""
     free, regions = all_free(fits), _by_region(fits)
@@ -131,7 +131,7 @@ def plot_marginals(
     return True
 
 
-def _marginal_curve(axes: plt.Axes, fit: Fit, name: str) -> None:
+def _marginal_curve(axes: plt.Axes, fit: RegionFit, name: str) -> None:
     x, density, result = _density(fit, name)
     density = density / density.max()
     color = STOKES_COLORS[fit.stokes]
@@ -142,7 +142,7 @@ def _marginal_curve(axes: plt.Axes, fit: Fit, name: str) -> None:
 
 
 def plot_posterior(
-    path: Path, fits: Sequence[Fit], truth: Mapping[str, float] | None, title: str
+    path: Path, fits: Sequence[RegionFit], truth: Mapping[str, float] | None, title: str
 ) -> bool:
     """The posterior of the chains, a colour for each region, for the most Stokes parameters.
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fits.record import with_error
+from fits.writing import with_error
 from jaxsky.checks import Numeric
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from blackjax.diagnostics import ess_bulk, rhat
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
-from fits.chains import ChainFile
+from fits.kept import ChainFile
 from fits.optimize import best_fit
 from fits.posterior import Likelihood, Posterior
 from fits.priors import Prior, check_priors

@@ -12,13 +12,13 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Bool
 
-from fits.chains import kept_chain
 from fits.common import CommonMaps
 from fits.grid import grid_fit, grid_is_possible
+from fits.inputs import Inputs
+from fits.kept import fingerprint, kept_chain
 from fits.optimize import best_fit
 from fits.posterior import chi2
 from fits.priors import priors_of
-from fits.record import fingerprint
 from fits.results import FitResult
 from fits.sampling import sample
 from fits.template_noise import Attenuation, attenuation
@@ -30,7 +30,7 @@ from jaxsky.settings import Experiment, SettingsError, at_key
 WEIGHTLESS = 1e-6
 
 
-class Fit(NamedTuple):
+class RegionFit(NamedTuple):
     """The fits of one region and choice of Stokes parameters, by method.
 
     `chi2` is the paper's sum over pixels at the best fit of each method, with `dof` degrees of
@@ -55,9 +55,16 @@ class Fit(NamedTuple):
         return float(scipy.stats.chi2.sf(self.results[method].chi2, self.dof_amplitudes))
 
 
-def all_free(fits: Sequence[Fit]) -> tuple[str, ...]:
+def all_free(fits: Sequence[RegionFit]) -> tuple[str, ...]:
     """Names of the parameters that are free in any of the fits."""
     return tuple(sorted({name for f in fits for r in f.results.values() for name in r.free}))
+
+
+def known_truth(inputs: Inputs, fits: Sequence[RegionFit]) -> dict[str, float] | None:
+    """The truth about the free parameters, if there is one."""
+    if inputs.truth is None:
+        return None
+    return {name: inputs.truth[name] for name in all_free(fits) if name in inputs.truth}
 
 
 def fit_pixels(
@@ -68,8 +75,8 @@ def fit_pixels(
     stokes: str,
     chains: Path | None = None,
     progress: Progress = QUIET,
-) -> Fit:
-    """The fits of one region and choice of Stokes parameters; see `run`."""
+) -> RegionFit:
+    """The fits of one region and choice of Stokes parameters; see `fit_regions`."""
     # An offset of a Stokes parameter that is not looked at has no effect.
     other = tuple(s for s in "QU" if s not in stokes)
     start = {
@@ -130,7 +137,7 @@ def fit_pixels(
         result = next(iter(results.values()))
         sky, sigma = prepared.sky, prepared.sigma
         lost = attenuation(like, result, sky, variances, sigma, used, stokes)
-    return Fit(region, stokes, results, values, dof, dof_amplitudes, nothing, lost)
+    return RegionFit(region, stokes, results, values, dof, dof_amplitudes, nothing, lost)
 
 
 def _expected(
@@ -171,13 +178,13 @@ def weightless(
     return tuple(n for n, part in zip(prepared.bands, share, strict=True) if part < WEIGHTLESS)
 
 
-def run(
+def fit_regions(
     settings: Experiment,
     prepared: CommonMaps,
     regions: dict[str, Bool[np.ndarray, " pix"]],
     chains: Path | None = None,
     progress: Progress = QUIET,
-) -> list[Fit]:
+) -> list[RegionFit]:
     """All fits that the settings ask for.
 
     Parameters

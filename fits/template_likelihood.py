@@ -5,7 +5,7 @@ dict of parameters, so the grid, the optimiser and the sampler share one definit
 
 * "diagonal", the paper's: sum over pixels of (data - model)^2 / sigma^2.
 * "exact": the data reduced to their inner products with the templates, y = T^T W d, with the
-  exact covariance of y (`fits.covariance`). Smoothed noise is correlated between pixels and the
+  exact covariance of y (`fits.fluctuations`). Smoothed noise is correlated between pixels and the
   CMB between bands; the diagonal form ignores both and so misstates its errors, while y is
   linear in the data, hence Gaussian with a covariance that can be computed.
 
@@ -35,7 +35,7 @@ from jaxsky.interpolation import NodeCounts, Nodes
 from jaxsky.sky import OFFSET, interpolation_nodes, unknown_parameter
 
 #: Covariance of the inner products <rows, data>: (band, row, stokes, pix) -> square matrix over
-#: (band, row) flattened. `fits.covariance.Fluctuations.covariance` is one.
+#: (band, row) flattened. `fits.fluctuations.Fluctuations.covariance` is one.
 CovarianceOf = Callable[[Float[Array, "band row stokes pix"]], Float[np.ndarray, "row row"]]
 
 

@@ -18,9 +18,7 @@ import numpy as np
 import pytest
 
 from commands import jaxsky, said
-from fits.chains import ChainFile, kept_chain
-from fits.realisations import realisations
-from fits.record import fingerprint
+from fits.kept import ChainFile, fingerprint, kept_chain, kept_realisations
 from jaxsky.io import InputError, whole, write_maps, write_text
 from jaxsky.io.folders import ALL, Owner, alone, occupied
 
@@ -292,7 +290,7 @@ def test_damaged_chains_are_refused(tmp_path):
 
 
 def test_realisations_go_on_after_a_full_disk(tmp_path, monkeypatch):
-    monkeypatch.setattr("fits.realisations.SAVED_EVERY", -1.0)
+    monkeypatch.setattr("fits.kept.SAVED_EVERY", -1.0)
     path = tmp_path / "simulations.npz"
 
     def make(key):
@@ -301,7 +299,7 @@ def test_realisations_go_on_after_a_full_disk(tmp_path, monkeypatch):
         return [jax.random.normal(key, (100,)), jax.random.normal(key, ())]
 
     def run(count=12):
-        return realisations(make, ("a", "b"), count, 3, path, "mark")
+        return kept_realisations(make, ("a", "b"), count, 3, path, "mark")
 
     with limited(5000), pytest.raises(OSError, match=r"simulations.npz: cannot be written \("):
         run()

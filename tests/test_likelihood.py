@@ -14,7 +14,7 @@ from jax.test_util import check_grads
 
 import systems
 from fits.compress import gram, square_root
-from fits.covariance import Fluctuations
+from fits.fluctuations import Fluctuations
 from fits.optimize import best_fit
 from fits.posterior import chi2
 from fits.template_likelihood import likelihood

@@ -9,9 +9,9 @@ import pytest
 from fits.commands.forecast import forecast_inputs
 from fits.inputs import inputs_of
 from fits.paper.sources import Sources
-from fits.record import write_log
 from fits.regions import region_masks
 from fits.separate.setup import build as build_separation
+from fits.writing import write_log
 from jaxsky.archive import cache_folder
 from jaxsky.experiment import build as build_experiment
 from jaxsky.io import InputError, write_maps

@@ -6,8 +6,8 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from fits.chains import ChainFile
 from fits.grid import grid_fit
+from fits.kept import ChainFile
 from fits.optimize import best_fit
 from fits.priors import Gaussian, Uniform, from_unbounded, log_prior, to_unbounded
 from fits.results import FitError, misfit

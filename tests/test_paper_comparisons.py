@@ -12,8 +12,8 @@ from fits.comparison import compare
 from fits.inputs import inputs_of
 from fits.paper.figures_model import forecast_settings
 from fits.paper.sources import Sources
-from fits.record import with_error
 from fits.regions import region_masks
+from fits.writing import with_error
 from jaxsky.settings import Experiment, load
 
 LABELS = [f"Figure {n}" for n in range(5, 13)]

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from fits import inputs as fit_inputs
+from fits.commands.fit import fit_numbers, fit_warnings
 from fits.commands.run import DEFAULTS
 from fits.common import common_maps
 from fits.inputs import Band, Inputs, read_band
-from fits.record import leaks
-from fits.report import result_json, warnings
-from fits.spectral_index import run
+from fits.spectral_index import fit_regions
 from fits.template_noise import TemplateNoise, prepared_variance
+from fits.writing import leaks
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, inputs, observe
 from jaxsky.harmonics import Preparation, alm_ell, gaussian_beam, resample, synthesis
 from jaxsky.inputs import Template
@@ -215,16 +215,16 @@ def test_a_band_without_weight_is_named_and_not_counted():
     inside = {"all": np.ones(NPIX, bool)}
     bands = {"30": (30.0, 10.0), "353": (353.0, 10.0)}
     settings, sky = settings_of(), sky_of(2)
-    (plain,) = run(settings, common_maps(inputs_of(sky, bands), NSIDE, 0.0), inside)
+    (plain,) = fit_regions(settings, common_maps(inputs_of(sky, bands), NSIDE, 0.0), inside)
     made = inputs_of(sky, bands | {"70": (70.0, 1e12)})
-    (fit,) = run(settings, common_maps(made, NSIDE, 0.0), inside)
+    (fit,) = fit_regions(settings, common_maps(made, NSIDE, 0.0), inside)
     assert (plain.weightless, fit.weightless) == ((), ("70",))
     assert (fit.dof, fit.dof_amplitudes) == (plain.dof, plain.dof_amplitudes) == (3070, 6)
-    said = " ".join(warnings(made, settings, [fit]))
+    said = " ".join(fit_warnings(made, settings, [fit]))
     assert "Band 70 carries no weight (all QU)" in said
-    found = result_json(made, settings, [fit])
+    found = fit_numbers(made, settings, [fit])
     assert found["results"]["all"]["QU"]["gradient"]["bands_without_weight"] == ["70"]
-    assert found["warnings"] == warnings(made, settings, [fit])
+    assert found["warnings"] == fit_warnings(made, settings, [fit])
 
 
 @pytest.mark.slow
@@ -251,7 +251,7 @@ def test_noise_of_templates_moves_a_fit_as_computed():
 
 
 def fitted(made, settings, inside):
-    (fit,) = run(settings, common_maps(made, NSIDE, 0.0), inside)
+    (fit,) = fit_regions(settings, common_maps(made, NSIDE, 0.0), inside)
     return fit
 
 
@@ -275,16 +275,16 @@ def test_templates_without_a_word_on_their_noise_are_warned_of():
     bands = {"30": (30.0, 10.0), "353": (353.0, 10.0)}
     made = inputs_of(sky, bands)
     fit = fitted(made, settings, inside)
-    assert "noise of the templates (dust and synchrotron)" in warnings(made, settings, [fit])[0]
+    assert "noise of the templates (dust and synchrotron)" in fit_warnings(made, settings, [fit])[0]
     made = inputs_of(sky, bands, {"dust": TemplateNoise()})
     fit = fitted(made, settings, inside)
-    assert "noise of the templates (synchrotron)" in warnings(made, settings, [fit])[0]
+    assert "noise of the templates (synchrotron)" in fit_warnings(made, settings, [fit])[0]
     exact = dict.fromkeys(("dust", "synchrotron"), TemplateNoise())
     made = inputs_of(sky, bands, exact)
-    assert warnings(made, settings, [fitted(made, settings, inside)]) == []
+    assert fit_warnings(made, settings, [fitted(made, settings, inside)]) == []
     noisy = dict.fromkeys(("dust", "synchrotron"), TemplateNoise(level=300.0))
     made = inputs_of(sky, bands, noisy)
-    (said,) = warnings(made, settings, [fitted(made, settings, inside)])
+    (said,) = fit_warnings(made, settings, [fitted(made, settings, inside)])
     assert said.startswith("all, QU: the noise of the templates attenuates dust by ")
     assert "sigma), to first order; the fit is not corrected for it." in said
 

@@ -9,7 +9,7 @@ from commands import jaxsky
 from fits.common import common_maps
 from fits.inputs import inputs_of
 from fits.regions import region_masks
-from fits.spectral_index import run
+from fits.spectral_index import fit_regions
 from jaxsky.settings import Experiment, load
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "wmap7_vw.toml"
@@ -63,8 +63,8 @@ def test_a_map_of_the_dust_index_shifts_as_a_whole(wmap):
     raw["fit"] |= {"methods": ["gradient"], "stokes": ["QU"], "regions": ["strip"]}
     settings = Experiment.model_validate(raw)
     inputs = inputs_of(settings)
-    (fit,) = run(settings, common_maps(inputs, 32, 0.0), region_masks(settings, ["strip"]))
-    (constant,) = run(
+    (fit,) = fit_regions(settings, common_maps(inputs, 32, 0.0), region_masks(settings, ["strip"]))
+    (constant,) = fit_regions(
         wmap.model_copy(update={"fit": settings.fit}),
         common_maps(inputs_of(wmap), 32, 0.0),
         region_masks(settings, ["strip"]),

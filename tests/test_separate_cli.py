@@ -155,7 +155,7 @@ def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
         tmp_path / "out",
     )
     monkeypatch.setattr(sys, "argv", ["jaxsky"])
-    realisations, progress = module.realisations, []
+    realisations, progress = module.kept_realisations, []
 
     def stopped(*arguments):
         def report(done, of):
@@ -165,7 +165,7 @@ def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
 
         return realisations(*arguments[:-1], report)
 
-    monkeypatch.setattr(module, "realisations", stopped)
+    monkeypatch.setattr(module, "kept_realisations", stopped)
     assert jaxsky(monkeypatch, "separate", path, "--out", out) == 130
     assert "Stopped; resume with --resume." in capsys.readouterr().err
     monkeypatch.undo()

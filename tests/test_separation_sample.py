@@ -10,7 +10,7 @@ import pytest
 import scipy.special
 import scipy.stats
 
-from fits.chains import ChainFile
+from fits.kept import ChainFile
 from fits.optimize import best_fit
 from fits.posterior import Posterior, value_and_gradient
 from fits.priors import Gaussian, Uniform

@@ -6,8 +6,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from fits.newton import Newton
-from fits.optimize import best_fit
+from fits.optimize import Newton, best_fit
 from fits.priors import Gaussian, Prior, Uniform, at_edge, prior_residuals, to_unbounded
 from fits.profile_likelihood import spectral_likelihood
 from fits.results import FitError

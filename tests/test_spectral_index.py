@@ -8,11 +8,11 @@ import pytest
 
 from fits.commands.run import DEFAULTS
 from fits.common import common_maps, prepare_component
-from fits.covariance import Fluctuations, uniform_level
+from fits.fluctuations import Fluctuations, uniform_level
 from fits.inputs import Band, Inputs, inputs_of
 from fits.optimize import best_fit
 from fits.regions import region_masks
-from fits.spectral_index import run
+from fits.spectral_index import fit_regions
 from fits.template_likelihood import likelihood
 from jaxsky import Bandpass, Dust, Sky, observe
 from jaxsky.cmb import camb_spectra, realisation
@@ -241,7 +241,9 @@ def test_embedded_run_recovers_the_truth(quick_settings, tmp_path):
     prepared = common_maps(inputs, 16, 300.0)
     how = quick_settings.fit.model_copy(update={"stokes": ["U", "QU"]})
     quick_settings = quick_settings.model_copy(update={"fit": how})
-    fits = run(quick_settings, prepared, region_masks(quick_settings, ["strip"]), tmp_path / "c.h5")
+    fits = fit_regions(
+        quick_settings, prepared, region_masks(quick_settings, ["strip"]), tmp_path / "c.h5"
+    )
     assert [(f.region, f.stokes) for f in fits] == [("strip", "U"), ("strip", "QU")]
     for fit in fits:
         results = fit.results

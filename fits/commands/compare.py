@@ -13,8 +13,8 @@ from fits.comparison import Comparison, check_comparison, compare
 from fits.full_sky import FIELDS
 from fits.inputs import inputs_of
 from fits.patch_comparison import PatchComparison, compare_patches
-from fits.record import leaks, probability, with_error, write_json, write_log
 from fits.regions import region_masks
+from fits.writing import leaks, probability, with_error, write_json, write_log
 from jaxsky.settings import Experiment, at_key
 
 #: A comparison with a smaller probability is pointed out.

@@ -25,7 +25,7 @@ from fits.plots import (
     round_numbers,
     with_powers,
 )
-from fits.record import probability, with_error
+from fits.writing import probability, with_error
 from jaxsky.harmonics import average_pixels
 
 OBSERVED, MODEL, FOREGROUNDS, NOISE = COLORS[1], COLORS[2], COLORS[0], "0.55"

@@ -1,11 +1,23 @@
 """`jaxsky fit`, from settings to a report."""
 
-from fits import report, spectral_index
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich import box
+from rich.table import Table
+
+from fits import posterior_plots
 from fits.commands.run import Command, Report, Run
 from fits.common import common_maps
-from fits.inputs import inputs_of
+from fits.inputs import Inputs, inputs_of
 from fits.regions import region_masks
+from fits.spectral_index import RegionFit, all_free, fit_regions, known_truth
+from fits.template_noise import unknown_noise
+from fits.writing import leaks, with_errors, write_json, write_log
 from jaxsky.settings import Experiment, at_key
+
+#: A fit with a smaller probability to exceed its chi^2 is pointed out.
+UNLIKELY = 0.01
 
 
 def _work(settings: Experiment, command: Run) -> Report:
@@ -16,16 +28,25 @@ def _work(settings: Experiment, command: Run) -> Report:
         prepared = common_maps(inputs, settings.common.nside, settings.common.fwhm)
     inputs = inputs._replace(bands={})  # their maps have served
     command.begin()
-    chains = command.out / "chain.h5"
-    fits = spectral_index.run(settings, prepared, regions, chains, command.steps)
-    command.steps.step("drawing")
-    written = report.write_report(command.out, inputs, settings, fits, command.steps.seconds)
-    return Report(
-        inputs.description,
-        [report.result_table(fits, report.known_truth(inputs, fits))],
-        report.warnings(inputs, settings, fits),
-        [*written, *([chains] if chains.exists() else [])],
-    )
+    out, steps, chains = command.out, command.steps, command.out / "chain.h5"
+    fits = fit_regions(settings, prepared, regions, chains, steps)
+    steps.step("drawing")
+    truth = known_truth(inputs, fits)
+    write_json(out / "result.json", fit_numbers(inputs, settings, fits))
+    written = [out / "result.json", out / "log.json"]
+    for name, plot in {
+        "grid.png": posterior_plots.plot_grids,
+        "marginals.png": posterior_plots.plot_marginals,
+        "posterior.png": posterior_plots.plot_posterior,
+    }.items():
+        # There is no picture of a grid of more than two parameters, or without a chain.
+        if plot(out / name, fits, truth, settings.title):
+            written.append(out / name)
+    write_log(out / "log.json", settings, steps.seconds)
+    if chains.exists():
+        written.append(chains)
+    warnings = fit_warnings(inputs, settings, fits)
+    return Report(inputs.description, [_table(fits, truth)], warnings, written)
 
 
 COMMAND = Command(
@@ -33,3 +54,123 @@ COMMAND = Command(
     _work,
     ("result.json", "log.json", "grid.png", "marginals.png", "posterior.png", "chain.h5"),
 )
+
+
+def _result(fit: RegionFit, method: str) -> dict[str, Any]:
+    result = fit.results[method]
+    kept = ("free", "best_fit", "interval_68", "covariance", "converged", "message")
+    numbers = {key: result.to_dict()[key] for key in kept}
+    numbers |= {"chi2": fit.chi2[method], "dof": fit.dof}
+    if fit.dof_amplitudes is not None:
+        numbers |= {
+            "chi2_amplitudes": result.chi2,
+            "dof_amplitudes": fit.dof_amplitudes,
+            "pte_amplitudes": fit.probability_to_exceed(method),
+        }
+    if fit.weightless:
+        numbers["bands_without_weight"] = list(fit.weightless)
+    if fit.attenuation is not None:
+        numbers["template_noise"] = fit.attenuation._asdict()
+    for key in ("tau", "acceptance", "discard", "steps"):
+        if key in result.details:
+            numbers[key] = result.details[key]
+    return numbers
+
+
+def fit_numbers(inputs: Inputs, settings: Experiment, fits: Sequence[RegionFit]) -> dict[str, Any]:
+    """All numbers: `results` by region, then Stokes parameters, then method."""
+    results: dict[str, Any] = {}
+    for fit in fits:
+        methods = {method: _result(fit, method) for method in fit.results}
+        results.setdefault(fit.region, {})[fit.stokes] = methods
+    return {
+        "description": inputs.description,
+        "likelihood": settings.fit.likelihood,
+        "truth": known_truth(inputs, fits),
+        "warnings": fit_warnings(inputs, settings, fits),
+        "results": results,
+    }
+
+
+def _short_names(names: Sequence[str]) -> list[str]:
+    """Names without their component where that leaves them different."""
+    short = [name.split(".", 1)[1] for name in names]
+    return [s if short.count(s) == 1 else name for name, s in zip(names, short, strict=True)]
+
+
+def _table(fits: Sequence[RegionFit], truth: Mapping[str, float] | None = None) -> Table:
+    """The best fits and 68 % intervals for the terminal, and the truth if there is one."""
+    free = all_free(fits)
+    table = Table(
+        box=box.SIMPLE,
+        pad_edge=False,
+        collapse_padding=True,
+        caption="best fit and central 68 % interval; chi2 counts pixels with the noise alone",
+    )
+    for column in ("region", "", "method"):
+        table.add_column(column)
+    for column in (*_short_names(free), "chi2/dof"):
+        table.add_column(column, justify="right", overflow="fold")
+    for fit in fits:
+        for method, result in fit.results.items():
+            cells = [
+                with_errors(result.best_fit[n], *result.interval_68[n]) if n in result.free else ""
+                for n in free
+            ]
+            mark = "" if result.converged else " (!)"
+            chi2 = f"{fit.chi2[method] / fit.dof:.3f}"
+            table.add_row(fit.region, fit.stokes, method + mark, *cells, chi2)
+        table.add_section()
+    if truth is not None:
+        known = [f"{truth[name]:g}" if name in truth else "" for name in free]
+        table.add_row("truth", "", "", *known, "")
+    return table
+
+
+def fit_warnings(inputs: Inputs, settings: Experiment, fits: Sequence[RegionFit]) -> list[str]:
+    """What a user should know before using the numbers, a sentence each, the gravest first."""
+    sentences = [*leaks(settings), *settings.left_out("fit")]
+    if unknown := [name for name in inputs.templates if name not in inputs.template_noise]:
+        sentences.append(unknown_noise(unknown))
+    for band in dict.fromkeys(name for fit in fits for name in fit.weightless):
+        where = ", ".join(f"{f.region} {f.stokes}" for f in fits if band in f.weightless)
+        sentences.append(
+            f"Band {band} carries no weight ({where}): its noise is too large, so the fit is one "
+            "of the other bands alone. It is not counted in degrees of freedom."
+        )
+    if "grid" in settings.fit.methods and not any("grid" in fit.results for fit in fits):
+        sentences.append(
+            "The grid was left out: it takes one or two free parameters with uniform priors."
+        )
+    sentences += filter(None, map(_attenuated, fits))
+    for fit in fits:
+        where = f"{fit.region}, {fit.stokes}"
+        for method, result in fit.results.items():
+            if not result.converged:
+                sentences.append(f"{where}, {method}: {result.message}")
+        method, result = next(iter(fit.results.items()))
+        probability = fit.probability_to_exceed(method)
+        if probability is not None and probability < UNLIKELY:
+            sentences.append(
+                f"{where}: the model does not fit the amplitudes of the templates (chi2 "
+                f"{result.chi2:.1f} for {fit.dof_amplitudes} degrees of freedom, probability "
+                f"{probability:.1g}); by chance, or its errors are too small."
+            )
+    return sentences
+
+
+def _attenuated(fit: RegionFit) -> str | None:
+    """What the noise of the templates does to a fit, if it does anything."""
+    lost = fit.attenuation
+    if lost is None:
+        return None
+    shares = ", ".join(f"{name} by {100 * share:.2g} %" for name, share in lost.shares.items())
+    sentence = f"{fit.region}, {fit.stokes}: the noise of the templates attenuates {shares}"
+    if not lost.shifts:
+        return f"{sentence}; what this does to parameters with maps of values is not known."
+    result = next(iter(fit.results.values()))
+    shifts = ", ".join(
+        f"{name} by {lost.shifts[name]:+.2g} ({lost.shifts[name] / error:+.1f} sigma)"
+        for name, error in result.sigma.items()
+    )
+    return f"{sentence}, which moves {shifts}, to first order; the fit is not corrected for it."

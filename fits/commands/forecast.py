@@ -17,8 +17,8 @@ from fits.common import prepare_component
 from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors, foreground_names, unit_sky
 from fits.plots import spread
 from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra, sky_fraction
-from fits.record import write_json, write_log
 from fits.regions import apodize, region_mask
+from fits.writing import write_json, write_log
 from jaxsky import Sky
 from jaxsky.checks import check_double
 from jaxsky.cmb import camb_spectra, tensor_spectra

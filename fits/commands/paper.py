@@ -15,7 +15,7 @@ from fits.commands.run import PAGE, Command, Report, Run
 from fits.paper import figures_data, figures_model
 from fits.paper.items import Impossible, Item, described, picture_of
 from fits.paper.sources import Sources
-from fits.record import write_log
+from fits.writing import write_log
 from jaxsky.io import write_text
 from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import Experiment

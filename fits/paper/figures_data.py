@@ -12,10 +12,9 @@ from fits.paper.items import TEXTS, Impossible, Item, Number, described, filled,
 from fits.paper.sources import Sources
 from fits.patch_comparison import compare_patches, template_patches
 from fits.posterior_plots import plot_grids
-from fits.record import probability, with_error
 from fits.regions import region_masks, region_words
-from fits.report import known_truth, with_errors
-from fits.spectral_index import run
+from fits.spectral_index import fit_regions, known_truth
+from fits.writing import probability, with_error, with_errors
 from jaxsky.settings import SettingsError
 
 PLANCK, WMAP = ("30", "44", "70", "353"), ("K", "Ka", "Q", "V", "W")
@@ -206,7 +205,7 @@ def figure_probability(sources: Sources, picture: Path) -> Item:
     chosen = settings.model_copy(update={"fit": spec})
     prepared = common_maps(inputs._replace(bands=bands), common.nside, common.fwhm)
     try:
-        fits = run(chosen, prepared, region_masks(chosen, spec.regions))
+        fits = fit_regions(chosen, prepared, region_masks(chosen, spec.regions))
     except SettingsError as error:
         raise Impossible(str(error)) from None
     plot_grids(picture, fits, known_truth(inputs, fits), settings.title)

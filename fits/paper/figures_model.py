@@ -29,8 +29,8 @@ from fits.plots import (
     with_powers,
 )
 from fits.pseudo_cl import sky_fraction
-from fits.record import with_error
 from fits.regions import region_words
+from fits.writing import with_error
 from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import analysis, expand, gaussian_beam, lmax_of, power_spectrum, synthesis
 from jaxsky.instrument import band_tables, load_instrument

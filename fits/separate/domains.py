@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fits.covariance import Fluctuations
+from fits.fluctuations import Fluctuations
 from fits.multipoles import harmonic_likelihood, multipoles_of
 from fits.noise import Noise
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood

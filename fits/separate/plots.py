@@ -20,8 +20,8 @@ from fits.plots import (
     spread,
     stokes_panels,
 )
-from fits.record import with_error
 from fits.separate.separate import Separation
+from fits.writing import with_error
 
 #: Bands whose residuals are drawn.
 SHOWN = 4

@@ -7,10 +7,10 @@ import numpy as np
 from rich.table import Table
 
 from fits.posterior_plots import plot_chains
-from fits.record import leaks, probability, with_error, write_json, write_log
 from fits.separate import plots
 from fits.separate.separate import SAMPLED, Separation
 from fits.separated_maps import HarmonicMaps
+from fits.writing import leaks, probability, with_error, write_json, write_log
 from jaxsky.inputs import parameter_unit
 from jaxsky.io import write_maps
 from jaxsky.settings import Experiment

@@ -8,13 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from fits.chains import kept_chain
+from fits.kept import fingerprint, kept_chain, kept_realisations
 from fits.optimize import best_fit
 from fits.priors import priors_of
 from fits.profile_likelihood import SpectralLikelihood
 from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra
-from fits.realisations import realisations
-from fits.record import fingerprint
 from fits.response import Response, widened
 from fits.results import FitResult, misfit
 from fits.sampling import sample
@@ -128,7 +126,7 @@ def separate(
     kept = None if out is None else out / "simulations.npz"
     mark = _mark(settings, setup)
     simulated = Simulated(
-        *realisations(
+        *kept_realisations(
             realisation.of,
             Simulated._fields,
             spec.nsims,

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fits.common import common_maps
-from fits.covariance import uniform_level
+from fits.fluctuations import uniform_level
 from fits.inputs import Band, Inputs, inputs_of
 from fits.mixing import NOMINAL
 from fits.multipoles import harmonic_coefficients

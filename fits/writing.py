@@ -1,6 +1,5 @@
-"""What a run leaves besides pictures: numbers, circumstances, and the mark of its data."""
+"""How a run writes its numbers: with errors, as JSON, and with a log of its circumstances."""
 
-import hashlib
 import json
 import platform
 import sys
@@ -9,7 +8,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from jaxsky.io import write_text
@@ -35,23 +33,19 @@ def leaks(settings: Experiment) -> list[str]:
     return list(filter(None, (leakage_warning(str(band.name), band.files) for band in bands)))
 
 
-def fingerprint(tree: Any) -> str:
-    """A hash of all arrays of a tree; functions, which work with them, are left out."""
-    digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(tree):
-        array = np.ascontiguousarray(leaf)
-        if array.dtype != object:
-            digest.update(array.tobytes())
-        elif not callable(leaf):
-            raise TypeError(f"{leaf!r} is neither an array nor a function.")
-    return digest.hexdigest()
-
-
 def with_error(value: float, error: float) -> str:
     """A value with its standard error, both to two digits of the error."""
     usable = np.isfinite(error) and error > 0
     digits = max(0, 1 - int(np.floor(np.log10(error)))) if usable else 4
     return f"{value:.{digits}f} \u00b1 {error:.{digits}f}"
+
+
+def with_errors(best: float, low: float, high: float) -> str:
+    """A value with its interval as differences, to two digits of the smaller one."""
+    smaller = min(abs(high - best), abs(best - low))
+    usable = np.isfinite(smaller) and smaller > 0
+    digits = max(0, 1 - int(np.floor(np.log10(smaller)))) if usable else 4
+    return f"{best:.{digits}f} {low - best:+.{digits}f} {high - best:+.{digits}f}"
 
 
 def probability(value: float) -> str:

@@ -1,20 +1,58 @@
-"""The file of a chain of emcee: whole at any moment, and checked before a run goes on with it."""
+"""What a stopped run resumes from: chains of emcee and realisations, kept in files with a mark.
 
+A file is whole at any moment, and refused if it is damaged or holds what was made of other data.
+"""
+
+import hashlib
+import os
 import time
-from collections.abc import Iterator
+import zipfile
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import emcee
 import h5py
+import jax
 import numpy as np
+from jaxtyping import Array
 
-from fits.realisations import SAVED_EVERY
+from jaxsky.checks import check_seed
 from jaxsky.io import InputError, whole
+from jaxsky.keys import realisation_key, stream
+from jaxsky.progress import QUIET
 
+#: Files are written after so many seconds, and when a run is stopped.
+SAVED_EVERY = 10.0
 #: Entries of numpy's random state, each an attribute of a chain in its file.
 RANDOM_STATE = 5
+#: What a damaged archive raises besides: RuntimeError for one that seems encrypted or packed in
+#: a way that is not known.
+ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, RuntimeError)
+
+
+def fingerprint(tree: Any) -> str:
+    """A hash of all arrays of a tree; functions, which work with them, are left out."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        array = np.ascontiguousarray(leaf)
+        if array.dtype != object:
+            digest.update(array.tobytes())
+        elif not callable(leaf):
+            raise TypeError(f"{leaf!r} is neither an array nor a function.")
+    return digest.hexdigest()
+
+
+def _other(path: Path, what: str) -> InputError:
+    """The error for a file of a run with other data or settings."""
+    return InputError(
+        f"{path}: holds {what} of other data or settings; choose another --out, or start again "
+        "with --overwrite."
+    )
 
 
 class ChainFile(emcee.backends.HDFBackend):
@@ -117,10 +155,7 @@ def kept_chain(path: Path, name: str, size: tuple[int, int], mark: str) -> Chain
             backend.reset(*size)
             file[name].attrs["fingerprint"] = mark
     elif held != mark:
-        raise InputError(
-            f"{path}: holds a chain of other data or settings; choose another --out, or "
-            "start again with --overwrite."
-        )
+        raise _other(path, "a chain")
     return backend
 
 
@@ -151,3 +186,85 @@ def _held(path: Path, name: str) -> str | None:
     if not intact:
         raise InputError(f"{path}: is damaged; start again with --overwrite.")
     return mark
+
+
+def kept_realisations(
+    make: Callable[[Array], Sequence[Array | np.ndarray]],
+    names: Sequence[str],
+    count: int,
+    seed: int,
+    path: Path | None = None,
+    mark: str = "",
+    report: Callable[[int, int], None] = QUIET.advance,
+) -> list[np.ndarray]:
+    """Results of a function of a random key, stacked over realisations.
+
+    Parameters
+    ----------
+    make : the function; a realisation depends on the seed and its own number only
+    names : of its results
+    count, seed : number of realisations, and what their keys are made of
+    path : file that keeps what is done; what it holds already is not made again
+    mark : of all that the results depend on; a file with another one is refused
+    report : called with the number of realisations done, and that of all
+    """
+    check_seed("seed", seed)
+    done = [] if path is None else _load(path, mark, names)
+    held, saved = len(done), time.monotonic()
+    try:
+        report(held, count)
+        for result in _made(make, seed, range(held, count)):
+            done.append(result)
+            report(len(done), count)
+            if path is not None and time.monotonic() - saved > SAVED_EVERY:
+                _save(path, mark, names, done)
+                held, saved = len(done), time.monotonic()
+    finally:
+        if path is not None and len(done) > held:
+            _save(path, mark, names, done)
+    return list(map(np.stack, zip(*done[:count], strict=True)))
+
+
+def _made(
+    make: Callable[[Array], Sequence[Array | np.ndarray]], seed: int, numbers: range
+) -> Iterator[list[np.ndarray]]:
+    """Realisations in order, made by as many threads as there are processors."""
+
+    def one(number: int) -> list[np.ndarray]:
+        key = stream(realisation_key(seed, number), "realisation")  # unlike what is observed
+        return [np.asarray(x) for x in make(key)]
+
+    first, rest = numbers[:1], numbers[1:]
+    yield from map(one, first)  # alone, so that each program is compiled once
+    threads = os.cpu_count() or 1
+    pool = ThreadPoolExecutor(threads)
+    try:
+        pending = deque(pool.submit(one, number) for number in rest[:threads])
+        for number in rest[threads:]:
+            yield pending.popleft().result()
+            pending.append(pool.submit(one, number))
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _save(path: Path, mark: str, names: Sequence[str], done: list[list[np.ndarray]]) -> None:
+    stacked = dict(zip(names, map(np.stack, zip(*done, strict=True)), strict=True))
+    with whole(path) as beside, beside.open("wb") as file:
+        np.savez(file, mark=mark, **stacked)  # type: ignore[arg-type]
+
+
+def _load(path: Path, mark: str, names: Sequence[str]) -> list[list[np.ndarray]]:
+    if not path.exists():
+        return []
+    try:
+        with np.load(path) as archive:
+            found = str(archive["mark"])
+            arrays = [archive[name] for name in names]
+        rows = [list(row) for row in zip(*arrays, strict=True)]
+    except (OSError, ValueError, KeyError, TypeError, EOFError, *ZIP_ERRORS) as error:
+        raise InputError(f"{path}: is damaged ({error}); start again with --overwrite.") from None
+    if found != mark:
+        raise _other(path, "realisations")
+    return rows

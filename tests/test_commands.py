@@ -10,11 +10,10 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from rich.table import Table
 
 from commands import jaxsky
 from fits.commands import console as terminal
-from fits.commands.page import Section, key_of, table_of, write_page
+from fits.commands.page import Section, Table, key_of, write_page
 from fits.commands.run import DEFAULTS
 from jaxsky.settings import SettingsError, load
 
@@ -125,17 +124,16 @@ def test_steps_on_a_terminal_leave_their_times(monkeypatch, tmp_path):
 
 
 def test_numbers_are_whole_however_narrow_the_terminal(capsys):
-    table = Table("name", *[f"column{i}" for i in range(12)])
-    table.add_row("/a/path/to/something", *["-1234567.89012"] * 12)
+    names = ("name", *(f"column{i}" for i in range(12)))
+    table = Table(names, (("/a/path/to/something", *["-1234567.89012"] * 12),))
     terminal.print_tables([table], width=40)
     assert capsys.readouterr().out.count("-1234567.89012") == 12
 
 
 def test_page(tmp_path):
-    table = Table("name", "value", title="A <table>")
-    table.add_row("beta", "1.53")
+    table = Table(("name", "value"), (("beta", "1.53"), (), ("T", "20")), title="A <table>")
     sections = [
-        Section("Results: all", "What & why", table=table_of(table), note="Note: read <this>"),
+        Section("Results: all", "What & why", table=table, note="Note: read <this>"),
         Section("picture", picture="a b.png"),
     ]
     write_page(tmp_path / "index.html", "A <sky>", ["one", "two"], sections, "Made by x,")

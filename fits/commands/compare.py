@@ -3,10 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from rich import box
-from rich.table import Table
-
 from fits.commands import compare_pictures as pictures
+from fits.commands.page import Table
 from fits.commands.run import Command, Report, Run
 from fits.common import common_maps
 from fits.comparison import Comparison, check_comparison, compare
@@ -92,37 +90,24 @@ def _numbers(comparison: Comparison, patches: PatchComparison | None) -> dict[st
 
 
 def _table(comparison: Comparison) -> Table:
-    """Slopes, correlations and probabilities for the terminal."""
-    table = Table(
-        box=box.SIMPLE,
-        pad_edge=False,
-        caption="Slope of observed on model with the error of noise and CMB; rms of their "
-        "difference, and that expected of noise and CMB, in uK_RJ; PTE: probability that noise and "
-        "CMB alone give a larger chi2, in pixels, EE and BB.",
-    )
-    for column in ("band", "region", ""):
-        table.add_column(column, no_wrap=True)
-    for column in ("slope", "r", "rms", "exp.", "PTE", "EE", "BB"):
-        table.add_column(column, justify="right", no_wrap=True)
+    """Slopes, correlations and probabilities."""
+    header = ("band", "region", "", "slope", "r", "rms", "exp.", "PTE", "EE", "BB")
     spectra = {s.band: s for s in comparison.spectra}
+    rows: list[tuple[str, ...]] = []
     for band in comparison.prepared.bands:
+        powers = [probability(p) for p in spectra[band].pte] if band in spectra else ["", ""]
         for i, s in enumerate(s for s in comparison.scatters if s.band == band):
-            power = ["", ""]
-            if i == 0 and band in spectra:
-                power = [probability(p) for p in spectra[band].pte]
-            table.add_row(
-                band if i == 0 else "",
-                s.region,
-                s.stokes,
-                with_error(s.slope, s.error).replace(" ", ""),
-                f"{s.correlation:.2f}",
-                f"{s.rms:.2f}",
-                f"{s.expected:.2f}",
-                s.pte_text,
-                *power,
-            )
-        table.add_section()
-    return table
+            slope = with_error(s.slope, s.error).replace(" ", "")
+            numbers = (f"{s.correlation:.2f}", f"{s.rms:.2f}", f"{s.expected:.2f}", s.pte_text)
+            first, last = (band, powers) if i == 0 else ("", ["", ""])
+            rows.append((first, s.region, s.stokes, slope, *numbers, *last))
+        rows.append(())
+    caption = (
+        "Slope of observed on model with the error of noise and CMB; rms of their difference, and "
+        "that expected of noise and CMB, in uK_RJ; PTE: probability that noise and CMB alone give "
+        "a larger chi2, in pixels, EE and BB."
+    )
+    return Table(header, tuple(rows), caption=caption, words=3)
 
 
 def comparison_warnings(comparison: Comparison, settings: Experiment) -> list[str]:

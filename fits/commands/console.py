@@ -7,12 +7,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.table import Table as RichTable
 from rich.text import Text
 
+from fits.commands.page import Table
 from jaxsky import progress
 
 #: Everything is printed as it is: names, titles and paths may have brackets and colons.
@@ -39,8 +41,19 @@ def print_tables(tables: Sequence[Table], width: int | None = None) -> None:
     """Print results on standard output, where it is too narrow for a number in longer lines."""
     out = Console(width=width, **PLAIN)
     for table in tables:
-        least = Measurement.get(out, out.options.update(width=10_000), table).minimum
-        Console(width=max(out.width, least), **PLAIN).print(table)
+        shown = RichTable(
+            title=table.title or None,
+            caption=table.caption or None,
+            box=box.SIMPLE,
+            pad_edge=False,
+            collapse_padding=True,
+        )
+        for i, word in enumerate(table.header):
+            shown.add_column(word, justify="left" if i < table.words else "right", overflow="fold")
+        for row in table.rows:
+            shown.add_row(*row) if row else shown.add_section()
+        least = Measurement.get(out, out.options.update(width=10_000), shown).minimum
+        Console(width=max(out.width, least), **PLAIN).print(shown)
 
 
 def print_written(paths: Sequence[Path]) -> None:

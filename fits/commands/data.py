@@ -5,11 +5,10 @@ from typing import Annotated
 
 import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
-from rich.table import Table
-from rich.text import Text
 
 from fits.commands.console import console, print_tables
 from fits.commands.endings import interruptible
+from fits.commands.page import Table
 
 data_commands = typer.Typer(
     help="Official data products: what there is, download, and checks.", no_args_is_help=True
@@ -34,33 +33,28 @@ def _list(products: Words = None, folder: Folder = None) -> None:
     from jaxsky.archive import cache_folder, find, product_sets, total_size
 
     folder = folder or cache_folder()
-    table = Table("file", "what", "nside", "unit", "size", "here", title=f"Kept in {folder}")
+    rows: list[tuple[str, ...]] = []
     group = None
     for product in find(products or []):
         if product.group != group:
             group = product.group
-            table.add_section()
-            table.add_row(Text(group, style="bold"), product.title)
+            rows += [(), (group, product.title, "", "", "", "")]
         path = folder / product.name
         here = path.is_file()
         known = product._replace(size=path.stat().st_size) if here else product
         size = total_size([known]) if known.size or known.about else ""
-        table.add_row(
-            product.name,
-            product.what,
-            str(product.nside or ""),
-            product.unit,
-            size,
-            "yes" if here else "",
-        )
+        nside = str(product.nside or "")
+        kept = "yes" if here else ""
+        rows.append((product.name, product.what, nside, product.unit or "", size, kept))
     if not products:
-        table.add_section()
-        table.add_row(Text("sets", style="bold"), "files of an analysis")
-        for name, kept in product_sets().items():
+        rows += [(), ("sets", "files of an analysis", "", "", "", "")]
+        for name, group_of in product_sets().items():
             members = find([name])
             count = sum((folder / p.name).is_file() for p in members)
-            size = total_size(members)
-            table.add_row(name, kept.title, "", "", size, f"{count} of {len(members)}")
+            held = f"{count} of {len(members)}"
+            rows.append((name, group_of.title, "", "", total_size(members), held))
+    header = ("file", "what", "nside", "unit", "size", "here")
+    table = Table(header, tuple(rows), title=f"Kept in {folder}", words=6)
     print_tables([table], width=None if console.is_terminal else 200)
 
 

@@ -3,10 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich import box
-from rich.table import Table
-
 from fits import posterior_plots
+from fits.commands.page import Table
 from fits.commands.run import Command, Report, Run
 from fits.common import common_maps
 from fits.inputs import Inputs, inputs_of
@@ -98,33 +96,29 @@ def _short_names(names: Sequence[str]) -> list[str]:
     return [s if short.count(s) == 1 else name for name, s in zip(names, short, strict=True)]
 
 
-def _table(fits: Sequence[RegionFit], truth: Mapping[str, float] | None = None) -> Table:
-    """The best fits and 68 % intervals for the terminal, and the truth if there is one."""
+def _table(fits: Sequence[RegionFit], truth: Mapping[str, float] | None) -> Table:
+    """The best fits and 68 % intervals, and the truth if there is one."""
     free = all_free(fits)
-    table = Table(
-        box=box.SIMPLE,
-        pad_edge=False,
-        collapse_padding=True,
-        caption="best fit and central 68 % interval; chi2 counts pixels with the noise alone",
-    )
-    for column in ("region", "", "method"):
-        table.add_column(column)
-    for column in (*_short_names(free), "chi2/dof"):
-        table.add_column(column, justify="right", overflow="fold")
+    rows: list[tuple[str, ...]] = []
     for fit in fits:
         for method, result in fit.results.items():
-            cells = [
+            values = [
                 with_errors(result.best_fit[n], *result.interval_68[n]) if n in result.free else ""
                 for n in free
             ]
             mark = "" if result.converged else " (!)"
             chi2 = f"{fit.chi2[method] / fit.dof:.3f}"
-            table.add_row(fit.region, fit.stokes, method + mark, *cells, chi2)
-        table.add_section()
+            rows.append((fit.region, fit.stokes, method + mark, *values, chi2))
+        rows.append(())
     if truth is not None:
         known = [f"{truth[name]:g}" if name in truth else "" for name in free]
-        table.add_row("truth", "", "", *known, "")
-    return table
+        rows.append(("truth", "", "", *known, ""))
+    return Table(
+        ("region", "", "method", *_short_names(free), "chi2/dof"),
+        tuple(rows),
+        caption="best fit and central 68 % interval; chi2 counts pixels with the noise alone",
+        words=3,
+    )
 
 
 def fit_warnings(inputs: Inputs, settings: Experiment, fits: Sequence[RegionFit]) -> list[str]:

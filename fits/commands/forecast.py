@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from rich.table import Table
 
 from fits import b_modes
 from fits.b_modes import BandLaw
+from fits.commands.page import Table
 from fits.commands.run import Command, Report, Run
 from fits.common import prepare_component
 from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors, foreground_names, unit_sky
@@ -296,33 +296,42 @@ def _numbers(found: Forecast, settings: Experiment) -> dict[str, Any]:
 
 
 def _tables(found: Forecast) -> list[Table]:
-    """The foregrounds in bands, and the errors, for the terminal."""
-    bands = Table(caption=f"BB of foregrounds at l = {b_modes.PIVOT}, and the r that has as much")
+    """The foregrounds in bands, and the errors."""
     ranges = [f"r, {where}" for where in next(iter(found.equal_r.values()))]
-    bands.add_column("band")
-    for heading in ("D_l / uK_CMB^2", "slope of C_l", *ranges):
-        bands.add_column(heading, justify="right")
-    for name, law in found.laws.items():
-        equal = [f"{r:.3g}" for r in found.equal_r[name].values()]
-        bands.add_row(name, f"{law.amplitude:.3g}", f"{law.slope:.2f}", *equal)
-
+    bands = [
+        (
+            name,
+            f"{law.amplitude:.3g}",
+            f"{law.slope:.2f}",
+            *(f"{r:.3g}" for r in found.equal_r[name].values()),
+        )
+        for name, law in found.laws.items()
+    ]
     errors = found.errors
-    numbers = Table(caption="errors of 68 %, all free parameters marginalised")
-    numbers.add_column("parameter")
-    for heading in ("value", "error", "others known", "prior"):
-        numbers.add_column(heading, justify="right")
-    for name in errors.free:
-        numbers.add_row(
+    numbers: list[tuple[str, ...]] = [
+        (
             name,
             f"{errors.fiducial[name]:.4g}",
             f"{errors.sigma(name):.2g}",
             f"{errors.known[name]:.2g}",
             f"{errors.priors[name]:.2g}" if name in errors.priors else "",
         )
+        for name in errors.free
+    ]
     if found.without_foregrounds is not None:
-        numbers.add_section()
-        numbers.add_row("r, without foregrounds", "", f"{found.without_foregrounds:.2g}")
-    return [bands, numbers]
+        numbers += [(), ("r, without foregrounds", "", f"{found.without_foregrounds:.2g}", "", "")]
+    return [
+        Table(
+            ("band", "D_l / uK_CMB^2", "slope of C_l", *ranges),
+            tuple(bands),
+            caption=f"BB of foregrounds at l = {b_modes.PIVOT}, and the r that has as much",
+        ),
+        Table(
+            ("parameter", "value", "error", "others known", "prior"),
+            tuple(numbers),
+            caption="errors of 68 %, all free parameters marginalised",
+        ),
+    ]
 
 
 def forecast_warnings(found: Forecast) -> list[str]:

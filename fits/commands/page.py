@@ -5,8 +5,6 @@ from html import escape
 from pathlib import Path
 from typing import NamedTuple
 
-from rich.table import Table as TerminalTable
-
 import jaxsky
 from jaxsky.io import write_text
 
@@ -33,10 +31,21 @@ a { color: #0072b2; }
 
 
 class Table(NamedTuple):
-    """A table as text; the first cell of a row is its heading."""
+    """A table as text, for the terminal and for a page.
+
+    Parameters
+    ----------
+    header : a word for each column
+    rows : cells; the first one is the heading of its row. Behind an empty row begins a new section
+    title, caption : above and below
+    words : columns that hold words rather than numbers, from the first on
+    """
 
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    title: str = ""
+    caption: str = ""
+    words: int = 1
 
 
 class Section(NamedTuple):
@@ -55,13 +64,6 @@ class Section(NamedTuple):
     picture: str | None = None
     table: Table | None = None
     note: str = ""
-
-
-def table_of(table: TerminalTable) -> Table:
-    """A table of the terminal as one of a page."""
-    header = tuple(str(column.header) for column in table.columns)
-    cells = [[str(cell) for cell in column.cells] for column in table.columns]
-    return Table(header, tuple(zip(*cells, strict=True)))
 
 
 def key_of(title: str) -> str:
@@ -86,6 +88,7 @@ def _table(table: Table) -> str:
     rows = "\n".join(
         f'<tr><th scope="row">{escape(row[0])}</th>{"".join(map(cell, row[1:]))}</tr>'
         for row in table.rows
+        if row
     )
     return (
         f'<div class="wide"><table>\n<thead><tr>{head}</tr></thead>\n'

@@ -10,11 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from rich.table import Table
-
 from fits.commands.console import Steps, console, print_tables, print_written, warn
 from fits.commands.endings import interruptible, logged
-from fits.commands.page import Section, table_of, write_page
+from fits.commands.page import Section, Table, write_page
 from jaxsky.io.folders import ALL, Folder, occupied
 from jaxsky.settings import Experiment, load, of_file
 
@@ -204,8 +202,8 @@ def _other_sky(settings: Experiment) -> list[str]:
 def _show(out: Path, title: str, report: Report, seconds: float) -> None:
     """Write the page of a command's tables and pictures."""
     tables = [
-        Section(str(t.title or f"Results {i}"), str(t.caption or ""), table=table_of(t))
-        for i, t in enumerate(report.tables, 1)
+        Section(table.title or f"Results {i}", table.caption, table=table)
+        for i, table in enumerate(report.tables, 1)
     ]
     pictures = [
         Section(path.stem.replace("_", " "), picture=path.name)

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
+from fits.commands.page import Table
 from fits.posterior_plots import plot_chains
 from fits.separate import plots
 from fits.separate.separate import SAMPLED, Separation
@@ -102,34 +102,31 @@ def _mean(degradation: np.ndarray) -> float:
 
 
 def tables(found: Separation) -> list[Table]:
-    """Parameters and r for the terminal."""
-    fit, truth = found.fit, found.setup.truth or {}
-    table = Table(caption=f"standard deviations; chi2/dof {fit.chi2 / fit.dof:.4f}")
-    table.add_column("parameter")
-    for column in ("best fit", *(["truth"] if truth else [])):
-        table.add_column(column, justify="right")
+    """Parameters and r, with the truth if it is known."""
+    fit, truth, ratio = found.fit, found.setup.truth or {}, found.tensors
+    rows: list[tuple[str, ...]] = []
     for name in fit.free:
         value, sigma = np.asarray(fit.best_fit[name]), np.asarray(found.sigma[name])
-        known = [f"{truth[name]:g}"] if name in truth else [""] * bool(truth)
-        if not value.ndim:
-            table.add_row(name, with_error(float(value), float(sigma)), *known)
-            continue
-        typical = with_error(float(np.nanmedian(value)), float(np.nanmedian(sigma)))
-        table.add_row(f"{name}, median of {int(np.isfinite(value).sum())} regions", typical, *known)
-    ratio = found.tensors
-    table.add_section()
-    shown = [] if not truth else [f"{truth.get('r', 0.0):g}"]
-    table.add_row("r", with_error(ratio.r, ratio.sigma), *shown)
-    table.add_row("r, 95 % below", f"{ratio.upper_95:.2g}", *([""] * bool(truth)))
+        shown = with_error(float(np.nanmedian(value)), float(np.nanmedian(sigma)))
+        regions = f", median of {int(np.isfinite(value).sum())} regions" if value.ndim else ""
+        rows.append((name + regions, shown, f"{truth[name]:g}" if name in truth else ""))
+    rows += [
+        (),
+        ("r", with_error(ratio.r, ratio.sigma), f"{truth.get('r', 0.0):g}"),
+        ("r, 95 % below", f"{ratio.upper_95:.2g}", ""),
+    ]
     if found.left is not None:
-        shift = f"{ratio.shift(found.left):+.1e}"
-        table.add_row("r, shift by foregrounds left", shift, "")
-    table.add_row(
-        "noise of CMB, times that without foregrounds",
-        f"{_mean(found.degradation):.2f}",
-        *([""] * bool(truth)),
-    )
-    return [table]
+        rows.append(("r, shift by foregrounds left", f"{ratio.shift(found.left):+.1e}", ""))
+    degradation = f"{_mean(found.degradation):.2f}"
+    rows.append(("noise of CMB, times that without foregrounds", degradation, ""))
+    columns = 3 if truth else 2
+    return [
+        Table(
+            ("parameter", "best fit", "truth")[:columns],
+            tuple(row[:columns] for row in rows),
+            caption=f"standard deviations; chi2/dof {fit.chi2 / fit.dof:.4f}",
+        )
+    ]
 
 
 def warnings(found: Separation, settings: Experiment) -> list[str]:

@@ -17,15 +17,16 @@ from jaxsky.experiment import Setup, build, cmb_spectra
 from jaxsky.galaxy import EmbeddedSky
 from jaxsky.inputs import (
     Template,
+    bandpass_of,
+    beam_of,
     check_stokes,
     embedded_galaxy,
     narrow,
     read,
-    read_bandpass_spec,
     read_sky,
     uK_RJ_per,
 )
-from jaxsky.io import MissingFileError, read_beam
+from jaxsky.io import MissingFileError
 from jaxsky.io.observations import Observed, read_observed
 from jaxsky.keys import realisation_key
 from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum, uniform_covariance
@@ -223,8 +224,7 @@ def _check_beam(folder: Path, spec: BandTable, observed: Observed, where: str) -
     if spec.beam is not None:
         said, same = f"beam: {spec.beam}", False
         if own.ndim:
-            with at_key(f"{where}.beam"):
-                given = read_beam(find_file(folder, spec.beam), own.size - 1)
+            given = np.asarray(beam_of(folder, spec, own.size - 1))
             same = np.allclose(given, own, rtol=0, atol=1e-6)
     elif spec.fwhm is not None:
         said, same = f"fwhm: {spec.fwhm:g} arcmin", not own.ndim and spec.fwhm == float(own)
@@ -240,30 +240,19 @@ def _check_beam(folder: Path, spec: BandTable, observed: Observed, where: str) -
 def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -> Band:
     """Map, bandpass and noise of a band from the files that its settings name.
 
-    Parameters
-    ----------
-    folder : of the files
-    spec : what the settings say
-    observed : how a simulated map was observed, for what they do not say
+    What they do not say is that of the simulation which made the map, `observed`.
     """
     where, found = f"bands.{spec.name}", read(folder, spec)
     check_stokes(where, found, "QU")
-    if spec.bandpass is not None:
-        with at_key(f"{where}.bandpass"):
-            bandpass = read_bandpass_spec(folder, spec.bandpass, spec.samples)
-    elif observed is not None:
+    if spec.bandpass is None and observed is not None:
         bandpass = observed.bandpass
     else:
-        raise SettingsError(f"{where}.bandpass: is missing.")
+        bandpass = bandpass_of(folder, spec)
     maps = narrow(found.maps[-2:] * uK_RJ_per(found.unit, bandpass, where))
     used, unit, nside = np.asarray(found.mask), found.unit, found.nside
     del found  # as large as all else
-    beam: float | Array = spec.fwhm or 0.0
-    if spec.beam is not None:
-        with at_key(f"{where}.beam"):
-            beam = jnp.asarray(read_beam(find_file(folder, spec.beam), 2 * nside))
-    elif spec.fwhm is None and observed is not None:
-        beam = observed.beam
+    if (beam := beam_of(folder, spec, 2 * nside)) is None:
+        beam = 0.0 if observed is None else observed.beam
     leakage = _leakage_of(observed, used, where)
     if spec.leakage is not None:
         leakage = _read_leakage(folder, spec, bandpass)

@@ -14,9 +14,8 @@ import scipy.cluster.vq
 from jaxtyping import Bool, Float, Int
 
 from jaxsky.checks import Numeric, check_seed
-from jaxsky.inputs import mask_at
 from jaxsky.io import degrade_mask, read_mask
-from jaxsky.settings import Experiment, MaskFile, find_file, parse_region
+from jaxsky.settings import Experiment, MaskFile, at_key, find_file, parse_region
 
 COMPARISONS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 
@@ -52,7 +51,8 @@ def region_mask(
         found = read_mask(path, key=mask.key, ordering=mask.ordering)
         if coarser and found.size < inside.size:
             found = healpy.ud_grade(found.astype(float), nside) > 0
-        inside = inside & (degrade_mask(found, nside) if coarser else mask_at(found, nside, where))
+        with at_key(where):
+            inside = inside & degrade_mask(found, nside)
     return np.asarray(inside)
 
 

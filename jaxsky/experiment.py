@@ -12,9 +12,10 @@ from jaxtyping import Array, Float
 from jaxsky.cmb import camb_spectra
 from jaxsky.galaxy import EmbeddedSky
 from jaxsky.harmonics import beam_ratio, gaussian_beam, resample
-from jaxsky.inputs import Template, read_bandpass_spec, read_sky, set_parameters_of
-from jaxsky.io import read_beam, read_spectra
+from jaxsky.inputs import Template, bandpass_of, beam_of, read_sky, set_parameters_of
+from jaxsky.io import read_spectra
 from jaxsky.io.observations import Observed
+from jaxsky.io.rotation import tangents
 from jaxsky.keys import realisation_key
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import DTYPES, Observation, ObservedBand, Source
@@ -246,26 +247,10 @@ def _truth(settings: Experiment, sources: Mapping[str, Source], cmb: bool) -> di
 def read_channel(
     settings: Experiment, spec: BandTable, nside: int, stokes: str = "QU", noisy: bool = True
 ) -> ObservedBand:
-    """How a band observes, from what its table says.
-
-    Parameters
-    ----------
-    settings : of the experiment
-    spec : one of its bands
-    nside, stokes : of the maps
-    noisy : with the noise [uK_RJ]
-    """
+    """How a band observes maps, from what its table says; if `noisy`, with noise [uK_RJ]."""
     folder, where = Path(settings.data_dir), f"bands.{spec.name}"
-    if spec.bandpass is None:
-        raise SettingsError(f"{where}.bandpass: is missing.")
-    with at_key(f"{where}.bandpass"):
-        band = read_bandpass_spec(folder, spec.bandpass, spec.samples)
-    if spec.beam is not None:
-        with at_key(f"{where}.beam"):
-            beam = jnp.asarray(read_beam(find_file(folder, spec.beam), 2 * nside))
-    elif spec.fwhm is not None:
-        beam = jnp.asarray(spec.fwhm)
-    else:
+    band = bandpass_of(folder, spec)
+    if (beam := beam_of(folder, spec, 2 * nside)) is None:
         raise SettingsError(f"{where}: give the beam either as fwhm or as a window, beam.")
     noise: Array | float | None = None
     if spec.noise is not None and noisy:
@@ -290,7 +275,7 @@ def read_channel(
                     "the full sky."
                 )
     target = None if settings.simulate.fwhm == "own" else settings.simulate.fwhm
-    return ObservedBand(band, beam, target, noise, settings.simulate.diagonal_noise)
+    return ObservedBand(band, jnp.asarray(beam), target, noise, settings.simulate.diagonal_noise)
 
 
 def _noise_unit(spec: BandTable, where: str) -> str:
@@ -360,9 +345,7 @@ def leak(intensity: Float[Array, " pix"]) -> Float[Array, "2 pix"]:
     minute and always have the same angle to the direction in which they move.
     """
     nside = healpy.npix2nside(intensity.size)
-    theta, phi = healpy.pix2ang(nside, np.arange(intensity.size))
     pole = healpy.Rotator(coord=["E", "G"])(np.array([0.0, 0.0, 1.0]))
-    south = [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)]
-    east = [-np.sin(phi), np.cos(phi), np.zeros_like(phi)]
+    south, east = tangents(*healpy.pix2ang(nside, np.arange(intensity.size)))
     angle = 2 * np.arctan2(np.einsum("i,ip", pole, east), np.einsum("i,ip", pole, south))
     return intensity * jnp.stack([jnp.cos(angle), jnp.sin(angle)])

@@ -15,11 +15,12 @@ from jaxsky import galaxy as model_galaxy
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import AME, Component, component_class, parameter_declaration
 from jaxsky.galaxy import EmbeddedSky, GalaxyModel, embedded_sky
-from jaxsky.io import Maps, degrade_mask, read_bandpass, read_maps, unit_factor
+from jaxsky.io import Maps, read_bandpass, read_beam, read_maps, unit_factor
 from jaxsky.io.columns import sentinels
 from jaxsky.io.folders import kept
 from jaxsky.settings import (
     BandpassSpec,
+    BandTable,
     ComponentTable,
     Experiment,
     MapFile,
@@ -46,21 +47,10 @@ def parameter_map(
     of: str = "that of the template",
     stated: bool = False,
 ) -> tuple[Float[np.ndarray, " pix"], Bool[np.ndarray, " pix"]]:
-    """The map of a spectral parameter, and where it is known.
+    """The map of a spectral parameter in its unit, and where it is known.
 
-    Parameters
-    ----------
-    found : what was read
-    name : of the parameter
-    nside : resolution that it must have
-    where : key in the settings, for the messages
-    of : whose nside that is
-    stated : the settings say which values are missing, so zeros are data
-
-    Returns
-    -------
-    Values in the parameter's unit, in pixels without one the median of the others, and a mask,
-    True where they are known; both of shape (pix,).
+    Elsewhere it is the median. `of` says whose nside it must have; if it is `stated` which values
+    are missing, zeros are data.
     """
     values, used = one_column(found, nside, where, of), np.asarray(found.mask)
     unit = parameter_unit(name)
@@ -121,26 +111,15 @@ def read(
 ) -> Maps:
     """The maps of a file; see `jaxsky.io.read_maps`.
 
-    Parameters
-    ----------
-    folder : of the files
-    spec : what the settings say
-    stokes : Stokes parameters of the columns where the use of the file tells them, in place of
-        those in the settings
-    zeros_are_data : see `jaxsky.io.read_maps`
+    `stokes` are the Stokes parameters where the use of the file tells them, in place of the
+    settings.
     """
-    return read_maps(
-        [find_file(folder, name) for name in spec.files],
-        fields=spec.fields,
-        hdu=spec.hdu or 1,
-        unit=spec.unit,
-        ordering=spec.ordering,
-        coordinates=spec.coordinates,
-        polarization=spec.polarization,
-        stokes=spec.stokes if stokes is None else stokes,
-        missing=spec.missing,
-        zeros_are_data=zeros_are_data,
-    )
+    keys = {"hdu", "fields", "unit", "ordering", "coordinates", "polarization", "missing", "stokes"}
+    options = spec.model_dump(include=keys, exclude_none=True)
+    if stokes is not None:
+        options["stokes"] = stokes
+    paths = [find_file(folder, name) for name in spec.files]
+    return read_maps(paths, zeros_are_data=zeros_are_data, **options)
 
 
 def read_parameter(
@@ -151,7 +130,7 @@ def read_parameter(
     where: str,
     of: str = "that of the template",
 ) -> tuple[Float[np.ndarray, " pix"], Bool[np.ndarray, " pix"]]:
-    """The map of a spectral parameter and where it is known; see `jaxsky.inputs`."""
+    """The map of a spectral parameter in a file, and where it is known; see `parameter_map`."""
     found = read(folder, spec, stokes="", zeros_are_data=True)
     return parameter_map(found, name, nside, where, of=of, stated=spec.missing is not None)
 
@@ -305,31 +284,19 @@ def set_parameters_of(
 ) -> dict[str, Template]:
     """Templates with some of their parameters set, by dotted name.
 
-    Parameters
-    ----------
-    templates, fixed : by name
-    components : names that there are; parameters of those without a template here are left out
+    Those of components without a template here are left out.
     """
-    by_template: dict[str, dict[str, float]] = {}
-    for name, value in fixed.items():
-        component = name.split(".")[0]
-        if component in templates or component not in components:
-            by_template.setdefault(component, {})[name] = value
-    changed = dict(templates)
-    for name, values in by_template.items():
-        if name not in templates:
+    for name in (key.split(".")[0] for key in fixed):
+        if name not in templates and name not in components:
             raise ValueError(
                 f"there is no component {name!r}; components are {', '.join(templates)}"
             )
-        new = set_parameters(Sky({name: templates[name].component}), values)[name]
-        changed[name] = templates[name]._replace(component=new)
+    changed = dict(templates)
+    for name, template in templates.items():
+        if values := {k: v for k, v in fixed.items() if k.split(".")[0] == name}:
+            new = set_parameters(Sky({name: template.component}), values)[name]
+            changed[name] = template._replace(component=new)
     return changed
-
-
-def mask_at(mask: Bool[np.ndarray, " pix"], nside: int, where: str) -> Bool[np.ndarray, " pix"]:
-    """A mask at the resolution at which it is used; see `jaxsky.io.degrade_mask`."""
-    with at_key(where):
-        return np.asarray(degrade_mask(mask, nside))
 
 
 def uK_RJ_per(unit: str, at: Bandpass | float, where: str) -> float:
@@ -350,16 +317,26 @@ def check_stokes(where: str, found: Maps, wanted: str) -> None:
 
 def read_bandpass_spec(folder: Path, spec: BandpassSpec, samples: int = 51) -> Bandpass:
     """The bandpass of a file, or a top-hat of so many samples."""
-    if spec.file is not None:
-        return read_bandpass(
-            find_file(folder, spec.file),
-            spec.band,
-            detectors=spec.detectors,
-            convention=spec.convention,
-            unit=spec.unit,
-            fields=spec.fields,
-        )
-    assert spec.center is not None  # one of file and center is given
-    if not spec.width:
-        return Bandpass.delta(spec.center)
-    return Bandpass.top_hat(spec.center, spec.width, spec.convention or "RJ", samples)
+    if spec.center is not None:
+        if not spec.width:
+            return Bandpass.delta(spec.center)
+        return Bandpass.top_hat(spec.center, spec.width, spec.convention or "RJ", samples)
+    options = spec.model_dump(exclude={"file", "center", "width"})
+    return read_bandpass(find_file(folder, str(spec.file)), **options)
+
+
+def bandpass_of(folder: Path, spec: BandTable) -> Bandpass:
+    """The bandpass that the settings of a band name."""
+    where = f"bands.{spec.name}.bandpass"
+    if spec.bandpass is None:
+        raise SettingsError(f"{where}: is missing.")
+    with at_key(where):
+        return read_bandpass_spec(folder, spec.bandpass, spec.samples)
+
+
+def beam_of(folder: Path, spec: BandTable, lmax: int) -> Float[Array, " ell"] | float | None:
+    """The FWHM [arcmin] of a band, or the window of its beam; None if neither is said."""
+    if spec.beam is None:
+        return spec.fwhm
+    with at_key(f"bands.{spec.name}.beam"):
+        return jnp.asarray(read_beam(find_file(folder, spec.beam), lmax))

@@ -46,7 +46,7 @@ def _turned(block: np.ndarray, rotator: healpy.Rotator) -> np.ndarray:
     return np.atleast_2d(turned)[-len(block) :]
 
 
-def _tangents(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
+def tangents(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
     """Unit vectors to the south and the east, shape (2, 3, pix)."""
     south = [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)]
     return np.array([south, [-np.sin(phi), np.cos(phi), np.zeros_like(phi)]])
@@ -62,12 +62,12 @@ def _interpolated(block: np.ndarray, rotator: healpy.Rotator) -> np.ndarray:
     source = rotator.I(*directions)
     if len(block) == 1:
         return healpy.get_interp_val(block[0], *source)[None]
-    s, e = _tangents(*directions)
+    s, e = tangents(*directions)
     tensor = block[0] * (s[:, None] * s - e[:, None] * e) + block[1] * (
         s[:, None] * e + e[:, None] * s
     )
     tensor = healpy.get_interp_val(tensor.reshape(9, -1), *source).reshape(3, 3, -1)
-    s, e = np.einsum("ji,kjp->kip", rotator.mat, _tangents(*directions))
+    s, e = np.einsum("ji,kjp->kip", rotator.mat, tangents(*directions))
     project = "ip,ijp,jp->p"
     ss, ee = np.einsum(project, s, tensor, s), np.einsum(project, e, tensor, e)
     return np.array([(ss - ee) / 2, np.einsum(project, s, tensor, e)])

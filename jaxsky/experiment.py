@@ -14,8 +14,8 @@ from jaxsky.galaxy import EmbeddedSky
 from jaxsky.harmonics import beam_ratio, gaussian_beam, resample
 from jaxsky.inputs import Template, bandpass_of, beam_of, read_sky, set_parameters_of
 from jaxsky.io import read_spectra
+from jaxsky.io.maps import tangents
 from jaxsky.io.observations import Observed
-from jaxsky.io.rotation import tangents
 from jaxsky.keys import realisation_key
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import DTYPES, Observation, ObservedBand, Source

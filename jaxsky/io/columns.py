@@ -7,7 +7,6 @@ healpy, the HEALPix libraries, PySM and this package; where a column stands says
 import numbers
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,8 +21,10 @@ from jaxsky.io.tables import (
     PIXELS,
     HealpixTable,
     InputError,
+    equals,
     open_fits,
 )
+from jaxsky.units import UNITS
 
 _LETTERS = {"I": "I", "T": "I", "Q": "Q", "U": "U"}
 _RUNS = ("FULL", "HM1", "HM2", "HR1", "HR2", "YR1", "YR2", "Y1", "Y2")
@@ -64,12 +65,9 @@ _CHOICES = ("", "I", "Q", "U", "II", "IQ", "IU", "QQ", "QU", "UU")
 
 
 def stokes(name: str) -> str | None:
-    """Stokes parameter of a column as far as its name is certain.
+    """Stokes parameter of a column as far as its name is certain; None if it is not.
 
-    Returns
-    -------
-    "I", "Q" or "U"; two of them for a covariance, and for an rms, which has no sign either; ""
-    for what has none, such as hits; None if the name is not on the list.
+    Two of them for a covariance, and for an rms, which has no sign either; "" for hits and others.
 
     Examples
     --------
@@ -101,10 +99,7 @@ def choose(names: Sequence[str]) -> list[int]:
 def parse_stokes(given: str | Sequence[str]) -> list[str]:
     """The Stokes parameters that an argument names, one entry per column.
 
-    Parameters
-    ----------
-    given : a letter per column ("IQU"), or words: a sequence, or text with blanks or commas
-        ("QQ QU UU"); an entry "" is a column without a Stokes parameter
+    A letter per column, or words in a sequence or in text; "" is a column without one.
 
     Examples
     --------
@@ -139,27 +134,14 @@ REPEATED, MORE_OFTEN = 4, 3
 ZEROS = 0.3
 
 
-def parse_missing(given: Any) -> list[float]:
-    """The numbers that an argument says to mark missing pixels."""
-    several: list = [given] if isinstance(given, numbers.Real | str) else list(given)
-    if any(isinstance(x, bool) or not isinstance(x, numbers.Real) for x in several):
-        raise InputError(f"Argument `missing` must be a number or a list of them, not {given!r}.")
-    return [float(x) for x in several]
-
-
 def sentinels(
     values: Float[np.ndarray, " pix"], lowest: float | None = None, *, zero: bool = False
 ) -> list[tuple[float, int]]:
     """Values that look like marks of missing pixels, with the number of their pixels.
 
     A mark is an extreme far from the rest, further out than the rest is from its median, and
-    repeated, or huge; the usual numbers (-999, -32768, ...) count also where they are nearer.
-
-    Parameters
-    ----------
-    values : of a column, NaN where they are known to be missing
-    lowest : what the lowest stored integer of the column stands for; None for other types
-    zero : zero is a usual number, too, rather than none
+    repeated, or huge; the usual numbers (-999, -32768, ...; `lowest`; zero, if so wished) count
+    also where they are nearer. Values are NaN where they are known to be missing.
     """
     known = np.isfinite(values)
     rest = values if known.all() else values[known]
@@ -201,36 +183,21 @@ def _is_continuous(values: np.ndarray) -> bool:
     return np.unique(some).size > some.size / 2
 
 
-def zeros(columns: Sequence[Float[np.ndarray, " pix"]]) -> float:
-    """Fraction of the pixels with values in which all columns are exactly 0."""
-    known = np.isfinite(columns[0])
-    empty = columns[0] == 0
-    for _, values in pairwise(columns):
-        known &= np.isfinite(values)
-        empty &= values == 0
-    return float(np.count_nonzero(empty & known)) / max(float(np.count_nonzero(known)), 1.0)
-
-
 POLARIZATIONS = {"COSMO": "COSMO", "IAU": "IAU"}
 
 
-class Source(NamedTuple):
-    """A table, and the columns that are read of it; None for those that their names tell."""
+class Columns(NamedTuple):
+    """Columns of tables: values in RING order, NaN where missing, and what is said of them.
 
-    path: Path
-    hdu: int | str
-    fields: list[int | str] | None
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Columns of one table: values in RING order, NaN where missing, and what is said of them."""
+    `lowest` is what the lowest integer stands for that a column can store, `alone` whether there is
+    no other in its table.
+    """
 
     where: str
     names: list[str]
     values: list[Float[np.ndarray, " pix"]]
     lowest: list[float | None]
-    alone: bool
+    alone: list[bool]
     nside: int
     unit: str
     coordinates: str
@@ -286,13 +253,13 @@ def _unit(table: HealpixTable, columns: list[int], given: str | None) -> str:
     return str(units[0])
 
 
-def _several(value: Any, scalar: type | tuple[type, ...]) -> list[Any]:
-    return [value] if isinstance(value, scalar) else list(value)
+def _several(value: Any) -> list[Any]:
+    return [value] if isinstance(value, str | Path | numbers.Integral) else list(value)
 
 
-def sources(path: Any, hdu: Any, fields: Any) -> list[Source]:
+def _split(path: Any, hdu: Any, fields: Any) -> list[tuple[Path, Any, list[Any] | None]]:
     """File, HDU and columns of each table, from arguments that may be lists."""
-    paths, hdus = _several(path, (str, Path)), _several(hdu, (str, numbers.Integral))
+    paths, hdus = _several(path), _several(hdu)
     number = max(len(paths), len(hdus))
     for name, given in {"path": paths, "hdu": hdus}.items():
         if len(given) not in (1, number) or not given:
@@ -300,73 +267,117 @@ def sources(path: Any, hdu: Any, fields: Any) -> list[Source]:
                 f"Argument `{name}` must be one, or as many as the other names, {number}, "
                 f"but is {len(given)}."
             )
-    wanted = None if fields is None else _several(fields, (str, numbers.Integral))
+    wanted = None if fields is None else _several(fields)
     if wanted is not None and not wanted:
         raise InputError(f"{paths[0]}: argument `fields` is empty.")
     if number == 1:
-        return [Source(Path(paths[0]), hdus[0], wanted)]
+        return [(Path(paths[0]), hdus[0], wanted)]
     if wanted is not None and len(wanted) not in (1, number):
         raise InputError(
             f"Argument `fields` must name one column of all {number} tables, or one of each, "
             f"not {len(wanted)}."
         )
-    columns = [None] * number if wanted is None else wanted * (number // len(wanted))
-    return [
-        Source(Path(p), h, None if c is None else [c])
-        for p, h, c in zip(
-            paths * (number // len(paths)), hdus * (number // len(hdus)), columns, strict=True
-        )
-    ]
+    columns = [None] * number if wanted is None else [[one] for one in wanted]
+    each = (one * (number // len(one)) for one in (paths, hdus, columns))
+    return [(Path(p), h, c) for p, h, c in zip(*each, strict=True)]
 
 
-def read_columns(
-    source: Source,
+def _read_table(
+    path: Path,
+    hdu: int | str,
+    fields: list[int | str] | None,
     unit: str | None,
     ordering: str | None,
     coordinates: str | None,
     polarization: str | None,
 ) -> Columns:
-    """The columns of one table; arguments as those of `read_maps`."""
-    with open_fits(source.path) as hdus:
-        table = HealpixTable(source.path, hdus, source.hdu)
-        if source.fields is None:
-            wanted = default_fields(table)
-        else:
-            wanted = [table.index(field) for field in source.fields]
-            if len(set(wanted)) < len(wanted):
-                raise InputError(f"{table.where}: `fields` names a column twice: {source.fields}.")
+    with open_fits(path) as hdus:
+        table = HealpixTable(path, hdus, hdu)
+        wanted = default_fields(table) if fields is None else [table.index(f) for f in fields]
+        if len(set(wanted)) < len(wanted):
+            raise InputError(f"{table.where}: `fields` names a column twice: {fields}.")
         unit = _unit(table, wanted, unit)
         order = table.state("ordering", ordering, ("ORDERING",), ORDERINGS)
+        alone = sum(name.upper() not in PIXELS for name in table.names) == 1
         return Columns(
-            where=table.where,
-            names=[table.names[i] for i in wanted],
-            values=[table.values(i, order) for i in wanted],
-            lowest=[table.lowest(i) for i in wanted],
-            alone=sum(name.upper() not in PIXELS for name in table.names) == 1,
-            nside=table.nside,
-            unit=unit,
-            coordinates=table.state(
-                "coordinates", coordinates, ("COORDSYS", "SKYCOORD"), COORDINATES
-            ),
-            polarization=table.state(
-                "polarization", polarization, ("POLCCONV",), POLARIZATIONS, default="COSMO"
-            ),
+            table.where,
+            [table.names[i] for i in wanted],
+            [table.values(i, order) for i in wanted],
+            [table.lowest(i) for i in wanted],
+            [alone] * len(wanted),
+            table.nside,
+            unit,
+            table.state("coordinates", coordinates, ("COORDSYS", "SKYCOORD"), COORDINATES),
+            table.state("polarization", polarization, ("POLCCONV",), POLARIZATIONS, "COSMO"),
         )
 
 
-def check_alike(tables: Sequence[Columns]) -> None:
-    """Refuse tables that differ in what one field has in common."""
+def read_columns(path: Any, hdu: Any, fields: Any, *stated: str | None) -> Columns:
+    """The columns of one or several tables, together; arguments as those of `read_maps`.
+
+    `stated` are unit, ordering, coordinates and polarization. Refuses tables that differ in what
+    one field has in common.
+    """
+    tables = [_read_table(*one, *stated) for one in _split(path, hdu, fields)]
+    first, *others = tables
     hints = {
         "nside": "one field has one nside",
         "unit": "read each by itself",
         "coordinates": "one field has one system of coordinates",
         "polarization": "give `polarization` if one of them does not say it",
     }
-    first = tables[0]
     for name, hint in hints.items():
-        for other in tables[1:]:
+        for other in others:
             one, two = getattr(first, name), getattr(other, name)
             if one != two:
                 raise InputError(
                     f"{other.where}: {name} is {two}, but that of {first.where} is {one}; {hint}."
                 )
+    lists = ("names", "values", "lowest", "alone")
+    joined: dict[str, Any] = {n: [x for t in tables for x in getattr(t, n)] for n in lists}
+    return first._replace(**joined)
+
+
+def mark_missing(columns: Columns, missing: Any, zeros_are_data: bool) -> None:
+    """Set the values that an argument says to mark missing pixels to NaN, in place.
+
+    Refuses columns in which other numbers seem to mark them, unless it says that none do.
+    """
+    marks = None
+    if missing is not None:
+        marks = [missing] if isinstance(missing, numbers.Real | str) else list(missing)
+        if any(isinstance(x, bool) or not isinstance(x, numbers.Real) for x in marks):
+            raise InputError(
+                f"Argument `missing` must be a number or a list of them, not {missing!r}."
+            )
+    found = marks == []
+    for values in columns.values:
+        for mark in marks or []:
+            marked = equals(values, float(mark), 1e-6)
+            found |= bool(marked.any())
+            values[marked] = np.nan
+    if found:
+        return
+    suspects = [
+        f"column {name} is {number:.9g} in {count} of {values.size} pixels, far from its other "
+        "values"
+        for name, values, low in zip(columns.names, columns.values, columns.lowest, strict=True)
+        for number, count in sentinels(values, low)
+    ]
+    if columns.unit in UNITS and not zeros_are_data and (share := _zeros(columns.values)) > ZEROS:
+        suspects.append(f"{', '.join(columns.names)}: exactly 0 in {share:.0%} of the pixels")
+    if suspects:
+        raise InputError(
+            f"{columns.where}: {'; '.join(suspects)}; give `missing`, the numbers that mark "
+            "pixels without a value, or `missing = []` if all are data."
+        )
+
+
+def _zeros(columns: Sequence[Float[np.ndarray, " pix"]]) -> float:
+    """Fraction of the pixels with values in which all columns are exactly 0."""
+    known = np.isfinite(columns[0])
+    empty = columns[0] == 0
+    for _, values in pairwise(columns):
+        known &= np.isfinite(values)
+        empty &= values == 0
+    return float(np.count_nonzero(empty & known)) / max(float(np.count_nonzero(known)), 1.0)

@@ -13,23 +13,91 @@ from jaxtyping import Bool, Float
 from jaxsky.bandpass import Bandpass
 from jaxsky.bare import takes_quantities
 from jaxsky.checks import Numeric
-from jaxsky.io.columns import (
-    ZEROS,
-    Columns,
-    check_alike,
-    parse_missing,
-    parse_stokes,
-    read_columns,
-    sentinels,
-    sources,
-    zeros,
-)
+from jaxsky.io.columns import Columns, mark_missing, parse_stokes, read_columns
 from jaxsky.io.columns import stokes as stokes_of
 from jaxsky.io.files import whole
 from jaxsky.io.quantities import unit_factor, unit_name
-from jaxsky.io.rotation import blocks, to_galactic
-from jaxsky.io.tables import InputError, equals
-from jaxsky.units import UNITS
+from jaxsky.io.tables import InputError
+
+
+def _blocks(where: str, names: Sequence[str], kinds: Sequence[str | None]) -> list[list[int]]:
+    """Rows that turn together when the coordinates change: (Q, U) pairs, and single scalars."""
+    found: list[list[int]] = []
+    row = 0
+    while row < len(kinds):
+        if list(kinds[row : row + 2]) == ["Q", "U"]:
+            found.append([row, row + 1])
+        elif kinds[row] in ("", "I"):
+            found.append([row])
+        else:
+            raise InputError(
+                f"{where}: column {names[row]} cannot be turned to Galactic "
+                "coordinates; read Q followed by U, and no covariances."
+            )
+        row += len(found[-1])
+    return found
+
+
+def _turned(block: np.ndarray, rotator: healpy.Rotator) -> np.ndarray:
+    """A scalar (1, pix) or Q and U (2, pix), turned in harmonic space."""
+    nside = healpy.npix2nside(block.shape[-1])
+    # Ring weights and eight iterations reach 1e-7 up to here; nothing does at 3 nside.
+    lmax = 5 * nside // 2
+    weights = nside > 1 and healpy.isnsideok(nside, nest=True)
+    maps = block[0] if len(block) == 1 else [np.zeros_like(block[0]), *block]
+    alm = healpy.map2alm(maps, lmax=lmax, iter=8, use_weights=weights)
+    turned = healpy.alm2map(rotator.rotate_alm(alm), nside, lmax=lmax)
+    return np.atleast_2d(turned)[-len(block) :]
+
+
+def tangents(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    """Unit vectors to the south and the east, shape (2, 3, pix)."""
+    south = [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)]
+    return np.array([south, [-np.sin(phi), np.cos(phi), np.zeros_like(phi)]])
+
+
+def _interpolated(block: np.ndarray, rotator: healpy.Rotator) -> np.ndarray:
+    """A scalar (1, pix) or Q and U (2, pix), turned by interpolation between pixels.
+
+    Q and U turn fast about the poles, so it is the tensor Q (ss - ee) + U (se + es) of the
+    directions south and east that is interpolated, by its Cartesian components.
+    """
+    directions = healpy.pix2ang(healpy.npix2nside(block.shape[-1]), np.arange(block.shape[-1]))
+    source = rotator.I(*directions)
+    if len(block) == 1:
+        return healpy.get_interp_val(block[0], *source)[None]
+    s, e = tangents(*directions)
+    tensor = block[0] * (s[:, None] * s - e[:, None] * e) + block[1] * (
+        s[:, None] * e + e[:, None] * s
+    )
+    tensor = healpy.get_interp_val(tensor.reshape(9, -1), *source).reshape(3, 3, -1)
+    s, e = np.einsum("ji,kjp->kip", rotator.mat, tangents(*directions))
+    project = "ip,ijp,jp->p"
+    ss, ee = np.einsum(project, s, tensor, s), np.einsum(project, e, tensor, e)
+    return np.array([(ss - ee) / 2, np.einsum(project, s, tensor, e)])
+
+
+def _to_galactic(
+    maps: Float[np.ndarray, "field pix"],
+    mask: Bool[np.ndarray, " pix"],
+    rows_together: Sequence[list[int]],
+    coordinates: str,
+) -> tuple[Float[np.ndarray, "field pix"], Bool[np.ndarray, " pix"]]:
+    """Maps turned to Galactic coordinates, Q and U as the spin-2 field they are.
+
+    Complete maps are turned in harmonic space, which is exact for a sky without structure above
+    l = 2.5 nside and cuts what is above. A map with pixels missing has no spherical harmonics:
+    it is interpolated between the four nearest pixels, and pixels next to missing ones are lost.
+    """
+    rotator = healpy.Rotator(coord=[coordinates, "G"])
+    turn = _turned if mask.all() else _interpolated
+    turned = np.zeros_like(maps)
+    for rows in rows_together:
+        turned[rows] = turn(maps[rows], rotator)
+    if not mask.all():
+        mask = _interpolated(mask[None].astype(float), rotator)[0] > 1 - 1e-9
+        turned[:, ~mask] = 0
+    return turned, mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,18 +141,15 @@ def _agree(stated: str, certain: str | None) -> bool:
     return certain in (stated, "") if stated == "I" else stated in (certain, certain * 2)
 
 
-def _kinds(tables: Sequence[Columns], given: str | Sequence[str] | None) -> list[str | None]:
+def _kinds(columns: Columns, given: str | Sequence[str] | None) -> list[str | None]:
     """The Stokes parameter of each column, where it has to be known."""
+    where, names, frame = columns.where, columns.names, columns.coordinates
     # healpy calls any map T or TEMPERATURE that is alone in its file.
+    doubtful = ("T", "TEMPERATURE") if len(names) > 1 or given is not None else ()
     certain = [
-        None
-        if table.alone and name in ("T", "TEMPERATURE") and (len(tables) > 1 or given is not None)
-        else stokes_of(name)
-        for table in tables
-        for name in table.names
+        None if alone and name in doubtful else stokes_of(name)
+        for name, alone in zip(names, columns.alone, strict=True)
     ]
-    names = [name for table in tables for name in table.names]
-    where, frame = tables[0].where, tables[0].coordinates
     if given is not None:
         stated = [""] * len(names) if isinstance(given, str) and not given else parse_stokes(given)
         if len(stated) != len(names):
@@ -99,7 +164,7 @@ def _kinds(tables: Sequence[Columns], given: str | Sequence[str] | None) -> list
                     f"{found or 'that it has no Stokes parameter'}."
                 )
         return list(stated)
-    if None in certain and (frame != "G" or tables[0].polarization == "IAU"):
+    if None in certain and (frame != "G" or columns.polarization == "IAU"):
         why = "has the IAU sign of U" if frame == "G" else "is not in Galactic coordinates"
         raise InputError(
             f"{where}: the file {why}, and the name of column {names[certain.index(None)]} does "
@@ -107,38 +172,6 @@ def _kinds(tables: Sequence[Columns], given: str | Sequence[str] | None) -> list
             f"letter for each of {', '.join(names)}."
         )
     return certain
-
-
-def _ask_about_values(tables: Sequence[Columns], zeros_are_data: bool) -> None:
-    """Refuse columns in which numbers seem to mark pixels without a value."""
-    columns = [column for table in tables for column in table.values]
-    suspects = []
-    for table in tables:
-        for name, values, lowest in zip(table.names, table.values, table.lowest, strict=True):
-            suspects += [
-                f"column {name} is {number:.9g} in {count} of {values.size} pixels, far from its "
-                "other values"
-                for number, count in sentinels(values, lowest)
-            ]
-    if tables[0].unit in UNITS and not zeros_are_data and (share := zeros(columns)) > ZEROS:
-        listed = ", ".join(name for table in tables for name in table.names)
-        suspects.append(f"{listed}: exactly 0 in {share:.0%} of the pixels")
-    if suspects:
-        raise InputError(
-            f"{tables[0].where}: {'; '.join(suspects)}; give `missing`, the numbers that mark "
-            "pixels without a value, or `missing = []` if all are data."
-        )
-
-
-def _mark(columns: Sequence[Float[np.ndarray, " pix"]], marks: Sequence[float]) -> bool:
-    """Set values that mark missing pixels to NaN, in place; True if there are any."""
-    found = False
-    for values in columns:
-        for mark in marks:
-            marked = equals(values, mark, 1e-6)
-            found |= bool(marked.any())
-            values[marked] = np.nan
-    return found
 
 
 def read_maps(
@@ -204,35 +237,25 @@ def read_maps(
         If `unit` is unknown.
     """
     unit = None if unit is None else unit_name(unit)
-    marks = None if missing is None else parse_missing(missing)
-    tables = [
-        read_columns(source, unit, ordering, coordinates, polarization)
-        for source in sources(path, hdu, fields)
-    ]
-    first = tables[0]
-    if nside is not None and nside != first.nside:
-        raise InputError(f"{first.where}: nside is {first.nside}, but {nside} is expected.")
-    check_alike(tables)
-    names = [name for table in tables for name in table.names]
-    kinds = _kinds(tables, stokes)
-    rows = None if first.coordinates == "G" else blocks(first.where, names, kinds)
-    columns = [column for table in tables for column in table.values]
-    if not (_mark(columns, marks or []) or marks == []):
-        _ask_about_values(tables, zeros_are_data)
-    for table in tables:
-        table.values.clear()
-    maps = np.empty((len(names), healpy.nside2npix(first.nside)))
+    found = read_columns(path, hdu, fields, unit, ordering, coordinates, polarization)
+    if nside is not None and nside != found.nside:
+        raise InputError(f"{found.where}: nside is {found.nside}, but {nside} is expected.")
+    names, frame = found.names, found.coordinates
+    kinds = _kinds(found, stokes)
+    rows = None if frame == "G" else _blocks(found.where, names, kinds)
+    mark_missing(found, missing, zeros_are_data)
+    maps = np.empty((len(names), healpy.nside2npix(found.nside)))
     for row in range(len(names)):
-        maps[row] = columns.pop(0)  # and given back: maps may be large
+        maps[row] = found.values.pop(0)  # and given back: maps may be large
     mask = np.asarray(np.isfinite(maps).all(axis=0))
     if not mask.any():
-        raise InputError(f"{first.where}: no pixel has values in {', '.join(names)}.")
+        raise InputError(f"{found.where}: no pixel has values in {', '.join(names)}.")
     maps[:, ~mask] = 0
-    if first.polarization == "IAU":
+    if found.polarization == "IAU":
         maps *= np.array([[(-1.0) ** (kind or "").count("U")] for kind in kinds])
     if rows is not None:
-        maps, mask = to_galactic(maps, mask, rows, first.coordinates)
-    return Maps(maps, mask, first.unit, tuple(names), tuple(kinds))
+        maps, mask = _to_galactic(maps, mask, rows, frame)
+    return Maps(maps, mask, found.unit, tuple(names), tuple(kinds))
 
 
 def _check_written(

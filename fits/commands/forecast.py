@@ -109,9 +109,6 @@ def forecast_inputs(settings: Experiment) -> ForecastInputs:
         if band.noise is None:
             raise SettingsError(f"bands.{name}.noise: is missing.")
     shown = spec.bands or spread(tuple(bands), SHOWN)
-    for name in shown:
-        if name not in bands:
-            raise SettingsError(f"forecast.bands: {name!r} is none of {', '.join(bands)}.")
     fwhm = max(template.fwhm for template in templates.values())
     nside = min(healpy.npix2nside(template.used.size) for template in templates.values())
     _check_resolution(spec.lmax, nside, fwhm)

@@ -8,24 +8,23 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxsky.io.columns import default_fields
-from jaxsky.io.files import check_file
-from jaxsky.io.tables import COORDINATES, ORDERINGS, HealpixTable, InputError, equals, open_fits
+from jaxsky.io.files import InputError, check_file
+from jaxsky.io.tables import COORDINATES, ORDERINGS, HealpixTable, equals, from_nested, open_fits
 
 
-def _choose(path: Path, key: str | None, known: list[str]) -> str:
-    if key is None and len(known) == 1:
-        return known[0]
-    if key not in known:
-        problem = "give `key`, as it has several masks" if key is None else f"no mask {key!r}"
-        raise InputError(f"{path}: {problem}; it has {', '.join(known)}.")
-    return key
-
-
-def _read_npz(path: Path, key: str | None) -> np.ndarray:
+def _read_npz(path: Path, key: str | None, ordering: str | None) -> np.ndarray:
+    """The values of a mask in an archive, in RING order."""
+    order = ORDERINGS.get((ordering or "RING").upper())
+    if order is None:
+        raise InputError(f"Argument `ordering` must be RING or NESTED, not {ordering!r}.")
     check_file(path)
     try:
         with np.load(path) as archive:
-            name = _choose(path, key, list(archive))
+            known = list(archive)
+            name = known[0] if key is None and len(known) == 1 else key
+            if name not in known:
+                what = "give `key`, as it has several masks" if key is None else f"no mask {key!r}"
+                raise InputError(f"{path}: {what}; it has {', '.join(known)}.")
             found = np.squeeze(archive[name])
     except InputError:
         raise
@@ -35,9 +34,11 @@ def _read_npz(path: Path, key: str | None) -> np.ndarray:
         raise InputError(
             f"{path}: {name} is no mask, but has type {found.dtype} and shape {found.shape}."
         )
+    if not healpy.isnpixok(found.size):
+        raise InputError(f"{path}: not a HEALPix mask, {found.size} is not 12 nside^2 pixels.")
     values = found.astype(np.float64)
     values[~np.isfinite(values) | equals(values, healpy.UNSEEN, 1e-5)] = np.nan
-    return values
+    return values if order == "RING" else from_nested(str(path), values)
 
 
 def _in_galactic(mask: np.ndarray, coordinates: str) -> np.ndarray:
@@ -84,14 +85,7 @@ def read_mask(
     path = Path(path)
     frame, others = "G", []
     if path.suffix == ".npz":
-        order = ORDERINGS.get((ordering or "RING").upper(), "")
-        if not order:
-            raise InputError(f"Argument `ordering` must be RING or NESTED, not {ordering!r}.")
-        values = _read_npz(path, key)
-        if not healpy.isnpixok(values.size):
-            raise InputError(f"{path}: not a HEALPix mask, {values.size} is not 12 nside^2 pixels.")
-        if order == "NESTED":
-            values = _from_nested(path, values)
+        values = _read_npz(path, key, ordering)
     else:
         with open_fits(path) as hdus:
             table = HealpixTable(path, hdus, hdu)
@@ -115,13 +109,6 @@ def read_mask(
         hint = f"; give `key` out of {', '.join(others)}" if key is None and others else ""
         raise InputError(f"{path}: the mask leaves no pixel{hint}.")
     return mask if frame == "G" else _in_galactic(mask, frame)
-
-
-def _from_nested(path: Path, values: np.ndarray) -> np.ndarray:
-    nside = healpy.npix2nside(values.size)
-    if not healpy.isnsideok(nside, nest=True):
-        raise InputError(f"{path}: ordering is NESTED, but nside is {nside}, no power of 2.")
-    return values[healpy.ring2nest(nside, np.arange(values.size))]
 
 
 def degrade_mask(

@@ -129,6 +129,14 @@ def _nested(nside: int) -> Int[np.ndarray, " pix"]:
     return healpy.ring2nest(nside, np.arange(healpy.nside2npix(nside))).astype(np.int32)
 
 
+def from_nested(where: str, values: Float[np.ndarray, " pix"]) -> Float[np.ndarray, " pix"]:
+    """Values in NESTED order, in RING order."""
+    nside = healpy.npix2nside(values.size)
+    if not healpy.isnsideok(nside, nest=True):
+        raise InputError(f"{where}: ordering is NESTED, but nside is {nside}, no power of 2.")
+    return values[_nested(nside)]
+
+
 class HealpixTable:
     """The columns and the header of the HEALPix table `hdu` in an open FITS file."""
 
@@ -281,10 +289,6 @@ class HealpixTable:
         NaN where it has no value: pixels that are not listed, UNSEEN, BAD_DATA and TNULL of the
         header, NaN and infinity. If `logical`, columns of true and false are 1 and 0.
         """
-        if ordering == "NESTED" and not healpy.isnsideok(self.nside, nest=True):
-            raise InputError(
-                f"{self.where}: ordering is NESTED, but nside is {self.nside}, no power of 2."
-            )
         npix = healpy.nside2npix(self.nside)
         if logical and self._kinds[index] == "L":
             column = np.array(self._table.data.field(index), dtype=np.float64).ravel()
@@ -297,11 +301,11 @@ class HealpixTable:
                 f"{self.where}: column {self.names[index]} has {column.size} values, but there "
                 f"are {expected} pixels."
             )
-        if pixels is None:
-            return column[_nested(self.nside)] if ordering == "NESTED" else column
-        full = np.full(npix, np.nan)
-        full[healpy.nest2ring(self.nside, pixels) if ordering == "NESTED" else pixels] = column
-        return full
+        if pixels is not None:
+            full = np.full(npix, np.nan)
+            full[pixels] = column
+            column = full
+        return from_nested(self.where, column) if ordering == "NESTED" else column
 
     def _real(self, index: int) -> Float[np.ndarray, " row"]:
         """A column of real numbers, NaN where it has none."""

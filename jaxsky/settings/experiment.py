@@ -1,7 +1,8 @@
 """The experiment file: one grammar for all commands, a sentence for each mistake."""
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -183,12 +184,12 @@ class Forecast(Table):
     )
     priors: dict[str, Positive] = Field(default={})
     spectra: Several[Literal["EE", "BB"]] = Field(["BB"])
-    fisher_lmax: Annotated[int, Field(ge=2, le=3000)] = 300
+    fisher_lmax: int = Field(300, ge=2, le=3000)
 
     @model_validator(mode="after")
     def _ranges(self) -> "Forecast":
-        for key, last in (("lmax", self.lmax), ("fisher_lmax", self.fisher_lmax)):
-            if not self.lmin < last:
+        for key in ("lmax", "fisher_lmax"):
+            if not self.lmin < (last := getattr(self, key)):
                 raise ValueError(f"{key}, {last}, must be above lmin, {self.lmin}")
         if not self.fit[0] < self.fit[1]:
             raise ValueError(f"fit must increase, but is {self.fit[0]}, {self.fit[1]}")
@@ -299,18 +300,20 @@ class Experiment(Table):
             raise MistakeAt("simulate.include", "has 'cmb', but cmb.include is false")
         components = list(self.sky.components)
         simulated = [*components, "cmb", "noise"]
-        known: list[tuple[str, Iterable[str], Collection[str]]] = [
-            ("common.components", self.common.components or (), components),
-            ("simulate.include", self.simulate.include or (), simulated),
-            ("simulate.leakage", self.simulate.leakage, names),
-            ("compare.patches", filter(None, [self.compare.patches]), names),
-            ("fit.regions", self.fit.regions, self.regions),
-            ("compare.regions", self.compare.regions, self.regions),
-            ("separate.region", [self.separate.region], self.regions),
-            ("forecast.region", [self.forecast.region], self.regions),
-        ]
-        for key, values, allowed in known:
-            for value in values:
+        known: dict[str, Collection[str]] = {
+            "common.components": components,
+            "simulate.include": simulated,
+            "simulate.leakage": names,
+            "compare.patches": names,
+            "fit.regions": self.regions,
+            "compare.regions": self.regions,
+            "separate.region": self.regions,
+            "forecast.region": self.regions,
+            "forecast.bands": names,
+        }
+        for key, allowed in known.items():
+            values = attrgetter(key)(self) or ()
+            for value in [values] if isinstance(values, str) else values:
                 if value not in allowed:
                     there = ", ".join(allowed) or "none is there"
                     raise MistakeAt(key, f"{value!r} is none of {there}")

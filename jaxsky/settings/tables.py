@@ -84,8 +84,8 @@ def _check_release(
         )
 
 
-#: Laws of the components of the embedded model.
-EMBEDDED = {"dust": "dust", "synchrotron": "synchrotron"}
+#: Components of the embedded model, named as their laws.
+EMBEDDED = ("dust", "synchrotron")
 
 
 class Embedded(Table):
@@ -109,8 +109,7 @@ class SmallScalesTable(Table):
 
     @model_validator(mode="after")
     def _increase(self) -> "SmallScalesTable":
-        for key in ("EE", "BB"):
-            first, last = getattr(self, key)
+        for key, (first, last) in {"EE": self.EE, "BB": self.BB}.items():
             if not first < last:
                 raise MistakeAt(key, f"must increase, but is {first}, {last}")
         return self
@@ -176,10 +175,10 @@ class SkyTable(Table):
     @property
     def components(self) -> dict[str, ComponentTable]:
         """All components, each with its law."""
-        laws = EMBEDDED if self.embedded is not None else {}
-        found = {name: ComponentTable() for name in laws} | self.given
+        known = EMBEDDED if self.embedded is not None else ()
+        found = {name: ComponentTable() for name in known} | self.given
         return {
-            name: one if one.law else one.model_copy(update={"law": laws.get(name)})
+            name: one if one.law or name not in known else one.model_copy(update={"law": name})
             for name, one in found.items()
         }
 
@@ -197,9 +196,9 @@ class SkyTable(Table):
                 if one.law is None:
                     raise ValueError("law is missing")
                 one.check(one.law)
-                own = self.embedded is not None and one.file is None and EMBEDDED.get(name)
+                own = one.file is None and name in self.templates
                 given = one.nu_ref is not None or "nu_ref" in one.parameters
-                if own and (one.law != own or given):
+                if own and (one.law != name or given):
                     raise ValueError("law and nu_ref are those of the embedded map; give a file")
             except ValueError as error:
                 raise MistakeAt(name, error) from None

@@ -1,3 +1,65 @@
-"""Fitting tools for jaxsky skies ("fits" as in model fits, not FITS files)."""
+"""Fitting tools for jaxsky skies ("fits" as in model fits, not FITS files).
+
+What users need is imported from here (`__all__`); each name when it is first asked for.
+"""
+
+import importlib
+from typing import TYPE_CHECKING
 
 import jaxsky.bare
+
+if TYPE_CHECKING:
+    from fits.commands.forecast import forecast
+    from fits.comparison import compare
+    from fits.discs import prepare_patches
+    from fits.fisher import fisher_errors
+    from fits.grid import grid_fit
+    from fits.multipoles import harmonic_coefficients, harmonic_likelihood, white_spectrum
+    from fits.noise import as_noise
+    from fits.optimize import Newton, best_fit
+    from fits.patches import fit_patches
+    from fits.posterior import chi2, hessian
+    from fits.priors import Gaussian, Uniform
+    from fits.profile_likelihood import spectral_likelihood
+    from fits.pseudo_cl import band_powers, bin_edges, masked_spectra
+    from fits.regions import apodize, clusters, latitude_bands, superpixels
+    from fits.results import FitError, FitResult
+    from fits.sampling import sample
+    from fits.separated_maps import component_maps, harmonic_component_maps, residual_maps
+    from fits.template_likelihood import likelihood
+    from fits.tensor_ratio import fit_tensors, power_model
+
+_NAMES = {
+    "commands.forecast": "forecast",
+    "comparison": "compare",
+    "discs": "prepare_patches",
+    "fisher": "fisher_errors",
+    "grid": "grid_fit",
+    "multipoles": "harmonic_coefficients harmonic_likelihood white_spectrum",
+    "noise": "as_noise",
+    "optimize": "Newton best_fit",
+    "patches": "fit_patches",
+    "posterior": "chi2 hessian",
+    "priors": "Gaussian Uniform",
+    "profile_likelihood": "spectral_likelihood",
+    "pseudo_cl": "band_powers bin_edges masked_spectra",
+    "regions": "apodize clusters latitude_bands superpixels",
+    "results": "FitError FitResult",
+    "sampling": "sample",
+    "separated_maps": "component_maps harmonic_component_maps residual_maps",
+    "template_likelihood": "likelihood",
+    "tensor_ratio": "fit_tensors power_model",
+}
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+__all__ = sorted(_MODULES)
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value = getattr(importlib.import_module(f"fits.{_MODULES[name]}"), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -8,11 +8,12 @@ import pytest
 
 from fits.grid import grid_fit
 from fits.kept import ChainFile
-from fits.optimize import best_fit
+from fits.optimize import Newton, best_fit
 from fits.priors import Gaussian, Uniform, from_unbounded, log_prior, to_unbounded
 from fits.results import FitError, misfit
 from fits.sampling import sample
 from fits.template_likelihood import likelihood
+from fits.writing import with_error
 from jaxsky import Dust, Sky, observe, set_parameters
 from test_likelihood import BANDS, START, fluctuations, problem
 
@@ -246,6 +247,40 @@ def by_each(like, start):
     yield best_fit(like, start, priors=PRIORS, throw=False)
     yield grid_fit(like, start, priors=PRIORS, points=50)
     yield sample(like, start, priors=PRIORS, nsteps=4000, progress=False, throw=False)
+
+
+def test_results_are_printed_written_and_given_to_getdist(like):
+    fit = best_fit(like, START, priors=PRIORS)
+    first, second, last = str(fit).splitlines()
+    value, sigma = fit.best_fit["dust.beta_dust"], fit.sigma["dust.beta_dust"]
+    assert first == f"dust.beta_dust = {with_error(value, sigma)}"
+    assert second.startswith("synchrotron.beta_syn = ")
+    assert last == f"chi2 = {fit.chi2:.1f} for {fit.dof} degrees of freedom"
+    numbers = fit.to_dict()
+    assert numbers["free"] == tuple(sorted(START))
+    assert numbers["sigma"] is fit.sigma
+    assert "details" not in numbers
+    with pytest.raises(ValueError, match="method 'gradient' has no samples"):
+        fit.to_getdist()
+    chain = sample(like, START, priors=PRIORS, nsteps=100, progress=False, throw=False)
+    assert "not converged: 100 steps are" in str(chain)
+    samples = chain.to_getdist("a chain", symbol=lambda name: name[-4:])
+    assert [p.label for p in samples.paramNames.names] == ["dust", "_syn"]
+    used = chain.details["chain"][chain.details["discard"] :: chain.details["thin"]]
+    assert samples.samples.shape == (used.shape[0] * used.shape[1], 2)
+
+
+def test_templates_take_newtons_method_and_the_no_u_turn_sampler(like):
+    default = best_fit(like, START, priors=PRIORS)
+    newton = best_fit(like, priors=PRIORS, solver=Newton())
+    chain = sample(like, priors=PRIORS, sampler="nuts", progress=False)
+    assert chain.converged
+    for name, sigma in default.sigma.items():
+        assert abs(newton.best_fit[name] - default.best_fit[name]) < 1e-6 * sigma
+        assert newton.sigma[name] == pytest.approx(sigma, rel=1e-6)
+        low, high = chain.interval_68[name]
+        assert (low + high) / 2 == pytest.approx(default.best_fit[name], abs=0.15 * sigma)
+        assert chain.sigma[name] == pytest.approx(sigma, rel=0.1)
 
 
 def test_a_chi2_that_is_astronomical_is_no_fit():

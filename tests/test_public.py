@@ -41,6 +41,17 @@ def modules():
                 yield importlib.import_module(found.name)
 
 
+def test_what_users_need_is_in_the_packages_themselves():
+    for package in (jaxsky, fits):
+        submodules = {found.name for found in pkgutil.iter_modules(package.__path__)}
+        for name in package.__all__:
+            assert getattr(package, name).__name__ == name
+            assert name not in submodules
+            assert name in dir(package)
+        with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+            package.nothing  # noqa: B018
+
+
 def public():
     """Functions, constructors and methods without an underscore, by name.
 

@@ -104,10 +104,10 @@ class FitResult(NamedTuple):
             )
             regions = f", median of {known.sum()} regions" if np.ndim(value) else ""
             lines.append(f"{name} = {shown}{regions}")
-        state = "" if self.converged else f"not converged: {self.message}"
-        return "\n".join(
-            [*lines, f"chi2 = {self.chi2:.1f} for {self.dof} degrees of freedom", state]
-        )
+        lines.append(f"chi2 = {self.chi2:.1f} for {self.dof} degrees of freedom")
+        if not self.converged:
+            lines.append(f"not converged: {self.message}")
+        return "\n".join(lines)
 
     def of_row(self, values: Mapping[str, Any], label: str) -> Any:
         """The entry of values by name that a row of the covariance is of."""

@@ -232,7 +232,7 @@ def _parts(mixing, pixels):
 
 
 @jax.custom_jvp
-def chi2(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, ""]:
+def least_chi2(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, ""]:
     """Sum over pixels of r^T W r = d^T W d - (M^T W d)^T (M^T W M)^-1 (M^T W d).
 
     Formed from the residuals, so nothing cancels where signals are far above the noise.
@@ -266,4 +266,4 @@ def _chi2_jvp(primals, tangents):
     return value, jnp.asarray(slope, value.dtype)
 
 
-chi2.defjvp(_chi2_jvp, symbolic_zeros=True)
+least_chi2.defjvp(_chi2_jvp, symbolic_zeros=True)

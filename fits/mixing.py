@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from fits.template_likelihood import Bands
+from fits.template_likelihood import NamedBands
 from jaxsky import Sky, parameter_names, set_parameters
 from jaxsky.bandpass import Samples, average
 from jaxsky.checks import Numeric
@@ -38,7 +38,7 @@ def spectral_names(sky: Sky) -> tuple[str, ...]:
     return tuple(n for n in parameter_names(sky) if n.split(".")[1] not in NOT_SPECTRAL)
 
 
-class SpectralBands(Bands):
+class SpectralBands(NamedBands):
     """Named bands with the parameters that act on their mixing matrix."""
 
     def parameter_names(self) -> tuple[str, ...]:

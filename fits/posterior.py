@@ -126,7 +126,7 @@ def hessian(like: Likelihood, params: Mapping[str, Numeric]) -> Float[np.ndarray
     return _dense("hessian", like, params)
 
 
-def fisher(like: Likelihood, params: Mapping[str, Numeric]) -> Float[np.ndarray, "par par"]:
+def fisher_matrix(like: Likelihood, params: Mapping[str, Numeric]) -> Float[np.ndarray, "par par"]:
     """Fisher matrix of the parameters, amplitudes marginalised at their best values.
 
     sum_p s^T A_i^T [N^-1 - N^-1 A (A^T N^-1 A)^-1 A^T N^-1] A_j s with A_i the derivative of the

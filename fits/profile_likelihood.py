@@ -141,7 +141,7 @@ class SpectralLikelihood(Likelihood):
 
     def total(self, local: Float[Array, "cell free"]) -> Float[Array, ""]:
         """-2 ln L for parameters of each cell."""
-        parts = self._mapped(amplitudes.chi2, self.matrices(local))
+        parts = self._mapped(amplitudes.least_chi2, self.matrices(local))
         return sum((jnp.sum(part) for part in parts), jnp.zeros(()))
 
     def derivatives(self, local: Float[Array, "cell free"]) -> amplitudes.Derivatives:

@@ -39,7 +39,7 @@ from jaxsky.sky import OFFSET, interpolation_nodes, unknown_parameter
 CovarianceOf = Callable[[Float[Array, "band row stokes pix"]], Float[np.ndarray, "row row"]]
 
 
-class Bands(eqx.Module):
+class NamedBands(eqx.Module):
     """Named bands with their instrumental parameters."""
 
     bandpasses: tuple[Bandpass, ...]
@@ -70,7 +70,7 @@ class SkyLikelihood(Likelihood):
     """Base class of those whose amplitudes are the templates'."""
 
     sky: Sky
-    bands: Bands
+    bands: NamedBands
 
     def check(self, params):
         known = (*parameter_names(self.sky), *self.bands.parameter_names())
@@ -234,7 +234,7 @@ def likelihood(
     if not stokes or set(stokes) - set(labels):
         raise ValueError(f"Argument `stokes` must be among {labels!r}, not {stokes!r}.")
     keep = np.array([labels.index(s) for s in stokes])
-    own = Bands(tuple(bands.values()), tuple(bands), labels)
+    own = NamedBands(tuple(bands.values()), tuple(bands), labels)
     params = SkyLikelihood({}, sky, own).check(start)
     offsets = [name for name in params if name.startswith("offset.")]
     for name in offsets:

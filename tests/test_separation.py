@@ -10,7 +10,7 @@ import scipy.optimize
 from fits.grid import grid_fit
 from fits.noise import as_noise
 from fits.optimize import best_fit
-from fits.posterior import chi2, fisher, hessian
+from fits.posterior import chi2, fisher_matrix, hessian
 from fits.priors import Gaussian, Uniform
 from fits.profile_likelihood import spectral_likelihood
 from fits.results import FitError
@@ -148,7 +148,7 @@ def test_value_amplitudes_and_fisher_are_the_dense_ones(kind, stokes, params):
     expected = dense_fisher(data, covariance, params)
     scale = np.sqrt(np.diag(expected))
     scale = np.outer(scale, scale)
-    np.testing.assert_allclose(fisher(like, params) / scale, expected / scale, atol=1e-8)
+    np.testing.assert_allclose(fisher_matrix(like, params) / scale, expected / scale, atol=1e-8)
     maps = component_maps(like, params, data, given)
     found = amplitudes.reshape(NPIX, 3, stokes).transpose(1, 2, 0)
     np.testing.assert_allclose(maps.amplitude, found, rtol=1e-8, atol=1e-8)

@@ -10,7 +10,7 @@ import scipy.stats
 
 from fits.multipoles import harmonic_coefficients, harmonic_likelihood, white_spectrum
 from fits.optimize import best_fit
-from fits.posterior import chi2, fisher, hessian
+from fits.posterior import chi2, fisher_matrix, hessian
 from fits.priors import Gaussian
 from fits.profile_likelihood import spectral_likelihood
 from fits.separated_maps import harmonic_component_maps
@@ -125,7 +125,7 @@ def test_value_amplitudes_and_fisher_are_the_dense_ones(kind, stokes, params, fw
     like = harmonic_likelihood(SKY[stokes], BANDS, alm, given, params, beams=fwhm)
     assert float(total(like, params)) == pytest.approx(value.sum(), rel=1e-8)
     scale = np.sqrt(np.outer(np.diag(information), np.diag(information)))
-    np.testing.assert_allclose(fisher(like, params) / scale, information / scale, atol=1e-8)
+    np.testing.assert_allclose(fisher_matrix(like, params) / scale, information / scale, atol=1e-8)
     maps = harmonic_component_maps(like, params, alm, given, beams=window)
     found = alm_to_healpy(maps.amplitude, LMAX)
     np.testing.assert_allclose(found, amplitudes, atol=1e-8 * np.abs(amplitudes).max())

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.b_modes import PIVOT, BandLaw
+from fits.b_modes import PIVOT
 from fits.mixing import Mixing, SpectralBands
 from jaxsky import Bandpass, Sky, get_parameters, parameter_names, set_parameters
 from jaxsky.bandpass import stack_bands
@@ -146,48 +146,42 @@ def foreground_names(
     )
 
 
+def _correlations(params: Mapping[str, Any], field: str, components: Sequence[str]) -> list[list]:
+    """The matrix of correlation coefficients of components, as rows."""
+    rows: list[list[Any]] = [[1.0] * len(components) for _ in components]
+    for (i, first), (j, second) in itertools.combinations(enumerate(components), 2):
+        rows[i][j] = rows[j][i] = params[f"{field}.{first}.{second}.correlation"]
+    return rows
+
+
 def fiducial(
-    sky: Sky,
-    laws: Mapping[tuple[str, str], BandLaw],
-    correlations: Mapping[tuple[str, str, str], float],
-    r: float,
-    A_lens: float,
+    sky: Sky, foregrounds: Mapping[str, float], r: float, A_lens: float
 ) -> dict[str, float]:
     """All parameters of the covariance by name, with their values.
 
     Parameters
     ----------
     sky : from `unit_sky`
-    laws : of each field and component, amplitude D_l at l = 80 [uK_RJ^2]
-    correlations : of each field and pair of components, in the order of the sky
+    foregrounds : parameters of their spectra of all kinds; see `foreground_names`
     r : tensor-to-scalar ratio
     A_lens : fraction of the lensing BB that is left
     """
-    _check_correlations(list(sky), correlations)
-    names = [name for name in parameter_names(sky) if not name.endswith(".amplitude")]
-    values = {"r": r, "A_lens": A_lens}
-    values |= {name: float(value) for name, value in get_parameters(sky, names).items()}
-    for key, law in laws.items():
-        values |= {".".join((*key, kind)): value for kind, value in law._asdict().items()}
-    return values | {".".join((*key, "correlation")): v for key, v in correlations.items()}
-
-
-def _check_correlations(
-    components: list[str], correlations: Mapping[tuple[str, str, str], float]
-) -> None:
-    for field in {field for field, _, _ in correlations}:
-        matrix, pairs = np.eye(len(components)), []
-        for (of, *pair), value in correlations.items():
-            if of == field:
-                i, j = map(components.index, pair)
-                matrix[i, j] = matrix[j, i] = value
-                pairs.append(f"{pair[0]} x {pair[1]} {value:.3g}")
+    components = list(sky)
+    for field in sorted({name.split(".")[0] for name in foregrounds}):
+        matrix = np.array(_correlations(foregrounds, field, components))
         if (least := np.linalg.eigvalsh(matrix).min()) < -ROUNDING:
+            pairs = [
+                f"{components[i]} x {components[j]} {matrix[i, j]:.3g}"
+                for i, j in itertools.combinations(range(len(components)), 2)
+            ]
             raise ValueError(
                 f"The correlations of {field}, {', '.join(pairs)}, are those of no sky (their "
                 f"matrix has the eigenvalue {least:.2g}); use more of the sky, or a wider range of "
                 "multipoles."
             )
+    names = [name for name in parameter_names(sky) if not name.endswith(".amplitude")]
+    of_sky = {name: float(value) for name, value in get_parameters(sky, names).items()}
+    return {"r": r, "A_lens": A_lens} | of_sky | dict(foregrounds)
 
 
 def _laws(params: Mapping[str, Array], model: ForecastModel) -> Float[Array, "band component"]:
@@ -210,10 +204,7 @@ def _spectra(
             to_C = 2 * jnp.pi / (PIVOT * (PIVOT + 1)) * params[f"{field}.{name}.amplitude"]
             slope = params[f"{field}.{name}.slope"]
             roots.append(jnp.sqrt(to_C) * (model.ell / PIVOT) ** (slope / 2))
-        rho = jnp.eye(len(names))
-        for i, j in itertools.combinations(range(len(names)), 2):
-            value = params[f"{field}.{names[i]}.{names[j]}.correlation"]
-            rho = rho.at[(i, j), (j, i)].set(value)
+        rho = jnp.array(_correlations(params, field, names))
         foregrounds = jnp.einsum("ij,il,jl->lij", rho, jnp.stack(roots), jnp.stack(roots))
         lensing = params["A_lens"] if field == "BB" else 1.0
         cmb = params["r"] * tensors + lensing * scalars

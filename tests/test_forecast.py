@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fits import fisher
-from fits.b_modes import BandLaw, noise_level, noise_weights
+from fits.b_modes import noise_level, noise_weights
 from fits.fisher import (
     ForecastModel,
     covariance_of_bands,
@@ -59,12 +59,12 @@ def model(centers=CENTERS, noise=2.0, fields=("BB",), bodies=1, sky=None) -> For
 
 
 def values(system: ForecastModel, r=0.01, amplitudes=(0.1, 1.0), rho=0.4) -> dict[str, float]:
-    laws, correlations = {}, {}
+    foregrounds = {}
     for field in system.fields:
         for name, amplitude, slope in zip(system.sky, amplitudes, (-2.4, -2.6), strict=True):
-            laws[field, name] = BandLaw(amplitude, slope)
-        correlations[field, "dust", "synchrotron"] = rho
-    return fiducial(system.sky, laws, correlations, r, 0.7)
+            foregrounds |= {f"{field}.{name}.amplitude": amplitude, f"{field}.{name}.slope": slope}
+        foregrounds[f"{field}.dust.synchrotron.correlation"] = rho
+    return fiducial(system.sky, foregrounds, r, 0.7)
 
 
 def modes() -> np.ndarray:
@@ -298,9 +298,12 @@ def test_covariance_is_that_of_maps_in_bands():
     }
     amplitudes = {"ame": 3.0, "dust": 0.2, "synchrotron": 1.5}
     system = model(sky=Sky(components))
-    laws = {("BB", n): BandLaw(80 * 81 / (2 * np.pi) * a**2, -2.0) for n, a in amplitudes.items()}
-    pairs = {("BB", *pair): 1.0 for pair in itertools.combinations(components, 2)}
-    found = covariance_of_bands(fiducial(system.sky, laws, pairs, 0.01, 0.5), system)[0]
+    spectra = {}
+    for name, amplitude in amplitudes.items():
+        spectra[f"BB.{name}.amplitude"] = 80 * 81 / (2 * np.pi) * amplitude**2
+        spectra[f"BB.{name}.slope"] = -2.0
+    spectra |= {f"BB.{a}.{b}.correlation": 1.0 for a, b in itertools.combinations(components, 2)}
+    found = covariance_of_bands(fiducial(system.sky, spectra, 0.01, 0.5), system)[0]
     sky = Sky({n: eqx.tree_at(lambda c: c.amplitude, c, amplitudes[n] * one)
                for n, c in components.items()})  # fmt: skip
     bands = list(bandpasses().values())

@@ -201,16 +201,15 @@ def _model(
     rows = {field: FIELDS.index(field) for field in fields}
     maps = {name: sky[name].amplitude for name in sky}
     auto = {name: band_powers(spectra, values) for name, values in maps.items()}
-    laws: dict[tuple[str, str], BandLaw] = {
-        (field, name): b_modes.fit_law(spectra, D[row], spec.fit, f"{field} of {name!r}")
-        for field, row in rows.items()
-        for name, D in auto.items()
-    }
-    correlations: dict[tuple[str, str, str], float] = {}
+    foregrounds: dict[str, float] = {}
+    for field, row in rows.items():
+        for name, D in auto.items():
+            law = b_modes.fit_law(spectra, D[row], spec.fit, f"{field} of {name!r}")
+            foregrounds |= {f"{field}.{name}.{kind}": v for kind, v in law._asdict().items()}
     for first, second in itertools.combinations(maps, 2):
         cross = band_powers(spectra, maps[first], maps[second])
         for field, row in rows.items():
-            correlations[field, first, second] = b_modes.band_correlation(
+            foregrounds[f"{field}.{first}.{second}.correlation"] = b_modes.band_correlation(
                 spectra, cross[row], auto[first][row], auto[second][row], spec.fit
             )
     ell, lmax = np.arange(spec.lmin, spec.fisher_lmax + 1), spec.fisher_lmax
@@ -226,7 +225,7 @@ def _model(
         jnp.asarray(sky_fraction(inputs.mask)),
         fields,
     )
-    return model, fiducial(model.sky, laws, correlations, settings.cmb.r, settings.cmb.A_lens)
+    return model, fiducial(model.sky, foregrounds, settings.cmb.r, settings.cmb.A_lens)
 
 
 def _errors(

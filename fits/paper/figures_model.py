@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import healpy
 import jax.numpy as jnp
@@ -76,8 +75,7 @@ def figure_templates(sources: Sources, picture: Path) -> Item:
         Q = np.asarray(layer.maps[0])
         rows.append([MapPanel(title, Q, color_limit(Q), UNITS["uK_RJ"])])
     plot_maps(picture, rows)
-    words: dict[str, Any] = {"sky": sources.sky_differs, **beams}
-    return described("Figure 1", picture, **words)
+    return described("Figure 1", picture, beams=beams, sky=sources.sky_differs)
 
 
 def figure_indices(sources: Sources, picture: Path) -> Item:

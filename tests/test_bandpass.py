@@ -89,10 +89,12 @@ def test_shift_and_stretch_move_the_band_and_keep_it_normalised():
 def test_gradients_against_finite_differences(convention):
     weights = jnp.asarray(np.hanning(NU.size) + 0.1)
 
+    @jax.jit
     def seen(delta, factor, w):
         band = Bandpass(jnp.asarray(NU), w, convention)
         return 100 * average(power_law, band.shifted(delta).stretched(factor))
 
+    @jax.jit
     def top_hat(center, width):
         return 100 * average(power_law, Bandpass.top_hat(center, width, convention))
 

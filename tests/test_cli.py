@@ -264,113 +264,24 @@ def test_init_leaves_files_alone(tmp_path, monkeypatch, capsys):
     assert {path.name for path in tmp_path.iterdir()} == {"mine.toml", "experiment.toml"}
 
 
-@pytest.mark.parametrize("command", ["fit", "compare", "separate", "simulate"])
-@pytest.mark.parametrize("seed", [-1, 2**32, 2**53, 1.5, "x"])
-def test_seeds_out_of_bounds(command, seed, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "out"
-    assert jaxsky(monkeypatch, command, "--set", f"seed={seed}", "--out", out) == 2
-    printed = one_sentence(capsys)
-    assert f"{command}.toml: seed: " in printed
-    assert "(given with --set)" in printed
-    assert str(seed) in printed
-    assert not out.exists()
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("nside = 8", "nside = 9", "common.nside: nside must be a power of two, not 9"),
-        ("nside = 8", "nside = 'x'", "common.nside: input should be a valid integer"),
-        ("nside = 8", "nsid = 8", "common.nsid: unknown key"),
         ("nside = 8", "nside = ", "is not valid TOML"),
-        ("nside = 8", "nside = 32", "nside 32 is larger than that of"),
-        ("fwhm = 600.0", "fwhm = 60.0", "finer than that of template 'dust', 120 arcmin"),
-        ("[sky.dust]", "[skies.dust]", "skies: unknown key"),
-        (
-            'law = "dust"',
-            'law = "dst"',
-            "sky.dust.law: there is no law 'dst'; laws are ame, cmb, dust",
-        ),
-        ('"dust.fits"', '"none.fits"', "none.fits"),
-        ('"dust.fits"', '"44.txt"', "44.txt"),
-        ('["Q_STOKES", "U_STOKES"]', '["Q_STOKES", "V_STOKES"]', "V_STOKES"),
-        ('["Q_STOKES", "U_STOKES"]', '["Q_STOKES"]', "bands.44: fields must name Q and U"),
         ('["full"]', '["fool"]', "fit.regions: 'fool' is none of strip, outside, full"),
-        ('["full"]', '["full"]\\nstokes = ["I"]', "fit.stokes.0: input should be 'Q'"),
-        ("start = 1.5", "start = 9.0", "start 9 is not inside the uniform prior"),
+        ('["full"]', '["full"]\nstokes = ["I"]', "fit.stokes.0: input should be 'Q'"),
         ("uniform = [0.5, 2.5]", "uniform = [2.5, 0.5]", "free.dust.beta_dust"),
-        ('"dust.beta_dust" =', '"dust.beta" =', "Unknown parameter 'dust.beta'"),
-        ("[sky.dust]", '[fixed]\\n"dust.T" = 3\\n[sky.dust]', "Unknown parameter 'dust.T'"),
-        (
-            "[sky.dust]",
-            '[fixed]\\n"dust.beta_dust" = 1.5\\n[sky.dust]',
-            "dust.beta_dust cannot be both free and fixed",
-        ),
-        (
-            "[sky.dust]",
-            '[fixed]\\n"ame.m60" = 1.5\\n[sky.dust]',
-            "fixed: there is no component 'ame'",
-        ),
-        ("width = 14.0", "width = 14.0, file = '44.txt'", "either as file or as center and width"),
-        ('"44.txt"', '"nothing.txt"', "nothing.txt"),
-        ('name = "70"', 'name = "44"', "names of the bands must differ"),
-        ("nu_ref = 353.0", "nu_ref = -1.0", "sky.dust.nu_ref: input should be greater than 0"),
+        ("[fit]", '[fixed]\n"dust.beta_dust" = 1.5\n[fit]', "cannot be both free and fixed"),
         ("nsteps = 2200", "nwalkers = 2", "fit.nwalkers"),
+        ("rms = 1e-6", "rms = 0.0", "bands.0.noise: must be greater than 0"),
+        ("1e-6 }", "1e-6, correlated = true }", "correlated goes with estimate_above only"),
     ],
 )
-def test_mistakes_in_settings_are_one_sentence(
-    folder, tmp_path, monkeypatch, capsys, old, new, words
-):
-    new = new.replace("\\n", "\n")
-    text = SETTINGS.format(noise="{ rms = 1e-6 }").replace('44.txt"', '44.txt"')
-    old = old if old in text else old.replace("'", '"')
-    assert old in text
-    path = folder / "mistake.toml"
-    path.write_text(text.replace(old, new, 1))
-    out = tmp_path / "out"
+def test_mistakes_are_one_sentence(folder, tmp_path, monkeypatch, capsys, old, new, words):
+    path, out = write_settings(folder, "wrong", "{ rms = 1e-6 }", **{old: new}), tmp_path / "out"
     assert jaxsky(monkeypatch, "fit", path, "--out", out) == 2
     assert words in one_sentence(capsys)
     assert not list(out.glob("*")) if out.exists() else True
-
-
-@pytest.mark.parametrize(
-    ("noise", "words"),
-    [
-        ("{ }", "noise as exactly one of"),
-        ("{ rms = 1.0, estimate_above = 30 }", "noise as exactly one of"),
-        ("{ rms = -1.0 }", "bands.0.noise.rms: input should be greater than or equal to 0, not -1"),
-        ("{ rms = 0.0 }", "bands.0.noise: must be greater than 0"),
-        ("{ covariance = ['QQ_COV', 'XX', 'UU_COV'] }", "XX"),
-        ("{ covariance = ['QU_COV', 'QQ_COV', 'UU_COV'] }", "are not QQ, QU, UU by their names"),
-        ("{ rms = 1e-6, correlated = true }", "correlated goes with estimate_above only"),
-    ],
-)
-def test_mistakes_in_the_noise_are_one_sentence(
-    folder, tmp_path, monkeypatch, capsys, noise, words
-):
-    path = write_settings(folder, "noise", noise)
-    assert jaxsky(monkeypatch, "fit", path, "--out", tmp_path / "out") == 2
-    assert words in one_sentence(capsys)
-
-
-def test_absent_settings_are_one_sentence(tmp_path, monkeypatch, capsys):
-    assert jaxsky(monkeypatch, "fit", tmp_path / "none.toml", "--out", tmp_path / "out") == 2
-    assert "none.toml: cannot be read (No such file or directory)" in one_sentence(capsys)
-
-
-def test_swapped_columns_are_refused(folder, tmp_path, monkeypatch, capsys):
-    swap = {'["Q_STOKES", "U_STOKES"]': '["U_STOKES", "Q_STOKES"]'}
-    path = write_settings(folder, "swapped", **swap)
-    assert jaxsky(monkeypatch, "fit", path, "--out", tmp_path / "out") == 2
-    assert "are not Q and U by their names" in one_sentence(capsys)
-
-
-def test_a_file_in_place_of_the_folder_is_left_alone(folder, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "out"
-    out.write_text("mine")
-    assert jaxsky(monkeypatch, "fit", write_settings(folder, "file"), "--out", out) == 2
-    assert "is not a folder" in one_sentence(capsys)
-    assert out.read_text() == "mine"
 
 
 def test_a_damaged_chain_is_named_and_kept(folder, tmp_path, monkeypatch, capsys):

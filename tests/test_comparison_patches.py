@@ -101,6 +101,7 @@ def test_picture(found, tmp_path):
     assert (tmp_path / "patches.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_pixels_too_wide_for_the_multipoles(settings, inputs):
     how = settings.compare.model_copy(update={"patches_nside": 32})
     with pytest.raises(

@@ -72,6 +72,7 @@ def test_every_parameter_changes_the_observation(sky):
 def test_gradients_against_finite_differences(sky):
     params = get_parameters(sky, spectral(sky))
 
+    @jax.jit
     def seen(logs):
         # In units of each parameter, so that one step of the differences suits all.
         moved = {n: params[n] * (1 + x) for n, x in logs.items()}
@@ -82,12 +83,11 @@ def test_gradients_against_finite_differences(sky):
 
 
 def test_a_constant_map_of_any_parameter_is_that_number(sky):
-    expected = observe(sky, systems.bands())
+    bands = systems.bands()[:1]
+    expected = observe(sky, bands)
     for name, value in get_parameters(sky, spectral(sky)).items():
         constant = set_parameters(sky, {name: jnp.full(systems.NPIX, value)})
-        np.testing.assert_allclose(
-            observe(constant, systems.bands()), expected, rtol=1e-9, err_msg=name
-        )
+        np.testing.assert_allclose(observe(constant, bands), expected, rtol=1e-9, err_msg=name)
 
 
 @pytest.mark.parametrize("stokes", [2, 3])

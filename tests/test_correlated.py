@@ -46,7 +46,9 @@ def mixed(level, coefficient):
 
 def test_spectra_are_recovered(spectra):
     count = 100
-    fields = jax.vmap(lambda key: gaussian_fields(key, spectra))(jax.random.split(KEY, count))
+    fields = jax.jit(jax.vmap(lambda key: gaussian_fields(key, spectra)))(
+        jax.random.split(KEY, count)
+    )
     assert fields.shape == (count, 4, (LMAX + 1) ** 2)
     ell = np.arange(2, LMAX + 1)
     scores = []
@@ -127,6 +129,7 @@ def test_derivatives(argument):
     # Through multipoles without power, without correlations and with repaired ones.
     at = [jnp.asarray(1.3), jnp.asarray(0.9)]
 
+    @jax.jit
     def fields(value):
         values = [*at[:argument], value, *at[argument + 1 :]]
         return gaussian_fields(KEY, repair(mixed(*values))[0])

@@ -192,10 +192,14 @@ def test_what_cannot_be_written_is_one_sentence(tmp_path):
     assert names(tmp_path) == ["a", "b"]
 
 
-def test_folders_that_cannot_be_made(tmp_path, monkeypatch, capsys):
-    (tmp_path / "file").touch()
-    assert jaxsky(monkeypatch, "forecast", "--out", tmp_path / "file" / "x") == 2
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_file_in_place_of_a_folder_is_left_alone(name, tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").write_text("mine")
+    assert jaxsky(monkeypatch, name, "--out", tmp_path / "file") == 2
+    assert "file: is not a folder" in sentence(capsys)
+    assert jaxsky(monkeypatch, name, "--out", tmp_path / "file" / "x") == 2
     assert "x: cannot be made (Not a directory); choose another --out" in sentence(capsys)
+    assert (tmp_path / "file").read_text() == "mine"
 
 
 # Chains and realisations.

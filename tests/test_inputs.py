@@ -249,6 +249,7 @@ def test_files_that_cannot_be_read_are_named_once(folder):
         ("{ rms = 1.0, covariance = ['a', 'b', 'c'] }", "not rms, covariance."),
         ("{ level = 1.0, rms = 2.0 }", "not level, rms."),
         ("{ white = 1.0 }", "noise.white: unknown key"),
+        ("{ level = 1.0, unit = 'MJy/sr' }", "noise.unit: must be a temperature such as uK_RJ or"),
         ("{ covariance = ['a', 'b', 'c', 'd'] }", "noise.covariance.fields: name the columns QQ, "),
         ("{ covariance = [] }", "not none."),
         ("{ covariance = 'QQ' }", "noise.covariance: input should be a valid table"),

@@ -39,6 +39,11 @@ BANDS = [
 ]
 
 
+def one_and(first, *others):
+    """A value for each run of the tests, and more of them for the slow ones."""
+    return [first, *(pytest.param(value, marks=pytest.mark.slow) for value in others)]
+
+
 def error(sky, **options):
     direct = observe(sky, BANDS, tolerance=0)
     return float(jnp.abs(observe(sky, BANDS, **options) / direct - 1).max())
@@ -51,7 +56,7 @@ def test_chebyshev_series_reproduce_polynomials_in_two_variables():
     np.testing.assert_allclose(_evaluate(coefs, a, b), a**3 * (1 + b**2), atol=1e-14)
 
 
-@pytest.mark.parametrize("tolerance", [1e-4, 1e-7, 1e-10, 1e-12])
+@pytest.mark.parametrize("tolerance", one_and(1e-10, 1e-4, 1e-7, 1e-12))
 @pytest.mark.parametrize("case", SKIES)
 def test_error_is_within_the_tolerance(case, tolerance):
     assert error(Sky({"c": SKIES[case]}), tolerance=tolerance) <= tolerance
@@ -100,14 +105,7 @@ def test_the_tolerance_holds_under_jit_where_the_fixed_count_does_not_do():
             np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-8 * float(jnp.abs(b).max()))
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        "beta_dust",
-        pytest.param("beta_dust and T_dust", marks=pytest.mark.slow),
-        pytest.param("beta_syn", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize("case", one_and("beta_dust", "beta_dust and T_dust", "beta_syn"))
 def test_gradients_through_maps_are_those_of_the_direct_sum(case):
     sky = Sky({"c": SKIES[case]})
 
@@ -143,7 +141,7 @@ def law(component, bands):
     return jnp.stack([band_sed(component, band, None) for band in bands])
 
 
-@pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9])
+@pytest.mark.parametrize("tolerance", one_and(1e-6, 1e-3, 1e-9))
 @pytest.mark.parametrize("case", ["beta_dust", "beta_dust and T_dust", "beta_syn"])
 def test_terms_add_up_to_the_law(case, tolerance):
     component = SKIES[case]
@@ -218,13 +216,7 @@ def test_derivatives_of_weights_are_those_of_the_law():
 
 
 @pytest.mark.parametrize(
-    "case",
-    [
-        "beta_syn",
-        "wide",
-        pytest.param("beta_dust and T_dust", marks=pytest.mark.slow),
-        pytest.param("both of two bodies", marks=pytest.mark.slow),
-    ],
+    "case", one_and("wide", "beta_syn", "beta_dust and T_dust", "both of two bodies")
 )
 def test_all_bands_at_once_are_each_alone(case):
     """Outside of jit, and inside, where a range that is too wide is summed directly."""

@@ -20,7 +20,7 @@ from test_likelihood import BANDS, START, fluctuations, problem
 PRIORS = {"dust.beta_dust": Uniform(0.5, 2.5), "synchrotron.beta_syn": Uniform(2.0, 4.5)}
 
 
-@pytest.fixture(scope="module", params=["diagonal", "exact"])
+@pytest.fixture(scope="module", params=[pytest.param("diagonal", marks=pytest.mark.slow), "exact"])
 def like(request):
     sky, data, sigma = problem()
     if request.param == "diagonal":

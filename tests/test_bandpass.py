@@ -123,14 +123,10 @@ def test_construction_inside_jit():
         ([30.0, np.nan], [1.0, 1.0], "RJ", "`nu` has 1 of 2 values that are not finite"),
         ([30.0, 31.0], [1.0, np.inf], "RJ", "`weights` has 1 of 2 values that are not finite"),
         ([-1.0, 31.0], [1.0, 1.0], "RJ", "`nu` must be positive, but its smallest value is -1"),
-        (
-            [30.0, 31.0],
-            [1.0, 1.0],
-            "flux",
-            "`convention` must be one of RJ, power, CMB, not 'flux'",
-        ),
+        ([30.0, 31.0], [1.0, 1.0], "flux",
+         "`convention` must be one of RJ, power, CMB, not 'flux'"),
     ],
-)
+)  # fmt: skip
 def test_bad_tables_are_refused(nu, weights, convention, words):
     with pytest.raises(ValueError, match=words):
         Bandpass(nu, weights, convention)

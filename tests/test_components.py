@@ -139,28 +139,19 @@ MAPS = np.ones((2, 12))
 @pytest.mark.parametrize(
     ("make", "error", "words"),
     [
-        (
-            lambda: Dust(np.ones(12)),
-            ValueError,
-            r"`amplitude` must have shape \(stokes, pix\).*\(12,\)",
-        ),
+        (lambda: Dust(np.ones(12)), ValueError,
+         r"`amplitude` must have shape \(stokes, pix\).*\(12,\)"),
         (lambda: Dust(np.ones((4, 12))), ValueError, r"`amplitude` .* has shape \(4, 12\)"),
         (lambda: Dust(MAPS, np.ones(11)), ValueError, r"`beta_dust` .* shape \(12,\), .* \(11,\)"),
         (lambda: Dust(MAPS, T_dust=0.0), ValueError, "`T_dust` must be positive.* is 0"),
         (lambda: Dust(MAPS, T_dust=-np.ones(12)), ValueError, "`T_dust` must be positive.* is -1"),
         (lambda: Dust(MAPS * np.nan), ValueError, "`amplitude` has 24 of 24 values that are not"),
         (lambda: Dust(MAPS, nu_ref=0.0), ValueError, "`nu_ref` must be positive"),
-        (
-            lambda: Dust(MAPS, E_dust=(1.0,)),
-            ValueError,
-            "`E_dust` has no effect with a single body",
-        ),
+        (lambda: Dust(MAPS, E_dust=(1.0,)), ValueError,
+         "`E_dust` has no effect with a single body"),
         (lambda: Dust(MAPS, nu_pivot=1.0), ValueError, "`nu_pivot` has no effect"),
-        (
-            lambda: Dust(MAPS, (1.6, 2.7), (9.4,), (1.0, 1.0)),
-            ValueError,
-            r"tuples with one entry a body, but have lengths \[2, 1, 2\]",
-        ),
+        (lambda: Dust(MAPS, (1.6, 2.7), (9.4,), (1.0, 1.0)), ValueError,
+         r"tuples with one entry a body, but have lengths \[2, 1, 2\]"),
         (lambda: Dust(MAPS, (1.6, 2.7)), ValueError, "must be tuples with one entry a body"),
         (lambda: Dust(MAPS * u.K), TypeError, "`amplitude` carries the unit K"),
         (lambda: Dust(MAPS, T_dust=21 * u.K), TypeError, "`T_dust` carries the unit K"),
@@ -168,13 +159,10 @@ MAPS = np.ones((2, 12))
         (lambda: Synchrotron(MAPS, 3j), TypeError, "`beta_syn` must be real"),
         (lambda: Synchrotron(MAPS, np.inf), ValueError, "`beta_syn` has 1 of 1 values"),
         (lambda: CMB(MAPS, T_cmb=-1.0), ValueError, "`T_cmb` must be positive"),
-        (
-            lambda: AME.from_dust_angles(np.ones(3), MAPS),
-            ValueError,
-            r"`intensity` must have shape",
-        ),
+        (lambda: AME.from_dust_angles(np.ones(3), MAPS), ValueError,
+         r"`intensity` must have shape"),
     ],
-)
+)  # fmt: skip
 def test_bad_arguments_are_refused(make, error, words):
     with pytest.raises(error, match=words):
         make()

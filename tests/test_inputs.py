@@ -180,53 +180,25 @@ def test_hits_in_another_file_with_a_unit_of_sigma0(folder):
 @pytest.mark.parametrize(
     ("spec", "stokes", "own", "words"),
     [
-        (
-            {"map": {"file": "wide.fits"}},
-            "QU",
-            None,
-            r"noise.map: nside is 2, but that of the map is 4\.",
-        ),
-        (
-            {"map": {"file": "rms.fits", "fields": ["Q_RMS", "U_RMS"]}},
-            "IQU",
-            None,
-            r"noise.map.fields: one or 3 are needed, not 2\.",
-        ),
-        (
-            {"map": {"file": "rms.fits", "fields": ["MINUS"]}},
-            "QU",
-            None,
-            r"noise: Argument `rms` has 384 of 384 values that are negative",
-        ),
-        (
-            {"map": {"file": "planck.fits", "fields": ["QQ_COV"]}},
-            "QU",
-            None,
-            r"noise: Unit 'K_CMB\^2' does not convert to 'uK_RJ'",
-        ),
+        ({"map": {"file": "wide.fits"}}, "QU", None,
+         r"noise.map: nside is 2, but that of the map is 4\."),
+        ({"map": {"file": "rms.fits", "fields": ["Q_RMS", "U_RMS"]}}, "IQU", None,
+         r"noise.map.fields: one or 3 are needed, not 2\."),
+        ({"map": {"file": "rms.fits", "fields": ["MINUS"]}}, "QU", None,
+         r"noise: Argument `rms` has 384 of 384 values that are negative"),
+        ({"map": {"file": "planck.fits", "fields": ["QQ_COV"]}}, "QU", None,
+         r"noise: Unit 'K_CMB\^2' does not convert to 'uK_RJ'"),
         ({"covariance": SIX[3:]}, "IQU", PLANCK, r"noise.covariance: I, Q and U need six columns"),
         ({"covariance": SIX[3:]}, "QU", None, r"noise.covariance: file is missing\."),
-        (
-            {"covariance": [*SIX[:3], "QU_COV", "QQ_COV", "UU_COV"]},
-            "QU",
-            PLANCK,
-            r"noise.covariance.fields: .*QU_COV, QQ_COV.* are not II, IQ, IU, QQ, QU, UU by their",
-        ),
+        ({"covariance": [*SIX[:3], "QU_COV", "QQ_COV", "UU_COV"]}, "QU", PLANCK,
+         r"noise.covariance.fields: .*QU_COV, QQ_COV.* are not II, IQ, IU, QQ, QU, UU by their"),
         ({"hits": {"fields": ["N_OBS"], "sigma0": 1.0}}, "QU", None, "hits: file is missing"),
-        (
-            {"hits": {"fields": ["N_OBS"], "sigma0": [1.0, 2.0]}},
-            "IQU",
-            WMAP,
-            r"noise.hits.sigma0: one or 3 are needed, not 2\.",
-        ),
-        (
-            {"hits": {"fields": ["MINUS"], "sigma0": 1.0}},
-            "QU",
-            WMAP,
-            r"noise: Argument `hits` is not positive in 191 of 192 pixels",
-        ),
+        ({"hits": {"fields": ["N_OBS"], "sigma0": [1.0, 2.0]}}, "IQU", WMAP,
+         r"noise.hits.sigma0: one or 3 are needed, not 2\."),
+        ({"hits": {"fields": ["MINUS"], "sigma0": 1.0}}, "QU", WMAP,
+         r"noise: Argument `hits` is not positive in 191 of 192 pixels"),
     ],
-)
+)  # fmt: skip
 def test_mistakes_in_noise_are_one_sentence(folder, spec, stokes, own, words):
     with pytest.raises(SettingsError, match=words):
         noise_of(folder, spec, stokes, own=own)
@@ -242,10 +214,7 @@ def test_files_that_cannot_be_read_are_named_once(folder):
 @pytest.mark.parametrize(
     ("noise", "words"),
     [
-        (
-            "{ }",
-            "one of level, rms, map, covariance, hits, weights, estimate_above, not none.",
-        ),
+        ("{ }", "one of level, rms, map, covariance, hits, weights, estimate_above, not none."),
         ("{ rms = 1.0, covariance = ['a', 'b', 'c'] }", "not rms, covariance."),
         ("{ level = 1.0, rms = 2.0 }", "not level, rms."),
         ("{ white = 1.0 }", "noise.white: unknown key"),
@@ -256,18 +225,14 @@ def test_files_that_cannot_be_read_are_named_once(folder):
         ("{ hits = { fields = ['N_OBS'] } }", "noise.hits.sigma0: is missing."),
         ("{ level = 1.0, unit = 'mk' }", "noise.unit: must be a temperature such as uK_RJ or"),
         ("{ hits = { sigma0 = 1.0 } }", "noise.hits.fields: name the columns N_OBS, not none."),
-        (
-            "{ hits = { fields = ['a', 'b'], sigma0 = 1 } }",
-            "noise.hits.fields: name the columns N_OBS",
-        ),
+        ("{ hits = { fields = ['a', 'b'], sigma0 = 1 } }",
+         "noise.hits.fields: name the columns N_OBS"),
         ("{ hits = { sigma0 = -1.0 } }", "noise.hits.sigma0: input should be greater than 0"),
         ("{ hits = { sigma0 = [1, 2, 3, 4] } }", "noise.hits.sigma0: list should have at most 3"),
-        (
-            "{ hits = { sigma0 = 1.0, hdu = 0 } }",
-            "noise.hits.hdu: input should be greater than or equal to 1, not 0",
-        ),
+        ("{ hits = { sigma0 = 1.0, hdu = 0 } }",
+         "noise.hits.hdu: input should be greater than or equal to 1, not 0"),
     ],
-)
+)  # fmt: skip
 def test_mistakes_in_the_table_of_noise_are_one_sentence(tmp_path, noise, words):
     path = tmp_path / "settings.toml"
     path.write_text(f"[[bands]]\nname = 'a'\nfile = 'a.fits'\nnoise = {noise}")

@@ -112,32 +112,20 @@ def test_low_multipoles_alone(tmp_path):
 def test_text_that_leaves_something_open(tmp_path):
     scalar = "L TT EE TE PP TP"
     for path, arguments, words in [
-        (
-            text(tmp_path / "a.txt", "L TT EE BB TE"),
-            {},
-            "a.txt: no header names the columns; give `format`, 'planck' for L TT TE EE BB or",
-        ),
+        (text(tmp_path / "a.txt", "L TT EE BB TE"), {},
+         "a.txt: no header names the columns; give `format`, 'planck' for L TT TE EE BB or"),
         (text(tmp_path / "s_scalCls.dat", scalar), {}, "no BB; read the lensed or total ones"),
-        (
-            text(tmp_path / "t_scalCls.dat", scalar, scalar),
-            {},
-            "no column BB; it has L, TT, EE, TE, PP, TP; CAMB writes it with lensed and total",
-        ),
+        (text(tmp_path / "t_scalCls.dat", scalar, scalar), {},
+         "no column BB; it has L, TT, EE, TE, PP, TP; CAMB writes it with lensed and total"),
         (text(tmp_path / "u.txt", "L TT EE", "L TT EE"), {}, "no column BB, TE; it has L, TT, EE"),
         (text(tmp_path / "v.txt", "L TT EE BB TE", "x TT EE BB TE"), {}, "no column L; it has X"),
         (text(tmp_path / "w_totCls.dat", "L TT EE TE"), {}, "4 columns, but format 'camb' has L"),
-        (
-            text(tmp_path / "p.txt", "L TT TE EE BB", "L TT TE EE BB"),
-            {"format": "camb"},
-            "`format` is 'camb', but the columns are L TT TE EE BB",
-        ),
-        (
-            text(tmp_path / "q.txt", "L TT EE BB TE", "L TT EE BB"),
-            {},
-            r"the header names 4 columns \(L TT EE BB\), but there are 5",
-        ),
+        (text(tmp_path / "p.txt", "L TT TE EE BB", "L TT TE EE BB"), {"format": "camb"},
+         "`format` is 'camb', but the columns are L TT TE EE BB"),
+        (text(tmp_path / "q.txt", "L TT EE BB TE", "L TT EE BB"), {},
+         r"the header names 4 columns \(L TT EE BB\), but there are 5"),
         (tmp_path / "p.txt", {"unit": "K^2"}, "`unit` is for FITS files, text is in uK"),
-    ]:
+    ]:  # fmt: skip
         with refused(words):
             read_spectra(path, LMAX, **arguments)
     with pytest.raises(ValueError, match="`format` must be one of planck, camb, not 'class'"):
@@ -205,33 +193,21 @@ def test_fits_that_leave_something_open(tmp_path):
         (fits(tmp_path / "a.fits"), {}, "column TEMPERATURE has no unit; give `unit`, such as"),
         (fits(tmp_path / "b.fits", **unit), {"unit": "K^2"}, "`unit` is K.2, but .* is in uK"),
         (tmp_path / "b.fits", {"format": "camb"}, "`format` is for text files, this is FITS"),
-        (
-            fits(tmp_path / "c.fits", column_units="uK"),
-            {},
-            "unit 'uK', which is no square of K_CMB",
-        ),
+        (fits(tmp_path / "c.fits", column_units="uK"), {},
+         "unit 'uK', which is no square of K_CMB"),
         (fits(tmp_path / "d.fits", column_units="K_RJ^2"), {}, "'K_RJ.2', which is no square"),
         (tmp_path / "a.fits", {"unit": "sheep"}, "'sheep', which is no square"),
         (fits(tmp_path / "e.fits", CL[0], **unit), {}, "no column EE, BB, TE; it has TEMPERATURE"),
         (fits(tmp_path / "f.fits", CL[:, :-1], **unit), {}, "ends at l = 29, but lmax is 30"),
-        (
-            fits(tmp_path / "g.fits", gap, column_names=names, **unit),
-            {},
-            "l = 9 is followed by l = 11",
-        ),
-        (
-            fits(tmp_path / "h.fits", extra_header=[("SPECTRUM", "D_ell")], **unit),
-            {},
-            "the header says 'D_ell'; spectra in FITS files must be C_l",
-        ),
-        (
-            fits(tmp_path / "i.fits", extra_header=[("COMMENT", "times l(l+1)/2pi")], **unit),
-            {},
-            r"the header says 'l\(l\+1\)'",
-        ),
+        (fits(tmp_path / "g.fits", gap, column_names=names, **unit), {},
+         "l = 9 is followed by l = 11"),
+        (fits(tmp_path / "h.fits", extra_header=[("SPECTRUM", "D_ell")], **unit), {},
+         "the header says 'D_ell'; spectra in FITS files must be C_l"),
+        (fits(tmp_path / "i.fits", extra_header=[("COMMENT", "times l(l+1)/2pi")], **unit), {},
+         r"the header says 'l\(l\+1\)'"),
         (tmp_path / "image.fits", {}, "image.fits: HDU 1 holds no table"),
         (tmp_path / "empty.fits", {}, r"empty.fits: no HDU 1; it has 0 \(PRIMARY\)"),
-    ]:
+    ]:  # fmt: skip
         with refused(words):
             read_spectra(path, LMAX, **arguments)
     whole = (tmp_path / "b.fits").read_bytes()
@@ -243,19 +219,15 @@ def test_fits_that_leave_something_open(tmp_path):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (
-            "L TT TE EE BB\n2 1,5 0 1 1\n",
-            "line 2: '1,5' is two numbers or one with a decimal comma",
-        ),
-        (
-            "L TT TE EE BB\n2 1O.5 0 1 1\n3 1 0 1 1\n",
-            "line 2: not a row of numbers: '2 1O.5 0 1 1'",
-        ),
+        ("L TT TE EE BB\n2 1,5 0 1 1\n",
+         "line 2: '1,5' is two numbers or one with a decimal comma"),
+        ("L TT TE EE BB\n2 1O.5 0 1 1\n3 1 0 1 1\n",
+         "line 2: not a row of numbers: '2 1O.5 0 1 1'"),
         ("L TT TE EE BB\n2 1 0 1 1\nx y z u v\n", "line 3: not a row of numbers: 'x y z u v'"),
         ("L TT TE EE BB\n2 1 0 1 1\x00\n", "for it has NUL bytes"),
         ("", "no line has numbers"),
     ],
-)
+)  # fmt: skip
 def test_damaged_rows_are_not_skipped(tmp_path, content, words):
     path = tmp_path / "b.txt"
     path.write_text(content)

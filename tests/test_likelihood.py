@@ -342,58 +342,31 @@ def same_templates():
     ("changes", "error", "words"),
     [
         ({"start": {}}, ValueError, "`start` must name at least one free parameter"),
-        (
-            {"start": {"dust.beta": 1.5}},
-            KeyError,
-            "Unknown parameter 'dust.beta'; .*calibration.44",
-        ),
+        ({"start": {"dust.beta": 1.5}}, KeyError,
+         "Unknown parameter 'dust.beta'; .*calibration.44"),
         ({"start": {"dust.amplitude": 1.5}}, KeyError, "Unknown parameter 'dust.amplitude'"),
         ({"start": {"calibration.45": 1.0}}, KeyError, "Unknown parameter 'calibration.45'"),
         ({"start": {"dust.beta_dust": np.ones(NPIX)}}, ValueError, "must be a number, not a map"),
-        (
-            {"data": np.ones((2, 2, 12))},
-            ValueError,
-            r"`data` must have .*\(2, 2, 192\), but",
-        ),
+        ({"data": np.ones((2, 2, 12))}, ValueError, r"`data` must have .*\(2, 2, 192\), but"),
         ({"sigma": np.ones(7)}, ValueError, r"`sigma` must broadcast to .*\(2, 2, 192\)"),
         ({"sigma": 0.0}, ValueError, "`sigma` has 1 of 1 values that are not > 0"),
         ({"sigma": -np.ones((2, 1, 1))}, ValueError, "`sigma` has 2 of 2 values that are not > 0"),
         ({"sigma": np.nan}, ValueError, "`sigma` has 1 of 1 values"),
         ({"sigma": np.inf}, ValueError, "No pixel is left"),
-        (
-            {"data": np.full((2, 2, NPIX), np.nan)},
-            ValueError,
-            "`data` has 768 values that are not",
-        ),
-        (
-            {"data": np.where(np.arange(NPIX) == 3, -1.6375e30, np.ones((2, 2, NPIX)))},
-            ValueError,
-            r"`data` has 4 values that are not finite \(or UNSEEN\) in pixels that are used",
-        ),
-        (
-            {"start": {"synchrotron.beta_syn": -3.1}},
-            ValueError,
-            "`synchrotron.beta_syn` must be from 0 to 10, but is -3.1; T ~ nu",
-        ),
+        ({"data": np.full((2, 2, NPIX), np.nan)}, ValueError, "`data` has 768 values that are not"),
+        ({"data": np.where(np.arange(NPIX) == 3, -1.6375e30, np.ones((2, 2, NPIX)))}, ValueError,
+         r"`data` has 4 values that are not finite \(or UNSEEN\) in pixels that are used"),
+        ({"start": {"synchrotron.beta_syn": -3.1}}, ValueError,
+         "`synchrotron.beta_syn` must be from 0 to 10, but is -3.1; T ~ nu"),
         ({"stokes": "V"}, ValueError, "`stokes` must be among 'QU', not 'V'"),
-        (
-            {"stokes": "Q", "start": {"offset.44.U": 0.0}},
-            ValueError,
-            "'offset.44.U' has no effect on Stokes Q",
-        ),
-        (
-            {"start": {"calibration.44.offset": 0.0}},
-            KeyError,
-            "parameter 'calibration.44.off",
-        ),
+        ({"stokes": "Q", "start": {"offset.44.U": 0.0}}, ValueError,
+         "'offset.44.U' has no effect on Stokes Q"),
+        ({"start": {"calibration.44.offset": 0.0}}, KeyError, "parameter 'calibration.44.off"),
         ({"stokes": ""}, ValueError, "`stokes` must be among 'QU', not ''"),
-        (
-            {"sky": same_templates(), "covariance_of": fluctuations().covariance},
-            ValueError,
-            "templates cannot be told apart",
-        ),
+        ({"sky": same_templates(), "covariance_of": fluctuations().covariance}, ValueError,
+         "templates cannot be told apart"),
     ],
-)
+)  # fmt: skip
 def test_bad_input_is_refused(changes, error, words):
     with pytest.raises(error, match=words):
         call(**changes)

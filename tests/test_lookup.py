@@ -278,11 +278,8 @@ def paper(settings):
         (build_separation, SEPARATION, {"common": f"mask = {{ {NONE} }}"}),
         (build_separation, SEPARATION, {"component": f"parameters = {{ T_dust = {{ {NONE} }} }}"}),
         (build_separation, SEPARATION, {"free": f", regions = {{ file = {{ {NONE} }} }}"}),
-        (
-            build_separation,
-            SEPARATION,
-            {"free": f", regions = {{ clusters = 2, of = [{{ {NONE} }}] }}"},
-        ),
+        (build_separation, SEPARATION,
+         {"free": f", regions = {{ clusters = 2, of = [{{ {NONE} }}] }}"}),
         (forecast_inputs, FORECAST.replace('"dust.fits"', '"none.fits"'), {}),
         (forecast_inputs, FORECAST, {"forecast": f"region = 'a'\n{REGION}"}),
         (build_experiment, EXPERIMENT, {"beam": 'beam = "none.fits"'}),
@@ -292,13 +289,10 @@ def paper(settings):
         (paper, PAPER.replace('"dust.fits"', '"none.fits"', 1), {}),
         (paper, PAPER, {"common": f"[paper.ame]\nnu_ref = 23.0\n{NONE}"}),
         (paper, PAPER, {"common": f"[paper.beta_syn]\n{NONE}"}),
-        (
-            paper,
-            PAPER,
-            {"common": "[paper.beta_syn]\nfile = 'beta.fits'\nsteepening = 'none.fits'"},
-        ),
+        (paper, PAPER,
+         {"common": "[paper.beta_syn]\nfile = 'beta.fits'\nsteepening = 'none.fits'"}),
     ],
-)
+)  # fmt: skip
 def test_all_settings_find_files_in_the_same_places(places, command, text, changes):
     data, cache, _ = places
     maps = 1 + np.arange(2 * 12 * 4**2).reshape(2, -1)

@@ -332,24 +332,16 @@ def parameter(folder, spec, name, entry):
 @pytest.mark.parametrize(
     ("spec", "name", "entry", "words"),
     [
-        (
-            DUST,
-            "beta_dust",
-            {"fields": ["K"], "unit": "K"},
-            "beta_dust is a pure number, but column K is in K",
-        ),
+        (DUST, "beta_dust", {"fields": ["K"], "unit": "K"},
+         "beta_dust is a pure number, but column K is in K"),
         (DUST, "beta_dust", {"fields": ["BETA", "ZEROS"]}, "must name one column, not BETA, ZEROS"),
         (DUST, "beta_dust", {"file": "coarse.fits"}, "nside is 2, but that of the template is 8"),
         (DUST, "beta_dust", {"fields": ["ZEROS"]}, "ZEROS is 0 in 40 pixels.*give `missing`"),
         (DUST, "T_dust", {"fields": ["BETA"]}, "T_dust is in K, but column BETA is in no unit"),
-        (
-            SYNCHROTRON,
-            "beta_syn",
-            {"fields": ["NEGATIVE"]},
-            "beta_syn is the index in T ~ nu.-beta_syn",
-        ),
+        (SYNCHROTRON, "beta_syn", {"fields": ["NEGATIVE"]},
+         "beta_syn is the index in T ~ nu.-beta_syn"),
     ],
-)
+)  # fmt: skip
 def test_maps_of_parameters_are_checked(folder, spec, name, entry, words):
     with pytest.raises(SettingsError, match=rf"sky.t.parameters.{name}: .*{words}"):
         parameter(folder, spec, name, entry)

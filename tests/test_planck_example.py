@@ -55,29 +55,21 @@ def test_no_example_has_noise_in_a_unit_of_its_own_or_leakage(path):
 @pytest.mark.parametrize(
     ("name", "corrected", "correction"),
     [
-        (
-            "LFI_SkyMap_044_1024_R3.00_full.fits",
-            "LFI_SkyMap_044-BPassCorrected_1024_R3.00_full.fits",
-            "LFI_CorrMap_044-BPassCorr_1024_R3.00_full.fits",
-        ),
-        (
-            "maps/LFI_SkyMap_070_1024_R3.00_full-ringhalf-1.fits.gz",
-            "LFI_SkyMap_070-BPassCorrected_1024_R3.00_full-ringhalf-1.fits.gz",
-            "LFI_CorrMap_070-BPassCorr_1024_R3.00_full-ringhalf-1.fits.gz",
-        ),
-        (
-            "LFI_SkyMap_030-field-IQU_1024_R3.00_full.fits",
-            "LFI_SkyMap_030-BPassCorrected-field-IQU_1024_R3.00_full.fits",
-            "LFI_CorrMap_030-BPassCorr_1024_R3.00_full.fits",
-        ),
-        (
-            "LFI_SkyMap_044_1024_R2.01_full.fits",
-            "LFI_SkyMap_044-BPassCorrected_1024_R3.00_full.fits",
-            'leakage = { file = "LFI_CorrMap_044-BPassCorr_0256_R2.01_full.fits", fwhm = 60.0 }',
-        ),
+        ("LFI_SkyMap_044_1024_R3.00_full.fits",
+         "LFI_SkyMap_044-BPassCorrected_1024_R3.00_full.fits",
+         "LFI_CorrMap_044-BPassCorr_1024_R3.00_full.fits"),
+        ("maps/LFI_SkyMap_070_1024_R3.00_full-ringhalf-1.fits.gz",
+         "LFI_SkyMap_070-BPassCorrected_1024_R3.00_full-ringhalf-1.fits.gz",
+         "LFI_CorrMap_070-BPassCorr_1024_R3.00_full-ringhalf-1.fits.gz"),
+        ("LFI_SkyMap_030-field-IQU_1024_R3.00_full.fits",
+         "LFI_SkyMap_030-BPassCorrected-field-IQU_1024_R3.00_full.fits",
+         "LFI_CorrMap_030-BPassCorr_1024_R3.00_full.fits"),
+        ("LFI_SkyMap_044_1024_R2.01_full.fits",
+         "LFI_SkyMap_044-BPassCorrected_1024_R3.00_full.fits",
+         'leakage = { file = "LFI_CorrMap_044-BPassCorr_0256_R2.01_full.fits", fwhm = 60.0 }'),
         ("HFI_SkyMap_353_2048_R2.02_full.fits", "HFI_SkyMap_353_2048_R3.01_full.fits", "Take"),
     ],
-)
+)  # fmt: skip
 def test_maps_that_hold_leakage_are_known_by_name(name, corrected, correction):
     (warning,) = leaks(Experiment(bands=[band_of(name)]))
     for word in ("bands.x", Path(name).name, corrected, correction):
@@ -144,28 +136,18 @@ def folder(tmp_path_factory):
         ({"rms": 5e-5}, {"rms": 160.0}),
         ({"rms": 9e-4}, {"rms": 1.2e-3}),
         ({"rms": 2e-10}, {"rms": 5e-11}),
-        (
-            {"map": {"file": "map.fits", "fields": ["RMS"]}},
-            {"map": {"file": "map.fits", "fields": ["RMS_BIG"]}},
-        ),
-        (
-            {"covariance": ["QQ_COV", "QU_COV", "UU_COV"]},
-            {"covariance": ["QQ_COV", "QU_COV", "UU_BIG"]},
-        ),
-        (
-            {"hits": {"fields": ["HITS"], "sigma0": 1e-4}},
-            {"hits": {"fields": ["HITS"], "sigma0": 100.0}},
-        ),
-        (
-            {"hits": {"fields": ["HITS"], "sigma0": 0.1}, "unit": "mK_CMB"},
-            {"hits": {"fields": ["HITS"], "sigma0": 0.1}},
-        ),
-        (
-            {"weights": {"fields": ["QQ", "QU", "UU"], "sigma0": [1e-4]}},
-            {"weights": {"fields": ["QQ", "QU", "UU"], "sigma0": [1e-4, 1e-12]}},
-        ),
+        ({"map": {"file": "map.fits", "fields": ["RMS"]}},
+         {"map": {"file": "map.fits", "fields": ["RMS_BIG"]}}),
+        ({"covariance": ["QQ_COV", "QU_COV", "UU_COV"]},
+         {"covariance": ["QQ_COV", "QU_COV", "UU_BIG"]}),
+        ({"hits": {"fields": ["HITS"], "sigma0": 1e-4}},
+         {"hits": {"fields": ["HITS"], "sigma0": 100.0}}),
+        ({"hits": {"fields": ["HITS"], "sigma0": 0.1}, "unit": "mK_CMB"},
+         {"hits": {"fields": ["HITS"], "sigma0": 0.1}}),
+        ({"weights": {"fields": ["QQ", "QU", "UU"], "sigma0": [1e-4]}},
+         {"weights": {"fields": ["QQ", "QU", "UU"], "sigma0": [1e-4, 1e-12]}}),
     ],
-)
+)  # fmt: skip
 def test_noise_far_from_the_rms_of_its_map_is_refused(folder, noise, wrong):
     fields = ["Q_STOKES", "U_STOKES"]
     assert read_band(folder, band_of("map.fits", fields=fields, noise=noise)).used.all()

@@ -223,11 +223,8 @@ def labelled(value, **changes):
         ({"start": {"dust.nu_ref": 353.0}}, KeyError, "Unknown parameter 'dust.nu_ref'"),
         ({"start": {"gain.24": 1.0}}, KeyError, "Unknown parameter 'gain.24'"),
         ({"start": {"dust.beta_dust": np.nan}}, ValueError, "`dust.beta_dust` has 1 of 1 values"),
-        (
-            {"start": {"dust.beta_dust": np.ones(3)}},
-            ValueError,
-            "'dust.beta_dust' must be a number",
-        ),
+        ({"start": {"dust.beta_dust": np.ones(3)}}, ValueError,
+         "'dust.beta_dust' must be a number"),
         ({"data": np.ones((8, 4, 48))}, ValueError, r"`data` must have .*\(8, 4, 48\)"),
         ({"data": np.ones((3, 2, 48))}, ValueError, "`data` must have .* with 8 bands"),
         ({"data": np.full((8, 2, 48), np.nan)}, ValueError, "`data` has 768 values that are not"),
@@ -239,27 +236,18 @@ def labelled(value, **changes):
         ({"noise": np.full(8, np.inf)}, ValueError, "must be finite for a whole band"),
         ({"noise": np.ones((8, 2, 2, 48))}, ValueError, "not positive definite in 384 of 384"),
         ({"unit": "MJy/sr"}, ValueError, "`unit` must be one of K_RJ or K_CMB, not 'MJy/sr'"),
-        (
-            {"sky": same_laws(), "start": {"a.beta_syn": 3.1}},
-            ValueError,
-            "a, b, cmb cannot be told",
-        ),
+        ({"sky": same_laws(), "start": {"a.beta_syn": 3.1}}, ValueError,
+         "a, b, cmb cannot be told"),
         (labelled(np.zeros(12, int)), ValueError, r"must have shape \(48,\) like a map"),
         (labelled(np.full(48, -1)), ValueError, "'dust.beta_dust' are negative in 48 pixels"),
         (labelled(np.zeros(48)), TypeError, "'dust.beta_dust' must be integers, but are float64"),
-        (
-            labelled(np.arange(48) % 3, start={"dust.beta_dust": np.ones(2)}),
-            ValueError,
-            "has 2 values, but its labels go up to 2",
-        ),
+        (labelled(np.arange(48) % 3, start={"dust.beta_dust": np.ones(2)}), ValueError,
+         "has 2 values, but its labels go up to 2"),
         (LABELLED | {"labels": {"dust.T_dust": HALVES}}, ValueError, "which is not in `start`"),
-        (
-            {"start": {"gain.23": 1.0}, "labels": {"gain.23": HALVES}},
-            ValueError,
-            "'gain.23' of a band cannot vary between regions",
-        ),
+        ({"start": {"gain.23": 1.0}, "labels": {"gain.23": HALVES}}, ValueError,
+         "'gain.23' of a band cannot vary between regions"),
     ],
-)
+)  # fmt: skip
 def test_bad_input_is_refused(changes, error, words):
     with pytest.raises(error, match=words):
         call(**changes)
@@ -283,27 +271,18 @@ def test_too_few_bands_are_refused():
 @pytest.mark.parametrize(
     ("changes", "error", "words"),
     [
-        (
-            two_bodies(start={"dust.E_dust.0": 1.0, "dust.E_dust.1": 2.0}),
-            FitError,
-            "do not determine dust.E_dust.0, dust.E_dust.1",
-        ),
-        (
-            {"start": {f"gain.{name}": 1.0 for name in BANDS}},
-            FitError,
-            "do not determine gain.145, gain.220, .* degenerate",
-        ),
+        (two_bodies(start={"dust.E_dust.0": 1.0, "dust.E_dust.1": 2.0}), FitError,
+         "do not determine dust.E_dust.0, dust.E_dust.1"),
+        ({"start": {f"gain.{name}": 1.0 for name in BANDS}}, FitError,
+         "do not determine gain.145, gain.220, .* degenerate"),
         ({"start": {}}, ValueError, "`start` must name at least one free parameter"),
         ({"fit": {"start": {"dust.T": 1.0}}}, KeyError, "Unknown parameter 'dust.T'"),
         ({"fit": {"start": {"gain.23": 1.0}}}, ValueError, "'gain.23' is not free"),
-        (
-            {"fit": {"priors": {"gain.23": Gaussian(1, 1)}}},
-            KeyError,
-            "'gain.23', which is not free",
-        ),
+        ({"fit": {"priors": {"gain.23": Gaussian(1, 1)}}}, KeyError,
+         "'gain.23', which is not free"),
         ({"fit": {"max_steps": 1}}, FitError, "The search stopped after 1 steps"),
     ],
-)
+)  # fmt: skip
 def test_fits_that_cannot_be_made_say_why(changes, error, words):
     with pytest.raises(error, match=words):
         fit(**changes)

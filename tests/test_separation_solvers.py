@@ -115,34 +115,19 @@ class Flat(Prior):
 @pytest.mark.parametrize(
     ("options", "error", "words"),
     [
-        (
-            {"solver": SOLVERS["BFGS"], "max_steps": 3},
-            FitError,
-            r"The search stopped after 3 steps, .* sigma from the optimum",
-        ),
-        (
-            {"start": FAR | {"dust.T_dust": 60.0, "dust.beta_dust": 3.0}, "max_steps": 0},
-            FitError,
-            "The search stopped after 0 steps, and not at an optimum",
-        ),
+        ({"solver": SOLVERS["BFGS"], "max_steps": 3}, FitError,
+         r"The search stopped after 3 steps, .* sigma from the optimum"),
+        ({"start": FAR | {"dust.T_dust": 60.0, "dust.beta_dust": 3.0}, "max_steps": 0}, FitError,
+         "The search stopped after 0 steps, and not at an optimum"),
         ({"start": FAR, "max_steps": 0}, FitError, r"after 0 steps, 1\.3e\+02 sigma from"),
         ({"solver": "BFGS"}, TypeError, "`solver` must be a least-squares solver.*, not str"),
         ({"solver": optx.Newton(1e-8, 1e-8)}, TypeError, "`solver` must be .*, not Newton"),
-        (
-            {
-                "solver": SOLVERS["LevenbergMarquardt"],
-                "priors": {"synchrotron.beta_syn": Wide()},
-            },
-            TypeError,
-            "takes uniform and Gaussian priors, not the Wide of 'synchrotron.beta_syn'",
-        ),
-        (
-            {"solver": SOLVERS["BFGS"], "priors": {"gain.23": Flat()}},
-            KeyError,
-            "'gain.23', which is not free",
-        ),
+        ({"solver": SOLVERS["LevenbergMarquardt"], "priors": {"synchrotron.beta_syn": Wide()}},
+         TypeError, "takes uniform and Gaussian priors, not the Wide of 'synchrotron.beta_syn'"),
+        ({"solver": SOLVERS["BFGS"], "priors": {"gain.23": Flat()}}, KeyError,
+         "'gain.23', which is not free"),
     ],
-)
+)  # fmt: skip
 def test_failures_say_what_they_are(options, error, words):
     with pytest.raises(error, match=words) as caught:
         best_fit(constant(), **options)

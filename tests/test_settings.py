@@ -98,32 +98,22 @@ def test_numbers_of_other_types_or_out_of_bounds(tmp_path, keys, value, words):
         ('common.mask = { file = "" }', "common.mask.file: "),
         ("fit.points = 200.0", "fit.points: input should be a valid integer, not 200.0"),
         ("cmb.include = 1", "cmb.include: input should be a valid boolean, not 1."),
-        (
-            'free."dust.beta_dust" = { start = "1.5" }',
-            "free.dust.beta_dust.start: input should be a valid number, not '1.5'.",
-        ),
-        (
-            'free."dust.beta_dust" = { start = 1.5, uniform = [1, true] }',
-            "free.dust.beta_dust.uniform.1: input should be a valid number, not True.",
-        ),
-        (
-            'free."dust.beta_dust" = { start = 1.5, uniform = [1, 2, 3] }',
-            "free.dust.beta_dust.uniform: tuple should have at most 2 items",
-        ),
-        (
-            'fixed."dust.beta_dust" = "1.5"',
-            "fixed.dust.beta_dust: input should be a valid number, not '1.5'.",
-        ),
+        ('free."dust.beta_dust" = { start = "1.5" }',
+         "free.dust.beta_dust.start: input should be a valid number, not '1.5'."),
+        ('free."dust.beta_dust" = { start = 1.5, uniform = [1, true] }',
+         "free.dust.beta_dust.uniform.1: input should be a valid number, not True."),
+        ('free."dust.beta_dust" = { start = 1.5, uniform = [1, 2, 3] }',
+         "free.dust.beta_dust.uniform: tuple should have at most 2 items"),
+        ('fixed."dust.beta_dust" = "1.5"',
+         "fixed.dust.beta_dust: input should be a valid number, not '1.5'."),
         ("separate.nsims = true", "separate.nsims: input should be a valid integer, not True."),
         ("separate.nsteps = 200.0", "separate.nsteps: input should be a valid integer"),
         ("separate.purify = 0", "separate.purify: input should be a valid boolean"),
         ('forecast.spectra = ["BB", "BB"]', "forecast.spectra: has 'BB' twice."),
         ("forecast.spectra = []", "forecast.spectra: list should have at least 1 item"),
         ('forecast.free = ["r", "r"]', "forecast.free: has 'r' twice."),
-        (
-            "forecast.fisher_lmax = 300.0",
-            "forecast.fisher_lmax: input should be a valid integer, not 300.0.",
-        ),
+        ("forecast.fisher_lmax = 300.0",
+         "forecast.fisher_lmax: input should be a valid integer, not 300.0."),
         ("cmb.r = false", "cmb.r: input should be a valid number, not False."),
         ("forecast.show_r = [0.1, 0.1]", "forecast.show_r: has 0.1 twice."),
         ("forecast.fit = [20, true]", "forecast.fit.1: input should be a valid integer"),
@@ -146,7 +136,7 @@ def test_numbers_of_other_types_or_out_of_bounds(tmp_path, keys, value, words):
         ("forecast.free = []", "forecast.free: is empty, and so is the table free."),
         ("paper.center = [180.0]", "paper.center"),
     ],
-)
+)  # fmt: skip
 def test_lists_and_switches(tmp_path, text, words):
     refused(tmp_path, words, main=text)
 

@@ -111,34 +111,19 @@ def test_unknown_names_are_answered_with_the_known_ones():
         (lambda s: Sky({"a.b": s["dust"]}), ValueError, "text without dots, not 'a.b'"),
         (lambda s: Sky({"": s["dust"]}), ValueError, "text without dots, not ''"),
         (lambda s: Sky({"dust": np.ones(3)}), TypeError, "'dust' must be a jaxsky Component"),
-        (
-            lambda s: Sky({"a": s["dust"], "b": Dust(np.ones((2, 12)))}),
-            ValueError,
-            r"share one shape \(stokes, pix\), but have .*\(2, 12\)",
-        ),
-        (
-            lambda s: observe(s, Bandpass.delta(30.0)),
-            TypeError,
-            "a list of Bandpass; .*observe_band",
-        ),
-        (
-            lambda s: observe(s, [30.0]),
-            TypeError,
-            "Entry 0 of `bands` must be a Bandpass, not float",
-        ),
+        (lambda s: Sky({"a": s["dust"], "b": Dust(np.ones((2, 12)))}), ValueError,
+         r"share one shape \(stokes, pix\), but have .*\(2, 12\)"),
+        (lambda s: observe(s, Bandpass.delta(30.0)), TypeError,
+         "a list of Bandpass; .*observe_band"),
+        (lambda s: observe(s, [30.0]), TypeError,
+         "Entry 0 of `bands` must be a Bandpass, not float"),
         (lambda s: observe(s, []), ValueError, "at least one band"),
-        (
-            lambda s: set_parameters(s, {"dust.beta_dust": np.ones(5)}),
-            ValueError,
-            r"'dust.beta_dust' must be a number or of shape \(48,\), but has shape \(5,\)",
-        ),
-        (
-            lambda s: set_parameters(s, {"dust.amplitude": 1.0}),
-            ValueError,
-            r"'dust.amplitude' must be shape \(2, 48\)",
-        ),
+        (lambda s: set_parameters(s, {"dust.beta_dust": np.ones(5)}), ValueError,
+         r"'dust.beta_dust' must be a number or of shape \(48,\), but has shape \(5,\)"),
+        (lambda s: set_parameters(s, {"dust.amplitude": 1.0}), ValueError,
+         r"'dust.amplitude' must be shape \(2, 48\)"),
     ],
-)
+)  # fmt: skip
 def test_bad_arguments_are_refused(call, error, words):
     with pytest.raises(error, match=words):
         call(systems.dust_and_synchrotron())

@@ -194,23 +194,11 @@ def test_resume_goes_on_with_a_cut_chain(folder, tmp_path, monkeypatch):
     assert json.loads((out / "result.json").read_text())["results"] == whole["results"]
 
 
-@pytest.mark.parametrize(
-    "noise",
-    [
-        "{ rms = 9e-7 }",
-        "{ estimate_above = 0 }",
-        "{ map = { file = '44.fits', fields = ['QQ_COV'] } }",
-    ],
-)
-def test_noise_can_be_given_in_other_ways(folder, tmp_path, monkeypatch, noise, capsys):
+@pytest.mark.parametrize("noise", ["{ rms = 9e-7 }", "{ estimate_above = 0 }"])
+def test_noise_can_be_given_in_other_ways(folder, tmp_path, monkeypatch, noise):
     few = 'methods = ["gradient"]\nstokes = ["QU"]'
     path = write_settings(folder, "noise", noise, **{'regions = ["full"]': few})
-    code = jaxsky(monkeypatch, "fit", path, "--out", tmp_path / "o")
-    if "map" in noise:  # a covariance is no rms
-        assert code == 2
-        assert "K_CMB^2" in one_sentence(capsys)
-        return
-    assert code == 0
+    assert jaxsky(monkeypatch, "fit", path, "--out", tmp_path / "o") == 0
     result = json.loads((tmp_path / "o" / "result.json").read_text())
     fit = result["results"]["full"]["QU"]["gradient"]
     for name, value in TRUTH.items():

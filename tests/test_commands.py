@@ -1,4 +1,4 @@
-"""What all commands have in common: keys on the command line, steps, and the page."""
+"""What all commands have in common: steps, the page, versions and completion."""
 
 import io
 import itertools
@@ -15,77 +15,6 @@ from commands import jaxsky
 from fits.commands import console as terminal
 from fits.commands.page import Section, Table, key_of, write_page
 from fits.commands.run import DEFAULTS
-from jaxsky.settings import SettingsError, load
-
-SETTINGS = """
-[common]
-nside = 16
-[free]
-"dust.beta_dust" = { start = 1.5, uniform = [0.5, 2.5] }
-[sky.dust]
-law = "dust"
-file = "dust.fits"
-nu_ref = 353.0
-[[bands]]
-name = "44"
-file = "44.fits"
-bandpass = { center = 44.1, width = 0.0 }
-noise = { rms = 1.0 }
-[[bands]]
-name = "70"
-file = "70.fits"
-bandpass = { center = 70.4, width = 0.0 }
-noise = { rms = 1.0 }
-"""
-
-
-@pytest.fixture
-def path(tmp_path):
-    (tmp_path / "a.toml").write_text(SETTINGS)
-    return tmp_path / "a.toml"
-
-
-def test_any_key_can_be_set(path):
-    given = load(
-        path,
-        [
-            "seed=3",
-            "common.nside=32",
-            "fit.regions = ['full']",
-            "title=two words",
-            "free.'dust.beta_dust'.start=1.6",
-            'free."dust.T_dust"={start = 20.0, gaussian = [20.0, 1.0]}',
-            "bands.1.fwhm=13.2",
-            "bands.0.noise.rms=2",
-            "cmb.include=false",
-        ],
-    )
-    assert (given.common.nside, given.seed, given.fit.regions) == (32, 3, ["full"])
-    assert given.title == "two words"
-    assert given.free["dust.beta_dust"].start == 1.6
-    assert given.free["dust.beta_dust"].uniform == (0.5, 2.5)
-    assert given.free["dust.T_dust"].gaussian == (20.0, 1.0)
-    assert [band.fwhm for band in given.bands] == [None, 13.2]
-    assert [band.noise.rms for band in given.bands] == [2.0, 1.0]
-    assert given.cmb.include is False
-
-
-@pytest.mark.parametrize(
-    ("assignment", "words"),
-    [
-        ("common.nside", "--set common.nside: must be KEY=VALUE"),
-        ("=3", "--set =3: must be KEY=VALUE"),
-        ("common.nsides=32", "common.nsides: unknown key"),
-        ("common.nside=33", "common.nside: nside must be a power of two, not 33 (given with"),
-        ("common.nside=big", "common.nside: input should be a valid integer, not 'big' (given"),
-        ("bands.2.fwhm=3", "--set bands.2.fwhm=3: 2: is not among the 2 entries, 0 to 1"),
-        ("bands.44.fwhm=3", "44: is not among the 2 entries"),
-        ("common=3", "common: input should be a valid table"),
-    ],
-)
-def test_what_cannot_be_set_is_one_sentence(path, assignment, words):
-    with pytest.raises(SettingsError, match=re.escape(words)):
-        load(path, [assignment])
 
 
 def steps(is_terminal: bool, monkeypatch, tmp_path) -> tuple[str, str]:

@@ -392,26 +392,6 @@ def test_what_cannot_be_written_stops_the_run(three, tmp_path, monkeypatch, caps
     assert sorted((tmp_path / "out").glob("sim_*/*.fits")) == sorted(written)
 
 
-def test_double_precision(folder, tmp_path, monkeypatch):
-    path = write(folder, ("sheet = false", 'sheet = false\nprecision = "double"'), name="double")
-    assert command(monkeypatch, path, "--out", tmp_path / "out") == 0
-    file = tmp_path / "out" / "sim_00000" / "30.fits"
-    assert pyfits.getheader(file, 1)["TFORM1"].endswith("D")
-    setup = build(load(path))
-    expected = simulate(realisation_key(3, 0), setup.sources, setup.observation, setup.cmb)
-    found = read_maps(file, fields=["Q", "U"]).maps
-    np.testing.assert_allclose(found, expected[0], rtol=0, atol=1e-12 * np.abs(found).max())
-
-
-def test_another_seed_is_another_sky(three, tmp_path, monkeypatch):
-    path, expected = three
-    for seed in (3, 4):
-        out = tmp_path / str(seed)
-        assert command(monkeypatch, path, "--out", out, "--set", f"seed={seed}") == 0
-        for name, data in content(out).items():
-            assert (data == expected[name]) == (seed == 3)
-
-
 def test_small_scales_can_be_the_same_for_all(folder, tmp_path, monkeypatch):
     found = {}
     for seed in ("", "small_scales_seed = 0", "small_scales_seed = 1"):
@@ -485,14 +465,6 @@ def test_a_key_changes_the_maps(folder, reference, change):
     maps = simulated(path)
     assert maps.shape == reference.shape
     assert np.abs(maps / reference - 1).max() > 1e-3
-
-
-def test_a_slope_for_both_is_one_for_each(folder):
-    one, two = (
-        simulated(write(folder, ("[cmb]", SMALL + "[cmb]"), small(f"slope = {slope}")))
-        for slope in ("-2.0", "[-2.0, -2.0]")
-    )
-    np.testing.assert_array_equal(one, two)
 
 
 def test_diagonal_noise(folder):

@@ -242,26 +242,6 @@ def test_mistakes_in_the_table_of_noise_are_one_sentence(tmp_path, noise, words)
     assert words in str(mistake.value)
 
 
-def test_settings_with_values_replaced(tmp_path, monkeypatch):
-    path = tmp_path / "settings.toml"
-    path.write_text("data_dir = '$SKY_MAPS'\nseed = 3\n[common]\nnside = 16\n")
-    monkeypatch.setenv("SKY_MAPS", "maps")
-    settings = load(path, ["seed=5"])
-    assert (settings.common.nside, settings.seed) == (16, 5)
-    assert settings.data_dir == str((tmp_path / "maps").resolve())
-    # A table that the file does not have; one that is none is a mistake, as without.
-    path.write_text("")
-    assert load(path, ["common.nside=2"]).common.nside == 2
-    with pytest.raises(SettingsError, match="bands"):
-        inputs_of(load(path))
-    path.write_text("common = 3")
-    with pytest.raises(SettingsError, match=r"common: input should be a valid table, not 3"):
-        load(path)
-    path.write_text("common.nside = 6")
-    with pytest.raises(SettingsError, match=r"common.nside: nside must be a power of two, not 6"):
-        load(path)
-
-
 def specs(file, **more):
     """Dust from a file, with a map of its index, and AME along it that is named before it."""
     dust = {"law": "dust", "file": file, "nu_ref": 353.0, "fwhm": 10.0}
@@ -307,21 +287,21 @@ def test_polarization_is_the_same_with_and_without_intensity(folder):
 
 
 @pytest.mark.parametrize(
-    ("file", "more", "words"),
+    ("file", "fields", "stokes", "words"),
     [
-        ("qu.fits", {}, r"sky.dust: fields must name I, Q and U, not Q_STOKES, U_STOKES\."),
-        ("iqu.fits", {"fields": ["Q_STOKES", "U_STOKES", "I_STOKES"]}, "are not I, Q and U by"),
+        ("qu.fits", None, "IQU", r"must name I, Q and U, not Q_STOKES, U_STOKES\."),
+        ("iqu.fits", ["Q_STOKES", "U_STOKES", "I_STOKES"], "IQU", "are not I, Q and U by"),
+        ("qu.fits", ["Q_STOKES"], "QU", r"sky.dust: fields must name Q and U, not Q_STOKES\."),
     ],
 )
-def test_templates_without_intensity_are_refused(folder, file, more, words):
+def test_templates_without_all_that_is_needed_are_refused(folder, file, fields, stokes, words):
     with pytest.raises(SettingsError, match=words):
-        templates_of(folder, specs(file, **more), "IQU")
+        templates_of(folder, specs(file, fields=fields), stokes)
 
 
-def test_one_column_is_no_polarization(folder):
-    words = r"sky.dust: fields must name Q and U, not Q_STOKES\."
-    with pytest.raises(SettingsError, match=words):
-        templates_of(folder, specs("qu.fits", fields=["Q_STOKES"]))
+def test_a_fit_needs_bands():
+    with pytest.raises(SettingsError, match="bands"):
+        inputs_of(Experiment())
 
 
 def test_angles_come_from_a_template_with_some(tmp_path):

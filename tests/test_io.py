@@ -121,17 +121,6 @@ def test_maps_in_another_hdu(tmp_path):
     assert read_mask(path, hdu=2).all()
 
 
-def test_partial_map_with_explicit_pixels(tmp_path, rng):
-    full = np.full(NPIX, healpy.UNSEEN)
-    full[100:200] = rng.normal(size=100)
-    path = tmp_path / "partial.fits"
-    kwargs = {"column_names": ["I"], "column_units": "uK_CMB", "dtype": np.float64}
-    healpy.write_map(path, full, partial=True, coord="G", **kwargs)
-    read = read_maps(path)
-    np.testing.assert_array_equal(read.mask, full != healpy.UNSEEN)
-    np.testing.assert_array_equal(read.maps[0, 100:200], full[100:200])
-
-
 def celestial(rng, nside, lmax):
     """A band-limited sky, I, Q, U and a scalar, in Celestial and in Galactic coordinates."""
     ell, m = healpy.Alm.getlm(lmax)

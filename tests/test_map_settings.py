@@ -59,62 +59,6 @@ def template(folder, entry):
 POLARIZED = ["Q_POLARISATION", "U_POLARISATION"]
 
 
-def test_wmap_nine_years(tmp_path):
-    """NESTED, mK without a kind, no coordinates; hits in the maps, weights in a second table."""
-    names = ["TEMPERATURE", *POLARIZED, "N_OBS"]
-    hits = RNG.integers(100, 900, NPIX).astype(float)
-    hits[3] = 0
-    maps = dict(zip(names, (I, Q, U, hits), strict=True))
-    weights = {"N_OBS": hits, "QQ": hits / 2, "QU": 0.1 * hits, "UU": hits / 3}
-    keys = {"ORDERING": "NESTED", "COORDSYS": None}
-    write(
-        tmp_path / "wmap_band_iqumap_r9_9yr_K_v5.fits",
-        table(maps, ["mK", *["mK,thermodynamic"] * 2, "counts"], "Stokes Maps", **keys),
-        table(weights, ["counts"] * 4, "Weight Arrays", **keys),
-    )
-    entry = {"file": "wmap_band_iqumap_r9_9yr_K_v5.fits", "fields": POLARIZED, "coordinates": "G"}
-    for noise, variance in (
-        ({"hits": {"fields": ["N_OBS"], "sigma0": 1.4}}, lambda n: 1.4**2 / n),
-        (
-            {"weights": {"fields": ["QQ", "QU", "UU"], "hdu": 2, "sigma0": 1.4}},
-            lambda n: 1.4**2 / (1 / 2 - 0.01 * 3) / n,
-        ),
-    ):
-        values, found = band(tmp_path, entry | {"noise": noise}, "mK_CMB")
-        assert np.flatnonzero(~found.used).tolist() == [3]
-        np.testing.assert_allclose(values[:, found.used], [Q[hits > 0], U[hits > 0]], rtol=1e-6)
-        factor = float(found.bandpass.conversion("mK_CMB", "uK_RJ"))
-        expected = variance(hits[hits > 0]) * factor**2
-        np.testing.assert_allclose(found.noise[0, 0, found.used], expected, rtol=1e-5)
-
-
-@pytest.mark.parametrize("iau", [False, True])
-def test_planck_maps_with_covariances(tmp_path, iau):
-    """2015 and 2018: NESTED, K_CMB, six columns of covariance; the same in IAU's sign."""
-    sign = -1 if iau else 1
-    names = ["I_STOKES", "Q_STOKES", "U_STOKES", "HITS"]
-    maps = dict(zip(names, (I, Q, sign * U, 9 + 0 * I), strict=True))
-    pairs = {"II": 1.0, "IQ": 0.0, "IU": 0.0, "QQ": 3.0, "QU": sign * 0.5, "UU": 2.0}
-    maps |= {f"{pair}_COV": np.full(NPIX, value) for pair, value in pairs.items()}
-    maps["Q_STOKES"] = np.where(np.arange(NPIX) == 7, -1.6375e30, Q)
-    units = ["K_CMB"] * 3 + ["n/a"] + ["(K_CMB)^2"] * 6
-    keys = {"ORDERING": "NESTED", "COORDSYS": "GALACTIC", "BAD_DATA": -1.6375e30}
-    keys["POLCCONV"] = "IAU" if iau else "COSMO"
-    write(tmp_path / "LFI_SkyMap_044_1024_R3.00_full.fits", table(maps, units, **keys))
-    entry = {
-        "file": "LFI_SkyMap_044_1024_R3.00_full.fits",
-        "fields": ["Q_STOKES", "U_STOKES"],
-        "noise": {"covariance": ["QQ_COV", "QU_COV", "UU_COV"]},
-    }
-    values, found = band(tmp_path, entry, "K_CMB")
-    used = np.arange(NPIX) != 7
-    np.testing.assert_array_equal(found.used, used)
-    np.testing.assert_allclose(values[:, used], [Q[used], U[used]], rtol=1e-6)
-    factor = float(found.bandpass.conversion("K_CMB", "uK_RJ"))
-    expected = np.array([[3.0, 0.5], [0.5, 2.0]])[..., None] * factor**2
-    np.testing.assert_allclose(found.noise, np.broadcast_to(expected, (2, 2, NPIX)), rtol=1e-6)
-
-
 def test_spass_with_files_of_its_noise(tmp_path):
     """IAU, a file for each Stokes parameter and each noise; all columns are called UNKNOWN1."""
     keys = {"POLCCONV": "IAU"}

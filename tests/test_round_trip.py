@@ -349,13 +349,6 @@ def test_intensity_alone_has_no_part_in_maps_of_q_and_u(tmp_path):
         build(load(path))
 
 
-def test_a_folder_without_the_maps_is_named(folder, monkeypatch, capsys):
-    arguments = ("--maps", folder / "nothing", "--out", folder / "none")
-    assert jaxsky(monkeypatch, "fit", folder / "x.toml", *arguments) == 2
-    assert "nothing/40.fits: no such file" in one_sentence(capsys)
-    assert not (folder / "none").exists()
-
-
 def test_a_cmb_above_the_noise_is_no_misfit(folder):
     prepared = common_maps(
         inputs_of(load(folder / "x.toml", ['bands.0.channels = ["140"]'])), 16, 480

@@ -215,6 +215,11 @@ def test_set_replaces_a_key_and_nothing_else(tmp_path):
             "truth = {}",
             "bands.0.noise = { rms = 1.0 }",
             "free.'dust.beta_dust'.start = 1.6",
+            'free."dust.T_dust"={start = 20.0, gaussian = [20.0, 1.0]}',
+            "seed=3",
+            "common.nside=32",
+            "fit.regions = ['full']",
+            "cmb.include=false",
             "title = \N{GREEK SMALL LETTER BETA} \N{COMET} = 2",
         ],
     )
@@ -223,9 +228,13 @@ def test_set_replaces_a_key_and_nothing_else(tmp_path):
     assert (band.fwhm, band.noise.rms, band.noise.level) == (30.0, 1.0, None)
     assert changed.free["dust.beta_dust"].start == 1.6
     assert changed.free["dust.beta_dust"].uniform == (1.0, 2.0)
+    assert changed.free["dust.T_dust"].gaussian == (20.0, 1.0)
+    assert (changed.common.nside, changed.seed, changed.fit.regions) == (32, 3, ["full"])
+    assert changed.cmb.include is False
     assert changed.title == "\N{GREEK SMALL LETTER BETA} \N{COMET} = 2"
-    with pytest.raises(SettingsError, match=r"bands.1.fwhm=3: 1: is not among the 1 entries"):
-        load(path, ["bands.1.fwhm=3"])
+    for entry in ("1", "44"):
+        with pytest.raises(SettingsError, match=f"=3: {entry}: is not among the 1 entries"):
+            load(path, [f"bands.{entry}.fwhm=3"])
     with pytest.raises(SettingsError, match=r"bands.0.fwhm=3: 0: is not among the entries of \[\]"):
         load(path, ["bands=[]", "bands.0.fwhm=3"])
 
@@ -240,6 +249,10 @@ def test_set_replaces_a_key_and_nothing_else(tmp_path):
             "sky.dust.small_scales = { EE = [9, 3], BB = [3, 9] }",
             "sky.dust.small_scales.EE: must increase, but is 9, 3",
         ),
+        ("common.nside", "--set common.nside: must be KEY=VALUE"),
+        ("=3", "--set =3: must be KEY=VALUE"),
+        ("common.nside=33", "common.nside: nside must be a power of two, not 33 (given with --set"),
+        ("common=3", "common: input should be a valid table"),
         ("cmb.cosmology = { r = 0.1 }", "cmb.cosmology: 'r' is no parameter of the cosmology"),
     ],
 )

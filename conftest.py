@@ -16,6 +16,8 @@ CACHE = Path(__file__).parent / ".cache"
 os.environ["JAXSKY_CACHE"] = str(CACHE)
 keep_programs(CACHE / "programs")
 
+#: Of memory, from which on programs are forgotten: a single file of tests adds no more than this.
+MOST_PIECES = 30_000
 DATA = Path(os.environ.get("JAXSKY_DATA", Path(__file__).parents[1] / "shared" / "data"))
 
 
@@ -34,13 +36,22 @@ def data_dir() -> Path:
     return DATA
 
 
+def _pieces() -> int:
+    """Pieces of memory that this process holds; many where the system does not say it."""
+    try:
+        return Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:
+        return MOST_PIECES + 1
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _programs() -> Iterator[None]:
-    """Forget the compiled programs of a file at its end.
+    """Forget compiled programs at the end of a file, once they are many.
 
     Each holds pieces of memory that the system counts, 65530 for a process by default: all of
     them at once are more, which is a segmentation fault in the compiler.
     """
     yield
-    jax.clear_caches()
-    gc.collect()
+    if _pieces() > MOST_PIECES:
+        jax.clear_caches()
+        gc.collect()

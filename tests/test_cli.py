@@ -259,6 +259,7 @@ def test_init_leaves_files_alone(tmp_path, monkeypatch, capsys):
         ('["full"]', '["fool"]', "fit.regions: 'fool' is none of strip, outside, full"),
         ('["full"]', '["full"]\nstokes = ["I"]', "fit.stokes.0: input should be 'Q'"),
         ("uniform = [0.5, 2.5]", "uniform = [2.5, 0.5]", "free.dust.beta_dust"),
+        ('"dust.beta_dust" =', '"dust.beta" =', "Unknown parameter 'dust.beta'"),
         ("[fit]", '[fixed]\n"dust.beta_dust" = 1.5\n[fit]', "cannot be both free and fixed"),
         ("nsteps = 2200", "nwalkers = 2", "fit.nwalkers"),
         ("rms = 1e-6", "rms = 0.0", "bands.0.noise: must be greater than 0"),

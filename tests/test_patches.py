@@ -27,9 +27,9 @@ NOISE = np.where(ELL > 1, SEEN[1, 80], 0.0)
 
 
 @functools.cache
-def patches():
+def patches(count=None):
     """Discs that do not overlap: independent, and all of one shape."""
-    centers = [(lon, lat) for lon, lat in disc_centers(2, 15.0).T]
+    centers = [(lon, lat) for lon, lat in disc_centers(2, 15.0).T[:count]]
     return prepare_patches(
         [Patch(f"{lon:.0f}", lon, lat, disc_mask(NSIDE, lon, lat)) for lon, lat in centers], WINDOW
     )
@@ -112,8 +112,8 @@ def test_noise_alone_is_no_detection():
 
 def test_units_do_not_matter():
     maps = sky(jax.random.key(3), *jnp.asarray(SEEN + NOISE))
-    one = fit_patches(maps, patches(), noise=NOISE)
-    other = fit_patches(1e-6 * maps, patches(), noise=1e-12 * NOISE)
+    one = fit_patches(maps, patches(4), noise=NOISE)
+    other = fit_patches(1e-6 * maps, patches(4), noise=1e-12 * NOISE)
     np.testing.assert_allclose(1e12 * other.A, one.A, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(other.alpha, one.alpha, atol=1e-4)
     np.testing.assert_allclose(1e24 * other.covariance[..., 0, 0], one.covariance[..., 0, 0], 1e-5)
@@ -170,7 +170,7 @@ def test_patches_of_one_shape_share_their_covariance():
     masks = [disc_mask(NSIDE, 10.0, 60.0), disc_mask(NSIDE, 200.0, -50.0), bicep2_mask(NSIDE)]
     found = prepare_patches([Patch("", 0.0, 0.0, mask) for mask in masks], WINDOW)
     assert found.shapes == (0, 0, 2)
-    assert set(patches().shapes) == {0}
+    assert set(patches(4).shapes) == {0}
     fits = fit_patches(sky(jax.random.key(5), *jnp.asarray(SEEN)), found)
     # Twice the area: smaller errors.
     assert np.all(fits.A_error[2] / fits.A[2] < 0.9 * fits.A_error[0] / fits.A[0])

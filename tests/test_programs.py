@@ -94,6 +94,7 @@ def test_a_damaged_program_is_made_again(tmp_path):
     assert second == first
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_made_is_done_without(tmp_path):
     (tmp_path / "file").write_text("")
     process(tmp_path / "file" / "programs")

@@ -431,6 +431,7 @@ def test_dust_and_ame_stay_as_correlated_as_they_are(pair):
     assert float(measured.std(axis=0).max()) < 0.05
 
 
+@pytest.mark.slow
 def test_the_spectra_of_a_pair_are_those_of_each_alone(pair):
     alms, parts, _, templates = pair
     for i, part in enumerate(parts):
@@ -438,6 +439,7 @@ def test_the_spectra_of_a_pair_are_those_of_each_alone(pair):
         assert_follows(alms[:, fields], part, REAL["dust"], templates[fields], 0.95 * 256)
 
 
+@pytest.mark.slow
 def test_repaired_multipoles_are_counted(pair):
     _, parts, repaired, templates = pair
     templates, ell = np.asarray(templates), alm_ell(128)

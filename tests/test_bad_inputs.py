@@ -119,86 +119,35 @@ first_pixels = equal([[1, 2, 3], [1, 2, 3]], lambda found: found.maps[:, :3])
 MAPS = [
     # Which Stokes parameter a column is
     fits_row("IAU, one column UNKNOWN1", {"UNKNOWN1": U}, "UNKNOWN1", "stokes", header=IAU),
-    fits_row(
-        "the same, said to be U",
-        {"UNKNOWN1": U},
-        right=equal([-U], values_of),
-        header=IAU,
-        stokes="U",
-    ),
-    fits_row(
-        "IAU, healpy's COLUMN_2, COLUMN_3",
-        {"COLUMN_2": Q, "COLUMN_3": U},
-        "COLUMN_2",
-        "stokes",
-        header=IAU,
-        fields=[0, 1],
-    ),
-    fits_row(
-        "celestial, healpy's COLUMN_2, COLUMN_3",
-        {"COLUMN_2": Q, "COLUMN_3": U},
-        "COLUMN_2",
-        "stokes",
-        header=CELESTIAL,
-        fields=[0, 1],
-    ),
-    fits_row(
-        "the same, said to be Q and U",
-        {"COLUMN_2": Q, "COLUMN_3": U},
-        right=equal(turned(np.array([Q, U])), values_of),
-        header=CELESTIAL,
-        fields=[0, 1],
-        stokes="QU",
-    ),
-    fits_row(
-        "celestial, a name that only begins with U",
-        {"UNITS": Q, "QUALITY": U},
-        "stokes",
-        header=CELESTIAL,
-        fields=["UNITS", "QUALITY"],
-    ),
-    fits_row(
-        "Galactic and COSMO, no name needed",
-        {"COLUMN_2": Q, "COLUMN_3": U},
-        right=equal([Q, U], values_of),
-        fields=[0, 1],
-    ),
-    fits_row(
-        "COV_QU of an IAU file",
-        {"COV_QU": column("COV_QU", "D", U, unit="K_CMB^2")},
-        right=equal([-U], values_of),
-        header=IAU,
-        fields=["COV_QU"],
-    ),
-    fits_row(
-        "QU_COV and UU_COV of an IAU file",
-        {n: column(n, "D", U, unit="K_CMB^2") for n in ("QU_COV", "UU_COV")},
-        right=equal([-U, U], values_of),
-        header=IAU,
-        fields=["QU_COV", "UU_COV"],
-    ),
+    fits_row("the same, said to be U", {"UNKNOWN1": U}, right=equal([-U], values_of), header=IAU,
+             stokes="U"),
+    fits_row("IAU, healpy's COLUMN_2, COLUMN_3", {"COLUMN_2": Q, "COLUMN_3": U}, "COLUMN_2",
+             "stokes", header=IAU, fields=[0, 1]),
+    fits_row("celestial, healpy's COLUMN_2, COLUMN_3", {"COLUMN_2": Q, "COLUMN_3": U}, "COLUMN_2",
+             "stokes", header=CELESTIAL, fields=[0, 1]),
+    fits_row("the same, said to be Q and U", {"COLUMN_2": Q, "COLUMN_3": U},
+             right=equal(turned(np.array([Q, U])), values_of), header=CELESTIAL, fields=[0, 1],
+             stokes="QU"),
+    fits_row("celestial, a name that only begins with U", {"UNITS": Q, "QUALITY": U}, "stokes",
+             header=CELESTIAL, fields=["UNITS", "QUALITY"]),
+    fits_row("Galactic and COSMO, no name needed", {"COLUMN_2": Q, "COLUMN_3": U},
+             right=equal([Q, U], values_of), fields=[0, 1]),
+    fits_row("COV_QU of an IAU file", {"COV_QU": column("COV_QU", "D", U, unit="K_CMB^2")},
+             right=equal([-U], values_of), header=IAU, fields=["COV_QU"]),
+    fits_row("QU_COV and UU_COV of an IAU file",
+             {n: column(n, "D", U, unit="K_CMB^2") for n in ("QU_COV", "UU_COV")},
+             right=equal([-U, U], values_of), header=IAU, fields=["QU_COV", "UU_COV"]),
     fits_row("celestial, Q alone", {"Q_STOKES": Q}, "Q_STOKES", header=CELESTIAL),
-    fits_row(
-        "said to be U, named Q",
-        {"Q_STOKES": Q},
-        "Q_STOKES",
-        "stokes",
-        fields=["Q_STOKES"],
-        stokes="U",
-    ),
+    fits_row("said to be U, named Q", {"Q_STOKES": Q}, "Q_STOKES", "stokes", fields=["Q_STOKES"],
+             stokes="U"),
     fits_row("more letters than columns", QU, "stokes", fields=["Q_STOKES"], stokes="QU"),
     # Missing values
-    fits_row(
-        "TNULL of an integer column",
-        {"I_STOKES": column("I_STOKES", "I", with_hole(100 * T, -32768, "i2"), null=-32768)},
-        right=equal(kept, mask_of),
-    ),
-    fits_row(
-        "TNULL of a scaled integer column",
-        {"I_STOKES": column("I_STOKES", "I", with_hole(100 * T, -32768, "i2"))},
-        right=equal(kept, mask_of),
-        header={"TSCAL1": 0.01, "TNULL1": -32768},
-    ),
+    fits_row("TNULL of an integer column",
+             {"I_STOKES": column("I_STOKES", "I", with_hole(100 * T, -32768, "i2"), null=-32768)},
+             right=equal(kept, mask_of)),
+    fits_row("TNULL of a scaled integer column",
+             {"I_STOKES": column("I_STOKES", "I", with_hole(100 * T, -32768, "i2"))},
+             right=equal(kept, mask_of), header={"TSCAL1": 0.01, "TNULL1": -32768}),
     fits_row(
         "TNULL of hits",
         {"HITS": column("HITS", "J", with_hole(np.arange(NPIX) + 1, -1, "i4"), null=-1, unit="")},
@@ -215,59 +164,33 @@ MAPS = [
         )
         for mark in (-1e30, -999.0, -32768.0, -9999.0, 1e20)
     ),
-    fits_row(
-        "-999, said to be missing",
-        {"I_STOKES": with_hole(T, -999)},
-        right=equal(kept, mask_of),
-        missing=-999.0,
-    ),
-    fits_row(
-        "a footprint of zeros",
-        {n: np.where(np.arange(NPIX) < NPIX // 3, 0.0, v) for n, v in QU.items()},
-        "33",
-        "missing",
-    ),
-    fits_row(
-        "a footprint of zeros, said to be missing",
-        {n: np.where(np.arange(NPIX) < NPIX // 3, 0.0, v) for n, v in QU.items()},
-        right=equal(np.arange(NPIX) >= NPIX // 3, mask_of),
-        missing=0.0,
-    ),
-    fits_row(
-        "a footprint of zeros, said to be data",
-        {n: np.where(np.arange(NPIX) < NPIX // 3, 0.0, v) for n, v in QU.items()},
-        right=equal(np.ones(NPIX, bool), mask_of),
-        missing=[],
-    ),
-    fits_row(
-        "zeros in one of two columns",
-        {"Q_STOKES": Q, "U_STOKES": 0 * U},
-        right=equal([Q, 0 * U], values_of),
-    ),
+    fits_row("-999, said to be missing", {"I_STOKES": with_hole(T, -999)},
+             right=equal(kept, mask_of), missing=-999.0),
+    fits_row("a footprint of zeros",
+             {n: np.where(np.arange(NPIX) < NPIX // 3, 0.0, v) for n, v in QU.items()}, "33",
+             "missing"),
+    fits_row("a footprint of zeros, said to be missing",
+             {n: np.where(np.arange(NPIX) < NPIX // 3, 0.0, v) for n, v in QU.items()},
+             right=equal(np.arange(NPIX) >= NPIX // 3, mask_of), missing=0.0),
+    fits_row("a footprint of zeros, said to be data",
+             {n: np.where(np.arange(NPIX) < NPIX // 3, 0.0, v) for n, v in QU.items()},
+             right=equal(np.ones(NPIX, bool), mask_of), missing=[]),
+    fits_row("zeros in one of two columns", {"Q_STOKES": Q, "U_STOKES": 0 * U},
+             right=equal([Q, 0 * U], values_of)),
     fits_row("a complex column", {"I_STOKES": column("I_STOKES", "M", T + 1j)}, "I_STOKES"),
     fits_row("a logical column", {"I_STOKES": column("I_STOKES", "L", T > 0)}, "I_STOKES"),
-    fits_row(
-        "a column of text", {"I_STOKES": column("I_STOKES", "4A", ["1.5"] * NPIX)}, "I_STOKES"
-    ),
-    fits_row(
-        "BAD_DATA as text",
-        {"I_STOKES": with_hole(T, -5e20)},
-        right=equal(kept, mask_of),
-        header={"BAD_DATA": "-5e20"},
-    ),
-    fits_row(
-        "BAD_DATA that is no number", {"I_STOKES": T}, "BAD_DATA", header={"BAD_DATA": "none!"}
-    ),
+    fits_row("a column of text", {"I_STOKES": column("I_STOKES", "4A", ["1.5"] * NPIX)},
+             "I_STOKES"),
+    fits_row("BAD_DATA as text", {"I_STOKES": with_hole(T, -5e20)}, right=equal(kept, mask_of),
+             header={"BAD_DATA": "-5e20"}),
+    fits_row("BAD_DATA that is no number", {"I_STOKES": T}, "BAD_DATA",
+             header={"BAD_DATA": "none!"}),
     fits_row("nothing but missing pixels", {"I_STOKES": np.full(NPIX, np.nan)}, "no pixel"),
     # Pixel numbers
     fits_row("a partial map", with_pixels("PIXEL", [0, 1, 2]), right=first_pixels, header=EXPLICIT),
     fits_row("a column PIX", with_pixels("PIX", [0, 1, 2]), right=first_pixels, header=EXPLICIT),
-    fits_row(
-        "PARTIAL without INDXSCHM",
-        with_pixels("PIXEL", [0, 1, 2]),
-        right=first_pixels,
-        header={"OBJECT": "PARTIAL"},
-    ),
+    fits_row("PARTIAL without INDXSCHM", with_pixels("PIXEL", [0, 1, 2]), right=first_pixels,
+             header={"OBJECT": "PARTIAL"}),
     fits_row("pixel -1", with_pixels("PIXEL", [0, -1]), "-1", header=EXPLICIT),
     fits_row("pixel 12 nside^2", with_pixels("PIXEL", [0, NPIX]), str(NPIX), header=EXPLICIT),
     fits_row("a pixel twice", with_pixels("PIXEL", [3, 3]), "more than once", header=EXPLICIT),
@@ -280,12 +203,8 @@ MAPS = [
     fits_row("nside 16.0", QU, right=equal([Q, U], values_of), header={"NSIDE": float(NSIDE)}),
     fits_row("nside 4.5", QU, "NSIDE", "4.5", header={"NSIDE": 4.5}),
     fits_row("180 pixels", {"I_STOKES": T[:180]}, "180", header={"NSIDE": None}),
-    fits_row(
-        "NESTED at nside 3",
-        {"I_STOKES": np.arange(108.0)},
-        "3",
-        header={"NSIDE": 3, "ORDERING": "NESTED"},
-    ),
+    fits_row("NESTED at nside 3", {"I_STOKES": np.arange(108.0)}, "3",
+             header={"NSIDE": 3, "ORDERING": "NESTED"}),
     # What a header says
     fits_row("no ORDERING", QU, "ORDERING", "ordering", header={"ORDERING": None}),
     fits_row("no COORDSYS", QU, "COORDSYS", "coordinates", header={"COORDSYS": None}),
@@ -295,21 +214,16 @@ MAPS = [
     fits_row("given ordering contradicts", QU, "ordering", "RING", ordering="NESTED"),
     fits_row("a bare K", {"I_STOKES": column("I_STOKES", "D", T, unit="K")}, "unit", "'K'"),
     fits_row("no unit", {"I_STOKES": column("I_STOKES", "D", T, unit=None)}, "unit"),
-    fits_row(
-        "two units", {"Q_STOKES": Q, "U_STOKES": column("U_STOKES", "D", U, unit="uK_CMB")}, "units"
-    ),
+    fits_row("two units", {"Q_STOKES": Q, "U_STOKES": column("U_STOKES", "D", U, unit="uK_CMB")},
+             "units"),
     fits_row("no such column", QU, "I_STOKES", fields=["I_STOKES"]),
     fits_row("column number -1", QU, "-1", fields=[-1]),
     fits_row("no column wanted", QU, "fields", fields=[]),
     fits_row("no such HDU", QU, "HDU", hdu=5),
     fits_row("HDU 0 has no table", QU, "HDU", hdu=0),
     # Masks
-    fits_row(
-        "a mask as healpy writes it, 1 and UNSEEN",
-        {"MASK": np.where(kept, 1.0, UNSEEN)},
-        right=equal(kept),
-        reader=read_mask,
-    ),
+    fits_row("a mask as healpy writes it, 1 and UNSEEN", {"MASK": np.where(kept, 1.0, UNSEEN)},
+             right=equal(kept), reader=read_mask),
     fits_row(
         "a partial mask",
         {
@@ -320,16 +234,12 @@ MAPS = [
         header=EXPLICIT,
         reader=read_mask,
     ),
-    fits_row(
-        "a mask of logicals",
-        {"MASK": column("MASK", "L", kept)},
-        right=equal(kept),
-        reader=read_mask,
-    ),
+    fits_row("a mask of logicals", {"MASK": column("MASK", "L", kept)}, right=equal(kept),
+             reader=read_mask),
     fits_row("a mask with 0.5", {"MASK": np.where(kept, 1.0, 0.5)}, "0.5", reader=read_mask),
     fits_row("a mask with 2", {"MASK": np.where(kept, 1.0, 2.0)}, "2", reader=read_mask),
     fits_row("a mask of nothing", {"MASK": np.zeros(NPIX)}, "no pixel", reader=read_mask),
-]
+]  # fmt: skip
 
 
 def raw(
@@ -394,11 +304,8 @@ nus = [30.0, 31.0, 32.0]
 BANDPASSES = [
     text("two columns", TABLE, nu=nus),
     text("commas between numbers", TABLE.replace(" ", ", "), nu=nus),
-    text(
-        "tabs and the ends of lines of Windows",
-        TABLE.replace(" ", "\t").replace("\n", "\r\n"),
-        nu=nus,
-    ),
+    text("tabs and the ends of lines of Windows", TABLE.replace(" ", "\t").replace("\n", "\r\n"),
+         nu=nus),
     text("a line of names", "nu weight\n" + TABLE, nu=nus),
     text("a byte-order mark", "\ufeff" + TABLE, nu=nus),
     text("a byte-order mark and a comment", "\ufeff# nu weight\n" + TABLE, nu=nus),
@@ -428,18 +335,10 @@ BANDPASSES = [
     text("UTF-16", TABLE.encode("utf-16"), nu=nus),
     text("bytes for a table", bytes(range(128, 200)), "text"),
     text("no convention", TABLE, "convention", reader=read_bandpass),
-    text(
-        "a beam with a damaged first row",
-        "0 1.O\n1 0.9\n2 0.8\n",
-        "line 1",
-        reader=partial(read_beam, lmax=2),
-    ),
-    text(
-        "a beam with decimal commas",
-        "0 1,0\n1 0,9\n2 0,8\n",
-        "line 1",
-        reader=partial(read_beam, lmax=2),
-    ),
+    text("a beam with a damaged first row", "0 1.O\n1 0.9\n2 0.8\n", "line 1",
+         reader=partial(read_beam, lmax=2)),
+    text("a beam with decimal commas", "0 1,0\n1 0,9\n2 0,8\n", "line 1",
+         reader=partial(read_beam, lmax=2)),
     text("a beam that ends early", "0 1\n1 0.9\n", "l", reader=partial(read_beam, lmax=2)),
     text(
         "spectra with a damaged row",
@@ -447,7 +346,7 @@ BANDPASSES = [
         "line 3",
         reader=partial(read_spectra, lmax=3),
     ),
-]
+]  # fmt: skip
 
 # Settings
 
@@ -694,24 +593,14 @@ TOGETHER = [
     sky("a map of beta_dust", BETA, beta=of_pixels(LEVELS)),
     sky("beta_dust in K", BETA, "beta.fits", "'K'", beta=of_pixels(LEVELS, "K")),
     sky("beta_dust in uK_CMB", BETA, "beta_dust", "uK_CMB", beta=of_pixels(LEVELS, "uK_CMB")),
-    sky(
-        "two columns of beta_dust",
+    sky("two columns of beta_dust",
         {"sky/dust/parameters": {"beta_dust": {"file": "beta.fits", "fields": [0, 1]}}},
-        "beta_dust",
-        beta=of_pixels(LEVELS) | of_pixels(LEVELS, name="RMS"),
-    ),
-    sky(
-        "T_dust without unit K",
-        {"sky/dust/parameters": {"T_dust": {"file": "T.fits"}}},
-        "T_dust",
-        T=of_pixels(20 * LEVELS, "mK_CMB"),
-    ),
-    sky(
-        "beta_syn of the other sign",
-        {"sky/synchrotron/parameters": {"beta_syn": {"file": "beta.fits"}}},
-        "beta_syn",
-        beta=of_pixels(-2 * LEVELS),
-    ),
+        "beta_dust", beta=of_pixels(LEVELS) | of_pixels(LEVELS, name="RMS")),
+    sky("T_dust without unit K", {"sky/dust/parameters": {"T_dust": {"file": "T.fits"}}}, "T_dust",
+        T=of_pixels(20 * LEVELS, "mK_CMB")),
+    sky("beta_syn of the other sign",
+        {"sky/synchrotron/parameters": {"beta_syn": {"file": "beta.fits"}}}, "beta_syn",
+        beta=of_pixels(-2 * LEVELS)),
     sky("beta_syn = -3.1", {"sky/synchrotron/parameters": {"beta_syn": -3.1}}, "beta_syn", "3.1"),
     sky("a parameter that is not there", {"sky/dust/parameters": {"beta": 1.5}}, "dust", "beta"),
     sky("no such file", {"bands/0/file": "none.fits"}, "none.fits"),
@@ -721,33 +610,20 @@ TOGETHER = [
     sky("a map of rms in the wrong unit", RMS, "44", "K_CMB", rms=of_pixels(1e3 * LEVELS, "K_CMB")),
     sky("a map of rms of 48 pixels", RMS, "rms.fits", "48", rms=of_pixels(LEVELS[:48], "K_CMB")),
     sky("a map of rms with zeros", RMS, "rms.fits", "missing", rms=of_pixels(0 * LEVELS, "K_CMB")),
-    sky(
-        "the noise of an instrument in uK_CMB, and a map in uK_RJ",
+    sky("the noise of an instrument in uK_CMB, and a map in uK_RJ",
         {"bands/0": {"name": "44", "instrument": "planck", "file": "44.fits"}},
         right=equal(240.0 / PIXEL / BAND_44.conversion("uK_RJ", "uK_CMB"), rms_of),
-        **{"44": {n: column(n, "D", v, unit="uK_RJ") for n, v in QU.items()}},
-    ),
+        **{"44": {n: column(n, "D", v, unit="uK_RJ") for n, v in QU.items()}}),
     sky("a map of U alone", {"bands/0/fields": ["U_STOKES"]}, "44"),
     sky("U before Q", {"bands/0/fields": ["U_STOKES", "Q_STOKES"]}, "44", "U_STOKES"),
-    sky(
-        "Q and U from two files",
+    sky("Q and U from two files",
         {"bands/0/file": ["q.fits", "u.fits"], "bands/0/stokes": "QU", "bands/0/fields": [0, 0]},
-        q={"A": Q},
-        u={"B": U},
-    ),
-    sky(
-        "a footprint of zeros in a band",
-        {},
-        "44.fits",
-        "missing",
-        **{"44": {n: np.where(np.arange(NPIX) < 90, 0.0, v) for n, v in QU.items()}},
-    ),
-    sky(
-        "a band table without a convention",
-        {"bands/0/bandpass": {"file": "dust.fits"}},
-        "dust.fits",
-    ),
-]
+        q={"A": Q}, u={"B": U}),
+    sky("a footprint of zeros in a band", {}, "44.fits", "missing",
+        **{"44": {n: np.where(np.arange(NPIX) < 90, 0.0, v) for n, v in QU.items()}}),
+    sky("a band table without a convention", {"bands/0/bandpass": {"file": "dust.fits"}},
+        "dust.fits"),
+]  # fmt: skip
 
 # Python
 
@@ -774,19 +650,15 @@ PYTHON = [
     python("negative nu_ref", lambda: Dust(MAPS_QU, nu_ref=-353.0), "nu_ref"),
     python("nu_ref in Hz", lambda: Dust(MAPS_QU, nu_ref=353e9), "nu_ref", "GHz"),
     python("nu_ref with a unit", lambda: Dust(MAPS_QU, nu_ref=353 * u.GHz), "nu_ref", "unit"),
-    python(
-        "beta_syn of the other sign, in Python",
-        lambda: Synchrotron(MAPS_QU, -3.1),
-        "beta_syn",
-        "3.1",
-    ),
+    python("beta_syn of the other sign, in Python", lambda: Synchrotron(MAPS_QU, -3.1), "beta_syn",
+           "3.1"),
     python("beta_syn of nan", lambda: Synchrotron(MAPS_QU, np.nan), "beta_syn"),
     python("beta_syn of another shape", lambda: Synchrotron(MAPS_QU, np.ones(7)), "beta_syn"),
     python("T_dust of zero", lambda: Dust(MAPS_QU, T_dust=0.0), "T_dust"),
     python("a unit that is none", lambda: unit_factor("K_CMB", "parsec"), "parsec"),
     python("kelvin of no kind", lambda: unit_factor("K", "uK_RJ", 44.0), "'K'"),
     python("a unit that needs a frequency", lambda: unit_factor("K_CMB", "uK_RJ"), "at"),
-]
+]  # fmt: skip
 
 ROWS = [*MAPS, *DAMAGED, *BANDPASSES, *STRICT, *TOGETHER, *PYTHON]
 

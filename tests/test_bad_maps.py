@@ -155,11 +155,6 @@ def test_names_that_are_certain_tell_the_sign(tmp_path, name, sign):
     np.testing.assert_array_equal(read_maps(path, fields=name).maps[0], sign * U)
 
 
-def test_without_turns_or_signs_no_name_is_needed(tmp_path):
-    path = save(tmp_path / "m.fits", {"COLUMN_2": Q, "COLUMN_3": U})
-    np.testing.assert_array_equal(read_maps(path, fields=[0, 1]).maps, [Q, U])
-
-
 @pytest.mark.parametrize("name", ["COLUMN_2", "UNKNOWN1", "UNITS", "USTOKES", "SIGNAL", "U_X"])
 def test_other_names_are_asked_about(tmp_path, name):
     path = save(tmp_path / "m.fits", {name: U, "X": Q}, POLCCONV="IAU")

@@ -299,11 +299,6 @@ def test_templates_without_all_that_is_needed_are_refused(folder, file, fields, 
         templates_of(folder, specs(file, fields=fields), stokes)
 
 
-def test_a_fit_needs_bands():
-    with pytest.raises(SettingsError, match="bands"):
-        inputs_of(Experiment())
-
-
 def test_angles_come_from_a_template_with_some(tmp_path):
     path = tmp_path / "settings.toml"
     spec = 'sky.{} = {{ law = "ame", file = "ame.fits", nu_ref = 22.8{} }}\n'

@@ -231,16 +231,6 @@ def test_units_that_are_none_are_named_with_their_key(tmp_path):
             band(tmp_path, {"file": "m.fits", "noise": {"hits": hits | change}})
 
 
-def test_noise_of_an_instrument_has_a_unit_of_its_own(tmp_path):
-    write(tmp_path / "44.fits", table({"Q": Q, "U": U}, ["uK_RJ"] * 2))
-    entry = {"name": "44", "instrument": "planck", "file": "44.fits"}
-    (own,) = Experiment.model_validate({"bands": [entry]}).bands
-    found = read_band(tmp_path, own)
-    pixel = healpy.nside2resol(NSIDE, arcmin=True)
-    expected = 240.0 / pixel / float(found.bandpass.conversion("uK_RJ", "uK_CMB"))
-    np.testing.assert_allclose(np.sqrt(found.noise[0, 0]), expected, rtol=1e-6)
-
-
 # Maps of parameters
 
 

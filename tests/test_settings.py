@@ -59,8 +59,6 @@ def test_files_that_are_right(tmp_path, text):
         (BEAMS, '"60"', "input should be a valid number"),
         (BEAMS, "true", "input should be a valid number"),
         (BEAMS, "nan", "input should be a finite number"),
-        (BEAMS, "inf", "input should be a finite number"),
-        (BEAMS, "-1", "input should be greater than"),
         (SEEDS, "true", "input should be a valid integer, not True."),
         (SEEDS, '"1"', "input should be a valid integer, not '1'."),
         (SEEDS, "1.0", "input should be a valid integer, not 1.0."),
@@ -120,48 +118,10 @@ def test_numbers_of_other_types_or_out_of_bounds(tmp_path, keys, value, words):
         ("paper.center = [180, true]", "paper.center.1: input should be a valid number"),
         ('paper.fwhm = "5"', "paper.fwhm: input should be a valid number, not '5'."),
         ("compare.regions = 'm.fits'", "compare.regions: input should be a valid list, not"),
-        ("title = 5", "title: input should be a valid string, not 5."),
-        ('fit.methods = ["guess"]', "fit.methods.0: input should be 'grid'"),
-        ("fit.nsteps = 0", "fit.nsteps: input should be greater than"),
-        ('fit.nwalkers = "32"', "fit.nwalkers: input should be a valid integer, not '32'."),
-        ("regions.strip = '|b| <= 95'", "regions.strip: "),
-        ("regions.strip = {}", "regions.strip.file: is missing."),
-        ("cmb.r = -0.1", "cmb.r: input should be greater than or equal to 0, not -0.1."),
-        ('simulate.outputs = ["all"]', "simulate.outputs.0: input should be 'total'"),
-        ("bands = [{ name = 44 }]", "bands.0.name: input should be a valid string, not 44."),
-        ("bands = [{ bandpass = { center = 44, width = -8 } }]", "bands.0.bandpass.width: "),
-        ('bands = [{ instrument = "core", channels = ["45", "45"] }]', "channels: has '45' twice"),
-        ('truth."dust.beta_dust" = "1.5"', "truth.dust.beta_dust: input should be a valid number"),
-        ("separate.lmin = 1", "separate.lmin: input should be greater than or equal to 2, not 1."),
-        ("forecast.free = []", "forecast.free: is empty, and so is the table free."),
-        ("paper.center = [180.0]", "paper.center"),
     ],
 )  # fmt: skip
 def test_lists_and_switches(tmp_path, text, words):
     refused(tmp_path, words, main=text)
-
-
-A = 'name = "a"\nbandpass = { center = 44.0 }\nfwhm = 27.0\nnoise = { level = 240.0 }\n'
-
-
-@pytest.mark.parametrize(
-    ("bands", "words"),
-    [
-        ([], "is no TOML file with a list of bands"),
-        (["fwhm = 27.0\n"], "name"),
-        ([A, A], "a, a"),
-        ([A.replace("27.0", '"27"')], "band a: fwhm: input should be a valid number, not '27'"),
-        ([A.replace("240.0", "-1.0")], "noise.level: input should be greater than or equal to 0"),
-        ([A + "colour = 1\n"], "band a: colour"),
-        ([A + 'instrument = "planck"\n'], "band a: instrument"),
-    ],
-)
-def test_files_of_instruments(tmp_path, bands, words):
-    (tmp_path / "own.toml").write_text("".join(f"[[bands]]\n{band}" for band in bands))
-    with pytest.raises(SettingsError, match=rf"bands.0.instrument: .*own.toml.*{words}"):
-        read(tmp_path, 'bands = [{{ instrument = "own.toml" }}]\n')
-    (tmp_path / "own.toml").write_text(f"[[bands]]\n{A}")
-    assert read(tmp_path, 'bands = [{{ instrument = "own.toml" }}]\n').bands[0].name == "a"
 
 
 @pytest.mark.parametrize("text", FILES.values(), ids=FILES)

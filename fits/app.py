@@ -17,7 +17,7 @@ import jaxsky
 from fits.commands.console import print_written, replace_unprintable
 from fits.commands.data import data_commands
 from fits.commands.endings import print_error, prompt
-from fits.commands.run import DEFAULTS, Options, run
+from fits.commands.run import DEFAULTS, Options, run_command
 from jaxsky.io.folders import ALL, cache_folder
 from jaxsky.programs import keep_programs
 
@@ -109,14 +109,14 @@ def _simulate(
     overwrite: Overwrite = False,
 ) -> None:
     """Simulate maps of the microwave sky as an experiment observes it."""
-    from fits.commands.simulate import simulation
+    from fits.commands.simulate import simulate_command
 
     if only is not None and only not in ONLY:
         raise ValueError(f"--only must be one of {', '.join(ONLY)}, not {only!r}.")
     indices = range(first, first + nsims)
     options = Options(settings_file, out, values, resume, overwrite)
     # With --overwrite all realisations are removed, so nobody else may be making any.
-    run(simulation(indices, only), options, ALL if overwrite else indices)
+    run_command(simulate_command(indices, only), options, ALL if overwrite else indices)
 
 
 def _analysis(name: str) -> Callable[..., None]:
@@ -136,7 +136,7 @@ def _analysis(name: str) -> Callable[..., None]:
         overwrite: Overwrite = False,
     ) -> None:
         options = Options(settings_file, out, values, resume, overwrite, maps)
-        run(import_module(f"fits.commands.{name}").COMMAND, options)
+        run_command(import_module(f"fits.commands.{name}").COMMAND, options)
 
     return command
 
@@ -155,7 +155,7 @@ def _forecast(
     """Forecast B modes: foregrounds against primordial ones, and errors on r and the laws."""
     from fits.commands.forecast import COMMAND
 
-    run(COMMAND, Options(settings_file, out, values, overwrite=overwrite))
+    run_command(COMMAND, Options(settings_file, out, values, overwrite=overwrite))
 
 
 @app.command("paper")
@@ -171,9 +171,9 @@ def _paper(
     overwrite: Overwrite = False,
 ) -> None:
     """Make the figures and tables of the paper again, and a page that shows them."""
-    from fits.commands.paper import figures
+    from fits.commands.paper import paper_command
 
-    run(figures(only or ()), Options(settings_file, out, values, resume, overwrite))
+    run_command(paper_command(only or ()), Options(settings_file, out, values, resume, overwrite))
 
 
 app.add_typer(data_commands, name="data")

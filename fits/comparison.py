@@ -30,7 +30,7 @@ STOKES = ("Q", "U", "QU")
 LEAST_PIXELS = 10
 
 
-class Simulated(NamedTuple):
+class ComparisonRealisations(NamedTuple):
     """Of each realisation, what is compared with the data.
 
     Parameters
@@ -205,7 +205,7 @@ def simulated_fluctuations(
     path: Path | None = None,
     mark: str = "",
     report: Callable[[int, int], None] = QUIET.advance,
-) -> Simulated:
+) -> ComparisonRealisations:
     """Realisations of noise and CMB on top of the model's foregrounds.
 
     Parameters
@@ -228,7 +228,8 @@ def simulated_fluctuations(
         squares = _sums_of_squares(noise + cmb, inside)
         return chi2, squares, spectra, power_spectrum(noise_alms)
 
-    return Simulated(*kept_realisations(make, Simulated._fields, nsims, seed, path, mark, report))
+    names = ComparisonRealisations._fields
+    return ComparisonRealisations(*kept_realisations(make, names, nsims, seed, path, mark, report))
 
 
 @jax.jit
@@ -267,7 +268,7 @@ def compare_pixels(
     prepared: CommonMaps,
     model: Float[Array, "band stokes pix"],
     regions: Mapping[str, Bool[np.ndarray, " pix"]],
-    simulated: Simulated,
+    simulated: ComparisonRealisations,
 ) -> list[Scatter]:
     """The observed maps against the model, in each region, for Q, U and both.
 

@@ -211,7 +211,7 @@ def _fit_powers(
     data = np.einsum("pibc,pic->pib", turn, powers - leaked)
     laws = np.einsum("pibc,picl->pibl", turn, np.einsum("pibil->pibl", windows))
     scale = np.mean(offset + seen * A[..., None], axis=-1, keepdims=True)
-    bands = Bands(data / scale, nu, offset / scale, width / scale, laws)
+    bands = BandCombinations(data / scale, nu, offset / scale, width / scale, laws)
     flat = jax.tree.map(lambda x: jnp.asarray(x.reshape(-1, *x.shape[2:])), bands)
     found = minimise(flat, jnp.asarray(slope), ends)
     A, alpha, straight, model, slopes, converged = (
@@ -293,7 +293,7 @@ def decorrelate(
         return np.where(good, root * (expected / sums)[..., None], np.eye(root.shape[-1]))
 
 
-class Bands(NamedTuple):
+class BandCombinations(NamedTuple):
     """Combinations d of bands with variance (2 / nu) ((d + offset)^2 + width^2)."""
 
     data: Float[Array, "... bin"]
@@ -308,7 +308,7 @@ def _variances(
     amplitudes: Float[np.ndarray, "patch x"],
     seen: Float[np.ndarray, "patch bin"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """nu, offset and width (`Bands`) of one field, with the amplitudes of all others as given.
+    """nu, offset and width (`BandCombinations`) of one field, with all other amplitudes given.
 
     `form` has the variances of d as a quadratic form of the amplitudes, those of the field first;
     d is `seen` for an amplitude of 1.
@@ -345,7 +345,7 @@ def _model(theta, bands, slope, ends):
 
 
 @partial(jax.jit, static_argnames="ends")
-def minimise(bands: Bands, slope: Array, ends: tuple[int, int]) -> tuple[Array, ...]:
+def minimise(bands: BandCombinations, slope: Array, ends: tuple[int, int]) -> tuple[Array, ...]:
     """The fit to each row of bands, powers of order one, with the prior of alpha.
 
     Returns A and alpha, the best A with the mean slope, d, its derivative by alpha for A = 1 and

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fits.discs import EDGES, Patch, bicep2_mask, disc_centers, disc_mask, prepare_patches
-from fits.patches import Bands, decorrelate, fit_patches, minimise
+from fits.patches import BandCombinations, decorrelate, fit_patches, minimise
 from jaxsky.cmb import gaussian_fields
 from jaxsky.harmonics import gaussian_beam, synthesis
 
@@ -143,7 +143,7 @@ def test_a_single_clean_band_of_chi2_is_its_own_amplitude():
     nu, data = np.array([[4.0, 10.0, 30.0]]), np.array([[0.7, 1.3, 1.1]])
     laws = np.zeros((1, 3, LMAX + 1))
     laws[0, :, 80] = 1.0  # no slope in it
-    bands = Bands(data, nu, 0 * nu, 1e-3 + 0 * nu, laws)
+    bands = BandCombinations(data, nu, 0 * nu, 1e-3 + 0 * nu, laws)
     A, alpha, *_, good = minimise(
         jax.tree.map(jnp.asarray, bands), jnp.array([-2.4, 3.0]), (40, 100)
     )

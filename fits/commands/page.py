@@ -30,7 +30,7 @@ a { color: #0072b2; }
 """
 
 
-class Table(NamedTuple):
+class TextTable(NamedTuple):
     """A table as text, for the terminal and for a page.
 
     Parameters
@@ -62,7 +62,7 @@ class Section(NamedTuple):
     title: str
     caption: str = ""
     picture: str | None = None
-    table: Table | None = None
+    table: TextTable | None = None
     note: str = ""
 
 
@@ -77,7 +77,7 @@ def key_of(title: str) -> str:
     return title.partition(":")[0].lower().replace(" ", "-")
 
 
-def _table(table: Table) -> str:
+def _table(table: TextTable) -> str:
     """A table; cells that begin with a number do not break."""
 
     def cell(text: str) -> str:

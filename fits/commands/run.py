@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from fits.commands.console import Steps, console, print_tables, print_written, warn
 from fits.commands.endings import interruptible, logged
-from fits.commands.page import Section, Table, write_page
+from fits.commands.page import Section, TextTable, write_page
 from jaxsky.io.folders import ALL, Folder, occupied
 from jaxsky.settings import Experiment, load, of_file
 
@@ -48,7 +48,7 @@ class Report(NamedTuple):
     """
 
     description: str
-    tables: Sequence[Table] = ()
+    tables: Sequence[TextTable] = ()
     warnings: Sequence[str] = ()
     written: Sequence[Path] = ()
     remark: str = ""
@@ -99,7 +99,7 @@ class Command(NamedTuple):
     resumable: bool = True
 
 
-def run(command: Command, options: Options, part: range = ALL) -> None:
+def run_command(command: Command, options: Options, part: range = ALL) -> None:
     """Run a command with what the command line says.
 
     `part` of the results is made, see `jaxsky.io.folders.occupied`.

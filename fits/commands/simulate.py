@@ -21,7 +21,7 @@ SHOWN, LMAX_SHOWN = 5, 1024
 DEPTH = 1e-7
 
 
-def simulation(indices: range, only: str | None = None) -> Command:
+def simulate_command(indices: range, only: str | None = None) -> Command:
     """The command that makes some realisations, of one thing only if that is asked for.
 
     What is kept and what is replaced is seen to map by map.

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from fits.commands.page import Table
+from fits.commands.page import TextTable
 from fits.posterior_plots import plot_chains
 from fits.separate import plots
 from fits.separate.separate import SAMPLED, Separation
@@ -101,7 +101,7 @@ def _mean(degradation: np.ndarray) -> float:
     return float(np.nanmean(degradation))
 
 
-def tables(found: Separation) -> list[Table]:
+def tables(found: Separation) -> list[TextTable]:
     """Parameters and r, with the truth if it is known."""
     fit, truth, ratio = found.fit, found.setup.truth or {}, found.tensors
     rows: list[tuple[str, ...]] = []
@@ -121,7 +121,7 @@ def tables(found: Separation) -> list[Table]:
     rows.append(("noise of CMB, times that without foregrounds", degradation, ""))
     columns = 3 if truth else 2
     return [
-        Table(
+        TextTable(
             ("parameter", "best fit", "truth")[:columns],
             tuple(row[:columns] for row in rows),
             caption=f"standard deviations; chi2/dof {fit.chi2 / fit.dof:.4f}",

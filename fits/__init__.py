@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import jaxsky.bare
 
 if TYPE_CHECKING:
+    from fits.cleaning import separate
     from fits.commands.forecast import forecast
     from fits.comparison import compare
     from fits.discs import prepare_patches
@@ -25,11 +26,13 @@ if TYPE_CHECKING:
     from fits.regions import apodize, clusters, latitude_bands, superpixels
     from fits.results import FitError, FitResult
     from fits.sampling import sample
+    from fits.separated_data import separation_data
     from fits.separated_maps import component_maps, harmonic_component_maps, residual_maps
     from fits.template_likelihood import likelihood
     from fits.tensor_ratio import fit_tensors, power_model
 
 _NAMES = {
+    "cleaning": "separate",
     "commands.forecast": "forecast",
     "comparison": "compare",
     "discs": "prepare_patches",
@@ -46,6 +49,7 @@ _NAMES = {
     "regions": "apodize clusters latitude_bands superpixels",
     "results": "FitError FitResult",
     "sampling": "sample",
+    "separated_data": "separation_data",
     "separated_maps": "component_maps harmonic_component_maps residual_maps",
     "template_likelihood": "likelihood",
     "tensor_ratio": "fit_tensors power_model",

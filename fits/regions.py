@@ -14,8 +14,18 @@ import scipy.cluster.vq
 from jaxtyping import Bool, Float, Int
 
 from jaxsky.checks import Numeric, check_seed
+from jaxsky.inputs import one_column, read
 from jaxsky.io import degrade_mask, read_mask
-from jaxsky.settings import Experiment, MaskFile, at_key, find_file, parse_region
+from jaxsky.settings import (
+    Experiment,
+    MapFile,
+    MaskFile,
+    Regions,
+    SettingsError,
+    at_key,
+    find_file,
+    parse_region,
+)
 
 COMPARISONS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 
@@ -164,6 +174,48 @@ def clusters(
     )
     centers = np.stack([points[good][found == k].mean(axis=0) for k in np.unique(found)])
     return scipy.cluster.vq.vq(points, centers)[0]
+
+
+def _map(
+    folder: Path, spec: MapFile, nside: int, where: str, used: Bool[np.ndarray, " pix"]
+) -> Float[np.ndarray, " pix"]:
+    """A map of one column at the resolution of the separation, with values where it is used."""
+    found = read(folder, spec, stokes="", zeros_are_data=True)
+    values = one_column(found, nside, where, "common.nside")
+    if empty := int(np.sum(used & ~np.asarray(found.mask))):
+        raise SettingsError(f"{where}: {empty} of {used.sum()} used pixels have no value.")
+    return values
+
+
+def parameter_labels(settings: Experiment, used: Bool[np.ndarray, " pix"]) -> dict[str, np.ndarray]:
+    """Regions of the free parameters of a separation that have them."""
+    labels = {}
+    for name, parameter in settings.free_in("separate").items():
+        if parameter.regions is None:
+            continue
+        with at_key(f"free.{name}.regions"):
+            labels[name] = _regions(settings, parameter.regions, used, f"free.{name}.regions")
+    return labels
+
+
+def _regions(
+    settings: Experiment, regions: Regions, used: Bool[np.ndarray, " pix"], where: str
+) -> np.ndarray:
+    folder, nside = Path(settings.data_dir), settings.common.nside
+    if regions.nside is not None:
+        return superpixels(nside, regions.nside)
+    if regions.latitudes is not None:
+        return latitude_bands(nside, regions.latitudes)
+    if regions.file is not None:
+        values = _map(folder, regions.file, nside, f"{where}.file", used)
+        if not np.array_equal(values[used], np.round(values[used])):
+            raise SettingsError(f"{where}.file: labels must be whole numbers.")
+        return np.where(used, values, 0).astype(int)
+    assert regions.clusters is not None  # one of them is given
+    # Without maps, pixels are alike that lie close together.
+    rows = [_map(folder, spec, nside, f"{where}.of", used) for spec in regions.of]
+    maps = np.stack(rows) if rows else np.stack(healpy.pix2vec(nside, np.arange(used.size)))
+    return clusters(np.where(used, maps, np.nan), regions.clusters, seed=settings.seed)
 
 
 def check_labels(name: str, labels: object, npix: int, used: np.ndarray) -> np.ndarray:

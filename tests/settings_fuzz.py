@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import fits.separate.setup
+import fits.separated_data
 from fits.commands.forecast import forecast_inputs
 from fits.commands.run import DEFAULTS
 from fits.common import common_maps
@@ -41,7 +41,7 @@ KINDS = {
     "simulate": Kind(DEFAULTS / "simulate.toml", experiment.build),
     "fit": Kind(DEFAULTS / "fit.toml", partial(_prepared, regions="fit")),
     "compare": Kind(DEFAULTS / "compare.toml", partial(_prepared, regions="compare")),
-    "separate": Kind(DEFAULTS / "separate.toml", fits.separate.setup.build),
+    "separate": Kind(DEFAULTS / "separate.toml", fits.separated_data.separation_data),
     "forecast": Kind(DEFAULTS / "forecast.toml", forecast_inputs),
     "paper": Kind(DEFAULTS / "paper.toml", partial(_prepared, regions="compare")),
 }

@@ -19,7 +19,7 @@ from astropy import units as u
 from astropy.io import fits as pyfits
 
 from fits.inputs import inputs_of
-from fits.separate.setup import build as build_separation
+from fits.separated_data import separation_data
 from jaxsky import Bandpass, Dust, Synchrotron
 from jaxsky.io import read_bandpass, read_beam, read_maps, read_mask, read_spectra, unit_factor
 from jaxsky.settings import load, of_file
@@ -394,7 +394,7 @@ BASES: dict[str, tuple[dict[str, Any], Callable[[Path], Any]]] = {
             "bands": [{"instrument": "litebird", "channels": ["40", "140", "402"]}],
             "free": FREE,
         },
-        and_then(build_separation),
+        and_then(separation_data),
     ),
     "forecast": (
         EMBEDDED | {"regions": {"clean": "|b| > 20"}, "forecast": {"region": "clean"}},

@@ -192,7 +192,7 @@ def test_a_law_has_one_class():
 
 
 def test_separate_refuses_what_has_no_polarization():
-    from fits.separate.setup import build
+    from fits.separated_data import separation_data
 
     settings = Experiment.model_validate(
         {
@@ -203,4 +203,4 @@ def test_separate_refuses_what_has_no_polarization():
         }
     )
     with pytest.raises(SettingsError, match=r"sky\.ff: FreeFree is not polarized"):
-        build(settings)
+        separation_data(settings)

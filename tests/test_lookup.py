@@ -10,7 +10,7 @@ from fits.commands.forecast import forecast_inputs
 from fits.inputs import inputs_of
 from fits.paper.sources import Sources
 from fits.regions import region_masks
-from fits.separate.setup import build as build_separation
+from fits.separated_data import separation_data
 from fits.writing import write_log
 from jaxsky.archive import cache_folder
 from jaxsky.experiment import build as build_experiment
@@ -274,11 +274,11 @@ def paper(settings):
         (fit, ANALYSIS, {"noise": f"{{ hits = {{ {NONE}, fields = ['a'], sigma0 = 1.0 }} }}"}),
         (fit, ANALYSIS, {"common": f"mask = {{ {NONE} }}"}),
         (fit, ANALYSIS, {"common": f"{REGION}[fit]\nregions = ['a']"}),
-        (build_separation, SEPARATION.replace('"dust.fits"', '"none.fits"'), {}),
-        (build_separation, SEPARATION, {"common": f"mask = {{ {NONE} }}"}),
-        (build_separation, SEPARATION, {"component": f"parameters = {{ T_dust = {{ {NONE} }} }}"}),
-        (build_separation, SEPARATION, {"free": f", regions = {{ file = {{ {NONE} }} }}"}),
-        (build_separation, SEPARATION,
+        (separation_data, SEPARATION.replace('"dust.fits"', '"none.fits"'), {}),
+        (separation_data, SEPARATION, {"common": f"mask = {{ {NONE} }}"}),
+        (separation_data, SEPARATION, {"component": f"parameters = {{ T_dust = {{ {NONE} }} }}"}),
+        (separation_data, SEPARATION, {"free": f", regions = {{ file = {{ {NONE} }} }}"}),
+        (separation_data, SEPARATION,
          {"free": f", regions = {{ clusters = 2, of = [{{ {NONE} }}] }}"}),
         (forecast_inputs, FORECAST.replace('"dust.fits"', '"none.fits"'), {}),
         (forecast_inputs, FORECAST, {"forecast": f"region = 'a'\n{REGION}"}),

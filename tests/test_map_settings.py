@@ -10,7 +10,7 @@ from astropy.io import fits as pyfits
 from fits.commands.run import DEFAULTS
 from fits.inputs import inputs_of, read_band
 from fits.regions import region_masks
-from fits.separate.setup import build
+from fits.separated_data import separation_data
 from jaxsky.inputs import read, read_sky
 from jaxsky.io import InputError
 from jaxsky.settings import BandTable, Experiment, MapFile, SettingsError, load
@@ -187,7 +187,7 @@ def test_masks_that_are_coarser_are_named_with_their_key(tmp_path):
         with pytest.raises(SettingsError, match=rf"{key}: .*{words}"):
             region_masks(settings, list(settings.regions))
         with pytest.raises(SettingsError, match=rf"{key}: .*{words}"):
-            build(settings)
+            separation_data(settings)
 
 
 def test_too_many_columns_or_others(tmp_path):
@@ -362,7 +362,9 @@ def separation(folder, **change):
 def test_maps_of_parameters_in_separations(folder):
     def with_(name, **entry):
         parameters = {name: {"file": "p.fits"} | entry}
-        return build(separation(folder, sky={"dust": {"law": "dust", "parameters": parameters}}))
+        return separation_data(
+            separation(folder, sky={"dust": {"law": "dust", "parameters": parameters}})
+        )
 
     for entry, words in [
         ({"name": "beta_dust", "file": "coarse.fits"}, "nside is 2, but common.nside is 8"),
@@ -373,12 +375,12 @@ def test_maps_of_parameters_in_separations(folder):
         with pytest.raises(SettingsError, match=where):
             with_(**entry)
     found = with_("T_dust", fields=["HOLES"], unit="K")
-    assert not found.domain.used[:40].any()
+    assert not found.used[:40].any()
     regions = {"file": {"file": "p.fits", "fields": ["HOLES"], "unit": "K"}}
     free = {"dust.beta_dust": {"start": 1.5, "regions": regions}}
     words = r"free.dust.beta_dust.regions.file: 40 of 768 used pixels have no value"
     with pytest.raises(SettingsError, match=words):
-        build(separation(folder, free=free))
+        separation_data(separation(folder, free=free))
     dust = {"law": "dust", "nu_ref": 353.0, "parameters": {"nu_ref": 545.0}}
     with pytest.raises(ValueError, match="nu_ref is given twice"):
         separation(folder, sky={"dust": dust})

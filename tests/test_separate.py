@@ -1,5 +1,6 @@
 """Separation from settings: pulls of laws and r, a wrong law, both domains, bad settings."""
 
+import dataclasses
 import functools
 
 import healpy
@@ -8,16 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fits import cleaning as module
+from fits.cleaning import separate
+from fits.commands import separate as command
 from fits.commands.run import DEFAULTS
+from fits.commands.separate import separation_tables, separation_warnings
+from fits.noise_response import Response, widened
 from fits.optimize import best_fit
 from fits.priors import priors_of
 from fits.pseudo_cl import band_powers
-from fits.response import Response, widened
-from fits.separate import report
-from fits.separate import separate as module
-from fits.separate.report import tables, warnings
-from fits.separate.separate import separate
-from fits.separate.setup import build
+from fits.separated_data import separation_data
 from fits.tensor_ratio import fit_tensors
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis
@@ -54,15 +55,15 @@ def settings(**changes):
 @functools.cache
 def separated(domain: str = "pixel", nsims: int = 20, sampler: str = "none"):
     how = settings(separate={"domain": domain, "nsims": nsims, "sampler": sampler})
-    setup = build(how)
-    return how, setup, separate(how, setup)
+    given = separation_data(how)
+    return how, given, separate(how, given)
 
 
 @pytest.mark.slow
 def test_pulls_of_laws_and_r():
     """In pixels outside a mask, where smoothed noise is correlated and E leaks into B."""
-    how, setup, found = separated("pixel", 200)
-    domain, lmax, count = setup.domain, 2 * NSIDE, 200
+    how, given, found = separated("pixel", 200)
+    lmax, count = 2 * NSIDE, 200
     spectra = camb_spectra(lmax)
     window = expand(gaussian_beam(FWHM, lmax))
 
@@ -75,16 +76,16 @@ def test_pulls_of_laws_and_r():
     sigma = 1 / np.sqrt(model.tensors @ np.linalg.solve(model.covariance(0.0), model.tensors))
     pulls, ratios = [], []
     for key in jax.random.split(jax.random.key(78), count):
-        noise = domain.noise_realisation(jax.random.fold_in(key, 1))
-        data = np.where(domain.used, setup.foregrounds + np.asarray(cmb(key)) + noise, 0.0)
-        like = domain.likelihood(data)
+        noise = given.noise_realisation(jax.random.fold_in(key, 1))
+        data = np.where(given.used, given.foregrounds + np.asarray(cmb(key)) + noise, 0.0)
+        like = given.likelihood(data)
         # A prior's mean is measured, too.
         prior = priors_of(how, "separate")
         mean = 21.0 + 2.0 * float(jax.random.normal(jax.random.fold_in(key, 2)))
         prior["dust.T_dust"] = type(prior["dust.T_dust"])(mean, 2.0)
         fit = best_fit(like, found.fit.best_fit, priors=prior)
-        pulls.append([(fit.best_fit[n] - setup.truth[n]) / found.sigma[n] for n in fit.free])
-        maps = domain.components(like, fit.best_fit, data, covariance=False).amplitude
+        pulls.append([(fit.best_fit[n] - given.truth[n]) / found.sigma[n] for n in fit.free])
+        maps = given.components(like, fit.best_fit, data, covariance=False).amplitude
         powers = band_powers(found.spectra, maps[found.components.index("cmb")])[1]
         ratios.append(fit_tensors(model, powers).r / sigma)
     every = np.column_stack([pulls, ratios])
@@ -97,23 +98,23 @@ def test_pulls_of_laws_and_r():
 
 @pytest.mark.parametrize("domain", ["pixel", pytest.param("harmonic", marks=pytest.mark.slow)])
 def test_both_domains_find_the_sky(domain):
-    _, setup, found = separated(domain)
+    _, given, found = separated(domain)
     for name in found.fit.free:
-        assert abs(found.fit.best_fit[name] - setup.truth[name]) < 4 * found.sigma[name]
-    assert abs(found.tensors.r - setup.truth["r"]) < 4 * found.tensors.sigma
+        assert abs(found.fit.best_fit[name] - given.truth[name]) < 4 * found.sigma[name]
+    assert abs(found.tensors.r - given.truth["r"]) < 4 * found.tensors.sigma
     assert found.tensors.probability > 1e-3
     assert abs(found.tensors.shift(found.left)) < 0.5 * found.tensors.sigma
     assert np.nanmin(found.degradation) > 1
     # What is left of the data is noise, less what the amplitudes have taken up.
-    noise = setup.domain.noise_realisation(jax.random.key(0))
+    noise = given.noise_realisation(jax.random.key(0))
     if domain == "pixel":
         share = np.nanstd(found.residuals, axis=(1, 2)) / noise.std(axis=(1, 2))
         assert np.all((share > 0.2) & (share < 1.05))
     amplitude = np.array(found.found.amplitude)
-    shown = setup.domain.emission(found.like, found.fit.best_fit, amplitude)
-    rest = setup.data - shown
+    shown = given.emission(found.like, found.fit.best_fit, amplitude)
+    rest = given.observed - shown
     np.testing.assert_array_less(rest.std(axis=(1, 2)), 1.2 * noise.std(axis=(1, 2)))
-    assert len(tables(found)) == 1
+    assert len(separation_tables(found)) == 1
 
 
 @pytest.mark.slow
@@ -126,14 +127,14 @@ def test_errors_of_multipoles_are_those_of_simulations():
 
 def test_noise_of_multipoles_has_its_spectrum():
     """That of pixels, and what is correlated between them; 20 draws of 2 x 65 modes: 2.8 %."""
-    _, setup, _ = separated("harmonic")
-    domain, ell = setup.domain, np.arange(2 * NSIDE + 1)
-    rest = np.where(ell > 1, 3 * domain.noise[:, 0], 0.0)
-    for correlated in (domain.correlated, rest):
-        changed = domain._replace(correlated=correlated)
+    _, given, _ = separated("harmonic")
+    ell = np.arange(2 * NSIDE + 1)
+    rest = np.where(ell > 1, 3 * given.noise[:, 0], 0.0)
+    for correlated in (given.correlated, rest):
+        changed = dataclasses.replace(given, correlated=correlated)
         draws = [changed.noise_realisation(key) for key in jax.random.split(jax.random.key(3), 20)]
         power = np.mean([power_spectrum(jnp.asarray(draw)) for draw in draws], axis=0)
-        expected = domain.noise + correlated[:, None]
+        expected = given.noise + correlated[:, None]
         np.testing.assert_allclose(
             power[..., 8:].mean(axis=-1), expected[..., 8:].mean(axis=-1), rtol=0.05
         )
@@ -147,11 +148,11 @@ def test_a_law_that_is_wrong_shows_in_r():
         regions={"wide": "|b| > 10"},
         separate={"sampler": "none", "region": "wide"},
     )
-    found = separate(how, build(how))
+    found = separate(how, separation_data(how))
     _, _, right = separated()
     assert abs(found.tensors.shift(found.left)) > 10 * abs(right.tensors.shift(right.left))
     assert found.left.sum() > 10 * right.left.sum()
-    said = " ".join(warnings(found, how))
+    said = " ".join(separation_warnings(found, how))
     assert "the laws do not describe the maps" in said
 
 
@@ -160,13 +161,13 @@ def test_regions_have_values_of_their_own():
     regions = {"dust.beta_dust": {"latitudes": [40.0]}, "synchrotron.beta_syn": {"clusters": 3}}
     free = {name: value | {"regions": regions.get(name)} for name, value in FREE.items()}
     how = settings(free=free, regions={"wide": "|b| > 15"}, separate={"region": "wide"})
-    setup = build(how)
-    found = separate(how, setup)
+    given = separation_data(how)
+    found = separate(how, given)
     assert np.shape(found.fit.best_fit["dust.beta_dust"]) == (2,)
     assert np.shape(found.sigma["synchrotron.beta_syn"]) == (3,)
     assert found.chain.labels == found.fit.labels
     for name in found.fit.free:
-        off = np.abs(np.asarray(found.fit.best_fit[name]) - setup.truth[name])
+        off = np.abs(np.asarray(found.fit.best_fit[name]) - given.truth[name])
         assert np.all(off < 4.5 * np.asarray(found.sigma[name]))
     shown = found.of_pixel("dust.beta_dust", found.fit.best_fit)
     latitude = np.abs(healpy.pix2ang(NSIDE, np.arange(shown.size), lonlat=True)[1])
@@ -176,18 +177,18 @@ def test_regions_have_values_of_their_own():
 
 def test_the_response_is_that_of_a_new_fit():
     """To first order in the noise; Gaussian priors draw their mean anew."""
-    how, setup, found = separated()
-    domain, priors = setup.domain, priors_of(how, "separate")
+    how, given, found = separated()
+    priors = priors_of(how, "separate")
     response = Response(found.like, found.fit.best_fit, {})
     amplitude = np.array(found.found.amplitude)
-    data = domain.emission(found.like, found.fit.best_fit, amplitude)
-    noise = 0.1 * domain.noise_realisation(jax.random.key(8))
-    like = domain.likelihood(data + noise)
+    data = given.emission(found.like, found.fit.best_fit, amplitude)
+    noise = 0.1 * given.noise_realisation(jax.random.key(8))
+    like = given.likelihood(data + noise)
     moved = response.moved(like, jax.random.key(0))
     again = best_fit(like, found.fit.best_fit)
     change = like.flat(again.best_fit) - response.theta
     np.testing.assert_allclose(moved - response.theta, change, rtol=0.05, atol=1e-6)
-    silent = domain.likelihood(data)
+    silent = given.likelihood(data)
     with_priors = Response(found.like, found.fit.best_fit, priors)
     steps = [with_priors.moved(silent, k) for k in jax.random.split(jax.random.key(1), 300)]
     scatter = np.cov((np.array(steps) - with_priors.theta).T)
@@ -217,9 +218,9 @@ def test_widened_samples_have_the_errors_of_simulations():
 
 def test_lensing_is_what_the_settings_say():
     """In the simulations that set errors as well as in the model."""
-    _, setup, whole = separated()
+    _, given, whole = separated()
     how = settings(cmb={"A_lens": 0.25}, separate={"sampler": "none"})
-    found = separate(how, setup)
+    found = separate(how, given)
     one, other = whole.tensors.model, found.tensors.model
     leak = whole.spectra.windows[1, :, 0] @ camb_spectra(whole.spectra.lmax)[1]
     np.testing.assert_allclose(other.lensing - leak, (one.lensing - leak) / 4, rtol=1e-9)
@@ -228,37 +229,37 @@ def test_lensing_is_what_the_settings_say():
     np.testing.assert_allclose(np.sqrt(np.diagonal(other.covariance(0.0))), scatter, rtol=1e-9)
     # In the first bin most is E that leaks.
     assert np.all(scatter[1:] < 0.9 * whole.simulated.total.std(axis=0, ddof=1)[1:])
-    assert "A_lens = 0.25" in " ".join(warnings(found, how))
+    assert "A_lens = 0.25" in " ".join(separation_warnings(found, how))
 
 
 def test_more_parameters_than_can_be_sampled_are_named(monkeypatch):
     monkeypatch.setattr(module, "SAMPLED", 2)
-    monkeypatch.setattr(report, "SAMPLED", 2)
-    _, setup, _ = separated()
+    monkeypatch.setattr(command, "SAMPLED", 2)
+    _, given, _ = separated()
     how = settings()
-    found = separate(how, setup)
+    found = separate(how, given)
     assert found.chain is None
-    assert "not sampled: 3 parameters are more than 2" in " ".join(warnings(found, how))
+    assert "not sampled: 3 parameters are more than 2" in " ".join(separation_warnings(found, how))
 
 
 def test_simulations_are_kept_and_gone_on_with(tmp_path):
-    how, setup, _ = separated()
+    how, given, _ = separated()
     counts = []
 
     class Counted(Progress):
         def advance(self, done, of):
             counts.append(done)
 
-    again = separate(how, setup, tmp_path, Counted())
+    again = separate(how, given, tmp_path, Counted())
     assert counts == list(range(21))
     counts.clear()
     more = how.model_copy(update={"separate": how.separate.model_copy(update={"nsims": 22})})
-    found = separate(more, setup, tmp_path, Counted())
+    found = separate(more, given, tmp_path, Counted())
     assert counts == [20, 21, 22]
     np.testing.assert_array_equal(found.simulated.total[:20], again.simulated.total)
     other = settings(cmb={"A_lens": 0.5}, separate={"sampler": "none"})
     with pytest.raises(InputError, match="holds realisations of other data or settings"):
-        separate(other, setup, tmp_path)
+        separate(other, given, tmp_path)
 
 
 def test_the_settings_that_come_along_are_valid():
@@ -317,7 +318,7 @@ def test_settings_that_contradict_themselves_are_refused(changes, words):
 )  # fmt: skip
 def test_settings_that_cannot_work_are_refused(changes, words):
     with pytest.raises(SettingsError, match=words):
-        build(settings(**changes))
+        separation_data(settings(**changes))
 
 
 @pytest.mark.parametrize(
@@ -328,7 +329,7 @@ def test_settings_that_cannot_work_are_refused(changes, words):
     ],
 )
 def test_spectra_that_cannot_be_taken_are_refused(changes, words):
-    _, setup, _ = separated()
+    _, given, _ = separated()
     how = settings(separate=changes)
     with pytest.raises(SettingsError, match=words):
-        separate(how, setup)
+        separate(how, given)

@@ -148,7 +148,7 @@ def test_multipoles_of_files(folder, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
-    from fits.separate import separate as module
+    from fits import cleaning as module
 
     path, out = (
         settings(folder, "stopped", **{'sampler = "emcee"': 'sampler = "none"'}),

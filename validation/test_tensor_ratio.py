@@ -3,11 +3,11 @@
 import jax
 import numpy as np
 
+from fits.cleaning import separate
 from fits.optimize import best_fit
 from fits.priors import priors_of
 from fits.pseudo_cl import band_powers
-from fits.separate.separate import separate
-from fits.separate.setup import build
+from fits.separated_data import separation_data
 from fits.tensor_ratio import fit_tensors
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.harmonics import expand, gaussian_beam, synthesis
@@ -35,9 +35,9 @@ SETTINGS = {
 
 def test_r_comes_back():
     how = Experiment.model_validate(SETTINGS)
-    setup = build(how)
-    found = separate(how, setup)
-    domain, lmax = setup.domain, 2 * NSIDE
+    given = separation_data(how)
+    found = separate(how, given)
+    lmax = 2 * NSIDE
     spectra, window = camb_spectra(lmax, R), expand(gaussian_beam(FWHM, lmax))
 
     @jax.jit
@@ -50,11 +50,11 @@ def test_r_comes_back():
     assert sigma < R
     pulls = []
     for key in jax.random.split(jax.random.key(91), SKIES):
-        noise = domain.noise_realisation(jax.random.fold_in(key, 1))
-        data = np.where(domain.used, setup.foregrounds + np.asarray(cmb(key)) + noise, 0.0)
-        like = domain.likelihood(data)
+        noise = given.noise_realisation(jax.random.fold_in(key, 1))
+        data = np.where(given.used, given.foregrounds + np.asarray(cmb(key)) + noise, 0.0)
+        like = given.likelihood(data)
         fit = best_fit(like, found.fit.best_fit, priors=priors_of(how, "separate"))
-        maps = domain.components(like, fit.best_fit, data, covariance=False).amplitude
+        maps = given.components(like, fit.best_fit, data, covariance=False).amplitude
         powers = band_powers(found.spectra, maps[found.components.index("cmb")])[1]
         pulls.append((fit_tensors(model, powers).r - R) / sigma)
     print(

@@ -1,26 +1,237 @@
-"""`jaxsky separate`, from settings to a report."""
+"""`jaxsky separate`, from settings to tables, maps and pictures."""
 
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fits.cleaning import SAMPLED, Separation, separate
+from fits.commands.page import TextTable
 from fits.commands.run import Command, Report, Run
+from fits.posterior_plots import plot_chains
 from fits.results import FitError
-from fits.separate import report
-from fits.separate.separate import separate
-from fits.separate.setup import build
+from fits.separated_data import PixelData, separation_data
+from fits.writing import leaks, probability, with_error, write_json, write_log
+from jaxsky.inputs import parameter_unit
+from jaxsky.io import write_maps
 from jaxsky.settings import Experiment
+
+#: Probabilities below this are worth a word.
+UNLIKELY = 1e-3
+#: As is E in B above this fraction of a power's standard deviation.
+LEAKED = 0.5
+PICTURES = ("components", "residuals", "spectra", "r")
+
+
+def _pixel_probability(found: Separation) -> dict[str, float] | None:
+    """How many pixels have a chi^2 that is too large."""
+    if not isinstance(found.data, PixelData):
+        return None
+    values = found.found.probability[np.isfinite(found.found.probability)]
+    return {f"below_{p:g}": float(np.mean(values < p)) for p in (0.05, 0.01, 0.001)}
+
+
+def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
+    """All numbers; band powers are D_l of BB in uK_CMB^2."""
+    fit, ratio, spectra = found.fit, found.tensors, found.spectra
+    bands, truth, simulated = list(found.data.bands), found.data.truth or {}, found.simulated
+    results: dict[str, Any] = {
+        "description": found.data.description,
+        "warnings": separation_warnings(found, settings),
+        "domain": settings.separate.domain,
+        "components": found.components,
+        "bands": bands,
+        "parameters": {
+            name: {
+                "best_fit": fit.best_fit[name],
+                "sigma": found.sigma[name],
+                "sigma_of_likelihood": fit.sigma[name],
+                "truth": truth.get(name),
+            }
+            for name in fit.free
+        },
+        "labels": fit.labels,
+        "covariance": found.covariance,
+        "chi2": fit.chi2,
+        "dof": fit.dof,
+        "converged": fit.converged,
+        "message": fit.message,
+        "solver": {key: fit.details[key] for key in ("solver", "steps", "distance")},
+        "pixels_with_small_probability": _pixel_probability(found),
+        "cmb_noise_degradation": float(np.nanmean(found.degradation)),
+        "residual_rms": dict(zip(bands, np.nanstd(found.residuals, axis=(1, 2)), strict=True)),
+        "r": {
+            "best_fit": ratio.r,
+            "sigma": ratio.sigma,
+            "upper_95": ratio.upper_95,
+            "truth": truth.get("r"),
+            "shift_by_foregrounds_left": None if found.left is None else ratio.shift(found.left),
+            "shift_by_errors_of_laws": ratio.shift(simulated.residual.mean(axis=0)),
+            "chi2": ratio.chi2,
+            "dof": ratio.dof,
+            "pte": ratio.probability,
+        },
+        "BB": {
+            "first": spectra.edges[:-1],
+            "last": [edge - 1 for edge in spectra.edges[1:]],
+            "cleaned": ratio.powers,
+            "covariance": ratio.covariance,
+            "noise": simulated.noise.mean(axis=0),
+            "residual_from_errors_of_laws": simulated.residual.mean(axis=0),
+            "foregrounds_left": found.left,
+            "lensing": ratio.model.lensing,
+            "tensors_r_1": ratio.model.tensors,
+        },
+        "simulations": len(simulated.theta),
+    }
+    if found.chain is not None:
+        chain = found.chain
+        results["posterior"] = {
+            "sampler": chain.method,
+            "interval_68": {
+                label: chain.of_row(chain.interval_68, label) for label in chain.labels
+            },
+            "converged": chain.converged,
+            "message": chain.message,
+        }
+    return results
+
+
+def separation_tables(found: Separation) -> list[TextTable]:
+    """Parameters and r, with the truth if it is known."""
+    fit, truth, ratio = found.fit, found.data.truth or {}, found.tensors
+    rows: list[tuple[str, ...]] = []
+    for name in fit.free:
+        value, sigma = np.asarray(fit.best_fit[name]), np.asarray(found.sigma[name])
+        shown = with_error(float(np.nanmedian(value)), float(np.nanmedian(sigma)))
+        regions = f", median of {int(np.isfinite(value).sum())} regions" if value.ndim else ""
+        rows.append((name + regions, shown, f"{truth[name]:g}" if name in truth else ""))
+    rows += [
+        (),
+        ("r", with_error(ratio.r, ratio.sigma), f"{truth.get('r', 0.0):g}"),
+        ("r, 95 % below", f"{ratio.upper_95:.2g}", ""),
+    ]
+    if found.left is not None:
+        rows.append(("r, shift by foregrounds left", f"{ratio.shift(found.left):+.1e}", ""))
+    degradation = f"{float(np.nanmean(found.degradation)):.2f}"
+    rows.append(("noise of CMB, times that without foregrounds", degradation, ""))
+    columns = 3 if truth else 2
+    return [
+        TextTable(
+            ("parameter", "best fit", "truth")[:columns],
+            tuple(row[:columns] for row in rows),
+            caption=f"standard deviations; chi2/dof {fit.chi2 / fit.dof:.4f}",
+        )
+    ]
+
+
+def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
+    """What a user should know before using the numbers, a sentence each."""
+    sentences = [*leaks(settings), *settings.left_out("separate")]
+    fit, ratio, simulated = found.fit, found.tensors, found.simulated
+    sentences += [
+        f"Band {band} carries no weight: its noise is too large. It is not counted in degrees of "
+        "freedom."
+        for band in found.like.weightless
+    ]
+    if not fit.converged:
+        sentences.append(fit.message)
+    elif fit.dof > 0 and abs(fit.chi2 / fit.dof - 1) > 0.1:
+        sentences.append(
+            f"chi2 / dof is {fit.chi2 / fit.dof:.3g}: the laws do not describe the maps, or the "
+            "noise is not what it is said to be."
+        )
+    if ratio.probability < UNLIKELY:
+        sentences.append(
+            f"BB of the cleaned CMB is not that of tensors, lensing, noise and errors of laws "
+            f"(probability {probability(ratio.probability)}); foregrounds may be left in it."
+        )
+    share = simulated.leaked.mean(axis=0) / simulated.total.std(axis=0, ddof=1)
+    if (share > LEAKED).any():
+        sentences.append(
+            f"E that leaks into B at the edge of the mask is up to {share.max():.1f} standard "
+            "deviations of BB in a bin. It is part of the model, but a larger "
+            "separate.apodization makes it and the errors smaller."
+        )
+    if settings.separate.sampler != "none" and len(fit.labels) > SAMPLED:
+        sentences.append(
+            f"The posterior was not sampled: {len(fit.labels)} parameters are more than {SAMPLED}."
+        )
+    if found.chain is not None and not found.chain.converged:
+        sentences.append(f"posterior: {found.chain.message}")
+    if settings.cmb.A_lens != 1:
+        A_lens = settings.cmb.A_lens
+        sentences.append(f"The lensing B modes are taken as known, A_lens = {A_lens:g}.")
+    return sentences
+
+
+def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path]:
+    """Maps of components, residuals, and parameters that have regions."""
+    mask, components = np.isfinite(found.maps).all(axis=(0, 1)), found.found
+    in_pixels = isinstance(found.data, PixelData)
+    names, units, columns = [], [], []
+    for name, maps in zip(found.components, found.maps, strict=True):
+        unit = "uK_CMB" if name == "cmb" else "uK_RJ"
+        for stokes, values in zip("QU", maps[-2:], strict=True):
+            names.append(f"{name.upper()}_{stokes}")
+            units.append(unit)
+            columns.append(values)
+        if in_pixels:
+            for stokes, values in zip("QU", components.sigma(name)[-2:], strict=True):
+                names.append(f"{name.upper()}_SIGMA_{stokes}")
+                units.append(unit)
+                columns.append(np.broadcast_to(values, mask.shape))
+    if in_pixels:
+        names += ["CHI2", "PROBABILITY"]
+        units += ["", ""]
+        columns += [components.chi2, components.probability]
+    written = [out / "components.fits", out / "residuals.fits"]
+    header = {"FWHM": (settings.common.fwhm, "[arcmin]")}
+    options: dict[str, Any] = {"mask": mask, "overwrite": True, "single": True}
+    write_maps(
+        written[0], np.stack(columns), names=names, unit=units, extra_header=header, **options
+    )
+    labels = [f"{band}_{stokes}" for band in found.data.bands for stokes in "QU"]
+    rest = found.residuals[:, -2:].reshape(len(labels), -1)
+    write_maps(written[1], rest, names=labels, unit=settings.separate.unit, **options)
+    varying = [name for name in found.fit.free if np.ndim(found.fit.best_fit[name])]
+    if varying:
+        written.append(out / "parameters.fits")
+        both = (found.fit.best_fit, found.sigma)
+        rows = [found.of_pixel(name, values) for name in varying for values in both]
+        titles = [t for n in varying for t in (n.upper(), f"{n.upper()}_SIGMA")]
+        units = [parameter_unit(name) for name in varying for _ in both]
+        write_maps(written[-1], np.stack(rows), names=titles, unit=units, **options)
+    return written
 
 
 def _work(settings: Experiment, command: Run) -> Report:
+    from fits.commands import separate_pictures as pictures
+
     command.steps.step("reading and preparing maps")
-    setup = build(settings)
+    data = separation_data(settings)
     command.begin()
     try:
-        found = separate(settings, setup, command.out, command.steps)
+        found = separate(settings, data, command.out, command.steps)
     except FitError as error:
         raise ValueError(f"The spectral parameters were not found. {error}") from None
     command.steps.step("drawing")
-    written = report.write_report(command.out, found, settings, command.steps.seconds)
-    return Report(
-        setup.description, report.tables(found), report.warnings(found, settings), written
-    )
+    out, title, warnings = command.out, settings.title, separation_warnings(found, settings)
+    write_json(out / "result.json", _numbers(found, settings))
+    written = [out / "result.json", *_write_maps(out, found, settings)]
+    pictures.plot_components(out / "components.png", found, title)
+    pictures.plot_residuals(out / "residuals.png", found, settings.separate.unit, title)
+    pictures.plot_spectra(out / "spectra.png", found, title)
+    pictures.plot_ratio(out / "r.png", found, title)
+    written += [out / f"{name}.png" for name in PICTURES]
+    if pictures.plot_parameters(out / "parameters.png", found, title):
+        written.append(out / "parameters.png")
+    if (chain := found.chain) is not None:
+        plot_chains(out / "posterior.png", {chain.method: chain}, data.truth, title)
+        written.append(out / "posterior.png")
+    write_log(out / "log.json", settings, command.steps.seconds)
+    written.append(out / "log.json")
+    return Report(data.description, separation_tables(found), warnings, written)
 
 
 COMMAND = Command(
@@ -32,12 +243,7 @@ COMMAND = Command(
         "components.fits",
         "residuals.fits",
         "parameters.fits",
-        "components.png",
-        "residuals.png",
-        "parameters.png",
-        "spectra.png",
-        "r.png",
-        "posterior.png",
+        *(f"{name}.png" for name in (*PICTURES, "parameters", "posterior")),
         "simulations.npz",
         "chain.h5",
     ),

@@ -1,4 +1,4 @@
-"""A component separation, from its settings to the tensor-to-scalar ratio."""
+"""A component separation, from data to the cleaned CMB and the tensor-to-scalar ratio."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,16 +9,14 @@ import numpy as np
 from jaxtyping import Float
 
 from fits.kept import fingerprint, kept_chain, kept_realisations
+from fits.noise_response import Realisation, Response, SimulatedNoise, widened
 from fits.optimize import best_fit
 from fits.priors import priors_of
 from fits.profile_likelihood import SpectralLikelihood
 from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra
-from fits.response import Response, widened
 from fits.results import FitResult, misfit
 from fits.sampling import sample
-from fits.separate.domains import PixelDomain
-from fits.separate.setup import Setup
-from fits.separate.simulations import Realisation, Simulated
+from fits.separated_data import MultipoleData, PixelData
 from fits.tensor_ratio import TensorFit, fit_tensors, power_model
 from jaxsky.checks import check_double
 from jaxsky.cmb import tensor_spectra
@@ -40,7 +38,7 @@ class Separation(NamedTuple):
 
     Parameters
     ----------
-    setup : what was separated
+    data : what was separated
     like : the likelihood of the spectral parameters
     fit : the most probable ones, with the errors that the likelihood gives
     sigma : their standard deviations, by name: in pixels those of the simulations, since the
@@ -57,7 +55,7 @@ class Separation(NamedTuple):
     chain : samples of the posterior, None if none were asked for
     """
 
-    setup: Setup
+    data: PixelData | MultipoleData
     like: SpectralLikelihood
     fit: FitResult
     sigma: dict[str, Any]
@@ -66,7 +64,7 @@ class Separation(NamedTuple):
     maps: Float[np.ndarray, "component stokes pix"]
     degradation: Float[np.ndarray, "stokes _"]
     residuals: Float[np.ndarray, "band stokes pix"]
-    simulated: Simulated
+    simulated: SimulatedNoise
     spectra: MaskedSpectra
     tensors: TensorFit
     left: Float[np.ndarray, " bin"] | None
@@ -79,14 +77,14 @@ class Separation(NamedTuple):
 
     def of_pixel(self, name: str, values: Mapping[str, Any]) -> Float[np.ndarray, " pix"]:
         """The map of a parameter with regions, from its values; NaN where masked."""
-        domain = self.setup.domain
-        assert isinstance(domain, PixelDomain)  # the one with regions
-        return np.where(domain.used, np.asarray(values[name])[domain.labels[name]], np.nan)
+        assert isinstance(self.data, PixelData)  # the one with regions
+        labels = self.data.labels[name]
+        return np.where(self.data.used, np.asarray(values[name])[labels], np.nan)
 
 
 def separate(
     settings: Experiment,
-    setup: Setup,
+    data: PixelData | MultipoleData,
     out: Path | None = None,
     progress: Progress = QUIET,
 ) -> Separation:
@@ -95,47 +93,46 @@ def separate(
     Parameters
     ----------
     settings : how
-    setup : what is separated, from `fits.separate.setup.build`
+    data : what is separated, from `fits.separated_data.separation_data`
     out : folder that keeps simulations and chains; what it holds is not made again
     progress : told of each step of the work
     """
     check_double("A separation")
-    spec, domain, priors = settings.separate, setup.domain, priors_of(settings, "separate")
+    spec, priors = settings.separate, priors_of(settings, "separate")
     progress.step("spectral parameters")
     with at_key("free"):
-        like = domain.likelihood(setup.data)
+        like = data.likelihood(data.observed)
     fit = best_fit(like, priors=priors, throw=False)
     # What no law describes is separated nevertheless, and said.
     fit.checked(throw=fit.message != misfit(fit.chi2, fit.dof))
     response = Response(like, fit.best_fit, priors)
     progress.step("components")
     best = like.named(jnp.asarray(response.theta))
-    found = domain.components(like, best, setup.data)
-    maps = domain.maps(found)
-    row = tuple(like.sky).index("cmb")
+    found = data.components(like, best, data.observed)
+    maps = data.maps(found)
+    row = found.components.index("cmb")
 
     progress.step("simulations")
-    window, spectra = _spectra(settings, setup.mask)
+    window, spectra = _spectra(settings, data.mask)
     highest = window.size - 1
     with at_key("cmb.cosmology"):
         tensors = tensor_spectra(highest, **settings.cmb.cosmology)
     # Simulated and modelled, lensing is what the settings say.
     lensed = cmb_spectra(settings, highest, r=0.0)
-    emission = domain.emission(like, best, _without(found.amplitude, row))
-    realisation = Realisation(domain, like, best, response, emission, row, spectra, window, lensed)
-    kept = None if out is None else out / "simulations.npz"
-    mark = _mark(settings, setup)
-    simulated = Simulated(
-        *kept_realisations(
-            realisation.of,
-            Simulated._fields,
-            spec.nsims,
-            settings.seed,
-            kept,
-            mark,
-            progress.advance,
-        )
+    foregrounds = np.array(found.amplitude)
+    foregrounds[row] = 0.0
+    emission = data.emission(like, best, foregrounds)
+    simulation = Realisation(data, like, best, response, emission, spectra, window, lensed)
+    made = kept_realisations(
+        simulation.of,
+        SimulatedNoise._fields,
+        spec.nsims,
+        settings.seed,
+        None if out is None else out / "simulations.npz",
+        _mark(settings, data),
+        progress.advance,
     )
+    simulated = SimulatedNoise(*made)
     progress.step("tensor-to-scalar ratio")
     # What the spectra know of E in B is part of the model.
     EE = lensed[1, : spectra.lmax + 1]
@@ -149,39 +146,32 @@ def separate(
         simulated.spectrum.mean(axis=0),
         simulated=simulated.total,
     )
-    ratio = fit_tensors(model, band_powers(spectra, maps[row])[1])
     left = None
-    if setup.foregrounds is not None:
-        alone = domain.maps(domain.components(like, best, setup.foregrounds, covariance=False))
-        left = band_powers(spectra, alone[row])[1]
+    if data.foregrounds is not None:
+        alone = simulation.cleaned(best, data.foregrounds)
+        left = band_powers(spectra, jnp.asarray(alone))[1]
     sigma, covariance = _errors(settings, like, fit, simulated)
     chain = None
+    ratio = fit_tensors(model, band_powers(spectra, maps[row])[1])
     if spec.sampler != "none" and len(fit.labels) <= SAMPLED:
         progress.step("posterior")
-        chain = _chain(settings, setup, like, fit, simulated, out, progress)
+        chain = _chain(settings, data, like, fit, simulated, out, progress)
     return Separation(
-        setup,
-        like,
-        fit,
-        sigma,
-        covariance,
-        found,
-        maps,
-        domain.degradation(like, best, "cmb"),
-        domain.residuals(like, best, setup.data, found),
-        simulated,
-        spectra,
-        ratio,
-        left,
-        chain,
+        data=data,
+        like=like,
+        fit=fit,
+        sigma=sigma,
+        covariance=covariance,
+        found=found,
+        maps=maps,
+        degradation=data.degradation(like, best),
+        residuals=data.residuals(like, best, found),
+        simulated=simulated,
+        spectra=spectra,
+        tensors=ratio,
+        left=left,
+        chain=chain,
     )
-
-
-def _without(amplitude: np.ndarray, row: int) -> np.ndarray:
-    """Amplitudes of all components but one."""
-    others = np.array(amplitude)
-    others[row] = 0.0
-    return others
 
 
 def _spectra(
@@ -208,11 +198,11 @@ def _spectra(
     return window, masked_spectra(mask, edges, window=window, pure=pure)
 
 
-def _mark(settings: Experiment, setup: Setup) -> str:
+def _mark(settings: Experiment, data: PixelData | MultipoleData) -> str:
     """What the simulations depend on."""
     left_out = {"separate": {"nsims", "sampler", "nsteps"}}
     said = settings.model_dump_json(exclude=left_out)
-    return f"{fingerprint((setup.data, setup.mask))} {said}"
+    return f"{fingerprint((data.observed, data.mask))} {said}"
 
 
 def _errors(settings, like, fit, simulated):
@@ -229,14 +219,14 @@ def _errors(settings, like, fit, simulated):
     return sizes, np.where(determined & determined[:, None], covariance, np.nan)
 
 
-def _chain(settings, setup, like, fit, simulated, out, progress):
+def _chain(settings, data, like, fit, simulated, out, progress):
     """Samples of the posterior; in pixels with the errors of the simulations."""
     spec = settings.separate
     size = int(np.isfinite(np.asarray(like.flat(fit.best_fit))).sum())
     nwalkers = max(WALKERS, 2 * size + 2)
     backend = None
     if spec.sampler == "emcee" and out is not None:
-        backend = kept_chain(out / "chain.h5", "mcmc", (nwalkers, size), _mark(settings, setup))
+        backend = kept_chain(out / "chain.h5", "mcmc", (nwalkers, size), _mark(settings, data))
     samples = sample(
         like,
         fit.best_fit,

@@ -7,6 +7,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 
+from fits.cleaning import Separation
 from fits.plots import (
     COLORS,
     COLUMN,
@@ -20,7 +21,6 @@ from fits.plots import (
     spread,
     stokes_panels,
 )
-from fits.separate.separate import Separation
 from fits.writing import with_error
 
 #: Bands whose residuals are drawn.
@@ -46,7 +46,7 @@ def plot_components(path: Path, found: Separation, title: str) -> None:
 
 def plot_residuals(path: Path, found: Separation, unit: str, title: str) -> None:
     """Data less components in a few bands, Q beside U."""
-    names, rows = list(found.setup.domain.bands), []
+    names, rows = list(found.data.bands), []
     for name in spread(names, SHOWN):
         maps = found.residuals[names.index(name), -2:]
         limit = 3 * float(np.nanstd(maps))
@@ -158,7 +158,7 @@ def plot_ratio(path: Path, found: Separation, title: str) -> None:
             label=f"95 %: $r < {_two_digits(ratio.upper_95)}$",
         )
         _interval(axes, ratio.r, ratio.sigma)
-        if (known := (found.setup.truth or {}).get("r")) is not None:
+        if (known := (found.data.truth or {}).get("r")) is not None:
             axes.axvline(known, color=TRUTH, lw=1.6, label="truth")
         low = min(0.0, ratio.r - 1.3 * ratio.sigma)
         shown = ratio.grid[ratio.posterior > 2e-3].max()

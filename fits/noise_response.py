@@ -1,0 +1,177 @@
+"""What noise does to a separation: errors of parameters, noise and residuals of BB.
+
+Smoothed noise is correlated between pixels, which the spectral likelihood does not know. So its
+errors are taken from simulations: foregrounds as they were found, with new noise. To first order
+the parameters move by -H^-1 times the gradient of -ln L; the components are then separated with
+those parameters, so that residual foregrounds appear with the noise that caused them.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fits.posterior import Likelihood, Posterior, value_and_gradient
+from fits.priors import Gaussian, Prior
+from fits.profile_likelihood import SpectralLikelihood
+from fits.pseudo_cl import MaskedSpectra, band_powers
+from fits.results import FitResult
+from fits.separated_data import MultipoleData, PixelData
+from fits.systems import Factor
+from jaxsky.checks import Numeric
+from jaxsky.cmb import realisation
+from jaxsky.harmonics import analysis, expand, power_spectrum, synthesis
+from jaxsky.keys import stream
+
+
+class Response:
+    """-H^-1 of a fit, with H the curvature of -log posterior.
+
+    Parameters
+    ----------
+    like : the likelihood that was fitted
+    params : the best fit
+    priors : those of the fit
+
+    Attributes
+    ----------
+    theta : the best fit as a vector; start values in regions without a pixel
+    """
+
+    def __init__(
+        self,
+        like: Likelihood,
+        params: Mapping[str, Numeric],
+        priors: Mapping[str, Prior] | None = None,
+    ) -> None:
+        self._posterior = posterior = Posterior(like, priors or {})
+        self.theta = np.array(like.flat(like.check(params)))
+        self._keep = np.flatnonzero(posterior.present & ~posterior.edges(self.theta))
+        curvature = posterior.curvature(self.theta, posterior.exact(self.theta), self._keep)
+        self._factor = Factor(curvature)
+        if not self._factor.positive:
+            raise ValueError("The best fit is no maximum of the posterior.")
+
+    def moved(self, like: Likelihood, key: Array) -> Float[np.ndarray, " par"]:
+        """The best fit to other data, within the bounds of uniform priors.
+
+        The means of Gaussian priors are drawn anew, too, since they were measured like the data.
+
+        Parameters
+        ----------
+        like : likelihood of data that are the best fit and noise
+        key : of jax.random, for the priors
+        """
+        gradient = np.array(value_and_gradient(like, self.theta)[1])
+        draws = np.asarray(jax.random.normal(key, gradient.shape))
+        for prior, where in self._posterior.priors:
+            assert isinstance(prior, Gaussian)  # the only one that is not a bound
+            gradient += np.where(where, draws / prior.sigma, 0.0)
+        theta = self.theta.copy()
+        theta[self._keep] -= self._factor.solve(gradient[self._keep])
+        return np.clip(theta, self._posterior.low, self._posterior.high)
+
+
+def widened(
+    samples: FitResult,
+    center: Float[np.ndarray, " par"],
+    hessian: Float[np.ndarray, "par par"],
+    errors: Float[np.ndarray, "sim par"],
+) -> FitResult:
+    """Samples of a posterior whose likelihood has wrong errors, stretched to the right ones.
+
+    About the best fit by S L^-1, with L L^T = H^-1 and S S^T the covariance of the estimates: the
+    open-faced sandwich of Shaby (2014, J. Comput. Graph. Stat. 23, 853). With too few simulations
+    for the covariance, each parameter by the ratio of its standard deviations.
+
+    Parameters
+    ----------
+    samples : of chains
+    center : the best fit, in their order
+    hessian : curvature of -log posterior there
+    errors : of estimates from simulations
+    """
+    inverse = np.linalg.inv(hessian)
+    if len(errors) > 4 * len(center):
+        wanted = np.atleast_2d(np.cov(errors.T))
+        turn = np.linalg.cholesky(wanted) @ np.linalg.inv(np.linalg.cholesky(inverse))
+    else:
+        turn = np.diag(errors.std(axis=0, ddof=1) / np.sqrt(np.diagonal(inverse)))
+    return samples.with_chain(center + (samples.details["chain"] - center) @ turn.T)
+
+
+class SimulatedNoise(NamedTuple):
+    """Of each simulation; band powers are D_b of BB [uK_CMB^2].
+
+    Parameters
+    ----------
+    theta : parameters, less the best fit
+    noise : band powers of the noise in the cleaned CMB
+    residual : those of the foregrounds that are left with these parameters
+    both : those of the sum
+    total : those of the sum and a CMB without tensors
+    leaked : those of that CMB without its B modes: E that pixels and mask turn into B
+    spectrum : C_l of the sum in the masked map, over the mean square of the mask
+    """
+
+    theta: Float[np.ndarray, "sim par"]
+    noise: Float[np.ndarray, "sim bin"]
+    residual: Float[np.ndarray, "sim bin"]
+    both: Float[np.ndarray, "sim bin"]
+    total: Float[np.ndarray, "sim bin"]
+    leaked: Float[np.ndarray, "sim bin"]
+    spectrum: Float[np.ndarray, "sim ell"]
+
+
+@partial(jax.jit, static_argnames="lmax")
+def _mean_spectrum(mask, maps, lmax):
+    """C_l of a masked map, the mean of EE and BB."""
+    power = power_spectrum(analysis(mask * jnp.where(mask > 0, maps, 0.0), lmax, 0))
+    return power.mean(axis=0) / jnp.mean(mask**2)
+
+
+class Realisation(NamedTuple):
+    """What a realisation is made of: simulated noise on top of the foregrounds that were found.
+
+    Parameters
+    ----------
+    data : what is separated, and how
+    like, best, response : the likelihood, the best fit by name, and what noise does to it
+    emission : foregrounds in the bands, as they were found
+    spectra, window : how BB is taken, and the beam of the maps
+    lensed : spectra of a CMB without tensors, up to the end of the window [uK_CMB^2]
+    """
+
+    data: PixelData | MultipoleData
+    like: SpectralLikelihood
+    best: Mapping[str, Array]
+    response: Response
+    emission: Float[np.ndarray, "band stokes _"]
+    spectra: MaskedSpectra
+    window: Float[np.ndarray, " ell"]
+    lensed: Float[np.ndarray, "4 ell"]
+
+    def cleaned(self, params: Mapping[str, Array], data: np.ndarray) -> np.ndarray:
+        """The map of the CMB with these parameters."""
+        found = self.data.components(self.like, params, data, covariance=False)
+        return self.data.maps(found)[found.components.index("cmb")]
+
+    def of(self, key: Array) -> Sequence[Array | np.ndarray]:
+        """What `SimulatedNoise` holds of one realisation."""
+        noise = self.data.noise_realisation(key)
+        observed = self.emission + noise
+        moved = self.response.moved(self.data.likelihood(observed), stream(key, "priors"))
+        alone = self.cleaned(self.best, noise)
+        both = self.cleaned(self.like.named(jnp.asarray(moved)), observed)
+        nside = healpy.npix2nside(both.shape[-1])
+        alm = realisation(stream(key, "cmb"), self.lensed) * expand(jnp.asarray(self.window))
+        sky, E = synthesis(alm, nside), synthesis(alm.at[1].set(0.0), nside)
+        every = (alone, both - alone, both, both + sky, E)
+        powers = [band_powers(self.spectra, jnp.asarray(maps))[1] for maps in every]
+        spectrum = _mean_spectrum(self.spectra.mask, both, self.spectra.lmax)
+        return [moved - self.response.theta, *powers, spectrum]

@@ -1,1 +1,0 @@
-"""The command `jaxsky separate`: from settings to components, spectra and r."""

@@ -31,7 +31,7 @@ def _log_posterior(like, axes, priors):
 
     def point(*values):
         params = dict(zip(names, values, strict=True))
-        value = like.total(jnp.stack(values)[None])
+        value = like.total(jnp.stack(values)[like.cells()])
         return -value / 2 + log_prior(params, priors), value
 
     if isinstance(like, PixelLikelihood):
@@ -92,8 +92,9 @@ def grid_fit(
 
     Parameters
     ----------
-    like : from `fits.template_likelihood`
-    start : the free parameters by name (the values do not matter); one or two
+    like : from `fits.likelihood` or `fits.spectral_likelihood`
+    start : the free parameters by name (the values do not matter), one or two; by default those
+        of the likelihood
     priors : a uniform prior for each of them
     points : points an axis
 

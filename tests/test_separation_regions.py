@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 
 from fits import mixing, systems
+from fits.grid import grid_fit
 from fits.noise import as_noise
 from fits.optimize import best_fit
 from fits.posterior import chi2
-from fits.priors import Gaussian
+from fits.priors import Gaussian, Uniform
 from fits.profile_likelihood import spectral_likelihood
 from fits.regions import clusters, latitude_bands, superpixels
 from fits.results import FitError
 from fits.sampling import sample
 from fits.separated_maps import component_maps
-from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe
+from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe, set_parameters
 from test_separation import BANDS, NPIX, START, TRUTH, problem, random_sky
 
 HALVES = np.arange(NPIX) % 2
@@ -358,3 +359,20 @@ def test_a_band_without_weight_is_named_and_not_counted(kind):
     light = spectral_likelihood(random_sky(), BANDS, data, noise, START)
     assert light.weightless == (next(iter(BANDS)),)
     assert light.dof(3) == without.dof(3) == whole.dof(3) - data[0].size
+
+
+def test_a_grid_knows_parameters_that_are_fixed_maps():
+    _, data, given, _ = problem("full")
+    T_dust = np.linspace(18.0, 22.0, NPIX)
+    sky = set_parameters(random_sky(), {"dust.T_dust": T_dust})
+    like = spectral_likelihood(sky, BANDS, data, given, {"dust.beta_dust": 1.5})
+    fit = best_fit(like)
+    value, sigma = (
+        fit.best_fit["dust.beta_dust"],
+        np.linalg.inv(fit.details["hessian"])[0, 0] ** 0.5,
+    )
+    prior = Uniform(value - 8 * sigma, value + 8 * sigma)
+    grid = grid_fit(like, priors={"dust.beta_dust": prior})
+    assert grid.best_fit["dust.beta_dust"] == pytest.approx(value, abs=0.1 * sigma)
+    assert grid.sigma["dust.beta_dust"] == pytest.approx(sigma, rel=0.05)
+    assert grid.chi2 == pytest.approx(fit.chi2, abs=0.01)

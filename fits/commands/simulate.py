@@ -108,5 +108,6 @@ def _draw_sheet(path: Path, files: Mapping[str, Path], lmax: int, settings: Expe
         for index, (axes, which) in enumerate(zip(panels[-1], ("EE", "BB"), strict=True)):
             draw_spectra(axes, {n: s[index] for n, s in spectra.items()}, unit)
             axes.set_title(which)
-            axes.set_ylim(bottom=axes.get_ylim()[1] * DEPTH)
+            low, high = axes.get_ylim()
+            axes.set_ylim(bottom=max(low, high * DEPTH))
         panels[-1, 0].legend(title="band", ncols=2, frameon=False)

@@ -22,7 +22,7 @@ NOTHING = 1e-5
 CHUNK = 32
 
 
-def band_covariance(
+def bandpower_covariance(
     spectra: MaskedSpectra,
     EE: Float[np.ndarray, " ell"],
     BB: Float[np.ndarray, " ell"],

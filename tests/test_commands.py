@@ -13,7 +13,7 @@ from rich.console import Console
 
 from commands import jaxsky
 from fits.commands import console as terminal
-from fits.commands.page import Section, TextTable, key_of, write_page
+from fits.commands.page import ResultTable, Section, key_of, write_page
 from fits.commands.run import DEFAULTS
 
 
@@ -54,13 +54,13 @@ def test_steps_on_a_terminal_leave_their_times(monkeypatch, tmp_path):
 
 def test_numbers_are_whole_however_narrow_the_terminal(capsys):
     names = ("name", *(f"column{i}" for i in range(12)))
-    table = TextTable(names, (("/a/path/to/something", *["-1234567.89012"] * 12),))
+    table = ResultTable(names, (("/a/path/to/something", *["-1234567.89012"] * 12),))
     terminal.print_tables([table], width=40)
     assert capsys.readouterr().out.count("-1234567.89012") == 12
 
 
 def test_page(tmp_path):
-    table = TextTable(("name", "value"), (("beta", "1.53"), (), ("T", "20")), title="A <table>")
+    table = ResultTable(("name", "value"), (("beta", "1.53"), (), ("T", "20")), title="A <table>")
     sections = [
         Section("Results: all", "What & why", table=table, note="Note: read <this>"),
         Section("picture", picture="a b.png"),

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from fits.commands import compare_pictures as pictures
-from fits.commands.page import TextTable
+from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
 from fits.common import common_maps
 from fits.comparison import Comparison, check_comparison, compare
@@ -89,7 +89,7 @@ def _numbers(comparison: Comparison, patches: PatchComparison | None) -> dict[st
     return found
 
 
-def _table(comparison: Comparison) -> TextTable:
+def _table(comparison: Comparison) -> ResultTable:
     """Slopes, correlations and probabilities."""
     header = ("band", "region", "", "slope", "r", "rms", "exp.", "PTE", "EE", "BB")
     spectra = {s.band: s for s in comparison.spectra}
@@ -107,7 +107,7 @@ def _table(comparison: Comparison) -> TextTable:
         "that expected of noise and CMB, in uK_RJ; PTE: probability that noise and CMB alone give "
         "a larger chi2, in pixels, EE and BB."
     )
-    return TextTable(header, tuple(rows), caption=caption, words=3)
+    return ResultTable(header, tuple(rows), caption=caption, words=3)
 
 
 def comparison_warnings(comparison: Comparison, settings: Experiment) -> list[str]:

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from fits.commands.page import TextTable
+from fits.commands.page import ResultTable
 from jaxsky import progress
 
 #: Everything is printed as it is: names, titles and paths may have brackets and colons.
@@ -37,7 +37,7 @@ def warn(sentence: str) -> None:
     console.print(Text.assemble(("(!)", "yellow"), " ", sentence))
 
 
-def print_tables(tables: Sequence[TextTable], width: int | None = None) -> None:
+def print_tables(tables: Sequence[ResultTable], width: int | None = None) -> None:
     """Print results on standard output, where it is too narrow for a number in longer lines."""
     out = Console(width=width, **PLAIN)
     for table in tables:

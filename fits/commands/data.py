@@ -8,7 +8,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, Trans
 
 from fits.commands.console import console, print_tables
 from fits.commands.endings import interruptible
-from fits.commands.page import TextTable
+from fits.commands.page import ResultTable
 
 data_commands = typer.Typer(
     help="Official data products: what there is, download, and checks.", no_args_is_help=True
@@ -54,7 +54,7 @@ def _list(products: Words = None, folder: Folder = None) -> None:
             held = f"{count} of {len(members)}"
             rows.append((name, group_of.title, "", "", total_size(members), held))
     header = ("file", "what", "nside", "unit", "size", "here")
-    table = TextTable(header, tuple(rows), title=f"Kept in {folder}", words=6)
+    table = ResultTable(header, tuple(rows), title=f"Kept in {folder}", words=6)
     print_tables([table], width=None if console.is_terminal else 200)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fits import posterior_plots
-from fits.commands.page import TextTable
+from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
 from fits.common import common_maps
 from fits.inputs import Inputs, inputs_of
@@ -96,7 +96,7 @@ def _short_names(names: Sequence[str]) -> list[str]:
     return [s if short.count(s) == 1 else name for name, s in zip(names, short, strict=True)]
 
 
-def _table(fits: Sequence[RegionFit], truth: Mapping[str, float] | None) -> TextTable:
+def _table(fits: Sequence[RegionFit], truth: Mapping[str, float] | None) -> ResultTable:
     """The best fits and 68 % intervals, and the truth if there is one."""
     free = all_free(fits)
     rows: list[tuple[str, ...]] = []
@@ -113,7 +113,7 @@ def _table(fits: Sequence[RegionFit], truth: Mapping[str, float] | None) -> Text
     if truth is not None:
         known = [f"{truth[name]:g}" if name in truth else "" for name in free]
         rows.append(("truth", "", "", *known, ""))
-    return TextTable(
+    return ResultTable(
         ("region", "", "method", *_short_names(free), "chi2/dof"),
         tuple(rows),
         caption="best fit and central 68 % interval; chi2 counts pixels with the noise alone",

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from fits import b_modes
 from fits.b_modes import BandLaw
-from fits.commands.page import TextTable
+from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
 from fits.common import prepare_component
 from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors, foreground_names, unit_sky
@@ -291,7 +291,7 @@ def _numbers(found: Forecast, settings: Experiment) -> dict[str, Any]:
     return results
 
 
-def _tables(found: Forecast) -> list[TextTable]:
+def _tables(found: Forecast) -> list[ResultTable]:
     """The foregrounds in bands, and the errors."""
     ranges = [f"r, {where}" for where in next(iter(found.equal_r.values()))]
     bands = [
@@ -317,12 +317,12 @@ def _tables(found: Forecast) -> list[TextTable]:
     if found.without_foregrounds is not None:
         numbers += [(), ("r, without foregrounds", "", f"{found.without_foregrounds:.2g}", "", "")]
     return [
-        TextTable(
+        ResultTable(
             ("band", "D_l / uK_CMB^2", "slope of C_l", *ranges),
             tuple(bands),
             caption=f"BB of foregrounds at l = {b_modes.PIVOT}, and the r that has as much",
         ),
-        TextTable(
+        ResultTable(
             ("parameter", "value", "error", "others known", "prior"),
             tuple(numbers),
             caption="errors of 68 %, all free parameters marginalised",

@@ -30,7 +30,7 @@ a { color: #0072b2; }
 """
 
 
-class TextTable(NamedTuple):
+class ResultTable(NamedTuple):
     """A table as text, for the terminal and for a page.
 
     Parameters
@@ -62,7 +62,7 @@ class Section(NamedTuple):
     title: str
     caption: str = ""
     picture: str | None = None
-    table: TextTable | None = None
+    table: ResultTable | None = None
     note: str = ""
 
 
@@ -77,7 +77,7 @@ def key_of(title: str) -> str:
     return title.partition(":")[0].lower().replace(" ", "-")
 
 
-def _table(table: TextTable) -> str:
+def _table(table: ResultTable) -> str:
     """A table; cells that begin with a number do not break."""
 
     def cell(text: str) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 from pydantic import TypeAdapter, ValidationError
 
-from fits.commands.page import Section, TextTable, write_page
+from fits.commands.page import ResultTable, Section, write_page
 from fits.commands.run import PAGE, Command, Report, Run
 from fits.paper import figures_data, figures_model
 from fits.paper.items import Impossible, Item, described, picture_of
@@ -173,7 +173,7 @@ def _write_page(sources: Sources, out: Path, items: list[Item]) -> list[Item]:
         for number in item.numbers
     )
     if rows:
-        table = TextTable(("quantity", "paper", "here", "about it", "see"), rows)
+        table = ResultTable(("quantity", "paper", "here", "about it", "see"), rows)
         items = [*items, described(NUMBERS, None, table=table)]
     seconds = sum(item.seconds or 0 for item in items)
     write_page(

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from fits.commands.console import Steps, console, print_tables, print_written, warn
 from fits.commands.endings import interruptible, logged
-from fits.commands.page import Section, TextTable, write_page
+from fits.commands.page import ResultTable, Section, write_page
 from jaxsky.io.folders import ALL, Folder, occupied
 from jaxsky.settings import Experiment, load, of_file
 
@@ -48,7 +48,7 @@ class Report(NamedTuple):
     """
 
     description: str
-    tables: Sequence[TextTable] = ()
+    tables: Sequence[ResultTable] = ()
     warnings: Sequence[str] = ()
     written: Sequence[Path] = ()
     remark: str = ""

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from fits.cleaning import SAMPLED, Separation, separate
-from fits.commands.page import TextTable
+from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
 from fits.posterior_plots import plot_chains
 from fits.results import FitError
@@ -97,7 +97,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
     return results
 
 
-def separation_tables(found: Separation) -> list[TextTable]:
+def separation_tables(found: Separation) -> list[ResultTable]:
     """Parameters and r, with the truth if it is known."""
     fit, truth, ratio = found.fit, found.data.truth or {}, found.tensors
     rows: list[tuple[str, ...]] = []
@@ -117,7 +117,7 @@ def separation_tables(found: Separation) -> list[TextTable]:
     rows.append(("noise of CMB, times that without foregrounds", degradation, ""))
     columns = 3 if truth else 2
     return [
-        TextTable(
+        ResultTable(
             ("parameter", "best fit", "truth")[:columns],
             tuple(row[:columns] for row in rows),
             caption=f"standard deviations; chi2/dof {fit.chi2 / fit.dof:.4f}",

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from fits.b_modes import PIVOT
 from fits.commands.forecast import forecast
 from fits.commands.forecast_pictures import plot_b_modes
-from fits.commands.page import TextTable
+from fits.commands.page import ResultTable
 from fits.paper.items import TEXTS, Impossible, Item, Number, described, filled, listed
 from fits.paper.sources import NSIDE, PAPER_FWHM, SYMBOLS, Index, Sources
 from fits.plots import (
@@ -382,4 +382,4 @@ def table_core(sources: Sources, picture: Path) -> Item:
         ("Noise [µK_RJ arcmin]", *(f"{float(channel.noise):.2f}" for channel in channels)),
         ("Width [GHz]", *(f"{float(channel.width):.3g}" for channel in channels)),
     )
-    return described("Table 1", None, table=TextTable(header, rows))
+    return described("Table 1", None, table=ResultTable(header, rows))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from fits.commands.page import TextTable
+from fits.commands.page import ResultTable
 
 #: Titles, captions, what differs from the paper, and numbers of its text, by label.
 TEXTS: dict[str, Any] = tomllib.loads(
@@ -50,7 +50,7 @@ class Item:
     caption: str
     differs: str
     picture: str | None = None
-    table: TextTable | None = None
+    table: ResultTable | None = None
     numbers: tuple[Number, ...] = ()
     seconds: float | None = None
 
@@ -65,7 +65,7 @@ def described(
     picture: Path | None,
     numbers: Sequence[Number] = (),
     *,
-    table: TextTable | None = None,
+    table: ResultTable | None = None,
     texts: str | None = None,
     **words: Any,
 ) -> Item:

@@ -9,25 +9,12 @@ from astropy.io import fits as pyfits
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.io import degrade_mask, read_maps, read_mask, write_maps
+from mapfiles import NSIDE, save, sky
 from refusals import refused
 
-NSIDE = 8
 NPIX = 12 * NSIDE**2
-HEADER = {"PIXTYPE": "HEALPIX", "ORDERING": "RING", "NSIDE": NSIDE, "COORDSYS": "G"}
 PLANCK = ["I_STOKES", "Q_STOKES", "U_STOKES", "HITS", "II_COV", "IQ_COV", "IU_COV"]
 PLANCK += ["QQ_COV", "QU_COV", "UU_COV"]
-
-
-def save(path, columns, units=None, before=(), **header):
-    """A FITS table as the archives have it; header=None leaves a keyword out."""
-    units = units or {}
-    cols = [
-        pyfits.Column(name=n, format="E", array=v, unit=units.get(n)) for n, v in columns.items()
-    ]
-    table = pyfits.BinTableHDU.from_columns(cols)
-    table.header.update({k: v for k, v in (HEADER | header).items() if v is not None})
-    pyfits.HDUList([pyfits.PrimaryHDU(), *before, table]).writeto(path)
-    return path
 
 
 @pytest.fixture
@@ -121,18 +108,8 @@ def test_maps_in_another_hdu(tmp_path):
     assert read_mask(path, hdu=2).all()
 
 
-def celestial(rng, nside, lmax):
-    """A band-limited sky, I, Q, U and a scalar, in Celestial and in Galactic coordinates."""
-    ell, m = healpy.Alm.getlm(lmax)
-    alm = rng.normal(size=(2, 3, ell.size)) / (1 + ell) ** 1.5
-    alm = alm[0] + 1j * np.where(m > 0, alm[1], 0)
-    alm[1:, ell < 2] = 0
-    turned = healpy.Rotator(coord=["C", "G"]).rotate_alm(alm)
-    return healpy.alm2map(alm, nside), healpy.alm2map(turned, nside)
-
-
-def test_coordinates_are_turned_with_spin_two(tmp_path, rng):
-    source, expected = celestial(rng, 16, 20)
+def test_coordinates_are_turned_with_spin_two(tmp_path):
+    source, expected = sky(16, "C", 20)
     path = tmp_path / "c.fits"
     healpy.write_map(path, source, coord="C", column_units="uK_RJ", dtype=np.float64)
     read = read_maps(path)
@@ -144,8 +121,8 @@ def test_coordinates_are_turned_with_spin_two(tmp_path, rng):
     np.testing.assert_allclose(pair.maps, read.maps[1:], atol=1e-12)
 
 
-def test_masked_maps_are_turned_between_pixels(tmp_path, rng):
-    source, expected = celestial(rng, 64, 8)
+def test_masked_maps_are_turned_between_pixels(tmp_path):
+    source, expected = sky(64, "C", 8)
     source[1, healpy.query_disc(64, [1, 0, 0], 0.3)] = healpy.UNSEEN
     path = tmp_path / "c.fits"
     healpy.write_map(path, source, coord="C", column_units="uK_RJ", dtype=np.float64)

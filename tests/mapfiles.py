@@ -23,6 +23,27 @@ def save(path, columns, units=None, formats=None, before=(), **header):
     return path
 
 
+def table(columns, units, name="MAP", form="E", **header):
+    """A table with columns given in RING, as they are in the file's ordering."""
+    nside = healpy.npix2nside(len(next(iter(columns.values()))))
+    order = np.arange(12 * nside**2)
+    if header.get("ORDERING") == "NESTED":
+        order = healpy.nest2ring(nside, order)
+    made = [
+        pyfits.Column(n, form, unit=unit, array=np.asarray(c)[order])
+        for (n, c), unit in zip(columns.items(), units, strict=True)
+    ]
+    hdu = pyfits.BinTableHDU.from_columns(made, name=name)
+    keys = {"PIXTYPE": "HEALPIX", "ORDERING": "RING", "NSIDE": nside, "COORDSYS": "G"} | header
+    hdu.header.update({k: v for k, v in keys.items() if v is not None})
+    return hdu
+
+
+def write(path, *tables):
+    pyfits.HDUList([pyfits.PrimaryHDU(), *tables]).writeto(path, overwrite=True)
+    return path
+
+
 def sky(nside, frame, lmax=16):
     """I, Q, U without structure above lmax, in a frame of coordinates and in Galactic ones."""
     rng = np.random.default_rng(3)

@@ -16,6 +16,7 @@ from jaxsky.inputs import (
 from jaxsky.io import InputError
 from jaxsky.noise_inputs import read_noise
 from jaxsky.settings import BandpassSpec, Experiment, MapFile, NoiseTable, SettingsError, load
+from mapfiles import table, write
 
 NSIDE = 4
 NPIX = 12 * NSIDE**2
@@ -26,18 +27,8 @@ SIX = ["II_COV", "IQ_COV", "IU_COV", "QQ_COV", "QU_COV", "UU_COV"]
 HOLE = 7
 
 
-def write(path, columns, units, nest=False, coordinates="G", nside=NSIDE):
-    """A FITS map in RING or NESTED from columns in RING."""
-    nested = [healpy.reorder(c, r2n=True) if nest else c for c in columns.values()]
-    cols = [
-        pyfits.Column(name=n, format="D", array=c, unit=u)
-        for n, c, u in zip(columns, nested, units, strict=True)
-    ]
-    table = pyfits.BinTableHDU.from_columns(cols)
-    table.header.update(PIXTYPE="HEALPIX", ORDERING="NESTED" if nest else "RING", NSIDE=nside)
-    if coordinates:
-        table.header["COORDSYS"] = coordinates
-    table.writeto(path)
+def save(path, columns, units, **header):
+    write(path, table(columns, units, form="D", **header))
 
 
 @pytest.fixture(scope="module")
@@ -64,22 +55,22 @@ def folder(tmp_path_factory, matrices, hits):
     covariance = dict(zip(SIX, matrices[rows, columns].copy(), strict=True))
     covariance["UU_COV"][HOLE] = healpy.UNSEEN
     units = ["K_CMB"] * 3 + ["K_CMB^2"] * 6
-    write(folder / "planck.fits", maps | covariance, units, nest=True)
+    save(folder / "planck.fits", maps | covariance, units, ORDERING="NESTED")
     # As WMAP's: mK that may be anything, "counts", no coordinates.
     wmap = {"TEMPERATURE": maps["I_STOKES"], "Q_POLARISATION": maps["Q_STOKES"]}
     wmap |= {"U_POLARISATION": maps["U_STOKES"], "N_OBS": hits, "MINUS": -hits}
     units = ["mK", *["mK,thermodynamic"] * 2, "counts", "counts"]
-    write(folder / "wmap.fits", wmap, units, nest=True, coordinates=None)
+    save(folder / "wmap.fits", wmap, units, ORDERING="NESTED", COORDSYS=None)
     rms = {f"{s}_RMS": 1e-6 * (1 + rng.random(NPIX)) for s in "IQU"}
     rms["Q_RMS"][HOLE] = np.nan
     rms["MINUS"] = -rms["I_RMS"]
-    write(folder / "rms.fits", rms, ["K_CMB"] * 4)
-    write(folder / "wide.fits", {"RMS": np.ones(12 * 2**2)}, ["uK_RJ"], nside=2)
-    write(folder / "iqu.fits", maps, ["uK_RJ"] * 3)
+    save(folder / "rms.fits", rms, ["K_CMB"] * 4)
+    save(folder / "wide.fits", {"RMS": np.ones(12 * 2**2)}, ["uK_RJ"])
+    save(folder / "iqu.fits", maps, ["uK_RJ"] * 3)
     polarized = {k: v for k, v in maps.items() if k != "I_STOKES"}
-    write(folder / "qu.fits", polarized, ["uK_RJ"] * 2)
-    write(folder / "beta.fits", {"BETA_D": 1.5 + 0.1 * rng.random(NPIX)}, ["1"])
-    write(folder / "ame.fits", {"I": 1 + rng.random(NPIX)}, ["K_RJ"])
+    save(folder / "qu.fits", polarized, ["uK_RJ"] * 2)
+    save(folder / "beta.fits", {"BETA_D": 1.5 + 0.1 * rng.random(NPIX)}, ["1"])
+    save(folder / "ame.fits", {"I": 1 + rng.random(NPIX)}, ["K_RJ"])
     return folder
 
 

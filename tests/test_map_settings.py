@@ -5,7 +5,6 @@ from pathlib import Path
 import healpy
 import numpy as np
 import pytest
-from astropy.io import fits as pyfits
 
 from fits.commands.run import DEFAULTS
 from fits.inputs import inputs_of, read_band
@@ -14,33 +13,11 @@ from fits.separated_data import separation_data
 from jaxsky.inputs import read, read_sky
 from jaxsky.io import InputError
 from jaxsky.settings import BandTable, Experiment, MapFile, SettingsError, load
+from mapfiles import NSIDE, table, write
 
-NSIDE = 8
 NPIX = 12 * NSIDE**2
 RNG = np.random.default_rng(11)
 I, Q, U = RNG.normal(size=(3, NPIX))  # noqa: E741
-NEST = healpy.nest2ring(NSIDE, np.arange(NPIX))
-
-
-def table(columns, units, name="MAP", form="E", **header):
-    """A table with columns given in RING, as they are in the file's ordering."""
-    nside = healpy.npix2nside(len(next(iter(columns.values()))))
-    order = np.arange(12 * nside**2)
-    if header.get("ORDERING") == "NESTED":
-        order = healpy.nest2ring(nside, order)
-    made = [
-        pyfits.Column(n, form, unit=unit, array=np.asarray(c)[order])
-        for (n, c), unit in zip(columns.items(), units, strict=True)
-    ]
-    hdu = pyfits.BinTableHDU.from_columns(made, name=name)
-    keys = {"PIXTYPE": "HEALPIX", "ORDERING": "RING", "NSIDE": nside, "COORDSYS": "G"} | header
-    hdu.header.update({k: v for k, v in keys.items() if v is not None})
-    return hdu
-
-
-def write(path, *tables):
-    pyfits.HDUList([pyfits.PrimaryHDU(), *tables]).writeto(path, overwrite=True)
-    return path
 
 
 def band(folder, entry, unit="uK_RJ"):

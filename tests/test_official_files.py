@@ -14,30 +14,16 @@ from jaxsky.inputs import read
 from jaxsky.io import InputError
 from jaxsky.noise import weights_covariance
 from jaxsky.settings import Experiment, MapFile, SettingsError
+from mapfiles import NSIDE, table, write
 
-NSIDE = 8
 NPIX = 12 * NSIDE**2
 SKY = "LFI_SkyMap_070_1024_R2.01_full.fits"
 CORRECTION = "LFI_CorrMap_070-BPassCorr_0256_R2.01_full.fits"
 
 
-def table(columns, units, name, ordering="NESTED", coordinates="GALACTIC", **header):
-    """A table as the archives write it: NESTED, single precision; columns given in RING."""
-    nside = healpy.npix2nside(len(next(iter(columns.values()))))
-    nest = healpy.nest2ring(nside, np.arange(12 * nside**2))
-    made = [
-        pyfits.Column(n, "E", unit=unit, array=c[nest])
-        for (n, c), unit in zip(columns.items(), units, strict=True)
-    ]
-    hdu = pyfits.BinTableHDU.from_columns(made, name=name)
-    hdu.header.update(PIXTYPE="HEALPIX", ORDERING=ordering, NSIDE=nside, **header)
-    if coordinates:
-        hdu.header["COORDSYS"] = coordinates
-    return hdu
-
-
-def write(path, *tables):
-    pyfits.HDUList([pyfits.PrimaryHDU(), *tables]).writeto(path)
+def archived(columns, units, name, **header):
+    """A table as the archives write it; columns given in RING."""
+    return table(columns, units, name, **{"ORDERING": "NESTED", "COORDSYS": "GALACTIC"} | header)
 
 
 def smooth_maps(seed, nside, fwhm, lmax=16):
@@ -60,11 +46,11 @@ def folder(tmp_path_factory):
     maps = {"TEMPERATURE": Q, "Q_POLARISATION": Q, "U_POLARISATION": U, "N_OBS": hits}
     weights = {"N_OBS": hits, "QQ": QQ, "QU": QU, "UU": UU}
     thermodynamic = ["mK,thermodynamic"] * 2
-    wmap = {"coordinates": None}
+    wmap = {"COORDSYS": None}
     write(
         folder / "wmap_band_iqumap_r9_9yr_K_v5.fits",
-        table(maps, ["mK", *thermodynamic, "counts"], "Stokes Maps", **wmap),
-        table(weights, ["counts"] * 4, "Weight Arrays", **wmap),
+        archived(maps, ["mK", *thermodynamic, "counts"], "Stokes Maps", **wmap),
+        archived(weights, ["counts"] * 4, "Weight Arrays", **wmap),
     )
     # Planck LFI: the map at one resolution and beam, the correction at another.
     true = smooth_maps(2, 2 * NSIDE, 0.0)
@@ -74,17 +60,18 @@ def folder(tmp_path_factory):
     covariance = dict.fromkeys(["QQ_COV", "UU_COV"], np.full(4 * NPIX, 1e-12))
     covariance["QU_COV"] = np.zeros(4 * NPIX)
     units = ["K_CMB"] * 3 + ["(K_CMB)^2"] * 3
-    write(folder / SKY, table(columns | covariance, units, "FREQ-MAP"))
+    write(folder / SKY, archived(columns | covariance, units, "FREQ-MAP"))
     coarse = 1e-6 * np.asarray(resample(leaked, gaussian_beam(700.0, 16), NSIDE))
     corrections = dict(zip(["Q_STOKES", "U_STOKES"], coarse, strict=True))
-    write(folder / CORRECTION, table(corrections, ["K_CMB"] * 2, "CORR-MAP"))
+    write(folder / CORRECTION, archived(corrections, ["K_CMB"] * 2, "CORR-MAP"))
     without = {"Q_STOKES": coarse[0]}
-    write(folder / "LFI_CorrMap_070_R2.01.fits", table(without, ["K_CMB"], "CORR-MAP"))
+    write(folder / "LFI_CorrMap_070_R2.01.fits", archived(without, ["K_CMB"], "CORR-MAP"))
     # Commander's dust, in the unit that the archive calls uK_RJ.
     dust = smooth_maps(4, 2 * NSIDE, 0.0)
     ml = dict(zip(["Q_ML_FULL", "U_ML_FULL"], dust, strict=True))
     write(
-        folder / "COM_CompMap_DustPol-commander_1024_R2.00.fits", table(ml, ["uK_RJ"] * 2, "DUST")
+        folder / "COM_CompMap_DustPol-commander_1024_R2.00.fits",
+        archived(ml, ["uK_RJ"] * 2, "DUST"),
     )
     return folder
 

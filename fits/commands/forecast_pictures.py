@@ -20,6 +20,7 @@ from fits.plots import (
     round_numbers,
     with_powers,
 )
+from fits.writing import with_error
 from jaxsky.settings import Experiment
 
 #: Primordial spectra, from the largest r on.
@@ -99,8 +100,8 @@ def _value(errors: Errors, name: str) -> str:
     """A parameter with its value and two digits of its error."""
     value, sigma = errors.fiducial[name], errors.sigma(name)
     symbol, unit = _symbol(name)
-    power = int(np.floor(np.log10(sigma)))
-    if not value and power < -2:
+    if not value and sigma < 0.01:
+        power = int(np.floor(np.log10(sigma)))
         return rf"${symbol} = 0 \pm {sigma / 10.0**power:.1f} \times 10^{{{power}}}{unit}$"
-    digits = max(0, 1 - power)
-    return rf"${symbol} = {value:.{digits}f} \pm {sigma:.{digits}f}{unit}$"
+    shown = with_error(value, sigma).replace("\u00b1", r"\pm")
+    return rf"${symbol} = {shown}{unit}$"

@@ -128,11 +128,11 @@ def make_figures(
         items[label] = replace(item, seconds=round(time.perf_counter() - start, 1))
         kept = Figures(mark, list(items.values()))
         write_text(out / KEPT, TypeAdapter(Figures).dump_json(kept, indent=2).decode())
-        _write_page(sources, out, [items[each] for each in steps if each in items])
+        _write_page(sources, out, items, steps)
         # No two figures have programs in common, and what these hold adds up.
         jax.clear_caches()
         gc.collect()
-    shown = _write_page(sources, out, [items[each] for each in steps if each in items])
+    shown = _write_page(sources, out, items, steps)
     write_log(out / "log.json", settings, time.perf_counter() - started)
     return shown
 
@@ -165,25 +165,28 @@ def _is_made(out: Path, item: Item | None) -> bool:
     return item.picture is None or (out / item.picture).is_file()
 
 
-def _write_page(sources: Sources, out: Path, items: list[Item]) -> list[Item]:
-    """Write the page of some items and the table of their numbers; returns all of these."""
+def _write_page(
+    sources: Sources, out: Path, items: Mapping[str, Item], order: Iterable[str]
+) -> list[Item]:
+    """Write the page of all items in order and the table of their numbers; returns these."""
+    shown = [items[label] for label in order if label in items]
     rows = tuple(
         (number.what, number.paper, number.ours, number.note, item.label)
-        for item in items
+        for item in shown
         for number in item.numbers
     )
     if rows:
         table = ResultTable(("quantity", "paper", "here", "about it", "see"), rows)
-        items = [*items, described(NUMBERS, None, table=table)]
-    seconds = sum(item.seconds or 0 for item in items)
+        shown.append(described(NUMBERS, None, table=table))
+    seconds = sum(item.seconds or 0 for item in shown)
     write_page(
         out / PAGE,
         f"A model of the microwave polarized sky: {sources.settings.title}",
         [sources.description, f"Figures and tables of {PAPER}, made again and numbered as there."],
-        [_section(item) for item in items],
+        [_section(item) for item in shown],
         f"Written by `jaxsky paper` in {seconds:.0f} s,",
     )
-    return items
+    return shown
 
 
 def _section(item: Item) -> Section:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fits.noise import as_noise
     from fits.optimize import Newton, best_fit
     from fits.patches import fit_patches
-    from fits.posterior import chi2, hessian
+    from fits.posterior import chi2, fisher_matrix, hessian
     from fits.priors import Gaussian, Uniform
     from fits.profile_likelihood import spectral_likelihood
     from fits.pseudo_cl import band_powers, bin_edges, masked_spectra
@@ -42,7 +42,7 @@ _NAMES = {
     "noise": "as_noise",
     "optimize": "Newton best_fit",
     "patches": "fit_patches",
-    "posterior": "chi2 hessian",
+    "posterior": "chi2 fisher_matrix hessian",
     "priors": "Gaussian Uniform",
     "profile_likelihood": "spectral_likelihood",
     "pseudo_cl": "band_powers bin_edges masked_spectra",

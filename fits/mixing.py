@@ -87,10 +87,6 @@ class Mixing(eqx.Module):
         """Names of the components, in order."""
         return tuple(self.sky)
 
-    def _sky_parameters(self, params):
-        own = self.bands.parameter_names()
-        return {name: value for name, value in params.items() if name not in own}
-
     def _calibrated(self, laws, bands):
         """Rows of the matrix in units of the data: amplitudes are uK."""
         size, kind = parse_unit(self.unit)
@@ -101,7 +97,7 @@ class Mixing(eqx.Module):
 
     def one(self, params: Mapping[str, Array]) -> Float[Array, "band component"]:
         """The matrix for parameters that are numbers."""
-        sky = set_parameters(self.sky, self._sky_parameters(params))
+        sky = set_parameters(self.sky, self.bands.sky_parameters(params))
         bands = self.bands.moved(self.samples, params)
         laws = [jax.vmap(lambda b, c=c: average(c.sed, b))(bands) for c in sky.components.values()]
         matrix = self._calibrated(jnp.stack(laws, axis=-1), bands)
@@ -114,7 +110,7 @@ class Mixing(eqx.Module):
         wide = eqx.tree_at(
             lambda s: [s[n].amplitude for n in names], self.sky, [amplitude] * len(names)
         )
-        wide = set_parameters(wide, self._sky_parameters(params))
+        wide = set_parameters(wide, self.bands.sky_parameters(params))
         columns = []
         for component in wide.components.values():
             nodes = choose_nodes(component, self.bands.bandpasses, TOLERANCE)

@@ -67,7 +67,7 @@ def known_truth(inputs: Inputs, fits: Sequence[RegionFit]) -> dict[str, float] |
     return {name: inputs.truth[name] for name in all_free(fits) if name in inputs.truth}
 
 
-def fit_pixels(
+def _fit_pixels(
     settings: Experiment,
     prepared: CommonMaps,
     used: Bool[np.ndarray, " pix"],
@@ -202,7 +202,7 @@ def fit_regions(
         if not pixels.any():
             raise SettingsError(f"fit.regions: region {region!r} leaves no pixel.")
     return [
-        fit_pixels(settings, prepared, pixels, region, stokes, chains, progress)
+        _fit_pixels(settings, prepared, pixels, region, stokes, chains, progress)
         for region, pixels in used.items()
         for stokes in settings.fit.stokes
     ]

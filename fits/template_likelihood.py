@@ -142,7 +142,7 @@ def _unit_sky(sky: Sky) -> Sky:
     return eqx.tree_at(lambda s: [s[n].amplitude for n in names], sky, [ones] * len(names))
 
 
-def is_uniform(sky: Sky) -> bool:
+def _is_uniform(sky: Sky) -> bool:
     """True if no spectral parameter is a map."""
     return all(leaf.ndim != 1 for leaf in jax.tree.leaves(sky))
 
@@ -244,7 +244,7 @@ def likelihood(
     shifts = {name: value for name, value in sky_params.items() if name.endswith(OFFSET)}
     sky = set_parameters(sky, {n: v for n, v in sky_params.items() if n not in shifts})
     weights = _weights(data, sigma)
-    if not is_uniform(sky) or pixelwise:
+    if not _is_uniform(sky) or pixelwise:
         at_start = set_parameters(sky, shifts)
         return _pixel_likelihood(
             params, at_start, sky, own, data, weights, keep, covariance_of, bool(offsets)

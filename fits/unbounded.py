@@ -1,4 +1,4 @@
-"""The spectral posterior in numbers without bounds whose covariance is about the unit matrix.
+"""The posterior in numbers without bounds whose covariance is about the unit matrix.
 
 A uniform prior becomes the logistic map of its range, whose Jacobian is part of the density; the
 curvature of -log posterior at the best fit gives the rest, until there are samples. Where a prior

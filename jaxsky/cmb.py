@@ -136,6 +136,7 @@ def _spectra(which: str, end: int, **arguments: Any) -> Float[np.ndarray, "4 ell
     return kept("spectra", mark, (4, end + 1), computed)
 
 
+@partial(jax.jit, static_argnames="stokes")
 def realisation(
     key: Array, spectra: Float[Array | np.ndarray, "4 ell"], stokes: str = "QU"
 ) -> Float[Array, "stokes alm"]:
@@ -149,11 +150,6 @@ def realisation(
     """
     if stokes not in ("QU", "IQU"):
         raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")
-    return _realisation(key, spectra, stokes)
-
-
-@partial(jax.jit, static_argnames="stokes")
-def _realisation(key, spectra, stokes):
     TT, EE, BB, TE = spectra
     zero = jnp.zeros_like(TT)
     rows = [TT, TE, zero], [TE, EE, zero], [zero, zero, BB]

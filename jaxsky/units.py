@@ -6,6 +6,7 @@ arrays; the names are static. Inside the package everything is uK_RJ.
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +39,18 @@ def parse_unit(unit: str) -> tuple[float, str]:
         raise ValueError(f"Unknown unit {unit!r}; known units are {', '.join(UNITS)}.") from None
 
 
-def _ratio(source: str, target: str, K_RJ_per: Callable[[str], Numeric]) -> Array:
+def _ratio(
+    source: str, target: str, nu: Numeric, nu_ref: Numeric, mean: Callable[[Any], Any]
+) -> Array:
+    """Factor between units; `mean` is the one over the band of values at its frequencies."""
+
+    def K_RJ_per(kind: str) -> Numeric:
+        if kind == "K_CMB":
+            return mean(cmb_derivative(nu))
+        if kind == "K_RJ":
+            return 1.0
+        return mean((nu_ref / nu) / (MJYSR_PER_K_RJ_AT_1GHZ * nu**2))
+
     (source_size, source_kind), (target_size, target_kind) = parse_unit(source), parse_unit(target)
     scale = source_size / target_size
     if source_kind == target_kind:
@@ -60,13 +72,7 @@ def conversion(source: str, target: str, nu: Numeric) -> Float[Array, "..."]:
     0.7772
     """
     nu = jnp.asarray(nu)
-
-    def K_RJ_per(kind: str) -> Array:
-        if kind == "K_CMB":
-            return cmb_derivative(nu)
-        return jnp.ones_like(nu) if kind == "K_RJ" else 1 / (MJYSR_PER_K_RJ_AT_1GHZ * nu**2)
-
-    return _ratio(source, target, K_RJ_per)
+    return _ratio(source, target, nu, nu, lambda values: values)
 
 
 @partial(jax.jit, static_argnames=("source", "target"))
@@ -90,11 +96,4 @@ def band_conversion(
     weights : weights on antenna temperature, summing to 1 (`Bandpass.quadrature`)
     nu_ref : frequency at which a brightness in MJy/sr is quoted [GHz]
     """
-
-    def K_RJ_per(kind: str) -> Numeric:
-        if kind == "K_CMB":
-            return jnp.sum(weights * cmb_derivative(nu))
-        iras = (nu_ref / nu) / (MJYSR_PER_K_RJ_AT_1GHZ * nu**2)
-        return 1.0 if kind == "K_RJ" else jnp.sum(weights * iras)
-
-    return _ratio(source, target, K_RJ_per)
+    return _ratio(source, target, nu, nu_ref, lambda values: jnp.sum(weights * values))

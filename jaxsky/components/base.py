@@ -52,8 +52,6 @@ def parameter(
         "unit": unit,
         "zero": zero,
     }
-    if default is dataclasses.MISSING:
-        return eqx.field(converter=_converted, metadata=metadata)
     return eqx.field(converter=_converted, metadata=metadata, default=default)
 
 

@@ -60,8 +60,7 @@ class Bandpass(eqx.Module):
     convention: str = eqx.field(static=True)
 
     def __init__(self, nu: ArrayLike, weights: ArrayLike, convention: str = "RJ") -> None:
-        self.nu = as_array("nu", nu)
-        self.weights = as_array("weights", weights)
+        self.nu, self.weights = as_array("nu", nu), as_array("weights", weights)
         self.convention = convention
         if convention not in CONVENTIONS:
             known = ", ".join(CONVENTIONS)

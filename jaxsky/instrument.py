@@ -72,11 +72,10 @@ class Instrument(eqx.Module):
     """
 
     name: str = eqx.field(static=True)
-    channels: tuple[Channel, ...]
+    channels: Sequence[Channel]
 
-    def __init__(self, name: str, channels: Sequence[Channel]) -> None:
-        self.name = name
-        self.channels = tuple(channels)
+    def __post_init__(self) -> None:
+        self.channels = tuple(self.channels)
         for i, channel in enumerate(self.channels):
             if not isinstance(channel, Channel):
                 raise TypeError(

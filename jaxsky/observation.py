@@ -100,32 +100,21 @@ class Observation(eqx.Module):
     nside: int = eqx.field(static=True)
     stokes: str = eqx.field(static=True, default="QU")
     finest: Float[Array, ""] | float = 0.0
-    names: tuple[str, ...] = eqx.field(static=True, default=())
-    lmax: int = eqx.field(static=True, default=0)
+    lmax: int = eqx.field(static=True, default=None)
     precision: str = eqx.field(static=True, default="double")
+    names: tuple[str, ...] = eqx.field(static=True, init=False)
 
-    def __init__(
-        self,
-        channels: Mapping[str, ObservedBand],
-        nside: int,
-        stokes: str = "QU",
-        finest: Float[Array, ""] | float = 0.0,
-        lmax: int | None = None,
-        precision: str = "double",
-    ) -> None:
-        self.channels, self.nside, self.stokes = dict(channels), nside, stokes
-        self.finest, self.precision = finest, precision
-        self.lmax = 2 * nside if lmax is None else lmax
+    def __post_init__(self) -> None:
         # JAX sorts dictionaries when it takes them apart.
-        self.names = tuple(channels)
+        self.channels, self.names = dict(self.channels), tuple(self.channels)
+        if self.lmax is None:
+            self.lmax = 2 * self.nside
         if not self.channels:
             raise ValueError("Argument `channels` must have at least one channel.")
-        if stokes not in ("QU", "IQU"):
-            raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")
-        if precision not in DTYPES:
-            raise ValueError(
-                f"Argument `precision` must be 'double' or 'single', not {precision!r}."
-            )
+        for name, known in {"stokes": ("QU", "IQU"), "precision": tuple(DTYPES)}.items():
+            if (value := getattr(self, name)) not in known:
+                one, other = known
+                raise ValueError(f"Argument `{name}` must be {one!r} or {other!r}, not {value!r}.")
 
     @property
     def dtype(self) -> type[np.floating]:

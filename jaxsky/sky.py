@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.checks import as_array
-from jaxsky.components import Component, check_value
+from jaxsky.components import Component, check_value, declared
 from jaxsky.interpolation import Nodes, band_sed, choose_nodes
 
 
@@ -226,7 +226,7 @@ def get_parameters(sky: Sky, names: Iterable[str]) -> dict[str, Array]:
 def check_parameter(sky: Sky, target: str, name: str, value: Array) -> None:
     """Raise ValueError if a concrete value, called `name`, is none that a parameter may have."""
     component, field = target.split(".")[:2]
-    check_value(type(sky[component]), field, name, value)
+    check_value(name, value, declared(type(sky[component]), field))
 
 
 def set_parameters(sky: Sky, params: Mapping[str, ArrayLike]) -> Sky:

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxsky.checks import (
+    Parameter,
     as_array,
     as_number,
     check_finite,
@@ -62,32 +63,25 @@ class SmallScales(eqx.Module):
 
     EE: tuple[int, int] = eqx.field(static=True)
     BB: tuple[int, int] = eqx.field(static=True)
-    slope: Float[Array, "2"] | None
-    tilt: Float[Array, ""]
-    amplitude: Float[Array, ""]
-    modulation_fwhm: Float[Array, ""]
+    slope: Float[Array, "2"] | None = None
+    tilt: Parameter = 0.0
+    amplitude: Parameter = 1.0
+    modulation_fwhm: Parameter = 180.0
 
-    def __init__(
-        self,
-        EE: tuple[int, int],
-        BB: tuple[int, int],
-        slope: ArrayLike | None = None,
-        tilt: ArrayLike = 0.0,
-        amplitude: ArrayLike = 1.0,
-        modulation_fwhm: ArrayLike = 180.0,
-    ) -> None:
-        for name, ends in {"EE": EE, "BB": BB}.items():
+    def __post_init__(self) -> None:
+        for name in ("EE", "BB"):
+            ends = getattr(self, name)
             if [type(end) for end in ends] != [int, int]:
                 raise TypeError(f"Argument `{name}` must be two integers, but is {ends!r}.")
-        self.EE, self.BB = (EE[0], EE[1]), (BB[0], BB[1])
-        if slope is not None:
-            slope = as_array("slope", slope)
+            setattr(self, name, tuple(ends))
+        if self.slope is not None:
+            slope = as_array("slope", self.slope)
             check_shape("slope", slope, slope.shape in ((), (2,)), "be a number or 2 numbers")
             check_finite("slope", slope)
-        self.slope = None if slope is None else jnp.broadcast_to(slope, 2)
-        self.tilt = as_number("tilt", tilt)
-        self.amplitude = as_number("amplitude", amplitude)
-        self.modulation_fwhm = as_number("modulation_fwhm", modulation_fwhm, positive=True)
+            self.slope = jnp.broadcast_to(slope, 2)
+        for name in ("tilt", "amplitude", "modulation_fwhm"):
+            positive = name == "modulation_fwhm"
+            setattr(self, name, as_number(name, getattr(self, name), positive))
         if is_concrete(self.amplitude) and self.amplitude < 0:
             raise ValueError(
                 f"Argument `amplitude` must not be negative, but is {self.amplitude:g}."

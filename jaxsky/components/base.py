@@ -154,20 +154,20 @@ class Component(eqx.Module):
                 continue
             value = getattr(self, field.name)
             for entry in value if isinstance(value, tuple) else (value,):
-                if entry is not None:
-                    _check(field.name, entry, amplitude.shape[-1], field.metadata)
+                if entry is None:
+                    continue
+                array, npix = as_array(field.name, entry), amplitude.shape[-1]
+                form = f"be a number or a map of shape ({npix},)"
+                check_shape(field.name, array, array.shape in ((), (npix,)), form)
+                if "positive" not in field.metadata:
+                    raise TypeError(
+                        f"Field `{field.name}` must be declared with jaxsky.components.parameter."
+                    )
+                check_value(field.name, array, field.metadata)
 
 
-def _check(name: str, value: object, npix: int, metadata: Any) -> None:
-    array = as_array(name, value)
-    good = array.shape in ((), (npix,))
-    check_shape(name, array, good, f"be a number or a map of shape ({npix},)")
-    if "positive" not in metadata:
-        raise TypeError(f"Field `{name}` must be declared with jaxsky.components.parameter.")
-    _check_value(name, array, metadata)
-
-
-def _check_value(name: str, value: Array, metadata: Any) -> None:
+def check_value(name: str, value: Array, metadata: Mapping[str, Any]) -> None:
+    """Raise ValueError if a concrete value is none that a field so `declared` may have."""
     (check_positive if metadata.get("positive") else check_finite)(name, value)
     within = metadata.get("within")
     if within is None or not is_concrete(value):
@@ -190,11 +190,6 @@ def parameter_declaration(field: str) -> Mapping[str, Any]:
     """What the first law with a parameter of this name declares about it; nothing if none has."""
     found = (declared(component, field) for component in _LAWS.values())
     return next((metadata for metadata in found if "symbol" in metadata), {})
-
-
-def check_value(component: type[Component], field: str, name: str, value: Array) -> None:
-    """Raise ValueError if a concrete value, called `name`, is none that a field may have."""
-    _check_value(name, value, declared(component, field))
 
 
 def component_class(law: str) -> type[Component]:

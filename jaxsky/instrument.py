@@ -44,9 +44,9 @@ class Channel(eqx.Module):
             check_positive("center - width / 2", lowest)
         parse_unit(self.noise_unit)
 
-    def band(self, samples: int = 51, convention: str = "RJ") -> Bandpass:
+    def band(self, samples: int = 51) -> Bandpass:
         """The top-hat band; see `Bandpass.top_hat`."""
-        return Bandpass.top_hat(self.center, self.width, convention, samples)
+        return Bandpass.top_hat(self.center, self.width, samples=samples)
 
 
 class Instrument(eqx.Module):
@@ -110,9 +110,9 @@ class Instrument(eqx.Module):
             raise TypeError(f"Argument `names` must be a list of names, not the string {names!r}.")
         return Instrument(self.name, [self[name] for name in names])
 
-    def bands(self, samples: int = 51, convention: str = "RJ") -> dict[str, Bandpass]:
+    def bands(self, samples: int = 51) -> dict[str, Bandpass]:
         """The top-hat bands of all channels by name; see `Bandpass.top_hat`."""
-        return {channel.name: channel.band(samples, convention) for channel in self.channels}
+        return {channel.name: channel.band(samples) for channel in self.channels}
 
     def observed(
         self, target: Array | float | None = None, samples: int = 51

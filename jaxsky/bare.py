@@ -44,7 +44,7 @@ def refuse_unit(name: str, value: object) -> None:
     elif (unit := _unit(value)) is not None:
         raise TypeError(
             f"Argument `{name}` carries the unit {unit}; jaxsky takes bare arrays. "
-            "Convert it first, for example with jaxsky.io.from_quantity."
+            "Convert it first, for example with jaxsky.from_quantity."
         )
 
 

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from numpy.polynomial.chebyshev import chebpts1, chebvander
 
 from jaxsky.bandpass import Bandpass, Samples, average, stack_bands
 from jaxsky.checks import is_concrete
@@ -46,15 +47,10 @@ AT_ONCE = 4096
 MAX_DIMENSIONS = 2
 
 
-def _chebyshev_nodes(n: int) -> Float[np.ndarray, " n"]:
-    """The n Chebyshev points of the first kind in (-1, 1)."""
-    return np.polynomial.chebyshev.chebpts1(n)
-
-
 def _coefficients(values: Float[Array, "..."]) -> Float[Array, "..."]:
     """Chebyshev coefficients of the tensor of values at the nodes, along every axis."""
     for axis, n in enumerate(values.shape):
-        inverse = np.polynomial.chebyshev.chebvander(_chebyshev_nodes(n), n - 1).T * 2 / n
+        inverse = chebvander(chebpts1(n), n - 1).T * 2 / n
         inverse[0] /= 2
         moved = jnp.tensordot(jnp.asarray(inverse, values.dtype), values, axes=(1, axis))
         values = jnp.moveaxis(moved, 0, axis)
@@ -92,16 +88,9 @@ def _is_map(leaf: Any) -> bool:
 
 def _split(component: Component) -> tuple[list[Array], Callable[..., Component]]:
     """The parameters that are maps, and a function from numbers in their place to a component."""
-    leaves, structure = jax.tree.flatten(component)
-    where = [i for i, leaf in enumerate(leaves) if _is_map(leaf)]
-
-    def rebuild(values):
-        replaced = list(leaves)
-        for i, value in zip(where, values, strict=True):
-            replaced[i] = value
-        return jax.tree.unflatten(structure, replaced)
-
-    return [leaves[i] for i in where], rebuild
+    maps, rest = eqx.partition(component, _is_map)
+    leaves, structure = jax.tree.flatten(maps)
+    return leaves, lambda values: eqx.combine(jax.tree.unflatten(structure, values), rest)
 
 
 def _range(values: Array) -> tuple[Array, Array]:
@@ -130,7 +119,7 @@ def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
     """
     maps, rebuild = _split(component)
     ranges = [_range(m) for m in maps]
-    grid = jnp.asarray(_chebyshev_nodes(MAX_NODES))
+    grid = jnp.asarray(chebpts1(MAX_NODES))
     worst = []
     for axis in range(len(maps)):
         lines = []
@@ -183,7 +172,7 @@ def _series(
         value = average(component.sed, band)
         return value, value
     axes = [
-        mid + half * jnp.asarray(_chebyshev_nodes(n), mid.dtype)
+        mid + half * jnp.asarray(chebpts1(n), mid.dtype)
         for (mid, half), n in zip(map(_range, maps), counts, strict=True)
     ]
     mesh = [axis.ravel() for axis in jnp.meshgrid(*axes, indexing="ij")]

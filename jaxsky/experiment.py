@@ -59,7 +59,7 @@ class Setup(NamedTuple):
     def observed(self, name: str) -> Observed:
         """How a band is observed, as its maps are."""
         channel = self.observation.channels[name]
-        beam = channel.beam if channel.target is None else channel.target
+        beam = channel.map_beam
         level = spectrum = covariance = None
         smoothed, noise = channel.target is not None, channel.noise
         if noise is not None and jnp.ndim(noise):
@@ -117,7 +117,7 @@ def build(
     }
     if not channels:
         raise SettingsError("bands: there are none.")
-    seen = {n: _width(c.beam) if target is None else target for n, c in channels.items()}
+    seen = {name: _width(channel.map_beam) for name, channel in channels.items()}
     if written:
         _check_pixels(nside, seen)
     for name, channel in channels.items():
@@ -331,7 +331,7 @@ def _leakage(
         maps = {}
         for name, fraction in fractions.items():
             channel = observation.channels[name]
-            beam = channel.beam if channel.target is None else channel.target
+            beam = channel.map_beam
             leaked = leak(fraction * observe_band(sky, channel.band)[0])
             window = beam if jnp.ndim(beam) else gaussian_beam(beam, 2 * observation.nside)
             maps[name] = resample(leaked, window, observation.nside)

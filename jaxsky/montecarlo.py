@@ -155,9 +155,8 @@ def _header(settings: Experiment, setup: Setup, name: str, index: int) -> dict[s
         "SIM": (index, "number of the realisation"),
         "CONTENT": (", ".join(settings.included()), "what the total is made of"),
     }
-    beam = channel.beam if channel.target is None else channel.target
-    if not np.ndim(beam):
-        header["FWHM"] = (float(beam), "[arcmin] beam of the maps")
+    if not np.ndim(channel.map_beam):
+        header["FWHM"] = (float(channel.map_beam), "[arcmin] beam of the maps")
     else:
         header["BEAM"] = ("table", "beam, in the table BEAM")
     noise = channel.noise

@@ -76,6 +76,11 @@ class ObservedBand(eqx.Module):
     noise: Float[Array, ""] | Float[Array, "stokes stokes pix"] | float | None = None
     diagonal: bool = eqx.field(static=True, default=False)
 
+    @property
+    def map_beam(self) -> Float[Array, ""] | Float[Array, " ell"] | float:
+        """Beam of the observed map: the target, or the own one."""
+        return self.beam if self.target is None else self.target
+
 
 class Observation(eqx.Module):
     """An experiment: channels by name, and the pixels of the maps.

@@ -107,14 +107,12 @@ def observe_bands(
         if names is not None and name not in names:
             continue
         channel = observation.channels[name]
-        beam = channel.beam if channel.target is None else channel.target
         parts = {
-            which: _seen(source, channel, i, beam, lmax, which)
-            for which, source in prepared.items()
+            which: _seen(source, channel, i, lmax, which) for which, source in prepared.items()
         }
         if cmb is not None:
             factor = channel.band.conversion("uK_CMB", "uK_RJ")
-            parts["cmb"] = _Part((cmb_alm,), (factor,), beam_ratio(beam, 0.0, lmax))
+            parts["cmb"] = _Part((cmb_alm,), (factor,), beam_ratio(channel.map_beam, 0.0, lmax))
         noise = _noise(stream(key, "noise", name), channel, observation)
         if isinstance(noise, _Part):
             parts["noise"] = noise
@@ -146,12 +144,11 @@ def _seen(
     source: HarmonicSource,
     channel: ObservedBand,
     index: int,
-    beam: Array | float,
     lmax: int,
     name: str,
 ) -> _Part:
     """A component in a band."""
-    window = beam_ratio(beam, source.fwhm, lmax, f"component {name!r}")
+    window = beam_ratio(channel.map_beam, source.fwhm, lmax, f"component {name!r}")
     if source.weights is not None:
         return _Part(source.alms, source.weights[index], window)
     # Kept where there are no weights.

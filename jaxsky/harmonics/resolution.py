@@ -25,10 +25,7 @@ FINE, FINE_VARIANCE = 0.25, 0.375
 
 
 def low_multipoles(
-    maps: Float[Array, "stokes pix"],
-    lmax: int,
-    iterations: int | None = None,
-    margin: int = MARGIN,
+    maps: Float[Array, "stokes pix"], lmax: int, iterations: int | None = None
 ) -> Float[Array, "stokes alm"]:
     """Packed coefficients up to lmax of maps that have higher multipoles, too.
 
@@ -39,19 +36,18 @@ def low_multipoles(
     maps : shape (stokes, pix), RING; one row is I, two are Q, U, three are I, Q, U
     lmax : largest multipole kept; above 2 nside of the maps coefficients are zero
     iterations : of `analysis`
-    margin : multipoles analysed, in units of those kept
     """
     resolved = 2 * healpy.npix2nside(maps.shape[-1])
-    return resize(analysis(maps, min(resolved, margin * lmax), iterations), lmax)
+    return resize(analysis(maps, min(resolved, MARGIN * lmax), iterations), lmax)
 
 
-@partial(jax.jit, static_argnames=("nside", "iterations", "margin"))
+@partial(jax.jit, static_argnames=("nside", "iterations", "fine"))
 def resample(
     maps: Float[Array, "stokes pix"],
     window: Float[Array, " ell"],
     nside: int,
     iterations: int | None = None,
-    margin: int = MARGIN,
+    fine: float = 0.0,
 ) -> Float[Array, "stokes pix"]:
     """Maps times a window in l, at another resolution: smoothing and degrading in one.
 
@@ -63,10 +59,15 @@ def resample(
     maps : shape (stokes, pix), RING; one row is I, two are Q, U, three are I, Q, U
     window : factor for each multipole 0 ... lmax; above 2 nside of the input nothing is left
     nside : resolution of the result
-    iterations, margin : of `low_multipoles`; with (0, 1) it takes a fraction of the time, and is
-        good where the window ends far below the multipoles that the pixels resolve
+    iterations : of `analysis`
+    fine : a window that ends below this fraction of the nside of the maps takes an analysis
+        without steps, of its own multipoles only
     """
-    alm = low_multipoles(maps, len(window) - 1, iterations, margin)
+    lmax = len(window) - 1
+    if lmax <= fine * healpy.npix2nside(maps.shape[-1]):
+        alm = analysis(maps, lmax, 0)
+    else:
+        alm = low_multipoles(maps, lmax, iterations)
     return synthesis(alm * expand(window), nside)
 
 
@@ -154,7 +155,7 @@ class Preparation(eqx.Module):
         """The maps at the common resolution."""
         if self.window is None:
             return average_pixels(maps, self.nside)
-        return _filtered(maps, self.window, self.nside, FINE)
+        return resample(maps, self.window, self.nside, fine=FINE)
 
     @eqx.filter_jit
     def of_noise(self, maps: Float[Array, "stokes pix"]) -> Float[Array, "stokes pix"]:
@@ -165,7 +166,7 @@ class Preparation(eqx.Module):
         """
         if self.window is None:
             return average_pixels(maps, self.nside)
-        return _filtered(maps, self.window, self.nside, np.inf)
+        return resample(maps, self.window, self.nside, fine=np.inf)
 
     @eqx.filter_jit
     def transpose(self, maps: Float[Array, "stokes pix"]) -> Float[Array, "stokes pix"]:
@@ -184,24 +185,12 @@ class Preparation(eqx.Module):
             return mean * (self.nside / self.nside_in) ** 2
         squared = jnp.asarray(_squared_window(np.asarray(self.window), 2 * self.nside_in))
         area = healpy.nside2pixarea(self.nside_in)
-        # One by one: a row may be as large as all else.
-        rows = [
-            _filtered(jnp.asarray(row[None], float), squared, self.nside, FINE_VARIANCE)[
-                0
-            ].block_until_ready()
-            for row in variance
-        ]
+        rows = []
+        for row in variance:  # one by one: a row may be as large as all else
+            values = jnp.asarray(row[None], float)
+            smoothed = resample(values, squared, self.nside, fine=FINE_VARIANCE)
+            rows.append(smoothed[0].block_until_ready())
         return area * jnp.stack(rows)
-
-
-def _filtered(
-    maps: Float[Array, "stokes pix"], window: Float[Array, " ell"], nside: int, fine: float
-) -> Float[Array, "stokes pix"]:
-    """Maps times a window, analysed without steps or margin up to a fraction of their nside."""
-    lmax = window.size - 1
-    good = lmax <= fine * healpy.npix2nside(maps.shape[-1])
-    alm = analysis(maps, lmax, 0) if good else low_multipoles(maps, lmax)
-    return synthesis(alm * expand(window), nside)
 
 
 def _check_nside(nside_in: int, nside: int, what: str) -> None:

@@ -195,11 +195,6 @@ def derivatives(
         gradient_i = -r^T W B_i
         fisher_ij = B_i^T W B_j - (A^T W B_i)^T G^-1 (A^T W B_j)
         hessian_ij = B_i^T W B_j - r^T W A_ij s - D_i^T G^-1 D_j.
-
-    Parameters
-    ----------
-    mixing, first, second : the matrix and its derivatives
-    pixels : data and weights
     """
     right = _projected(mixing, _weighted(pixels, pixels.data))
     amplitudes, lower = _solved(mixing, pixels, right)
@@ -236,11 +231,6 @@ def least_chi2(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Arr
     """Sum over pixels of r^T W r = d^T W d - (M^T W d)^T (M^T W M)^-1 (M^T W d).
 
     Formed from the residuals, so nothing cancels where signals are far above the noise.
-
-    Parameters
-    ----------
-    mixing : the matrix M
-    pixels : data and weights
     """
     _, rest, weighted = _parts(mixing, pixels)
     return jnp.sum(rest * weighted)

@@ -169,12 +169,8 @@ def band_covariance(
 ) -> Float[np.ndarray, "cell group row row"]:
     """D = sum_p d_p d_p^T / sigma_p^2 over the pixels of each cell, in one pass.
 
-    Parameters
-    ----------
-    data : maps (band, stokes, pix), of any precision and on disk if need be
-    noise : separable; the part of the bands is not applied
-    cells, used : which pixels to add up
-    layout : which Stokes parameters to correlate
+    `data` are maps (band, stokes, pix), of any precision and on disk if need be; `noise` is
+    separable, and its part of the bands is not applied.
     """
     groups = layout.groups
     size = len(data) * len(groups[0])

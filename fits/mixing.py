@@ -124,13 +124,7 @@ class Mixing(eqx.Module):
     def __call__(
         self, params: Mapping[str, Float[Array, " cell"]], cells: int
     ) -> Float[Array, "cell band component"]:
-        """The matrices of cells, each with its own parameters.
-
-        Parameters
-        ----------
-        params : arrays of the length of the cells by name; the others keep their values
-        cells : number of cells
-        """
+        """The matrices of cells with their own parameters; those not given keep their values."""
         moving = any(name.split(".")[0] in ("shift", "width") for name in params)
         if cells > CELLS and not moving:
             return self._interpolated(params, cells)

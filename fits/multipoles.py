@@ -232,13 +232,7 @@ def _compressed(rows: np.ndarray, multipoles: Multipoles, layout: Layout) -> Pix
     """Vectors with the same covariance of bands as the coefficients of each multipole.
 
     They are the triangular factor of the coefficients (QR), so squares are not formed: signals 1e8
-    above the noise leave no trace in chi^2.
-
-    Parameters
-    ----------
-    rows : coefficients without beams (band, stokes, alm)
-    multipoles : their weights
-    layout : which Stokes parameters to correlate
+    above the noise leave no trace in chi^2. `rows` are coefficients without beams.
     """
     lmin = multipoles.lmin
     weights = np.moveaxis(layout.rows(multipoles.weights[..., lmin:]), -1, 0)[..., None]

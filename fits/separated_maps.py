@@ -44,7 +44,7 @@ class ComponentMaps(NamedTuple):
     probability: Float[np.ndarray, " pix"]
 
     def map(self, name: str) -> Float[np.ndarray, "stokes pix"]:
-        """Amplitude of a component."""
+        """Amplitude of a component: a map, or coefficients."""
         return self.amplitude[self.components.index(name)]
 
     def sigma(self, name: str) -> Float[np.ndarray, "stokes ..."]:
@@ -83,6 +83,11 @@ def _explained(matrix, pixels):
     return _by_pixel(amplitudes.explained, matrix, pixels)
 
 
+def _covariance(matrix: Array, pixels: Pixels) -> np.ndarray:
+    """Covariance of the amplitudes; the weights are in the place of data, which do not count."""
+    return np.asarray(_inverse(matrix, pixels._replace(data=pixels.weights)))
+
+
 @jax.jit
 def _inverse(matrix, pixels):
     return _by_pixel(amplitudes.inverse_gram, matrix, pixels)
@@ -102,19 +107,21 @@ def _alone(matrix, pixels, unknowns):
 def _pixels(
     layout: Layout, noise: Noise, used: np.ndarray, part: slice, data: np.ndarray | None = None
 ) -> Pixels:
-    """Data and weights of some pixels; masked ones are zero and have unit weight."""
+    """Data and weights of some pixels; masked ones are zero and have unit weight.
+
+    Without data, the weights are in their place.
+    """
     mask = used[part]
     weights = noise.weights(part)
     if weights.shape[-1] > 1 or not mask.all():
         weights = np.where(mask, weights, 1.0)
-    values = np.zeros((weights.shape[1], weights.shape[0], 1))
+    weights = values = weights.swapaxes(0, 1)
     if data is not None:
-        values = np.asarray(data[..., part], float)
-        values = np.where(mask & (weights.swapaxes(0, 1) > 0), values, 0.0)
+        values = np.where(mask & (weights > 0), np.asarray(data[..., part], float), 0.0)
     cross = noise.cross(part) if layout.joint else None
     return Pixels(
         jnp.asarray(layout.rows(values)),
-        jnp.asarray(layout.rows(weights.swapaxes(0, 1))),
+        jnp.asarray(layout.rows(weights)),
         None if cross is None else jnp.asarray(np.where(mask, cross, 0.0))[None],
     )
 
@@ -177,8 +184,7 @@ def component_maps(
         square[part] += squares
         count[part] += (noise.weights(part) > 0)[own].sum(axis=(0, 1)) - len(names) * len(own)
         if covariance and not (uniform and part.start):
-            # The weights are in the place of data, which do not count.
-            inverse = np.asarray(_inverse(matrix, pixels._replace(data=pixels.weights)))
+            inverse = _covariance(matrix, pixels)
             where = slice(0, 1) if uniform else part
             for k, s in enumerate(own):
                 group, first = (0, k * len(names)) if layout.joint else (k, 0)
@@ -268,8 +274,7 @@ def noise_degradation(
         if uniform and part.start:
             continue
         pixels = _pixels(layout, noise._replace(pixel_sigma=None) if uniform else noise, used, part)
-        pixels = pixels._replace(data=pixels.weights)
-        inverse = np.asarray(_inverse(matrix, pixels))
+        inverse = _covariance(matrix, pixels)
         own = [c + k * len(names) for k in range(len(layout.groups[0]))]
         alone = np.asarray(_alone(matrix, pixels, tuple(own)))
         ratio = np.sqrt(np.stack([inverse[:, u, u] for u in own], axis=1) / alone)
@@ -280,25 +285,13 @@ def noise_degradation(
 
 
 class HarmonicMaps(ComponentMaps):
-    """Coefficients of the components, without any beam.
+    """Component maps as packed coefficients of E, B or I, E, B, without any beam.
 
-    Attributes
-    ----------
-    components : their names
-    amplitude : generalised least-squares estimates, packed coefficients of E, B or I, E, B, uK at
-        the reference frequency of each law; CMB in uK_CMB. Zero where l < lmin.
-    covariance : of the components, for each Stokes parameter and multipole [uK^2 sr]: their noise
-        spectra; None if not asked for. NaN where l < lmin, as are the others.
-    chi2, dof : of each multipole: sum over bands, Stokes parameters and m of the weighted
-        residuals squared, and their number less that of amplitudes
-    probability : to exceed chi2, the spectral parameters taken as known
+    `covariance` [uK^2 sr], the noise spectra, `chi2`, summed over m, too, `dof` and `probability`
+    are of multipoles instead of pixels. Where l < lmin, coefficients are zero and the others NaN.
     """
 
     __slots__ = ()
-
-    def alm(self, name: str) -> Float[np.ndarray, "stokes alm"]:
-        """Coefficients of a component."""
-        return self.map(name)
 
     def noise(self, name: str) -> Float[np.ndarray, "stokes ell"]:
         """Spectrum N_l of the noise of a component [uK^2 sr]."""

@@ -40,12 +40,7 @@ def _independent(matrix: np.ndarray) -> list[np.ndarray]:
 
 
 class Factor:
-    """Factors of a symmetric matrix; `positive` tells whether it is positive definite.
-
-    Parameters
-    ----------
-    matrix : dense or sparse; a dense one is factorised block by block
-    """
+    """Factors of a symmetric matrix, a dense one block by block; `positive` if it is definite."""
 
     def __init__(self, matrix: np.ndarray | scipy.sparse.csc_matrix) -> None:
         diagonal = matrix.diagonal()
@@ -92,13 +87,9 @@ class Factor:
 def degenerate(
     matrix: np.ndarray | scipy.sparse.csc_matrix, names: Sequence[str], threshold: float = 1e-10
 ) -> list[str]:
-    """Names of parameters that the data do not tell apart; empty if there are none.
+    """Names of parameters that the data do not tell apart, from the curvature of -log posterior.
 
-    Parameters
-    ----------
-    matrix : curvature of -log posterior
-    names : of all parameters
-    threshold : least eigenvalue of the matrix scaled to a unit diagonal
+    `threshold` is the least eigenvalue of the matrix scaled to a unit diagonal.
     """
     diagonal = matrix.diagonal()
     if (bad := ~(diagonal > 0)).any():
@@ -120,20 +111,10 @@ def degenerate(
 def variances(
     factor: Factor, scatter: scipy.sparse.csc_matrix, shared: np.ndarray
 ) -> Float[np.ndarray, " par"]:
-    """Diagonal of H^-1 S H^-1 for sparse H and S.
+    """Diagonal of H^-1 S H^-1 for sparse H, given by its factor, and S; NaN if it takes too long.
 
-    Without the shared parameters H falls into small independent parts, so a few solutions serve
-    all of them at once; those for the shared parameters are made one by one.
-
-    Parameters
-    ----------
-    factor : of H
-    scatter : S
-    shared : True for parameters that many cells have in common
-
-    Returns
-    -------
-    Variances; NaN where the parts are too large for this.
+    Without parameters that many cells share H falls into small independent parts, so a few
+    solutions serve all of them at once.
     """
     size = len(shared)
     if shared.any():

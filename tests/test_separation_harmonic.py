@@ -238,7 +238,7 @@ def test_estimates_scatter_as_they_say():
         fit = best_fit(like, TRUTH)
         pulls.append([(fit.best_fit[n] - TRUTH[n]) / fit.sigma[n] for n in fit.free])
         made = harmonic_component_maps(like, TRUTH, data, given, beams=FWHM)
-        power = power + np.asarray(power_spectrum(made.alm("cmb") - truth[0]))
+        power = power + np.asarray(power_spectrum(made.map("cmb") - truth[0]))
     mean, scatter = np.mean(pulls, axis=0), np.std(pulls, axis=0)
     # Statistical errors of mean and scatter are 0.07 and 0.05; 2000 simulations have 0.05 and 1.01.
     assert np.all(np.abs(mean) < 0.15 + 0.07)

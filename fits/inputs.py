@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from fits.template_noise import TemplateNoise, read_template_noise
 from jaxsky import Bandpass
-from jaxsky.experiment import Setup, build, cmb_spectra
+from jaxsky.experiment import SimulationInputs, cmb_spectra, simulation_inputs
 from jaxsky.galaxy import EmbeddedSky
 from jaxsky.inputs import (
     Template,
@@ -115,7 +115,7 @@ def inputs_of(
     if missing:
         if "noise" not in settings.included():
             raise SettingsError("simulate.include: leaves out the noise, which errors are made of.")
-        setup = build(settings, missing, written=False, galaxy=galaxy)
+        setup = simulation_inputs(settings, missing, written=False, galaxy=galaxy)
         made, alone = _simulated(settings, setup, foregrounds and not bands)
         bands = {str(s.name): (bands | made)[str(s.name)] for s in settings.bands}
         truths.append(setup.truth)
@@ -145,7 +145,7 @@ def _template_noise(
 
 
 def _simulated(
-    settings: Experiment, setup: Setup, foregrounds: bool
+    settings: Experiment, setup: SimulationInputs, foregrounds: bool
 ) -> tuple[dict[str, Band], dict[str, Array] | None]:
     """Bands as the first realisation of `jaxsky simulate` has them, and their foregrounds."""
     observation, key = setup.observation, realisation_key(settings.seed)
@@ -155,7 +155,7 @@ def _simulated(
     for name, maps in observe_bands(key, sky, observation, setup.cmb):
         observed, total, where = setup.observed(name), maps["total"], f"bands.{name}"
         noise, correlated = _noise_of(observed, used.size, where)
-        if (leakage := _leakage_of(observed, used, where)) is not None:
+        if (leakage := _leakage_of(observed, used)) is not None:
             total = total + leakage.maps
         band, beam = observed.bandpass, observed.beam
         bands[name] = Band(total, used, band, beam, noise, correlated, leakage)
@@ -172,7 +172,6 @@ def _noise_of(
     """Covariance of each pixel and spectrum beyond it of the noise of a simulation."""
     nside = healpy.npix2nside(npix)
     if observed.covariance is not None:
-        _check_size("NOISE", observed.covariance, npix, where)
         return jnp.asarray(observed.covariance), None
     if observed.level is not None:
         return uniform_covariance(observed.level, nside), None
@@ -184,18 +183,10 @@ def _noise_of(
     return uniform_covariance(0.0, nside), jnp.asarray(np.pad(observed.spectrum, (0, beyond)))
 
 
-def _leakage_of(observed: Observed | None, used: Bool[np.ndarray, " pix"], where: str):
+def _leakage_of(observed: Observed | None, used: Bool[np.ndarray, " pix"]) -> Leakage | None:
     if observed is None or observed.leakage is None:
         return None
-    _check_size("LEAKAGE", observed.leakage, used.size, where)
     return Leakage(jnp.asarray(observed.leakage), used, observed.beam)
-
-
-def _check_size(table: str, values: np.ndarray, npix: int, where: str) -> None:
-    if values.shape[-1] != npix:
-        raise SettingsError(
-            f"{where}.file: its table {table} has {values.shape[-1]} pixels, its map {npix}."
-        )
 
 
 def _from_file(settings: Experiment, spec: BandTable) -> tuple[Band, Mapping[str, float] | None]:
@@ -253,7 +244,7 @@ def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -
     del found  # as large as all else
     if (beam := beam_of(folder, spec, 2 * nside)) is None:
         beam = 0.0 if observed is None else observed.beam
-    leakage = _leakage_of(observed, used, where)
+    leakage = _leakage_of(observed, used)
     if spec.leakage is not None:
         leakage = _read_leakage(folder, spec, bandpass)
     if spec.noise is None:

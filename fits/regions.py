@@ -20,7 +20,7 @@ from jaxsky.settings import (
     Experiment,
     MapFile,
     MaskFile,
-    Regions,
+    RegionsTable,
     SettingsError,
     at_key,
     find_file,
@@ -199,7 +199,7 @@ def parameter_labels(settings: Experiment, used: Bool[np.ndarray, " pix"]) -> di
 
 
 def _regions(
-    settings: Experiment, regions: Regions, used: Bool[np.ndarray, " pix"], where: str
+    settings: Experiment, regions: RegionsTable, used: Bool[np.ndarray, " pix"], where: str
 ) -> np.ndarray:
     folder, nside = Path(settings.data_dir), settings.common.nside
     if regions.nside is not None:

@@ -10,6 +10,3 @@ T_CMB: Final = 2.72548
 
 #: Brightness of 1 K_RJ at 1 GHz, 2 k nu^2 / c^2 [MJy/sr].
 MJYSR_PER_K_RJ_AT_1GHZ: Final = 2 * 1.380649e-23 * 1e18 / 299792458.0**2 * 1e20
-
-#: Speed of light as a frequency per wavenumber [GHz cm].
-GHZ_PER_INVERSE_CM: Final = 29.9792458

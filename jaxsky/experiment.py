@@ -29,7 +29,7 @@ PIXELS = 1.5
 UNSEEN_WINDOW = 1e-8
 
 
-class Setup(NamedTuple):
+class SimulationInputs(NamedTuple):
     """What is simulated, ready for `jaxsky.simulate`.
 
     Parameters
@@ -82,13 +82,13 @@ class Setup(NamedTuple):
         )
 
 
-def build(
+def simulation_inputs(
     settings: Experiment,
     names: Collection[str] | None = None,
     *,
     written: bool = True,
     galaxy: EmbeddedSky | None = None,
-) -> Setup:
+) -> SimulationInputs:
     """Read what the settings name, and check that it can work.
 
     Parameters
@@ -132,7 +132,7 @@ def build(
     observation = Observation(channels, nside, stokes, min(seen.values()), lmax, precision)
     cmb = cmb_spectra(settings, lmax) if "cmb" in included else None
     leakage = _leakage(settings, foregrounds, observation, galaxy)
-    return Setup(
+    return SimulationInputs(
         sources,
         observation,
         cmb,

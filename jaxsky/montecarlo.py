@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxsky
-from jaxsky.experiment import Setup
+from jaxsky.experiment import SimulationInputs
 from jaxsky.io import write_maps, write_text
 from jaxsky.io.files import check_guards
 from jaxsky.io.folders import alone
@@ -140,7 +140,7 @@ def _claim(out: Path, settings: Experiment, overwrite: bool) -> None:
         write_text(out / LOG, json.dumps(content, indent=2) + "\n")
 
 
-def _header(settings: Experiment, setup: Setup, name: str, index: int) -> dict[str, Any]:
+def _header(settings: Experiment, setup: SimulationInputs, name: str, index: int) -> dict[str, Any]:
     channel = setup.observation.channels[name]
     nu = np.asarray(channel.band.nu)
     header: dict[str, Any] = {
@@ -221,7 +221,7 @@ def _write_behind(jobs: Iterator[tuple[Path, Callable[[], None]]]) -> Iterator[W
 
 def _jobs(
     settings: Experiment,
-    setup: Setup,
+    setup: SimulationInputs,
     seen: Iterator[tuple[str, dict[str, Array]]],
     files: Mapping[str, Path],
     index: int,
@@ -253,7 +253,7 @@ def _jobs(
 
 def run(
     settings: Experiment,
-    setup: Setup,
+    setup: SimulationInputs,
     out: Path,
     indices: range,
     overwrite: bool = False,

@@ -19,7 +19,7 @@ from jaxsky.noise import (
     weights_covariance,
 )
 from jaxsky.settings import (
-    Columns,
+    ColumnKeys,
     MapFile,
     MapKeys,
     NoiseColumns,
@@ -165,7 +165,7 @@ def _file(spec: NoiseColumns, own: MapKeys | None, kind: str, where: str) -> Map
             raise SettingsError(f"{where}: file is missing.")
         if len(own.files) > 1 or (isinstance(own.hdu, list) and spec.hdu is None):
             raise SettingsError(f"{where}: the map has several files or HDUs; give file and hdu.")
-        taken = set(Columns.model_fields) - {"fields", "unit", "missing"}
+        taken = set(ColumnKeys.model_fields) - {"fields", "unit", "missing"}
         said = own.model_dump(include=taken, exclude_none=True) | said
     return MapFile(**said)
 

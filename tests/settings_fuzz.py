@@ -37,8 +37,8 @@ def _prepared(settings: Experiment, regions: str) -> None:
 
 
 KINDS = {
-    "experiment": Kind(DEFAULTS / "experiment.toml", experiment.build),
-    "simulate": Kind(DEFAULTS / "simulate.toml", experiment.build),
+    "experiment": Kind(DEFAULTS / "experiment.toml", experiment.simulation_inputs),
+    "simulate": Kind(DEFAULTS / "simulate.toml", experiment.simulation_inputs),
     "fit": Kind(DEFAULTS / "fit.toml", partial(_prepared, regions="fit")),
     "compare": Kind(DEFAULTS / "compare.toml", partial(_prepared, regions="compare")),
     "separate": Kind(DEFAULTS / "separate.toml", fits.separated_data.separation_data),

@@ -15,7 +15,7 @@ import systems
 from commands import jaxsky, one_sentence
 from fits.commands.run import DEFAULTS
 from jaxsky import experiment, inputs, montecarlo
-from jaxsky.experiment import build
+from jaxsky.experiment import simulation_inputs
 from jaxsky.galaxy import GalaxyModel
 from jaxsky.harmonics import alm_ell, expand, gaussian_beam, synthesis
 from jaxsky.io import read_maps, write_maps
@@ -130,7 +130,7 @@ def test_files_are_the_simulation(folder, tmp_path, monkeypatch, capsys):
     assert command(monkeypatch, path, "--out", out) == 0
     assert " 2 maps in " in " ".join(capsys.readouterr().err.split())
     assert sorted(content(out)) == ["sim_00000/143.fits", "sim_00000/30.fits"]
-    setup = build(load(path))
+    setup = simulation_inputs(load(path))
     key = realisation_key(3, 0)
     expected = simulate(key, setup.sources, setup.observation, jnp.asarray(setup.cmb))
     for name, maps in zip(setup.observation.names, expected, strict=True):
@@ -236,7 +236,7 @@ def test_beams_and_noise_of_all_kinds(folder):
          'fields = ["QQ_COV", "QU_COV", "UU_COV"] } }'),
         ("sheet = false", "diagonal_noise = true"),
     )  # fmt: skip
-    channels = build(load(path)).observation.channels
+    channels = simulation_inputs(load(path)).observation.channels
     fields = ["QQ_COV", "QU_COV", "UU_COV"]
     columns = read_maps(folder / "covariance.fits", fields=fields).maps
     np.testing.assert_allclose(channels["30"].noise[[0, 0, 1], [0, 1, 1]], columns)
@@ -246,7 +246,7 @@ def test_beams_and_noise_of_all_kinds(folder):
     np.testing.assert_allclose(channels["143"].beam, gaussian_beam(800.0, 16), rtol=1e-6)
     assert channels["30"].beam == 800.0
     none = write(folder, (f"noise = {rms}", ""))
-    assert build(load(none)).observation.channels["143"].noise is None
+    assert simulation_inputs(load(none)).observation.channels["143"].noise is None
 
 
 def test_multipoles_that_no_map_shows_are_left_out(folder):
@@ -256,11 +256,11 @@ def test_multipoles_that_no_map_shows_are_left_out(folder):
         ('beam = "beam.txt"', "fwhm = 500.0"),
         ('{ rms = 1.0, unit = "uK_RJ" }', "{ level = 1.0 }"),
     )
-    lmax = build(load(rough)).observation.lmax
+    lmax = simulation_inputs(load(rough)).observation.lmax
     window = np.asarray(gaussian_beam(1200.0, 2 * lmax))
     assert lmax < 128
     assert window[lmax - 1] > 1e-8 > window[lmax + 1]
-    assert build(load(write(folder))).observation.lmax == 16
+    assert simulation_inputs(load(write(folder))).observation.lmax == 16
 
 
 # Realisations.
@@ -415,7 +415,7 @@ def test_small_scales_can_be_the_same_for_all(folder, tmp_path, monkeypatch):
 
 def simulated(path):
     settings = load(path)
-    setup = build(settings)
+    setup = simulation_inputs(settings)
     key = realisation_key(settings.seed, 0)
     cmb = None if setup.cmb is None else jnp.asarray(setup.cmb)
     return np.asarray(simulate(key, setup.sources, setup.observation, cmb))
@@ -506,7 +506,7 @@ def test_keys_of_instruments_and_of_the_embedded_sky(folder, monkeypatch):
     def made(*changes):
         wide = ("fwhm = 1200.0", "fwhm = 1400.0")
         path = write(folder, wide, *changes, text=INSTRUMENT, name="core")
-        return build(load(path)).observation
+        return simulation_inputs(load(path)).observation
 
     plain = made()
     assert plain.names == ("45", "105")
@@ -526,7 +526,7 @@ def test_keys_of_the_cmb_reach_camb(folder, monkeypatch):
     )
     spectra = 'spectra = "cmb.dat"\nformat = "camb"\n'
     for line in ("", "r = 0.05\n", "cosmology = { H0 = 70.0 }\n"):
-        build(load(write(folder, (spectra, line))))
+        simulation_inputs(load(write(folder, (spectra, line))))
     assert asked == [((16, 0.0), {}), ((16, 0.05), {}), ((16, 0.0), {"H0": 70.0})]
 
 
@@ -748,7 +748,7 @@ def test_intensity_and_the_sheet(folder, tmp_path, monkeypatch):
     (picture,) = out.glob("*.png")
     assert picture.name == "sim_00007.png"
     assert picture.read_bytes().startswith(b"\x89PNG")
-    setup = build(load(path))
+    setup = simulation_inputs(load(path))
     key = realisation_key(3, 7)
     expected = simulate(key, setup.sources, setup.observation, jnp.asarray(setup.cmb))
     found = read_maps(out / "sim_00007" / "30.fits", fields=["I", "Q", "U"])

@@ -13,7 +13,7 @@ from fits.regions import region_masks
 from fits.separated_data import separation_data
 from fits.writing import write_log
 from jaxsky.archive import cache_folder
-from jaxsky.experiment import build as build_experiment
+from jaxsky.experiment import simulation_inputs
 from jaxsky.io import InputError, write_maps
 from jaxsky.settings import Experiment, MapFile, SettingsError, find_file, found_files, load
 
@@ -282,10 +282,10 @@ def paper(settings):
          {"free": f", regions = {{ clusters = 2, of = [{{ {NONE} }}] }}"}),
         (forecast_inputs, FORECAST.replace('"dust.fits"', '"none.fits"'), {}),
         (forecast_inputs, FORECAST, {"forecast": f"region = 'a'\n{REGION}"}),
-        (build_experiment, EXPERIMENT, {"beam": 'beam = "none.fits"'}),
-        (build_experiment, EXPERIMENT, {"bandpass": f"{{ {NONE} }}"}),
-        (build_experiment, EXPERIMENT, {"noise": f"{{ map = {{ {NONE} }} }}"}),
-        (build_experiment, EXPERIMENT, {"cmb": '[cmb]\nspectra = "none.fits"'}),
+        (simulation_inputs, EXPERIMENT, {"beam": 'beam = "none.fits"'}),
+        (simulation_inputs, EXPERIMENT, {"bandpass": f"{{ {NONE} }}"}),
+        (simulation_inputs, EXPERIMENT, {"noise": f"{{ map = {{ {NONE} }} }}"}),
+        (simulation_inputs, EXPERIMENT, {"cmb": '[cmb]\nspectra = "none.fits"'}),
         (paper, PAPER.replace('"dust.fits"', '"none.fits"', 1), {}),
         (paper, PAPER, {"common": f"[paper.ame]\nnu_ref = 23.0\n{NONE}"}),
         (paper, PAPER, {"common": f"[paper.beta_syn]\n{NONE}"}),

@@ -22,7 +22,7 @@ from jaxsky.harmonics import smooth
 from jaxsky.io import Maps, unit_factor
 from jaxsky.keys import realisation_key
 from jaxsky.noise import estimate_variance
-from jaxsky.settings import Common
+from jaxsky.settings import CommonTable
 
 #: Annotations of arguments that may be numbers, or hold some.
 NUMERIC = re.compile(
@@ -175,7 +175,7 @@ def test_what_is_refused_inside_of_other_things():
     with pytest.raises(TypeError, match="Argument `tolerance` carries the unit GHz"):
         observe(sky, [Bandpass.delta(44.0)], tolerance=QUANTITY)
     with pytest.raises(ValidationError, match="fwhm\\n  Input should be a valid number"):
-        Common(fwhm=60 * u.arcmin)
+        CommonTable(fwhm=60 * u.arcmin)
 
 
 def test_arrays_of_other_packages_are_refused():

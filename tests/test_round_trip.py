@@ -12,9 +12,11 @@ from fits.common import common_maps
 from fits.inputs import inputs_of
 from fits.results import misfit
 from fits.spectral_index import _expected
-from jaxsky.experiment import build, cmb_spectra
+from jaxsky import Bandpass
+from jaxsky.experiment import cmb_spectra, simulation_inputs
 from jaxsky.harmonics import gaussian_beam
-from jaxsky.io import write_maps
+from jaxsky.io import InputError, write_maps
+from jaxsky.io.observations import Observed, observed_tables, read_observed
 from jaxsky.montecarlo import run
 from jaxsky.settings import SettingsError, load
 
@@ -64,7 +66,9 @@ def settings_in(folder, text=SETTINGS, **replaced):
 def written(path, out, *values):
     """The maps of the first realisation that settings describe; their folder."""
     settings = load(path, values)
-    assert len(list(run(settings, build(settings), out, range(1)))) == len(settings.bands)
+    assert len(list(run(settings, simulation_inputs(settings), out, range(1)))) == len(
+        settings.bands
+    )
     return out / "sim_00000"
 
 
@@ -242,7 +246,7 @@ def test_smoothed_noise_of_pixels_is_not_guessed(files, tmp_path):
     values = ["simulate.fwhm = 400.0", 'bands.1 = { name = "70", instrument = "planck" }']
     settings = load(files, values)
     out = tmp_path / "sims"
-    assert list(run(settings, build(settings), out, range(1)))
+    assert list(run(settings, simulation_inputs(settings), out, range(1)))
     with pytest.raises(SettingsError, match=r"bands.44.noise: .*smoothed"):
         inputs_of(load(files, [*values, f'common.maps = "{out / "sim_00000"}"']))
 
@@ -308,10 +312,10 @@ def test_lensing_and_cosmology_are_those_of_the_settings(tmp_path):
 def test_truth_about_what_is_not_simulated_is_left_out(tmp_path):
     path = settings_in(tmp_path)
     for include in (["dust", "noise"], ["cmb"]):
-        setup = build(load(path, [f"simulate.include = {include}"]))
+        setup = simulation_inputs(load(path, [f"simulate.include = {include}"]))
         assert not any(name.startswith("synchrotron") for name in setup.truth)
     with pytest.raises(SettingsError, match=r"truth: there is no component 'ame'"):
-        build(load(path, ['truth."ame.m60" = 1.0']))
+        simulation_inputs(load(path, ['truth."ame.m60" = 1.0']))
 
 
 def test_maps_without_noise_have_no_errors(folder):
@@ -346,7 +350,7 @@ def test_intensity_alone_has_no_part_in_maps_of_q_and_u(tmp_path):
     without = inputs_of(load(settings_in(tmp_path / "without")))
     assert_same_bands(own.bands, without.bands)
     with pytest.raises(SettingsError, match=r"sky.ff: FreeFree is not polarized.*simulate.stokes"):
-        build(load(path))
+        simulation_inputs(load(path))
 
 
 def test_a_cmb_above_the_noise_is_no_misfit(folder):
@@ -364,3 +368,11 @@ def test_a_cmb_above_the_noise_is_no_misfit(folder):
     np.testing.assert_allclose(expected, np.mean(squares), rtol=0.15)
     assert misfit(50.0 * expected * 1000, 1000, expected) is None
     assert misfit(150.0 * expected * 1000, 1000, expected) is not None
+
+
+def test_tables_of_another_size_than_the_map_are_refused(tmp_path):
+    observed = Observed(Bandpass.delta(100.0), 30.0, covariance=np.ones((2, 2, 48)))
+    options = {"names": ["Q", "U"], "unit": "uK_RJ", "tables": observed_tables(observed)}
+    write_maps(tmp_path / "a.fits", np.zeros((2, 192)), **options)
+    with pytest.raises(InputError, match="its table NOISE has 48 pixels, its map 192"):
+        read_observed(tmp_path / "a.fits")

@@ -51,7 +51,7 @@ def _work(settings: Experiment, command: Run, indices: range) -> Report:
     out, steps, options = command.out, command.steps, command.options
     steps.step("reading templates")
     montecarlo.check_folder(out, settings, options.resume, options.overwrite, indices)
-    setup = experiment.build(settings)
+    setup = experiment.simulation_inputs(settings)
     names = setup.observation.names
     seconds, notes, count = {}, dict[str, None](), len(indices) * len(names)
     steps.step("simulating")

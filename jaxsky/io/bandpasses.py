@@ -11,7 +11,6 @@ from astropy.io import fits as pyfits
 from jaxtyping import Float
 
 from jaxsky.bandpass import CONVENTIONS, Bandpass
-from jaxsky.constants import GHZ_PER_INVERSE_CM
 from jaxsky.io.files import InputError, is_fits
 from jaxsky.io.tables import open_fits, select_hdu
 from jaxsky.io.text import TextTable, read_text
@@ -98,9 +97,9 @@ def _to_GHz(
 #: Frequencies [GHz] and weights of a table.
 Samples: TypeAlias = tuple[np.ndarray, np.ndarray]
 
-#: Unit of a RIMO's WAVENUMBER -> (factor to GHz, convention). The LFI column holds frequencies,
-#: and its weights act on antenna temperature; those of HFI act on power.
-_RIMO = {"GHz": (1.0, "RJ"), "1/cm": (GHZ_PER_INVERSE_CM, "power")}
+#: Unit of a RIMO's WAVENUMBER -> convention. The LFI column holds frequencies, and its weights act
+#: on antenna temperature; those of HFI act on power.
+_RIMO = {"GHz": "RJ", "1/cm": "power"}
 #: Names of columns that hold no frequencies.
 _NO_FREQUENCY = re.compile(
     r"index|idx|i|n|no\.?|number|row|sample|channel|id|weights?|w|t|trans\w*|response|bandpass",
@@ -162,9 +161,8 @@ def _rimo_samples(path: Path, hdus: pyfits.HDUList, name: str) -> tuple[Samples,
         raise InputError(
             f"{path}, HDU {name!r}: WAVENUMBER has the unit {unit!r}, not {' or '.join(_RIMO)}."
         )
-    scale, convention = _RIMO[unit]
-    samples = _merged(data[0][0] * scale, data[0][1])
-    return _checked(path, *samples), convention
+    samples = _merged(*_to_GHz(path, np.array(data[0]), unit))
+    return _checked(path, *samples), _RIMO[unit]
 
 
 def _rimo_names(

@@ -96,17 +96,23 @@ def read_observed(path: Path) -> Observed | None:
                 raise InputError(f"{path}: {key} of its table BANDPASS is {value}.")
             return None if value is None else float(value)
 
-        def columns(table: str, names: Sequence[str]) -> list[np.ndarray] | None:
-            return [column(table, name) for name in names] if table in tables else None
+        def maps(table: str, names: Sequence[str]) -> list[np.ndarray] | None:
+            if table not in tables:
+                return None
+            found, npix = [column(table, name) for name in names], hdus[1].header["NAXIS2"]
+            if found[0].size != npix:
+                raise InputError(
+                    f"{path}: its table {table} has {found[0].size} pixels, its map {npix}."
+                )
+            return found
 
         beam: float | Array | None = number("FWHM")
         if beam is None and "BEAM" in tables:
             beam = jnp.asarray(column("BEAM", "BEAM"))
         if beam is None:
             raise InputError(f"{path}: the table of its beam is missing.")
-        spectrum = columns("NOISE_SPECTRUM", ["N_L"])
-        noise = columns("NOISE", NOISE)
-        leakage = columns("LEAKAGE", "QU")
+        spectral = "NOISE_SPECTRUM" in tables
+        noise, leakage = maps("NOISE", NOISE), maps("LEAKAGE", "QU")
         truth: dict[str, float] = {}
         if "TRUTH" in tables:
             names = [str(name) for name in tables["TRUTH"].data["NAME"]]
@@ -115,7 +121,7 @@ def read_observed(path: Path) -> Observed | None:
             Bandpass(column("BANDPASS", "NU"), column("BANDPASS", "WEIGHT"), header["CONVENT"]),
             beam,
             number("NOISE"),
-            spectrum[0] if spectrum else None,
+            column("NOISE_SPECTRUM", "N_L") if spectral else None,
             np.array([noise[:2], noise[1:]]) if noise else None,
             np.array(leakage) if leakage else None,
             truth,

@@ -1,10 +1,10 @@
 """The experiment file: its tables, a sentence for each mistake, and the files that it names."""
 
-from jaxsky.settings.experiment import Common, Experiment, IndexFile, parse_region
+from jaxsky.settings.experiment import CommonTable, Experiment, IndexFile, parse_region
 from jaxsky.settings.files import (
     BandpassSpec,
     BeamedMap,
-    Columns,
+    ColumnKeys,
     MapFile,
     MapKeys,
     MaskFile,
@@ -14,7 +14,7 @@ from jaxsky.settings.files import (
 from jaxsky.settings.tables import (
     BandTable,
     ComponentTable,
-    Regions,
+    RegionsTable,
     SmallScalesTable,
     leakage_warning,
 )

@@ -29,8 +29,8 @@ from jaxsky.settings.types import (
     RegionName,
     Seed,
     SettingsError,
+    SettingsTable,
     Several,
-    Table,
     Word,
     check_names,
     check_reference,
@@ -69,7 +69,7 @@ def _latitudes(value: str) -> str:
 Region = Annotated[str, AfterValidator(_latitudes)] | MaskFile
 
 
-class Common(Table):
+class CommonTable(SettingsTable):
     """How templates and maps are brought together: for fit, compare, separate and paper.
 
     Parameters
@@ -87,7 +87,7 @@ class Common(Table):
     maps: FileName | None = None
 
 
-class Simulate(Table):
+class SimulateTable(SettingsTable):
     """How bands without a map are simulated, and what `jaxsky simulate` writes.
 
     Parameters
@@ -114,7 +114,7 @@ class Simulate(Table):
     leakage: dict[str, float] = Field(default={})
 
 
-class Fit(Table):
+class FitTable(SettingsTable):
     """How spectral parameters are fitted to templates."""
 
     regions: Several[Word] = Field(["strip", "full"])
@@ -126,7 +126,7 @@ class Fit(Table):
     nsteps: int = Field(3000, ge=1)
 
 
-class Compare(Table):
+class CompareTable(SettingsTable):
     """How maps are compared with the model."""
 
     regions: Several[Word] = Field(["strip", "outside", "full"])
@@ -138,7 +138,7 @@ class Compare(Table):
     patches_nside: Nside = 256
 
 
-class Separate(Table):
+class SeparateTable(SettingsTable):
     """How components are separated, and r taken from the cleaned BB."""
 
     domain: Literal["pixel", "harmonic"] = "pixel"
@@ -154,7 +154,7 @@ class Separate(Table):
     purify: bool = True
 
 
-class Forecast(Table):
+class ForecastTable(SettingsTable):
     """Spectra of the foregrounds outside of a mask, and the Fisher matrix.
 
     Parameters
@@ -187,7 +187,7 @@ class Forecast(Table):
     fisher_lmax: int = Field(300, ge=2, le=3000)
 
     @model_validator(mode="after")
-    def _ranges(self) -> "Forecast":
+    def _ranges(self) -> "ForecastTable":
         for key in ("lmax", "fisher_lmax"):
             if not self.lmin < (last := getattr(self, key)):
                 raise ValueError(f"{key}, {last}, must be above lmin, {self.lmin}")
@@ -207,7 +207,7 @@ class IndexFile(BeamedMap):
     steepening: float | FileName = 0.0
 
 
-class Paper(Table):
+class PaperTable(SettingsTable):
     """What only the figures of the paper need.
 
     Parameters
@@ -228,7 +228,7 @@ class Paper(Table):
     beta_syn: IndexFile | None = None
 
     @model_validator(mode="after")
-    def _plausible(self) -> "Paper":
+    def _plausible(self) -> "PaperTable":
         if self.ame is not None and self.ame.nu_ref is None:
             raise MistakeAt("ame.nu_ref", "is missing")
         keys = {"ame": "steepening", "beta_dust": "nu_ref steepening", "beta_syn": "nu_ref"}
@@ -241,7 +241,7 @@ class Paper(Table):
         return self
 
 
-class Experiment(Table):
+class Experiment(SettingsTable):
     """All settings: a sky, the bands in which it is observed, and what is done with them.
 
     Parameters
@@ -261,17 +261,17 @@ class Experiment(Table):
     sky: SkyTable = SkyTable()
     bands: list[BandTable] = Field(default=[])
     cmb: CMBTable = CMBTable()
-    common: Common = Common()
+    common: CommonTable = CommonTable()
     regions: dict[RegionName, Region] = Field(default={})
     free: dict[str, FreeParameter] = Field(default={})
     fixed: dict[str, float] = Field(default={})
     truth: dict[str, float] = Field(default={})
-    simulate: Simulate = Simulate()
-    fit: Fit = Fit()
-    compare: Compare = Compare()
-    separate: Separate = Separate()
-    forecast: Forecast = Forecast()
-    paper: Paper = Paper()
+    simulate: SimulateTable = SimulateTable()
+    fit: FitTable = FitTable()
+    compare: CompareTable = CompareTable()
+    separate: SeparateTable = SeparateTable()
+    forecast: ForecastTable = ForecastTable()
+    paper: PaperTable = PaperTable()
 
     @model_validator(mode="after")
     def _consistent(self, info: ValidationInfo) -> "Experiment":

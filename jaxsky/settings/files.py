@@ -11,15 +11,15 @@ from jaxsky.settings.types import (
     Hdus,
     MistakeAt,
     Positive,
+    SettingsTable,
     Several,
     Stokes,
-    Table,
     Word,
 )
 from jaxsky.units import UNITS
 
 
-class Columns(Table):
+class ColumnKeys(SettingsTable):
     """Columns of a FITS table, or of several with a column each.
 
     What a header says need not be given; see `jaxsky.io.read_maps`.
@@ -45,7 +45,7 @@ class Columns(Table):
         return ", ".join(Path(file).name for file in self.files)
 
 
-class MapKeys(Columns):
+class MapKeys(ColumnKeys):
     """A map where there may be none; its Stokes parameters if names of columns are not certain."""
 
     stokes: Stokes | None = None
@@ -69,7 +69,7 @@ class BeamedMap(MapFile):
     fwhm: float = Field(0.0, ge=0)
 
 
-class MaskFile(Table):
+class MaskFile(SettingsTable):
     """A mask, 1 where a pixel is used: FITS, or one entry of an .npz file."""
 
     file: FileName
@@ -77,7 +77,7 @@ class MaskFile(Table):
     ordering: Literal["RING", "NESTED"] | None = None
 
 
-class BandpassSpec(Table):
+class BandpassSpec(SettingsTable):
     """A bandpass: a table in a file, or a top-hat."""
 
     file: FileName | None = None
@@ -103,7 +103,7 @@ def _list(value: Any) -> Any:
     return value if isinstance(value, list | tuple) else [value]
 
 
-class NoiseColumns(Columns):
+class NoiseColumns(ColumnKeys):
     """Columns about the noise, in the file of the map that has it unless they have their own.
 
     What else is not given is as in that map. A list alone names the columns. `sigma0` is the noise
@@ -118,7 +118,7 @@ class NoiseColumns(Columns):
         return {"fields": list(value)} if isinstance(value, list | tuple) else value
 
 
-class NoiseTable(Table):
+class NoiseTable(SettingsTable):
     """Noise of a band or of a template: exactly one of its kinds.
 
     A level is white noise [unit arcmin]; that of a template is seen through its beam. The others

@@ -18,8 +18,8 @@ from jaxsky.settings.types import (
     Pair,
     Positive,
     Seed,
+    SettingsTable,
     Several,
-    Table,
     TensorRatio,
     Word,
     check_component_names,
@@ -88,7 +88,7 @@ def _check_release(
 EMBEDDED = ("dust", "synchrotron")
 
 
-class Embedded(Table):
+class EmbeddedTable(SettingsTable):
     """The embedded model of the Galaxy; `model` are numbers of `jaxsky.galaxy.GalaxyModel`."""
 
     nside: Nside = 128
@@ -96,7 +96,7 @@ class Embedded(Table):
     model: dict[str, float] = Field(default={})
 
 
-class SmallScalesTable(Table):
+class SmallScalesTable(SettingsTable):
     """Small scales of a component; see `jaxsky.small_scales.SmallScales`."""
 
     EE: Pair[int]
@@ -159,13 +159,13 @@ class ComponentTable(MapKeys):
         check_reference(law, self.nu_ref, self.parameters)
 
 
-class SkyTable(Table):
+class SkyTable(SettingsTable):
     """Components of the sky by name, and the embedded model, whose maps those replace."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, ComponentTable] = Field(init=False)
 
-    embedded: Embedded | None = None
+    embedded: EmbeddedTable | None = None
 
     @property
     def given(self) -> dict[str, ComponentTable]:
@@ -211,7 +211,7 @@ class SkyTable(Table):
         return self
 
 
-class CMBTable(Table):
+class CMBTable(SettingsTable):
     """The CMB: from CAMB, or from a file of spectra.
 
     It is part of what is observed and of what is known about it. `A_lens` multiplies the B modes
@@ -307,7 +307,7 @@ class BandTable(MapKeys):
         return bands
 
 
-class Regions(Table):
+class RegionsTable(SettingsTable):
     """Where a parameter has values of its own: exactly one of these."""
 
     nside: Nside | None = None
@@ -317,14 +317,14 @@ class Regions(Table):
     file: MapFile | None = None
 
     @model_validator(mode="after")
-    def _one_kind(self) -> "Regions":
+    def _one_kind(self) -> "RegionsTable":
         self.one_of("regions", ("nside", "latitudes", "clusters", "file"))
         if self.of and self.clusters is None:
             raise ValueError("of goes with clusters only")
         return self
 
 
-class FreeParameter(Table):
+class FreeParameter(SettingsTable):
     """A free parameter: where to start, its prior, and its regions if it has several values.
 
     Without a start it is the middle of the prior.
@@ -333,7 +333,7 @@ class FreeParameter(Table):
     start: float | None = None
     uniform: Pair[float] | None = None
     gaussian: Pair[float] | None = None
-    regions: Regions | None = None
+    regions: RegionsTable | None = None
 
     @model_validator(mode="after")
     def _one_prior(self) -> "FreeParameter":

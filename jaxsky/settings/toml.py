@@ -108,7 +108,7 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
         options[assignment.partition("=")[0].strip()] = " (given with --set)"
     named = raw.get("data_dir", ".")
     try:
-        name = expand(named) if isinstance(named, str) else "."
+        name = _expand(named) if isinstance(named, str) else "."
         folder = (path.absolute().parent / name).resolve()
         if folder.exists() and not folder.is_dir():
             raise ValueError(f"{folder} is not a folder")
@@ -120,7 +120,7 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
     return settings.model_copy(update={"data_dir": str(folder)})
 
 
-def expand(text: str) -> str:
+def _expand(text: str) -> str:
     """Expand `~` and environment variables, $NAME or ${NAME:-default}, in a path."""
 
     def value(match: re.Match[str]) -> str:
@@ -148,7 +148,7 @@ def find_file(folder: Path, name: str) -> Path:
     """
     if not os.path.lexists(folder / name):
         try:
-            name = expand(name)
+            name = _expand(name)
         except ValueError as error:
             raise InputError(f"{name}: {error}.") from None
     path, cache = folder / name, None

@@ -48,7 +48,7 @@ class MistakeAt(ValueError):
         super().__init__(f"{self.key}: {self.words}")
 
 
-class Table(BaseModel):
+class SettingsTable(BaseModel):
     """A table of settings: its fields are the keys, and no others, with values of their types.
 
     A number in quotes, a switch where a number is meant and an empty word are mistakes.

@@ -1,4 +1,7 @@
-"""The experiment file: one grammar for all commands, a sentence for each mistake."""
+"""The experiment file: one grammar for all commands, a sentence for each mistake.
+
+What each key means is said in `fits/defaults/experiment.toml`, which `jaxsky init` writes.
+"""
 
 import re
 from collections.abc import Collection
@@ -70,15 +73,7 @@ Region = Annotated[str, AfterValidator(_latitudes)] | MaskFile
 
 
 class CommonTable(SettingsTable):
-    """How templates and maps are brought together: for fit, compare, separate and paper.
-
-    Parameters
-    ----------
-    nside, fwhm : common resolution [arcmin]; fwhm = 0 averages pixels without smoothing
-    mask : of all regions
-    components : those of the sky that are modelled, by default all
-    maps : folder of a realisation that `jaxsky simulate` wrote, for bands without a file
-    """
+    """How templates and maps are brought together: for fit, compare, separate and paper."""
 
     nside: Nside = 64
     fwhm: float = Field(60.0, ge=0)
@@ -88,18 +83,7 @@ class CommonTable(SettingsTable):
 
 
 class SimulateTable(SettingsTable):
-    """How bands without a map are simulated, and what `jaxsky simulate` writes.
-
-    Parameters
-    ----------
-    nside : of the maps, by default that of the coarsest map of the sky
-    fwhm : common beam [arcmin] of the maps that are written; "own" is that of each band
-    stokes, unit, outputs, precision, sheet : of what is written
-    include : what is simulated, "cmb" and "noise" among the names; by default all
-    diagonal_noise : the paper's diagonal of the Cholesky factor
-    small_scales_seed : one set of small scales for all realisations
-    leakage : fraction of the intensity that leaks into Q and U, by band; it is known and subtracted
-    """
+    """How bands without a map are simulated, and what `jaxsky simulate` writes."""
 
     nside: Nside | None = None
     fwhm: Positive | Literal["own"] = "own"
@@ -155,20 +139,7 @@ class SeparateTable(SettingsTable):
 
 
 class ForecastTable(SettingsTable):
-    """Spectra of the foregrounds outside of a mask, and the Fisher matrix.
-
-    Parameters
-    ----------
-    region, apodization : what is used, and over which angle [deg] its edge rises
-    bands : whose spectra are shown
-    lmin, lmax, width : of the bins
-    fit : multipoles of the power laws
-    show_r : of the primordial spectra that are drawn
-    free : of the CMB, besides the spectral parameters of the table free
-    foregrounds : what is free of the foregrounds' spectra
-    priors : standard deviations of Gaussian priors on what is not in the table free
-    spectra, fisher_lmax : of the Fisher matrix
-    """
+    """Spectra of the foregrounds outside of a mask, and the Fisher matrix."""
 
     region: Word = "outside"
     apodization: float = Field(4.0, ge=0, lt=90)
@@ -208,16 +179,7 @@ class IndexFile(BeamedMap):
 
 
 class PaperTable(SettingsTable):
-    """What only the figures of the paper need.
-
-    Parameters
-    ----------
-    fwhm : beam of the templates with small scales [arcmin]
-    center : of the patches: l, b [deg]
-    dust, synchrotron : small scales of the figures; the maps that are compared have none of these
-    ame : an intensity, to be polarized along the dust
-    beta_dust, beta_syn : maps of indices
-    """
+    """What only the figures of the paper need."""
 
     fwhm: Positive = 5.0
     center: Pair[float] = (180.0, 30.0)

@@ -238,16 +238,7 @@ class CMBTable(SettingsTable):
 
 
 class BandTable(MapKeys):
-    """A band: how it observes, and its map; without a map it is simulated.
-
-    Parameters
-    ----------
-    name : of the band; a choice of several of an instrument is `channels`
-    instrument : of which it is a channel, for what is not given here
-    samples : of the top-hat of a bandpass that is no table
-    fwhm, beam : FWHM of a Gaussian beam [arcmin], or the file of a window
-    leakage : what leaked from intensity into Q and U, to be subtracted
-    """
+    """A band: how it observes, and its map; without a map it is simulated."""
 
     name: BandName | None = None
     instrument: str | None = None

@@ -265,8 +265,6 @@ def _read_template(
     used = np.asarray(found.mask) & known
     with at_key(f"sky.{name}"):
         if spec.angles:
-            if len(maps) != 1:
-                raise ValueError(f"fields must name one intensity map, not {len(maps)} maps")
             component: Component = AME.from_dust_angles(
                 maps[0], others[spec.angles].component.amplitude, **parameters
             )

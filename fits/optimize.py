@@ -203,7 +203,7 @@ def best_fit(
     solver : of optimistix: a least-squares solver, which works on the residuals, or a minimiser,
         which works on their sum of squares. Parameters, and so tolerances, are in units of their
         values at the start for the first, and of their standard deviations there for the second;
-        with uniform priors, those of numbers without bounds. Or `fits.optimize.Newton()`: damped
+        with uniform priors, those of numbers without bounds. Or `fits.Newton()`: damped
         steps of Newton's method with exact second derivatives, clipped at the bounds. By default
         that for spectral likelihoods, else `LevenbergMarquardt`
     max_steps : of the search; by default 100 of Newton's method, or 500 of optimistix
@@ -232,7 +232,7 @@ def best_fit(
     if not (solver is None or isinstance(solver, Solver)):
         raise TypeError(
             "Argument `solver` must be a least-squares solver or a minimiser of optimistix, or "
-            f"fits.optimize.Newton(), not {type(solver).__name__}."
+            f"fits.Newton(), not {type(solver).__name__}."
         )
     like = like.at(start)
     priors = check_priors(priors, like.free)

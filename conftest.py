@@ -16,8 +16,8 @@ CACHE = Path(__file__).parent / ".cache"
 os.environ["JAXSKY_CACHE"] = str(CACHE)
 keep_programs(CACHE / "programs")
 
-#: Of memory, from which on programs are forgotten: a single file of tests adds no more than this.
-MOST_PIECES = 30_000
+#: Of memory, from which on programs are forgotten; the programs of so many take about 1 GB.
+MOST_PIECES = 10_000
 DATA = Path(os.environ.get("JAXSKY_DATA", Path(__file__).parents[1] / "shared" / "data"))
 
 

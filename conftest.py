@@ -1,6 +1,5 @@
 """Double precision for all tests and slow checks, and the real sky data where it is to be had."""
 
-import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,7 +7,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from jaxsky.programs import keep_programs
+from jaxsky.programs import forget_programs, keep_programs
 
 jax.config.update("jax_enable_x64", True)
 # What can be had again, of the tests and of the commands that they start.
@@ -53,5 +52,4 @@ def _programs() -> Iterator[None]:
     """
     yield
     if _pieces() > MOST_PIECES:
-        jax.clear_caches()
-        gc.collect()
+        forget_programs()

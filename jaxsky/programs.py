@@ -5,6 +5,8 @@ Compilation takes longer than most commands compute. Programs with a transform a
 """
 
 import contextlib
+import ctypes
+import gc
 import hashlib
 import os
 import platform
@@ -73,6 +75,14 @@ def keep_programs(folder: Path) -> None:
     compilation_cache.LRUCache = _Cache  # type: ignore[misc]
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def forget_programs() -> None:
+    """Forget all compiled programs of this process, and give their memory back to the system."""
+    jax.clear_caches()
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):  # of glibc: what lies between live pieces
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _prune(folder: Path) -> None:

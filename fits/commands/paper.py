@@ -1,13 +1,11 @@
 """`jaxsky paper`: all figures and tables of the paper in order, and the page that shows them."""
 
-import gc
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import jax
 from pydantic import TypeAdapter, ValidationError
 
 from fits.commands.page import ResultTable, Section, write_page
@@ -17,6 +15,7 @@ from fits.paper.items import Impossible, Item, described, picture_of
 from fits.paper.sources import Sources
 from fits.writing import write_log
 from jaxsky.io import write_text
+from jaxsky.programs import forget_programs
 from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import Experiment
 
@@ -129,9 +128,10 @@ def make_figures(
         kept = Figures(mark, list(items.values()))
         write_text(out / KEPT, TypeAdapter(Figures).dump_json(kept, indent=2).decode())
         _write_page(sources, out, items, steps)
+        if not any(steps[later].__module__ == figures_data.__name__ for later in todo[done + 1 :]):
+            sources.forget_bands()
         # No two figures have programs in common, and what these hold adds up.
-        jax.clear_caches()
-        gc.collect()
+        forget_programs()
     shown = _write_page(sources, out, items, steps)
     write_log(out / "log.json", settings, time.perf_counter() - started)
     return shown

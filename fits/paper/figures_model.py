@@ -7,7 +7,7 @@ from pathlib import Path
 import healpy
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from fits.b_modes import PIVOT
 from fits.commands.forecast import forecast
@@ -227,19 +227,25 @@ def figure_randomised(sources: Sources, picture: Path) -> Item:
     steeper = dataclasses.replace(small, tilt=small.tilt + TILT)
     other = stream(sources.key, "other small scales", "synchrotron")
     own = sources.small_scales_key("synchrotron")
-    drawn = {
-        f"with small scales, {fwhm:g}'": sources.continued("synchrotron"),
-        "another realisation": sources.with_small_scales(layer, other),
-        f"steeper by {-TILT:g}": sources.with_small_scales(
+    # Made one after the other: each takes as much memory as all the rest of the figure.
+    makers = {
+        f"with small scales, {fwhm:g}'": lambda: sources.continued("synchrotron"),
+        "another realisation": lambda: sources.with_small_scales(layer, other),
+        f"steeper by {-TILT:g}": lambda: sources.with_small_scales(
             layer._replace(small_scales=steeper), own
         ),
     }
+
+    def Q_of(maps: Float[Array, "2 pix"]) -> Float[np.ndarray, " pix"]:
+        return np.asarray(maps[0], np.float32)
+
     wide = polarization_template(layer.maps, layer.fwhm, layer.fwhm, nside)
-    panels = {f"template, {layer.fwhm / 60:.2g}°": np.asarray(wide[0])}
-    for title, continued in drawn.items():
-        (alm,) = continued.alms
+    panels = {f"template, {layer.fwhm / 60:.2g}°": Q_of(wide)}
+    del wide
+    for title, make in makers.items():
+        (alm,) = make().alms
         beam = gaussian_beam(fwhm, lmax_of(alm))
-        panels[title] = np.asarray(synthesis(alm * expand(beam), nside)[0])
+        panels[title] = Q_of(synthesis(alm * expand(beam), nside))
     template, *rest = [_disc(values, center, SIZE) for values in panels.values()]
     middle = float(template.mean())
     limit = color_limit(rest[0] - middle, 0.995)

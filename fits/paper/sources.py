@@ -155,6 +155,11 @@ class Sources:
         self.key = realisation_key(settings.seed)
         self._made: dict[tuple[str, ...], Any] = {}
 
+    def forget_bands(self) -> None:
+        """Forget the maps of the bands, the largest of all that is kept."""
+        for name in ("inputs", "comparison"):
+            self._made.pop((name,), None)
+
     @property
     def embedded(self) -> bool:
         """True if dust and synchrotron are those of the embedded model."""

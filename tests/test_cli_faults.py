@@ -87,6 +87,7 @@ def test_a_log_is_that_of_the_last_run(monkeypatch, capsys, tmp_path):
     assert not (tmp_path / endings.LOG).exists()
 
 
+@pytest.mark.slow
 def test_terminals_without_unicode(tmp_path):
     """Tables, and names that an encoding lacks."""
     environment = os.environ | {"PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
@@ -98,6 +99,7 @@ def test_terminals_without_unicode(tmp_path):
     assert "Traceback" not in run.stderr
 
 
+@pytest.mark.slow
 def test_a_reader_that_leaves():
     run = subprocess.run(
         f"{JAXSKY} data list | head -n 1", shell=True, capture_output=True, text=True, check=True
@@ -154,16 +156,8 @@ cli.main()
 """
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        "computing",
-        *(
-            pytest.param(how, marks=pytest.mark.slow)
-            for how in ("swallowed", "other_error", "caught")
-        ),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["computing", "swallowed", "other_error", "caught"])
 def test_ctrl_c_ends_a_command(tmp_path, how):
     began = time.monotonic()
     run = subprocess.run(

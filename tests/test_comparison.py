@@ -96,6 +96,7 @@ def test_realisations_have_the_covariance(prepared, realised):
     assert expected[0, 1] > 0.05 * root[0] * root[1]
 
 
+@pytest.mark.slow
 def test_noise_is_prepared_as_maps_are(prepared):
     """White noise keeps its spectrum without the refinement of the analysis."""
     (op, *_), npix = prepared.fluctuations.preparations, 12 * 32**2

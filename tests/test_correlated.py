@@ -44,6 +44,7 @@ def mixed(level, coefficient):
     return jnp.stack(blocks, axis=-1) * scale[:, None, None] * scale[:, None]
 
 
+@pytest.mark.slow
 def test_spectra_are_recovered(spectra):
     count = 100
     fields = jax.jit(jax.vmap(lambda key: gaussian_fields(key, spectra)))(

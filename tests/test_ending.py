@@ -63,12 +63,13 @@ def ends(*cases: str) -> list[int]:
     return [int(line.split()[1]) for line in run.stdout.splitlines()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("names", "gradient"),
     [
         ("smooth rotate", True),
-        pytest.param("synthesis analysis", True, marks=pytest.mark.slow),
-        pytest.param("synthesis analysis smooth rotate healpy", False, marks=pytest.mark.slow),
+        ("synthesis analysis", True),
+        ("synthesis analysis smooth rotate healpy", False),
     ],
 )
 def test_a_script_may_end_in_any_transform(names, gradient):

@@ -168,6 +168,7 @@ def test_seeds_differ():
             assert np.std(first[i, j] - second[i, j]) > 0.05 * np.std(first[i, j])
 
 
+@pytest.mark.slow
 def test_power_on_all_scales(galaxy):
     lat = lonlat(64)[1]
     mask = healpy.smoothing((abs(lat) > 30).astype(float), fwhm=np.deg2rad(5)).clip(0, 1)
@@ -179,6 +180,7 @@ def test_power_on_all_scales(galaxy):
                 assert -3.0 < slope < -1.9
 
 
+@pytest.mark.slow
 def test_steps_have_converged():
     reference = line_of_sight(GalaxyModel(), 16, steps=500)
     scale = np.std(reference, axis=-1)
@@ -286,6 +288,7 @@ def test_resembles_the_real_sky(data_dir, galaxy, name, file, least_Q, least_U):
     assert correlate(1, abs(lat) > 20) > 0.3
 
 
+@pytest.mark.slow
 def test_the_default_model_is_kept(tmp_path, monkeypatch):
     monkeypatch.setenv("JAXSKY_CACHE", str(tmp_path))
     made, expected = default_galaxy(16), embedded_sky(16)

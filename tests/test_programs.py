@@ -54,6 +54,7 @@ def kept(folder):
     return {path.name for path in programs.program_folder(folder).iterdir()}
 
 
+@pytest.mark.slow
 def test_a_second_process_adds_nothing_and_transforms_are_not_kept(tmp_path):
     first, _ = process(tmp_path)
     names = kept(tmp_path)

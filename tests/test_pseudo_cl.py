@@ -132,6 +132,7 @@ def oblong(pure, count=200):
     return spectra, np.std([band_powers(spectra, sky(key, *rows)) for key in keys], 0, ddof=1)
 
 
+@pytest.mark.slow
 def test_errors_with_a_mask_that_is_not_a_disc():
     spectra, error = oblong(False)
     predicted = np.sqrt(np.einsum("ibib->ib", bandpower_covariance(spectra, *DUST)))

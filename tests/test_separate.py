@@ -125,6 +125,7 @@ def test_errors_of_multipoles_are_those_of_simulations():
         assert found.simulated.theta[:, i].std() == pytest.approx(found.fit.sigma[name], rel=0.3)
 
 
+@pytest.mark.slow
 def test_noise_of_multipoles_has_its_spectrum():
     """That of pixels, and what is correlated between them; 20 draws of 2 x 65 modes: 2.8 %."""
     _, given, _ = separated("harmonic")

@@ -347,6 +347,7 @@ def test_noise_of_each_pixel():
         assert abs(np.mean(products - rho)) < 4 * np.sqrt(np.mean(1 + rho**2) / NPIX)
 
 
+@pytest.mark.slow
 def test_noise_of_each_pixel_is_smoothed():
     """The sum of squares of smoothed noise, against the covariance as a dense matrix."""
     target, beam, count = 1100.0, 800.0, 8

@@ -67,6 +67,7 @@ def test_own_beams_are_accounted_for():
     np.testing.assert_allclose(prepared[2], prepared[0], atol=2e-4 * float(prepared[0].std()))
 
 
+@pytest.mark.slow
 def test_variance_of_prepared_noise():
     """Against 400 draws: a map of variances is smoothed by the square of the kernel."""
     nside_in, nside = 32, 16
@@ -89,6 +90,7 @@ def test_variance_of_prepared_noise():
             assert ratio[:, band].mean() == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.slow
 def test_uniform_noise_is_drawn_by_multipoles():
     """As smoothed white noise in pixels: the same variance and the same spectrum."""
     nside_in, nside, lmax = 32, 16, 47
@@ -178,6 +180,7 @@ def test_missing_pixels_take_their_surroundings_along():
     assert 700 < averaged.sum() < 768
 
 
+@pytest.mark.slow
 def test_missing_pixels_do_not_bias():
     """Data without the plane, templates with it: both get the same holes before smoothing."""
     nside = 32

@@ -137,6 +137,7 @@ def hole(nside, radius):
     return mask
 
 
+@pytest.mark.slow
 def test_masked_index_is_the_mean_under_the_beam():
     nside, fwhm = 32, 600.0
     beta, mask = noisy_index(nside, 0.1), hole(nside, 8.0)

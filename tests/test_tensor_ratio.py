@@ -102,7 +102,8 @@ def test_powers_of_the_model_give_its_r_and_others_shift_it():
     assert 0 < negative.upper_95 < fit_tensors(one, one.mean(0.001)).upper_95
 
 
-@pytest.mark.parametrize("r", [pytest.param(0.0, marks=pytest.mark.slow), 0.02])
+@pytest.mark.slow
+@pytest.mark.parametrize("r", [0.0, 0.02])
 def test_r_over_skies(r):
     """Estimates scatter about the truth with their errors."""
     one = model()

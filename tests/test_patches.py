@@ -110,6 +110,7 @@ def test_noise_alone_is_no_detection():
     np.testing.assert_array_less(alpha_error, 3.0001)
 
 
+@pytest.mark.slow
 def test_units_do_not_matter():
     maps = sky(jax.random.key(3), *jnp.asarray(SEEN + NOISE))
     one = fit_patches(maps, patches(4), noise=NOISE)

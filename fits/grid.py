@@ -112,10 +112,15 @@ def grid_fit(
     like = like.at(start)
     free = like.free
     priors = check_priors(priors, free)
-    number = sum(value.size for value in like.start.values())
-    if number > 2:
+    for name, value in like.start.items():
+        if value.size > 1:
+            raise ValueError(
+                f"A grid takes parameters with one value, but {name!r} has {value.size}, one for "
+                "each region; use the gradient fit or MCMC."
+            )
+    if len(free) > 2:
         raise ValueError(
-            f"A grid takes one or two free parameters, not {number} ({', '.join(free)}); "
+            f"A grid takes one or two free parameters, not {len(free)} ({', '.join(free)}); "
             "use the gradient fit or MCMC."
         )
     ranges = {name: bounds(name, priors) for name in free}

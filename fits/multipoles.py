@@ -146,9 +146,13 @@ class Multipoles(NamedTuple):
             return 1 / np.sqrt(self.weights)
 
     def without_beams(self, alm: np.ndarray) -> Float[np.ndarray, "band stokes alm"]:
-        """Coefficients without their beam, up to lmax."""
+        """Coefficients without their beam, up to lmax; zero below lmin."""
         short = np.asarray(resize(jnp.asarray(alm), self.inverse.shape[-1] - 1))
-        return short * self.inverse[:, None, self.ell]
+        rows = np.where(self.ell >= self.lmin, short * self.inverse[:, None, self.ell], 0.0)
+        if not np.isfinite(rows).all():
+            bad = int(np.sum(~np.isfinite(alm)))
+            raise ValueError(f"Argument `alm` has {bad} of {alm.size} values that are not finite.")
+        return rows
 
 
 def check_alm(alm: Numeric, bands: int) -> np.ndarray:
@@ -320,9 +324,6 @@ def harmonic_likelihood(
     components = len(sky.components)
     multipoles = multipoles_of(alm, noise, beams, components, lmin, lmax)
     rows = multipoles.without_beams(alm)
-    if not np.isfinite(rows).all():
-        bad = int(np.sum(~np.isfinite(alm)))
-        raise ValueError(f"Argument `alm` has {bad} of {alm.size} values that are not finite.")
     pixels = tuple(_compressed(rows, multipoles, layout) for layout in like.layout)
     bands_used = (multipoles.weights > 0).sum(axis=0)[..., multipoles.ell]
     values = bands_used - components * (multipoles.ell >= lmin)

@@ -141,7 +141,8 @@ def spread(names: Sequence[str], count: int) -> list[str]:
 
 def color_limit(values: np.ndarray, quantile: float = 0.99) -> float:
     """End of a scale of colours about zero: nearly all values are within."""
-    return float(np.nanquantile(np.abs(values), quantile)) or 1.0
+    known = np.abs(values[np.isfinite(values)])
+    return (float(np.quantile(known, quantile)) if known.size else 0.0) or 1.0
 
 
 def _image(

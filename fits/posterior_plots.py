@@ -61,15 +61,21 @@ def plot_grids(
     return True
 
 
+def _shown(fit: RegionFit) -> FitResult:
+    """The result that says most of a posterior: that of a grid, a chain or another method."""
+    best = [r for r in fit.results.values() if "axes" in r.details or "chain" in r.details]
+    return min(best, key=lambda r: "chain" in r.details, default=next(iter(fit.results.values())))
+
+
 def _drawable(fits: Sequence[RegionFit], name: str) -> list[RegionFit]:
     """Fits that have a parameter, with a finite error."""
-    firsts = [(fit, next(iter(fit.results.values()))) for fit in fits]
-    return [fit for fit, r in firsts if name in r.free and np.isfinite(r.sigma[name])]
+    shown = [(fit, _shown(fit)) for fit in fits]
+    return [fit for fit, r in shown if name in r.free and np.isfinite(r.sigma[name])]
 
 
 def _limits(fits: Sequence[RegionFit], name: str) -> tuple[float, float] | None:
     """Range of a parameter that shows all fits to four standard deviations."""
-    results = [next(iter(fit.results.values())) for fit in _drawable(fits, name)]
+    results = [_shown(fit) for fit in _drawable(fits, name)]
     if not results:
         return None
     low = min(r.best_fit[name] - 4 * r.sigma[name] for r in results)
@@ -97,14 +103,12 @@ def _grid_panel(axes: plt.Axes, result: FitResult, truth: Mapping[str, float] | 
 
 def _density(fit: RegionFit, name: str) -> tuple[np.ndarray, np.ndarray, FitResult]:
     """A marginal distribution from the best method there is: grid, chain or Gaussian."""
-    if "grid" in fit.results:
-        result = fit.results["grid"]
+    result = _shown(fit)
+    if "axes" in result.details:
         return result.details["axes"][name], result.details["marginals"][name], result
-    if "mcmc" in fit.results:
-        result = fit.results["mcmc"]
+    if "chain" in result.details:
         density = result.to_getdist(fit.stokes, label).get1DDensity(name)
         return density.x, density.P, result
-    result = fit.results["gradient"]
     sigma = result.sigma[name]
     x = result.best_fit[name] + sigma * np.linspace(-5, 5, 201)
     return x, np.exp(-0.5 * ((x - result.best_fit[name]) / sigma) ** 2), result
@@ -148,7 +152,7 @@ def plot_posterior(
 
     Returns False, without a picture, if no fit has a chain.
     """
-    with_chain = [f for f in fits if "mcmc" in f.results]
+    with_chain = [f for f in fits if "mcmc" in f.results and "chain" in f.results["mcmc"].details]
     if not with_chain:
         return False
     most = max(with_chain, key=lambda f: len(f.stokes)).stokes

@@ -99,9 +99,8 @@ class FitResult(NamedTuple):
         lines = []
         for name, value in self.best_fit.items():
             known = np.isfinite(value)
-            shown = with_error(
-                *(float(np.median(np.asarray(x)[known])) for x in (value, self.sigma[name]))
-            )
+            both = (np.asarray(x)[known] for x in (value, self.sigma[name]))
+            shown = with_error(*map(np.median, both)) if known.any() else "unknown"
             regions = f", median of {known.sum()} regions" if np.ndim(value) else ""
             lines.append(f"{name} = {shown}{regions}")
         lines.append(f"chi2 = {self.chi2:.1f} for {self.dof} degrees of freedom")
@@ -196,7 +195,9 @@ class FitResult(NamedTuple):
             if not lost.ndim:
                 where = f": from {start[name]:g} it went to {value:.3g} +- {self.sigma[name]:.2g}"
             failures.append(f"The data do not constrain {name!r}{where}; {help_by_prior((name,))}.")
-        if (wrong := misfit(chi2, dof, expected)) and wrong not in self.message:
+        # Where nothing was found, there is no chi^2 either.
+        wrong = misfit(chi2, dof, expected) if np.isfinite(chi2) or self.converged else None
+        if wrong and wrong not in self.message:
             failures.insert(0, wrong)
         if not failures:
             return self

@@ -41,7 +41,12 @@ def with_error(value: float, error: float) -> str:
 
 
 def with_errors(best: float, low: float, high: float) -> str:
-    """A value with its interval as differences, to two digits of the smaller one."""
+    """A value with its interval as differences, to two digits of the smaller one.
+
+    Without an interval the value alone, and nothing where there is no value.
+    """
+    if not np.isfinite([low, high]).all():
+        return f"{best:.4f}" if np.isfinite(best) else ""
     smaller = min(abs(high - best), abs(best - low))
     usable = np.isfinite(smaller) and smaller > 0
     digits = max(0, 1 - int(np.floor(np.log10(smaller)))) if usable else 4

@@ -52,7 +52,6 @@ def uniform_map(
     return sigma * stokes_noise(key, stokes, healpy.nside2npix(nside), sigma.dtype)
 
 
-@partial(jax.jit, static_argnames=("lmax", "stokes"))
 def uniform_alm(
     key: Array, noise: ArrayLike, lmax: int, stokes: int = 2
 ) -> Float[Array, "stokes alm"]:
@@ -67,7 +66,11 @@ def uniform_alm(
     """
     if stokes not in (1, 2, 3):
         raise ValueError(f"Argument `stokes` must be 1, 2 or 3, not {stokes!r}.")
-    noise = as_array("noise", noise)
+    return _uniform_alm(key, as_array("noise", noise), lmax, stokes)
+
+
+@partial(jax.jit, static_argnames=("lmax", "stokes"))
+def _uniform_alm(key, noise, lmax, stokes):
     spins = jnp.array({1: [0], 2: [2, 2], 3: [0, 2, 2]}[stokes])
     there = jnp.arange(lmax + 1) >= spins[:, None]
     levels = jnp.where(there, noise * (math.pi / 180 / 60), 0)

@@ -8,9 +8,11 @@ mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from fits.plots import draw_title, in_formula, label, plain, save
-from fits.posterior_plots import plot_chains
+from fits.plots import color_limit, draw_title, in_formula, label, plain, save
+from fits.posterior_plots import _drawable, plot_chains, plot_marginals, plot_posterior
 from fits.results import FitResult
+from fits.spectral_index import RegionFit
+from fits.writing import with_errors
 
 NAMES = [
     "$x_$",
@@ -46,6 +48,38 @@ def test_titles_keep_their_characters():
     draw_title(figure, r"$x_$ and \$ 100 %")
     assert figure._suptitle.get_text().replace(r"\$", "$") == r"$x_$ and \$ 100 %"
     plt.close(figure)
+
+
+def test_fits_without_a_chain_or_an_error_are_left_out(tmp_path):
+    """One parameter at the edge of its prior, and a chain that had nothing to draw from."""
+    free, nan = ("dust.beta_dust", "dust.T_dust"), float("nan")
+    best = {"dust.beta_dust": 1.5, "dust.T_dust": 40.0}
+    sigma = {"dust.beta_dust": 0.1, "dust.T_dust": nan}
+    ends = {name: (best[name] - sigma[name], best[name] + sigma[name]) for name in free}
+    covariance = np.diag([0.01, nan])
+    edge = FitResult(
+        "gradient", best, sigma, ends, free, covariance, 1.0, 10, False, "It is at an edge.", {}
+    )
+    nothing = dict.fromkeys(free, nan)
+    open_ = edge._replace(
+        method="mcmc", best_fit=nothing, sigma=nothing, message="Nothing.", chi2=nan
+    )
+    fit = RegionFit("full", "QU", {"gradient": edge, "mcmc": open_}, {}, 10, None)
+    assert not plot_posterior(tmp_path / "posterior.png", [fit], None, "")
+    assert plot_marginals(tmp_path / "marginals.png", [fit], None, "")
+    chain = np.random.default_rng(0).normal([1.5, 39.0], [0.1, 1.0], (200, 8, 2))
+    drawn = edge._replace(details={"chain": chain, "discard": 0, "thin": 1}).with_chain(chain)
+    fit = fit._replace(results={"gradient": edge, "mcmc": drawn})
+    assert _drawable([fit], "dust.T_dust") == [fit]
+    assert plot_posterior(tmp_path / "posterior.png", [fit], None, "")
+    assert open_.judged(nan, 10, best) == open_
+    assert "dust.T_dust = unknown" in str(open_)
+    assert with_errors(nan, nan, nan) == ""
+    assert with_errors(40.0, nan, nan) == "40.0000"
+
+
+def test_maps_without_a_pixel_have_a_scale_of_colours():
+    assert color_limit(np.full(12, np.nan)) == 1.0
 
 
 def test_chains_of_any_name_are_drawn(tmp_path):

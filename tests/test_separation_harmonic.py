@@ -387,6 +387,11 @@ def test_other_bad_input():
     like = harmonic_likelihood(SKY[2], BANDS, ALM, np.ones(8), START, beams=FWHM)
     with pytest.raises(ValueError, match=r"`alm` must have 2 rows a band .* but has 3"):
         harmonic_component_maps(like, {}, np.zeros((8, 3, 49)), np.ones(8), beams=FWHM)
+    with pytest.raises(ValueError, match=r"`alm` has 16 of 784 values that are not finite"):
+        harmonic_component_maps(like, {}, NAN, np.ones(8), beams=FWHM)
+    unused = np.where(np.arange(49) < 2, np.nan, ALM)  # the monopole and a dipole
+    with_unused = harmonic_likelihood(SKY[2], BANDS, unused, np.ones(8), START, beams=FWHM)
+    assert float(chi2(with_unused, START)) == float(chi2(like, START))
     many = dataclasses.replace(like, index=np.zeros((5, 3), int))
     with pytest.raises(ValueError, match=r"`like` has regions, 5 in all"):
         harmonic_component_maps(many, {}, ALM, np.ones(8), beams=FWHM)

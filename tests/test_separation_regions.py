@@ -361,6 +361,16 @@ def test_a_band_without_weight_is_named_and_not_counted(kind):
     assert light.dof(3) == without.dof(3) == whole.dof(3) - data[0].size
 
 
+def test_a_grid_does_not_take_regions():
+    _, data, given, _ = problem("full")
+    labels = {"dust.beta_dust": HALVES}
+    like = spectral_likelihood(
+        random_sky(), BANDS, data, given, {"dust.beta_dust": 1.5}, labels=labels
+    )
+    with pytest.raises(ValueError, match=r"'dust.beta_dust' has 2, one for each region"):
+        grid_fit(like, priors={"dust.beta_dust": Uniform(1.0, 2.0)})
+
+
 def test_a_grid_knows_parameters_that_are_fixed_maps():
     _, data, given, _ = problem("full")
     T_dust = np.linspace(18.0, 22.0, NPIX)

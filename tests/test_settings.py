@@ -200,6 +200,10 @@ def test_set_replaces_a_key_and_nothing_else(tmp_path):
         ("common.nside", "--set common.nside: must be KEY=VALUE"),
         ("=3", "--set =3: must be KEY=VALUE"),
         ("common.nside=33", "common.nside: nside must be a power of two, not 33 (given with --set"),
+        (
+            "fit.regions=[3]",
+            "fit.regions.0: input should be a valid string, not 3 (given with --set",
+        ),
         ("common=3", "common: input should be a valid table"),
         ("cmb.cosmology = { r = 0.1 }", "cmb.cosmology: 'r' is no parameter of the cosmology"),
     ],

@@ -97,7 +97,9 @@ def plot_model_maps(
     names, rows = list(comparison.prepared.bands), []
     region = "full" if "full" in comparison.regions else next(iter(comparison.regions))
     weights = jnp.asarray(comparison.prepared.used[None], float)
-    used = np.asarray(average_pixels(weights, nside))[0] > 0.5
+    share = np.asarray(average_pixels(weights, nside))[0]
+    # Half of a pixel is used, or half as much as in the fullest where a mask is finer than that.
+    used = share > share.max() / 2
     for band in bands:
         both = [
             np.where(used, average_pixels(maps[names.index(band)], nside), np.nan)

@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from fits import posterior_plots
 from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
@@ -163,8 +165,11 @@ def _attenuated(fit: RegionFit) -> str | None:
     if not lost.shifts:
         return f"{sentence}; what this does to parameters with maps of values is not known."
     result = next(iter(fit.results.values()))
+    # What is at the edge of its prior stays there.
     shifts = ", ".join(
         f"{name} by {lost.shifts[name]:+.2g} ({lost.shifts[name] / error:+.1f} sigma)"
         for name, error in result.sigma.items()
+        if np.isfinite(error)
     )
-    return f"{sentence}, which moves {shifts}, to first order; the fit is not corrected for it."
+    moves = f", which moves {shifts}, to first order" if shifts else ""
+    return f"{sentence}{moves}; the fit is not corrected for it."

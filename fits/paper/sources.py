@@ -29,6 +29,7 @@ from jaxsky.inputs import (
     read_sky,
     uK_RJ_per,
 )
+from jaxsky.io import InputError
 from jaxsky.io.text import read_text
 from jaxsky.keys import realisation_key, stream
 from jaxsky.presets import from_pysm_beta
@@ -52,10 +53,8 @@ NU_AME, AME_FWHM, NSIDE = 23.0, 60.0, 64
 KNOWN = 15 / 8
 #: A map resolves beams of 1.5 pixels, and of 1.45 still well.
 PIXELS = 1.45
-#: Resolution of the paper's maps of indices [arcmin], and by how much that of its synchrotron is
-#: made steeper.
+#: Resolution of the paper's maps of indices [arcmin].
 FWHM = {"beta_dust": 180.0, "beta_syn": 600.0}
-STEEPENING = 0.13
 #: Names as they are shown.
 SYMBOLS = {"beta_dust": "β_dust", "beta_syn": "β_syn"}
 #: What a map has that is drawn: the paper's mean; its scatter, of which the paper gives that of
@@ -366,6 +365,10 @@ def _read_index(folder: Path, name: str, spec: IndexFile) -> Index:
 
 def _of_spectrum(folder: Path, file: str) -> float:
     """By how much a spectrum in a file steepens: frequency [GHz] and antenna temperature."""
-    with at_key("paper.beta_syn.steepening"):
+    key = "paper.beta_syn.steepening"
+    try:
         nu, temperature = read_text(find_file(folder, file)).numbers([0, 1]).T
+    except InputError as error:
+        raise InputError(f"{key}: {error}") from None
+    with at_key(f"{key}: {file}"):
         return float(steepening(nu, temperature))

@@ -27,4 +27,6 @@ from jaxsky.components.synchrotron import Synchrotron
 
 for _module in pkgutil.iter_modules(__path__):
     _found = importlib.import_module(f"{__name__}.{_module.name}")
-    globals().update({name: value for name, value in vars(_found).items() if name[0] != "_"})
+    for _name, _value in vars(_found).items():
+        if _name[0] != "_" and getattr(_value, "__module__", "") == _found.__name__:
+            globals()[_name] = _value

@@ -132,9 +132,14 @@ def _nested(nside: int) -> Int[np.ndarray, " pix"]:
 def from_nested(where: str, values: Float[np.ndarray, " pix"]) -> Float[np.ndarray, " pix"]:
     """Values in NESTED order, in RING order."""
     nside = healpy.npix2nside(values.size)
+    check_nested(where, nside)
+    return values[_nested(nside)]
+
+
+def check_nested(where: str, nside: int) -> None:
+    """Raise InputError if pixels of this nside have no NESTED order."""
     if not healpy.isnsideok(nside, nest=True):
         raise InputError(f"{where}: ordering is NESTED, but nside is {nside}, no power of 2.")
-    return values[_nested(nside)]
 
 
 class HealpixTable:
@@ -301,11 +306,14 @@ class HealpixTable:
                 f"{self.where}: column {self.names[index]} has {column.size} values, but there "
                 f"are {expected} pixels."
             )
-        if pixels is not None:
-            full = np.full(npix, np.nan)
-            full[pixels] = column
-            column = full
-        return from_nested(self.where, column) if ordering == "NESTED" else column
+        if pixels is None:
+            return from_nested(self.where, column) if ordering == "NESTED" else column
+        full = np.full(npix, np.nan)
+        if ordering == "NESTED":
+            check_nested(self.where, self.nside)
+            pixels = healpy.nest2ring(self.nside, pixels)
+        full[pixels] = column
+        return full
 
     def _real(self, index: int) -> Float[np.ndarray, " row"]:
         """A column of real numbers, NaN where it has none."""

@@ -174,6 +174,8 @@ class NoiseTable(SettingsTable):
             words = "is missing" if numbered else f"is of hits and weights, not of a {kind}"
             raise MistakeAt(f"{kind}.sigma0", words)
         if kind == "map":
+            if spec.file is None and not spec.fields:
+                raise MistakeAt("map.file", "is missing, or fields of the map's own file")
             return
         choices = self.COLUMNS[kind].split(" or ")
         if len(spec.fields or []) not in [len(choice.split(", ")) for choice in choices]:

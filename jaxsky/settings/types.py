@@ -191,9 +191,10 @@ def mistakes(
     for where, what in types.items():
         if where not in wrong and not any(place.startswith(f"{where}.") for place in places):
             wrong[where] = [what]
-    sentences = [
-        ": ".join(filter(None, (k, " or ".join(w)))) + options.get(k, "") for k, w in wrong.items()
-    ]
+    sentences = []
+    for where, what in wrong.items():
+        given = [o for key, o in options.items() if f"{where}.".startswith(f"{key}.")]
+        sentences.append(": ".join(filter(None, (where, " or ".join(what)))) + "".join(given[:1]))
     return "; ".join(sentences)
 
 

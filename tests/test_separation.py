@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import numpy as np
+import optimistix as optx
 import pytest
 import scipy.optimize
 
@@ -335,10 +336,12 @@ def test_other_ways_to_fit_give_the_same():
     like = spectral_likelihood(sky, BANDS, data, given, START)
     priors = {"dust.T_dust": Gaussian(19.6, 0.05)}
     fit = best_fit(like, priors=priors)
-    other = best_fit(like, START, priors=priors)
+    other = best_fit(like, START, priors=priors, solver=optx.LevenbergMarquardt(1e-10, 1e-10))
     np.testing.assert_allclose(like.flat(other.best_fit), like.flat(fit.best_fit), rtol=1e-7)
-    # The curvature of residuals with the noise of the amplitudes is that of the sum.
-    np.testing.assert_allclose(other.covariance, np.linalg.inv(fit.details["hessian"]), rtol=1e-6)
+    np.testing.assert_allclose(other.covariance, fit.covariance, rtol=1e-4, atol=1e-9)
+    # Signals are far above the noise of a pixel, so the curvature alone is nearly right.
+    curvature = np.sqrt(np.diag(np.linalg.inv(fit.details["hessian"])))
+    np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), curvature, rtol=0.01)
     one = spectral_likelihood(sky, BANDS, data, given, {"dust.beta_dust": 1.5})
     grid = grid_fit(one, {"dust.beta_dust": 1.5}, priors={"dust.beta_dust": Uniform(1.0, 2.0)})
     fit = best_fit(one, priors={"dust.beta_dust": Uniform(1.0, 2.0)})

@@ -192,9 +192,9 @@ def mistakes(
         if where not in wrong and not any(place.startswith(f"{where}.") for place in places):
             wrong[where] = [what]
     sentences = []
-    for where, what in wrong.items():
+    for where, said in wrong.items():
         given = [o for key, o in options.items() if f"{where}.".startswith(f"{key}.")]
-        sentences.append(": ".join(filter(None, (where, " or ".join(what)))) + "".join(given[:1]))
+        sentences.append(": ".join(filter(None, (where, " or ".join(said)))) + "".join(given[:1]))
     return "; ".join(sentences)
 
 

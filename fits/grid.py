@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fits.posterior import Likelihood
+from fits.posterior import Likelihood, chi2
 from fits.priors import Prior, bounds, check_priors, log_prior
 from fits.results import FitResult
 from fits.template_likelihood import PixelLikelihood
@@ -31,7 +31,7 @@ def _log_posterior(like, axes, priors):
 
     def point(*values):
         params = dict(zip(names, values, strict=True))
-        value = like.total(jnp.stack(values)[like.cells()])
+        value = chi2(like, params)
         return -value / 2 + log_prior(params, priors), value
 
     if isinstance(like, PixelLikelihood):

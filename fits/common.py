@@ -18,6 +18,7 @@ from jaxsky import Bandpass, Sky, observe
 from jaxsky.checks import Numeric
 from jaxsky.components import Component
 from jaxsky.harmonics import Preparation, beam_ratio, gaussian_beam, pixel_window
+from jaxsky.settings import Experiment, at_key
 
 #: A pixel is used if no more than this fraction of what was smoothed or averaged was missing.
 MISSING = 0.01
@@ -78,6 +79,12 @@ class CommonMaps(NamedTuple):
             stokes=stokes,
             covariance_of=self.covariance_of if kind == "exact" else None,
         )
+
+
+def prepared_maps(settings: Experiment, inputs: Inputs) -> CommonMaps:
+    """Templates and maps at the resolution of the settings, whose key errors name."""
+    with at_key("common"):
+        return common_maps(inputs, settings.common.nside, settings.common.fwhm)
 
 
 def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:

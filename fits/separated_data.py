@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fits.common import common_maps
+from fits.common import prepared_maps
 from fits.fluctuations import Fluctuations, uniform_level
 from fits.inputs import Inputs, inputs_of
 from fits.mixing import NOMINAL
@@ -249,9 +249,7 @@ def _pixel_data(
     shared: dict[str, Any],
 ) -> PixelData:
     """Maps at the common resolution; `factors` are the unit of the data per uK_RJ."""
-    common = settings.common
-    with at_key("common"):
-        prepared = common_maps(inputs, common.nside, common.fwhm)
+    prepared = prepared_maps(settings, inputs)
     used = prepared.used & inside
     _check_some(used)
 

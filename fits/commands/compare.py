@@ -6,14 +6,14 @@ from typing import Any
 from fits.commands import compare_pictures as pictures
 from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
-from fits.common import common_maps
+from fits.common import prepared_maps
 from fits.comparison import Comparison, check_comparison, compare
 from fits.full_sky import FIELDS
 from fits.inputs import inputs_of
 from fits.patch_comparison import PatchComparison, compare_patches
 from fits.regions import region_masks
 from fits.writing import leaks, probability, with_error, write_json, write_log
-from jaxsky.settings import Experiment, at_key
+from jaxsky.settings import Experiment
 
 #: A comparison with a smaller probability is pointed out.
 UNLIKELY = 0.01
@@ -23,8 +23,7 @@ def _work(settings: Experiment, command: Run) -> Report:
     command.steps.step("reading and preparing maps")
     regions = region_masks(settings, settings.compare.regions)
     inputs = inputs_of(settings)
-    with at_key("common"):
-        prepared = common_maps(inputs, settings.common.nside, settings.common.fwhm)
+    prepared = prepared_maps(settings, inputs)
     check_comparison(settings, prepared, regions)
     command.begin()
     out, steps = command.out, command.steps

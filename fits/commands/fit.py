@@ -8,13 +8,13 @@ import numpy as np
 from fits import posterior_plots
 from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
-from fits.common import common_maps
+from fits.common import prepared_maps
 from fits.inputs import Inputs, inputs_of
 from fits.regions import region_masks
 from fits.spectral_index import RegionFit, all_free, fit_regions, known_truth
 from fits.template_noise import unknown_noise
 from fits.writing import leaks, with_errors, write_json, write_log
-from jaxsky.settings import Experiment, at_key
+from jaxsky.settings import Experiment
 
 #: A fit with a smaller probability to exceed its chi^2 is pointed out.
 UNLIKELY = 0.01
@@ -24,8 +24,7 @@ def _work(settings: Experiment, command: Run) -> Report:
     command.steps.step("reading and preparing maps")
     regions = region_masks(settings, settings.fit.regions)
     inputs = inputs_of(settings)
-    with at_key("common"):
-        prepared = common_maps(inputs, settings.common.nside, settings.common.fwhm)
+    prepared = prepared_maps(settings, inputs)
     inputs = inputs._replace(bands={})  # their maps have served
     command.begin()
     out, steps, chains = command.out, command.steps, command.out / "chain.h5"

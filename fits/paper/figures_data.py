@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from fits.commands import compare_pictures as pictures
-from fits.common import common_maps
+from fits.common import prepared_maps
 from fits.comparison import Comparison
 from fits.paper.items import TEXTS, Impossible, Item, Number, described, filled, listed
 from fits.paper.sources import Sources
@@ -195,7 +195,7 @@ def _template_patches(sources: Sources, picture: Path) -> Item:
 
 def figure_probability(sources: Sources, picture: Path) -> Item:
     """Figure 11: the probability of beta_dust and beta_syn on a grid, from Q and from U."""
-    settings, inputs, common = sources.settings, sources.inputs(), sources.settings.common
+    settings, inputs = sources.settings, sources.inputs()
     bands = {name: inputs.bands[name] for name in FITTED if name in inputs.bands} or inputs.bands
     if len(settings.free_in("fit")) != 2:
         raise Impossible("A grid takes two free parameters, in the table `free`.")
@@ -203,7 +203,7 @@ def figure_probability(sources: Sources, picture: Path) -> Item:
         update={"methods": ["grid"], "stokes": ["Q", "U", "QU"], "regions": ["strip", "full"]}
     )
     chosen = settings.model_copy(update={"fit": spec})
-    prepared = common_maps(inputs._replace(bands=bands), common.nside, common.fwhm)
+    prepared = prepared_maps(settings, inputs._replace(bands=bands))
     try:
         fits = fit_regions(chosen, prepared, region_masks(chosen, spec.regions))
     except SettingsError as error:

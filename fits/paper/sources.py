@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.common import common_maps
+from fits.common import prepared_maps
 from fits.comparison import Comparison, compare
 from fits.inputs import Inputs, inputs_of
 from fits.paper.items import TEXTS, Impossible, filled, listed
@@ -214,9 +214,8 @@ class Sources:
     @once
     def comparison(self) -> Comparison:
         """The maps against the model, at the common resolution."""
-        common, regions = self.settings.common, self.settings.compare.regions
-        prepared = common_maps(self.inputs(), common.nside, common.fwhm)
-        return compare(self.settings, prepared, region_masks(self.settings, regions))
+        masks = region_masks(self.settings, self.settings.compare.regions)
+        return compare(self.settings, prepared_maps(self.settings, self.inputs()), masks)
 
     def _spec(self, law: str) -> tuple[str, ComponentTable]:
         found = [(n, spec) for n, spec in self.settings.sky.components.items() if spec.law == law]

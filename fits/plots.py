@@ -76,10 +76,12 @@ def label(name: str) -> str:
     return shift + (known.get("symbol") or in_formula(parts[1])) + number + unit
 
 
-def draw_title(figure: plt.Figure, title: str, **options: Any) -> None:
-    """Write a title above a figure as it is; what is longer than three lines is cut."""
-    lines = [textwrap.fill(line, 110, max_lines=3) for line in title.splitlines()]
-    figure.suptitle(plain("\n".join(lines)), **options)
+def draw_title(figure: plt.Figure, title: str, fontsize: float = 9, **options: Any) -> None:
+    """Write a title above a figure as it is, in its width; three lines at most, then it is cut."""
+    # A letter is some 0.55 times as wide as high, in points of 1/72 inch.
+    letters = int(figure.get_figwidth() * 72 / (0.55 * fontsize))
+    lines = [textwrap.fill(line, letters, max_lines=3) for line in title.splitlines()]
+    figure.suptitle(plain("\n".join(lines)), fontsize=fontsize, **options)
 
 
 def save(figure: plt.Figure, path: Path) -> None:

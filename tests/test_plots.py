@@ -82,6 +82,15 @@ def test_maps_without_a_pixel_have_a_scale_of_colours():
     assert color_limit(np.full(12, np.nan)) == 1.0
 
 
+@pytest.mark.parametrize("width", [3.5, 5.0, 7.0])
+def test_titles_are_as_wide_as_the_figure(width):
+    figure = plt.figure(figsize=(width, 2))
+    draw_title(figure, "Embedded model of the Galaxy (not data), Planck and WMAP")
+    box = figure._suptitle.get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= figure.bbox.width
+    plt.close(figure)
+
+
 def test_chains_of_any_name_are_drawn(tmp_path):
     free = ("dust.$x_$", "calibration.44_%")
     chain = np.random.default_rng(0).normal(size=(200, 8, 2))

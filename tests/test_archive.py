@@ -50,6 +50,7 @@ def test_the_catalogue_is_complete():
         parts = name.split("_")
         if "Map" in name and found.nside:
             assert str(found.nside).zfill(4) in parts
+    assert products["wmap_band_iqumap_r9_9yr_K_v5.fits"].unit == "mK_CMB"
     for wanted in ("wmap9", "planck2015-lfi", "commander2015", "haslam"):
         assert find([wanted])
 
@@ -63,7 +64,6 @@ def test_sets_are_files_of_the_catalogue():
         "LFI_RIMO_R3.31.fits",
     }
     for name, found in product_sets().items():
-        assert found.name == name
         assert len(find([name])) == len(found.files)
         assert name not in {p.group for p in find()}
     assert total_size(find(["planck-44-70"])) == "about 1.8 GB"
@@ -159,7 +159,7 @@ def served(server, monkeypatch, tmp_path):
     second = wanted._replace(name="second.fits", addresses=(f"{server}/good/second.fits",))
     known = {NAME: wanted, "second.fits": second}
     monkeypatch.setattr("jaxsky.archive.products.catalogue", lambda: known)
-    sets = {"both": ProductSet("both", "An analysis", (NAME, "second.fits"))}
+    sets = {"both": ProductSet("An analysis", (NAME, "second.fits"))}
     for module in ("products", ""):
         monkeypatch.setattr(f"jaxsky.archive.{module}".rstrip(".") + ".product_sets", lambda: sets)
     monkeypatch.setenv("JAXSKY_CACHE", str(tmp_path / "cache"))
@@ -189,7 +189,10 @@ def test_the_command(served, monkeypatch, capsys):
     assert "map.fits: hash, columns, complete" in capsys.readouterr().err
     (served / NAME).write_bytes(CONTENT[:-3000])
     assert command(monkeypatch, "verify") == 1
-    assert f"has {len(CONTENT) - 3000} bytes, but should have" in capsys.readouterr().err
+    assert "map.fits: not a FITS file, or a truncated one" in capsys.readouterr().err
+    (served / NAME).write_bytes(CONTENT + 2880 * b" ")
+    assert command(monkeypatch, "verify") == 1
+    assert f"has {len(CONTENT) + 2880} bytes, but should have" in capsys.readouterr().err
 
 
 def test_mistakes_of_the_command(served, server, monkeypatch, capsys, tmp_path):

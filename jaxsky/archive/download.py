@@ -1,6 +1,7 @@
 """Download of products into a cache: resumed, checked, whole or not at all."""
 
 import contextlib
+import errno
 import json
 import os
 import re
@@ -16,13 +17,11 @@ import urllib3
 from jaxsky.archive.products import (
     DownloadError,
     Product,
-    check_size,
-    check_structure,
+    check_product,
     checksums,
-    file_hash,
     in_words,
+    recorded,
     remember,
-    writing,
 )
 from jaxsky.io import InputError
 from jaxsky.io.folders import cache_folder, locked
@@ -30,10 +29,13 @@ from jaxsky.io.folders import cache_folder, locked
 #: Seconds to wait for a connection, and for more bytes.
 TIMEOUT = (10.0, 60.0)
 CHUNK = 2**20
-_RANGE = re.compile(r"bytes (\d+)-(\d+)/(\d+|\*)")
+_RANGE = re.compile(r"bytes (\d+)-\d+/(\d+|\*)")
 
 #: What may be done about a file of another size or hash.
 ANEW = "; if the archive has issued the file anew, --accept takes it"
+
+#: What is wrong with a disk.
+_FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used up"}
 
 Report = Callable[[int, int | None], None]
 
@@ -76,19 +78,26 @@ def discard(part: Path) -> None:
     part.unlink(missing_ok=True)
 
 
-def _transfer(address: str, part: Path, report: Report, size: int | None = None) -> None:
+def _transfer(address: str, part: Path, size: int | None, report: Report) -> None:
     """Bring a file of so many bytes, or what is missing of the part that is there."""
     state = _state(part)
     if state is not None and state.address == address:
-        whole = part.stat().st_size == state.total
-        if whole or _resume(address, part, state, report, size):
+        have = part.stat().st_size
+        if have == state.total:
             return
+        with _get(address, {"Range": f"bytes={have}-", "If-Range": state.version}) as answer:
+            if rest := _rest(answer, state, have):
+                _check(answer, part, have, rest.total, size)
+                _receive(answer, part, have, rest.total, report)
+                return
     with _get(address, {}) as answer:
         answer.raise_for_status()
         if answer.status_code != requests.codes.ok:
             raise RefusedError(f"answers {answer.status_code}")
-        total = _length(answer)
-        _check(answer, part, total, total, size)
+        text = answer.headers.get("Content-Length", "")
+        plain = text.isdecimal() and "Transfer-Encoding" not in answer.headers
+        total = int(text) if plain else None
+        _check(answer, part, 0, total, size)
         discard(part)
         if version := _version(answer):
             state = _State(address, version, total)
@@ -96,27 +105,19 @@ def _transfer(address: str, part: Path, report: Report, size: int | None = None)
         _receive(answer, part, 0, total, report)
 
 
-def _resume(address: str, part: Path, state: _State, report: Report, size: int | None) -> bool:
-    """Bring what is missing; False if the server has no such rest of this version of the file."""
-    have = part.stat().st_size
-    with _get(address, {"Range": f"bytes={have}-", "If-Range": state.version}) as answer:
-        if answer.status_code in (requests.codes.ok, requests.codes.range_not_satisfiable):
-            return False
-        answer.raise_for_status()
-        found = _RANGE.fullmatch(answer.headers.get("Content-Range", ""))
-        if answer.status_code != requests.codes.partial_content or found is None:
-            return False
-        total = state.total if found[3] == "*" else int(found[3])
-        dated = not state.version.startswith('"')  # a date need not be said again, a tag must
-        if (
-            int(found[1]) != have
-            or _version(answer) not in (None if dated else state.version, state.version)
-            or state.total not in (None, total)
-        ):
-            return False
-        _check(answer, part, total, total and total - have, size)
-        _receive(answer, part, have, total, report)
-    return True
+def _rest(answer: requests.Response, state: _State, have: int) -> _State | None:
+    """The version of a file of which an answer is the rest; None if it is that of another."""
+    if answer.status_code == requests.codes.range_not_satisfiable:
+        return None
+    answer.raise_for_status()
+    found = _RANGE.fullmatch(answer.headers.get("Content-Range", ""))
+    if answer.status_code != requests.codes.partial_content or found is None:
+        return None
+    total = state.total if found[2] == "*" else int(found[2])
+    dated = not state.version.startswith('"')  # a date need not be said again, a tag must
+    same = _version(answer) in (None if dated else state.version, state.version)
+    fits = int(found[1]) == have and state.total in (None, total)
+    return state._replace(total=total) if same and fits else None
 
 
 def _get(address: str, headers: dict[str, str]) -> requests.Response:
@@ -146,13 +147,8 @@ def _version(answer: requests.Response) -> str | None:
     return tag if tag.startswith('"') else answer.headers.get("Last-Modified")
 
 
-def _length(answer: requests.Response) -> int | None:
-    text = answer.headers.get("Content-Length", "")
-    return int(text) if text.isdecimal() and "Transfer-Encoding" not in answer.headers else None
-
-
 def _check(
-    answer: requests.Response, part: Path, total: int | None, rest: int | None, size: int | None
+    answer: requests.Response, part: Path, have: int, total: int | None, size: int | None
 ) -> None:
     """Refuse what need not be transferred to know that it is wrong, or has no room."""
     encoding = answer.headers.get("Content-Encoding", "identity")
@@ -161,10 +157,10 @@ def _check(
     if size is not None and total not in (None, size):
         raise RefusedError(f"has {total} bytes, but should have {size}{ANEW}")
     free = shutil.disk_usage(part.parent).free
-    if rest is not None and rest > free:
+    if total is not None and total - have > free:
         raise DownloadError(
-            f"{part.parent}: {in_words(free)} are free, but {part.stem} takes {in_words(rest)} "
-            "more; make room, or give another --dir."
+            f"{part.parent}: {in_words(free)} are free, but {part.stem} takes "
+            f"{in_words(total - have)} more; make room, or give another --dir."
         )
 
 
@@ -254,17 +250,24 @@ def fetch(
     checksums(folder)  # a damaged record is said before anything is transferred
     if os.path.lexists(path):
         return _kept(product, path, part)
-    with writing(folder):
+    try:
         folder.mkdir(parents=True, exist_ok=True)
         with locked(folder / f".{product.name}.lock", waiting=waiting):
             if path.exists():  # another process has brought it
                 return _kept(product, path, part)
-            found = _download(product, addresses, part, accept, report)
+            _download(product, addresses, part, accept, report)
             if accept or product.hash is None:
-                remember(product, folder, found)
+                remember(product, folder, part)
             # A cached file is never anything but whole.
             os.replace(part, path)
             _tidy(part)
+    except OSError as error:
+        if error.errno in _FULL:
+            said = f"{folder}: {_FULL[error.errno]}; make room and fetch it again to resume."
+        else:
+            where, why = error.filename or folder, error.strerror or error
+            said = f"{where}: cannot be written ({why}); give another --dir."
+        raise DownloadError(said) from None
     return path
 
 
@@ -279,8 +282,7 @@ def _kept(product: Product, path: Path, part: Path) -> Path:
     try:
         if not path.is_file():
             raise InputError(f"{path}: is no file, or a link to none.")
-        check_size(product, path.parent)
-        check_structure(product, path)
+        check_product(recorded(product, path.parent)._replace(hash=None), path)
     except InputError as error:
         raise InputError(f"{error} It is left as it is; move it away and fetch it again.") from None
     with contextlib.suppress(OSError):  # the cache may be of someone else
@@ -295,19 +297,16 @@ def _tidy(part: Path) -> None:
 
 
 def _download(
-    product: Product,
-    addresses: Sequence[str],
-    part: Path,
-    accept: bool,
-    report: Report,
-) -> str:
-    """Bring the file from the first address that has it; returns its hash."""
-    failures = []
-    begun = _state(part)
+    product: Product, addresses: Sequence[str], part: Path, accept: bool, report: Report
+) -> None:
+    """Bring the file from the first address that has it."""
+    wanted = product._replace(size=None, hash=None) if accept else product
+    failures, begun = [], _state(part)
     for address in sorted(addresses, key=lambda a: begun is None or a != begun.address):
         try:
-            _transfer(address, part, report, None if accept else product.size)
-            return _checked(product, part, accept)
+            _transfer(address, part, wanted.size, report)
+            _check_came(wanted, part)
+            return
         except CutError as cut:
             raise DownloadError(
                 f"{product.name}: the transfer from {address} ended early, after {cut} bytes; "
@@ -323,17 +322,11 @@ def _download(
     )
 
 
-def _checked(product: Product, part: Path, accept: bool) -> str:
-    """The hash of a file that came; removed and refused if it is not what it should be."""
+def _check_came(product: Product, part: Path) -> None:
+    """Remove and refuse a file that came, if it is not what it should be."""
     try:
-        check_structure(product, part)
-        size, found = part.stat().st_size, file_hash(part, product.hash or "sha256:")
-        if not accept and product.size not in (None, size):
-            raise InputError(f"has {size} bytes, but should have {product.size}{ANEW}.")
-        if not accept and product.hash not in (None, found):
-            raise InputError(f"has {found}, but should have {product.hash}{ANEW}.")
+        check_product(product, part, ANEW)
     except InputError as error:
         discard(part)
         said = str(error).replace(str(part), product.name).rstrip(".")
         raise RefusedError(f"sent another file ({said})") from None
-    return found

@@ -1,12 +1,10 @@
 """What the archives hold, from `products.toml`; what of it is kept here, and checks of that."""
 
-import errno
 import json
 import os
 import re
 import tomllib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -23,20 +21,11 @@ from jaxsky.io.tables import HealpixTable, open_fits
 
 
 class Product(NamedTuple):
-    """A file of an archive.
+    """A file of an archive; None stands for what is not known, or not there.
 
-    Parameters
-    ----------
-    name : of the file
-    group, title, what : its group, what that is, and what this one is
-    addresses : where it can be had, best first
-    size : in bytes, None where it is not known exactly
-    about : in MB, where only that is known
-    hash : "sha256:..." or "md5:...", None where none is known
-    nside : resolution, None if it holds no maps
-    unit : of the maps, as `jaxsky.units` has it; None if there is none
-    columns : that the first table has, at least
-    lmax : last multipole of a table of spectra, None for other files
+    `addresses` go best first; `size` is in bytes, or `about` in MB where only that is known;
+    `hash` is "sha256:..." or "md5:..."; `columns` are those that the first table has, at least;
+    `lmax` is the last multipole of a table of spectra.
     """
 
     name: str
@@ -54,9 +43,8 @@ class Product(NamedTuple):
 
 
 class ProductSet(NamedTuple):
-    """Files that belong together, by their names: what one analysis takes."""
+    """Names of files that belong together: what one analysis takes."""
 
-    name: str
     title: str
     files: tuple[str, ...]
 
@@ -68,28 +56,14 @@ def _table() -> dict[str, Any]:
 
 @cache
 def product_sets() -> dict[str, ProductSet]:
-    """All sets by name.
-
-    Examples
-    --------
-    >>> len(product_sets()["planck-44-70"].files)
-    5
-    """
-    return {
-        name: ProductSet(name, entry["title"], tuple(entry["files"]))
-        for name, entry in _table()["sets"].items()
-    }
+    """All sets by name."""
+    sets = _table()["sets"].items()
+    return {name: ProductSet(entry["title"], tuple(entry["files"])) for name, entry in sets}
 
 
 @cache
 def catalogue() -> dict[str, Product]:
-    """All products by the name of their file.
-
-    Examples
-    --------
-    >>> catalogue()["wmap_band_iqumap_r9_9yr_K_v5.fits"].unit
-    'mK_CMB'
-    """
+    """All products by the name of their file."""
     found, sources = {}, _table()["sources"]
     for group, common in _table()["groups"].items():
         shared = {key: value for key, value in common.items() if key != "files"}
@@ -127,13 +101,7 @@ def in_words(size: float) -> str:
 
 
 def total_size(products: Sequence[Product]) -> str:
-    """The size of products together, in words; "about" unless that of each is known exactly.
-
-    Examples
-    --------
-    >>> total_size(find(["wmap9"])), total_size(find(["planck-44-70"]))
-    ('503 MB', 'about 1.8 GB')
-    """
+    """The size of products together, in words; "about" unless that of each is known exactly."""
     sizes = [p.size if p.size or p.about is None else 1e6 * p.about for p in products]
     known = sum(size for size in sizes if size is not None)
     size = in_words(known)
@@ -146,7 +114,6 @@ def total_size(products: Sequence[Product]) -> str:
 CHECKSUMS = "checksums.json"
 _HASH = re.compile(r"(sha256|md5):[0-9a-f]+")
 _MOVE = "move it away to go on without the hashes in it."
-_FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used up"}
 
 
 class DownloadError(ValueError):
@@ -167,40 +134,26 @@ def checksums(folder: Path) -> dict[str, str]:
     return known
 
 
-def known_hash(product: Product, folder: Path) -> str | None:
-    """The hash that a file should have: its own when it was fetched, or the catalogue's."""
-    return checksums(folder).get(product.name, product.hash)
+def recorded(product: Product, folder: Path) -> Product:
+    """A product as it was fetched: one that was taken as it came has its own hash, and any size."""
+    known = checksums(folder).get(product.name, product.hash)
+    return product._replace(hash=known, size=product.size if known == product.hash else None)
 
 
-def file_hash(path: Path, like: str = "sha256:") -> str:
+def file_hash(path: Path, like: str) -> str:
     """The hash of a file by the algorithm of another hash."""
     algorithm = like.partition(":")[0]
     return f"{algorithm}:{pooch.file_hash(str(path), alg=algorithm)}"
 
 
-def remember(product: Product, folder: Path, value: str) -> None:
-    """Record the hash of a product's file."""
+def remember(product: Product, folder: Path, path: Path) -> None:
+    """Record the hash of the file that came for a product."""
+    found = file_hash(path, product.hash or "sha256:")
     with locked(folder / f".{CHECKSUMS}.lock"):
-        known = checksums(folder) | {product.name: value}
+        known = checksums(folder) | {product.name: found}
         new = folder / f".{CHECKSUMS}.new"
         new.write_text(json.dumps(known, indent=2, sort_keys=True) + "\n")
         os.replace(new, folder / CHECKSUMS)
-
-
-@contextmanager
-def writing(folder: Path) -> Iterator[None]:
-    """What is wrong with a disk while it is written to, as a DownloadError."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno in _FULL:
-            raise DownloadError(
-                f"{folder}: {_FULL[error.errno]}; make room and fetch it again to resume."
-            ) from None
-        where = error.filename or folder
-        raise DownloadError(
-            f"{where}: cannot be written ({error.strerror or error}); give another --dir."
-        ) from None
 
 
 def verify(product: Product, folder: Path) -> str:
@@ -208,27 +161,26 @@ def verify(product: Product, folder: Path) -> str:
     path = folder / product.name
     if not path.is_file():
         raise InputError(f"{path}: is not there; fetch it with `jaxsky data fetch`.")
-    check_size(product, folder)
-    known = known_hash(product, folder)
-    if known is not None and (found := file_hash(path, known)) != known:
-        raise InputError(f"{path}: has the hash {found}, but should have {known}; fetch it anew.")
-    return ", ".join([*(["hash"] if known else []), *check_structure(product, path)])
+    return ", ".join(check_product(recorded(product, folder), path))
 
 
-def check_size(product: Product, folder: Path) -> None:
-    """Raise InputError if a product's file has another size than the catalogue says."""
-    path = folder / product.name
-    size = path.stat().st_size
-    # The hash of a file that was accepted as it came stands in for the catalogue's size.
-    if product.size not in (None, size) and known_hash(product, folder) == product.hash:
-        raise InputError(f"{path}: has {size} bytes, but should have {product.size}.")
-
-
-def check_structure(product: Product, path: Path) -> list[str]:
+def check_product(product: Product, path: Path, hint: str = "") -> list[str]:
     """Check that a file is complete and what the catalogue says; returns what was checked.
 
-    Reads headers and ends of tables only, whatever the size.
+    Of tables headers and ends are read only; all of the file if there is a hash. `hint` says what
+    may be done about another size or hash.
     """
+    structure, size = _check_structure(product, path), path.stat().st_size
+    if product.size not in (None, size):
+        raise InputError(f"{path}: has {size} bytes, but should have {product.size}{hint}.")
+    if product.hash is None:
+        return structure
+    if (found := file_hash(path, product.hash)) != product.hash:
+        raise InputError(f"{path}: has the hash {found}, but should have {product.hash}{hint}.")
+    return ["hash", *structure]
+
+
+def _check_structure(product: Product, path: Path) -> list[str]:
     with path.open("rb") as file:
         start = file.read(512)
     shown = " ".join(start[:60].decode("ascii", "replace").split())

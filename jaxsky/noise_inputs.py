@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsky.bandpass import Bandpass
 from jaxsky.inputs import narrow, read
 from jaxsky.io import Maps, unit_factor
-from jaxsky.io.columns import stokes as stokes_of
+from jaxsky.io.columns import stokes_of
 from jaxsky.noise import (
     check_covariance,
     covariance_from_columns,

@@ -104,9 +104,14 @@ def test_q_and_u_of_two_files_or_hdus_are_one_field(tmp_path):
 def test_files_of_one_field_must_agree(tmp_path):
     q = save(tmp_path / "q.fits", {"Q": Q}, POLCCONV="IAU")
     for header, unit, arguments, words in [
-        ({}, "K_CMB", {}, "polarization is COSMO, but that of .*q.fits.* is IAU; give `polarizat"),
-        ({"COORDSYS": "C", "POLCCONV": "IAU"}, "K_CMB", {}, "coordinates is C, but .* is G"),
-        ({"POLCCONV": "IAU"}, "uK_CMB", {}, "unit is uK_CMB, but .* is K_CMB"),
+        ({}, "K_CMB", {}, "polarization of column U is COSMO, but that of Q .* is IAU; give `pola"),
+        (
+            {"COORDSYS": "C", "POLCCONV": "IAU"},
+            "K_CMB",
+            {},
+            "coordinates of column U is C, but .* is G",
+        ),
+        ({"POLCCONV": "IAU"}, "uK_CMB", {}, "unit of column U is uK_CMB, but .* is K_CMB"),
         ({"POLCCONV": "IAU"}, "K_CMB", {"hdu": [1, 1, 1]}, "`path` must be one, or as many as"),
         ({"POLCCONV": "IAU"}, "K_CMB", {"fields": ["Q", "U", "V"]}, "or one of each, not 3"),
         ({"POLCCONV": "IAU"}, "K_CMB", {"stokes": "IQU"}, "names 3 columns, but 2 are read, Q, U"),
@@ -119,7 +124,7 @@ def test_files_of_one_field_must_agree(tmp_path):
     save(u, {"U": U})
     np.testing.assert_array_equal(read_maps([q, u], polarization="IAU").maps, [Q, -U])
     coarse = save(tmp_path / "c.fits", {"U": np.ones(48)}, NSIDE=2, POLCCONV="IAU")
-    with refused(r"c.fits, HDU 1: nside is 2, but that of .*q.fits.* is 8"):
+    with refused(r"c.fits, HDU 1: nside of column U is 2, but that of Q in .*q.fits.* is 8"):
         read_maps([q, coarse])
 
 
@@ -413,6 +418,9 @@ def test_columns_in_the_table_by_name(tmp_path):
             read_maps(path, fields=[odd])
     with refused("no HDU True"):
         read_maps(path, hdu=True, fields="BETA")
+    columns = ("HITS", "Q_353GHz", "U_353GHz", "Q_RMS")
+    path = save(tmp_path / "n.fits", dict.fromkeys(columns, I))
+    assert read_maps(path).names == columns[1:3]
     cube = save(tmp_path / "c.fits", {"I": np.ones((NPIX, 4))}, formats={"I": "4D"}, NSIDE=None)
     assert read_maps(cube, nside=16).nside == 16  # packed by rows, as HEALPix writes
     with refused("NSIDE is 8, but its columns have 3072 pixels"):

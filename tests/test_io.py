@@ -234,7 +234,7 @@ def test_bad_arguments(bare, arguments, words):
         ({"INDXSCHM": "EXPLICIT", "NSIDE": None}, {}, "explicit indexing without NSIDE"),
         ({}, {"unit": "uK_RJ"}, "`unit` is uK_RJ, but column Q_X is in uK_CMB"),
         ({}, {"fields": ["Q_X", "T_D"]}, "column T_D has the unit 'K', which leaves open"),
-        ({}, {"fields": ["Q_X", "V"]}, r"different units.*: Q_X \[uK_CMB\], V \[MJy/sr\]"),
+        ({}, {"fields": ["Q_X", "V"]}, "unit of column V is MJy/sr, but that of Q_X .* is uK_CMB"),
     ],
 )
 def test_bad_headers(tmp_path, header, arguments, words):
@@ -316,7 +316,7 @@ def test_bad_masks(tmp_path):
         (tmp_path / "m.npz", {}, "give `key`, as it has several masks; it has A, B"),
         (tmp_path / "m.npz", {"key": "C"}, "no mask 'C'; it has A, B"),
         (tmp_path / "m.npz", {"key": "B"}, r"100 is not 12 nside\^2 pixels"),
-        (tmp_path / "m.npz", {"key": "A", "ordering": "up"}, "RING or NESTED, not 'up'"),
+        (tmp_path / "m.npz", {"key": "A", "ordering": "up"}, "one of RING, NESTED, not 'up'"),
         (tmp_path / "bad.npz", {}, r"bad.npz: not a readable .npz archive"),
         (tmp_path / "none.npz", {}, r"none.npz: no such file"),
         (tmp_path / "none.fits", {}, r"none.fits: no such file"),

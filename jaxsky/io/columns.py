@@ -6,24 +6,20 @@ healpy, the HEALPix libraries, PySM and this package; where a column stands says
 
 import numbers
 import re
-from collections.abc import Sequence
-from itertools import pairwise, product
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from functools import reduce
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import healpy
 import numpy as np
 from jaxtyping import Float
 
+from jaxsky.io.files import InputError
 from jaxsky.io.quantities import is_ambiguous, unit_name
-from jaxsky.io.tables import (
-    COORDINATES,
-    ORDERINGS,
-    PIXELS,
-    HealpixTable,
-    InputError,
-    equals,
-    open_fits,
-)
+from jaxsky.io.tables import PIXELS, HealpixTable, equals, open_fits
 from jaxsky.units import UNITS
 
 _LETTERS = {"I": "I", "T": "I", "Q": "Q", "U": "U"}
@@ -64,36 +60,12 @@ _KNOWN = _known()
 _CHOICES = ("", "I", "Q", "U", "II", "IQ", "IU", "QQ", "QU", "UU")
 
 
-def stokes(name: str) -> str | None:
+def stokes_of(name: str) -> str | None:
     """Stokes parameter of a column as far as its name is certain; None if it is not.
 
     Two of them for a covariance, and for an rms, which has no sign either; "" for hits and others.
-
-    Examples
-    --------
-    >>> [stokes(n) for n in ("Q_POLARISATION", "TEMPERATURE", "TU_COV", "U-ML", "HITS", "UNKNOWN1")]
-    ['Q', 'I', 'IU', 'U', '', None]
     """
     return _KNOWN.get(name.strip().upper().replace("-", "_").replace(" ", "_"))
-
-
-def choose(names: Sequence[str]) -> list[int]:
-    """Numbers of the first columns that are called I, Q and U, whatever follows after "_" or "-".
-
-    Good enough to choose by, but no evidence of what is in them.
-
-    Examples
-    --------
-    >>> choose(["HITS", "Q_353GHz", "U_353GHz", "Q_RMS"])
-    [1, 2]
-    """
-
-    def kind(name: str) -> str:
-        beginning = re.match(r"[IQU](?=[_-])", name.upper())
-        return stokes(name) or (beginning[0] if beginning and stokes(name) is None else "")
-
-    kinds = [kind(name) for name in names]
-    return [kinds.index(letter) for letter in "IQU" if letter in kinds]
 
 
 def parse_stokes(given: str | Sequence[str]) -> list[str]:
@@ -183,30 +155,49 @@ def _is_continuous(values: np.ndarray) -> bool:
     return np.unique(some).size > some.size / 2
 
 
-POLARIZATIONS = {"COSMO": "COSMO", "IAU": "IAU"}
+class Column(NamedTuple):
+    """A column of a HEALPix table: values in RING order, NaN where missing, and what it is.
 
-
-class Columns(NamedTuple):
-    """Columns of tables: values in RING order, NaN where missing, and what is said of them.
-
-    `lowest` is what the lowest integer stands for that a column can store, `alone` whether there is
-    no other in its table.
+    `lowest` is what the lowest integer stands for that it can store, None for other types; `alone`
+    says that its table has no other column.
     """
 
     where: str
-    names: list[str]
-    values: list[Float[np.ndarray, " pix"]]
-    lowest: list[float | None]
-    alone: list[bool]
-    nside: int
+    name: str
     unit: str
+    values: Float[np.ndarray, " pix"]
+    lowest: float | None
+    alone: bool
     coordinates: str
     polarization: str
 
+    @property
+    def nside(self) -> int:
+        """Resolution of the map."""
+        return healpy.npix2nside(self.values.size)
+
+
+#: What all columns of one field have in common, and what to do where they do not.
+_COMMON = {
+    "nside": "one field has one nside",
+    "unit": "read columns of different units each by itself",
+    "coordinates": "one field has one system of coordinates",
+    "polarization": "give `polarization` if one of them does not say it",
+}
+
 
 def default_fields(table: HealpixTable, argument: str = "fields") -> list[int]:
-    """The first I, Q and U columns that are there, by their names; else a column that is alone."""
-    if found := choose(table.names):
+    """The first I, Q and U columns that are there, by their names; else a column that is alone.
+
+    What follows after "_" or "-" does not count: good enough to choose by, but no evidence.
+    """
+
+    def kind(name: str) -> str | None:
+        beginning = re.match(r"[IQU](?=[_-])", name.upper())
+        return beginning[0] if stokes_of(name) is None and beginning else stokes_of(name)
+
+    kinds = [kind(name) for name in table.names]
+    if found := [kinds.index(letter) for letter in "IQU" if letter in kinds]:
         return found
     columns = [i for i, name in enumerate(table.names) if name.upper() not in PIXELS]
     if len(columns) == 1:
@@ -217,44 +208,29 @@ def default_fields(table: HealpixTable, argument: str = "fields") -> list[int]:
     )
 
 
-def _units_agree(given: str, found: str) -> bool:
-    """True if a unit from an argument is the header's, or makes its bare kelvins definite."""
-    return given == found or (is_ambiguous(found) and re.sub("_(CMB|RJ)", "", given) == found)
-
-
-def _unit(table: HealpixTable, columns: list[int], given: str | None) -> str:
-    """The one unit of some columns, from the header and the argument."""
-    units = []
-    for column in columns:
-        text, name = table.unit(column), table.names[column]
-        try:
-            found = None if text is None else unit_name(text)
-        except ValueError:
-            found = None
-        if given is None and (found is None or is_ambiguous(found)):
-            says = (
-                f"has the unit {text!r}, which leaves open what is meant" if text else "has no unit"
-            )
-            raise InputError(
-                f'{table.where}: column {name} {says}; give `unit`, such as "uK_CMB", "K_RJ", '
-                '"MJy/sr", "K" for a temperature of matter or "" for a pure number.'
-            )
-        if given is not None and found is not None and not _units_agree(given, found):
-            raise InputError(
-                f"{table.where}: argument `unit` is {given or 'that of a pure number'}, but column "
-                f"{name} is {f'in {found}' if found else 'a pure number'}."
-            )
-        units.append(found if given is None else given)
-    if len(set(units)) > 1:
-        listed = ", ".join(f"{table.names[c]} [{v}]" for c, v in zip(columns, units, strict=True))
+def _unit(table: HealpixTable, column: int, given: str | None) -> str:
+    """The unit of a column, from the header or the argument that stands in for it."""
+    text, name, found = table.unit(column), table.names[column], None
+    if text is not None:
+        with suppress(ValueError):
+            found = unit_name(text)
+    if given is None and (found is None or is_ambiguous(found)):
+        says = f"has the unit {text!r}, which leaves open what is meant" if text else "has no unit"
         raise InputError(
-            f"{table.where}: columns have different units, read each by itself: {listed}."
+            f'{table.where}: column {name} {says}; give `unit`, such as "uK_CMB", "K_RJ", '
+            '"MJy/sr", "K" for a temperature of matter or "" for a pure number.'
         )
-    return str(units[0])
+    # An argument may make the header's bare kelvins definite.
+    if given is not None and found not in (None, given, re.sub("_(CMB|RJ)", "", given)):
+        raise InputError(
+            f"{table.where}: argument `unit` is {given or 'that of a pure number'}, but column "
+            f"{name} is {f'in {found}' if found else 'a pure number'}."
+        )
+    return str(found if given is None else given)
 
 
 def _several(value: Any) -> list[Any]:
-    return [value] if isinstance(value, str | Path | numbers.Integral) else list(value)
+    return [value] if isinstance(value, str | Path | numbers.Real) else list(value)
 
 
 def _split(path: Any, hdu: Any, fields: Any) -> list[tuple[Path, Any, list[Any] | None]]:
@@ -287,97 +263,74 @@ def _read_table(
     hdu: int | str,
     fields: list[int | str] | None,
     unit: str | None,
-    ordering: str | None,
-    coordinates: str | None,
-    polarization: str | None,
-) -> Columns:
+    stated: Mapping[str, str | None],
+) -> list[Column]:
     with open_fits(path) as hdus:
         table = HealpixTable(path, hdus, hdu)
         wanted = default_fields(table) if fields is None else [table.index(f) for f in fields]
         if len(set(wanted)) < len(wanted):
             raise InputError(f"{table.where}: `fields` names a column twice: {fields}.")
-        unit = _unit(table, wanted, unit)
-        order = table.state("ordering", ordering, ("ORDERING",), ORDERINGS)
+        units = {i: _unit(table, i, unit) for i in wanted}
+        order = table.state("ordering", stated["ordering"])
+        frame = table.state("coordinates", stated["coordinates"])
+        sign = table.state("polarization", stated["polarization"], "COSMO")
         alone = sum(name.upper() not in PIXELS for name in table.names) == 1
-        return Columns(
-            table.where,
-            [table.names[i] for i in wanted],
-            [table.values(i, order) for i in wanted],
-            [table.lowest(i) for i in wanted],
-            [alone] * len(wanted),
-            table.nside,
-            unit,
-            table.state("coordinates", coordinates, ("COORDSYS", "SKYCOORD"), COORDINATES),
-            table.state("polarization", polarization, ("POLCCONV",), POLARIZATIONS, "COSMO"),
-        )
+        rest = (alone, frame, sign)
+        return [
+            Column(table.where, table.names[i], own, table.values(i, order), table.lowest(i), *rest)
+            for i, own in units.items()
+        ]
 
 
-def read_columns(path: Any, hdu: Any, fields: Any, *stated: str | None) -> Columns:
+def read_columns(
+    path: Any, hdu: Any, fields: Any, unit: str | None, stated: Mapping[str, str | None]
+) -> list[Column]:
     """The columns of one or several tables, together; arguments as those of `read_maps`.
 
-    `stated` are unit, ordering, coordinates and polarization. Refuses tables that differ in what
-    one field has in common.
+    `stated` are ordering, coordinates and polarization.
     """
-    tables = [_read_table(*one, *stated) for one in _split(path, hdu, fields)]
-    first, *others = tables
-    hints = {
-        "nside": "one field has one nside",
-        "unit": "read each by itself",
-        "coordinates": "one field has one system of coordinates",
-        "polarization": "give `polarization` if one of them does not say it",
-    }
-    for name, hint in hints.items():
-        for other in others:
-            one, two = getattr(first, name), getattr(other, name)
-            if one != two:
-                raise InputError(
-                    f"{other.where}: {name} is {two}, but that of {first.where} is {one}; {hint}."
-                )
-    lists = ("names", "values", "lowest", "alone")
-    joined: dict[str, Any] = {n: [x for t in tables for x in getattr(t, n)] for n in lists}
-    return first._replace(**joined)
+    tables = [_read_table(*one, unit, stated) for one in _split(path, hdu, fields)]
+    first, *others = (column for table in tables for column in table)
+    for (name, hint), other in product(_COMMON.items(), others):
+        one, two = getattr(first, name), getattr(other, name)
+        if one != two:
+            raise InputError(
+                f"{other.where}: {name} of column {other.name} is {two}, but that of "
+                f"{first.name} in {first.where} is {one}; {hint}."
+            )
+    return [first, *others]
 
 
-def mark_missing(columns: Columns, missing: Any, zeros_are_data: bool) -> None:
+def mark_missing(columns: Sequence[Column], missing: Any, zeros_are_data: bool) -> None:
     """Set the values that an argument says to mark missing pixels to NaN, in place.
 
     Refuses columns in which other numbers seem to mark them, unless it says that none do.
     """
-    marks = None
-    if missing is not None:
-        marks = [missing] if isinstance(missing, numbers.Real | str) else list(missing)
-        if any(isinstance(x, bool) or not isinstance(x, numbers.Real) for x in marks):
-            raise InputError(
-                f"Argument `missing` must be a number or a list of them, not {missing!r}."
-            )
+    marks = None if missing is None else _several(missing)
+    if any(isinstance(x, bool) or not isinstance(x, numbers.Real) for x in marks or ()):
+        raise InputError(f"Argument `missing` must be a number or a list of them, not {missing!r}.")
     found = marks == []
-    for values in columns.values:
-        for mark in marks or []:
-            marked = equals(values, float(mark), 1e-6)
-            found |= bool(marked.any())
-            values[marked] = np.nan
+    for column, mark in product(columns, marks or ()):
+        marked = equals(column.values, float(mark), 1e-6)
+        found |= bool(marked.any())
+        column.values[marked] = np.nan
     if found:
         return
     suspects = [
-        f"column {name} is {number:.9g} in {count} of {values.size} pixels, far from its other "
+        f"column {c.name} is {number:.9g} in {count} of {c.values.size} pixels, far from its other "
         "values"
-        for name, values, low in zip(columns.names, columns.values, columns.lowest, strict=True)
-        for number, count in sentinels(values, low)
+        for c in columns
+        for number, count in sentinels(c.values, c.lowest)
     ]
-    if columns.unit in UNITS and not zeros_are_data and (share := _zeros(columns.values)) > ZEROS:
-        suspects.append(f"{', '.join(columns.names)}: exactly 0 in {share:.0%} of the pixels")
+    # One after the other: an array of all of them may be large.
+    known = reduce(np.logical_and, (np.isfinite(c.values) for c in columns))
+    empty = reduce(np.logical_and, (c.values == 0 for c in columns))
+    share = np.count_nonzero(empty & known) / max(1, int(np.count_nonzero(known)))
+    if columns[0].unit in UNITS and not zeros_are_data and share > ZEROS:
+        names = ", ".join(c.name for c in columns)
+        suspects.append(f"{names}: exactly 0 in {share:.0%} of the pixels")
     if suspects:
         raise InputError(
-            f"{columns.where}: {'; '.join(suspects)}; give `missing`, the numbers that mark "
+            f"{columns[0].where}: {'; '.join(suspects)}; give `missing`, the numbers that mark "
             "pixels without a value, or `missing = []` if all are data."
         )
-
-
-def _zeros(columns: Sequence[Float[np.ndarray, " pix"]]) -> float:
-    """Fraction of the pixels with values in which all columns are exactly 0."""
-    known = np.isfinite(columns[0])
-    empty = columns[0] == 0
-    for _, values in pairwise(columns):
-        known &= np.isfinite(values)
-        empty &= values == 0
-    return float(np.count_nonzero(empty & known)) / max(float(np.count_nonzero(known)), 1.0)

@@ -13,11 +13,9 @@ from jaxtyping import Bool, Float
 from jaxsky.bandpass import Bandpass
 from jaxsky.bare import takes_quantities
 from jaxsky.checks import Numeric
-from jaxsky.io.columns import Columns, mark_missing, parse_stokes, read_columns
-from jaxsky.io.columns import stokes as stokes_of
-from jaxsky.io.files import whole
+from jaxsky.io.columns import Column, mark_missing, parse_stokes, read_columns, stokes_of
+from jaxsky.io.files import InputError, whole
 from jaxsky.io.quantities import unit_factor, unit_name
-from jaxsky.io.tables import InputError
 
 
 def _blocks(where: str, names: Sequence[str], kinds: Sequence[str | None]) -> list[list[int]]:
@@ -141,35 +139,36 @@ def _agree(stated: str, certain: str | None) -> bool:
     return certain in (stated, "") if stated == "I" else stated in (certain, certain * 2)
 
 
-def _kinds(columns: Columns, given: str | Sequence[str] | None) -> list[str | None]:
+def _kinds(columns: Sequence[Column], given: str | Sequence[str] | None) -> list[str | None]:
     """The Stokes parameter of each column, where it has to be known."""
-    where, names, frame = columns.where, columns.names, columns.coordinates
+    first, names = columns[0], [column.name for column in columns]
     # healpy calls any map T or TEMPERATURE that is alone in its file.
     doubtful = ("T", "TEMPERATURE") if len(names) > 1 or given is not None else ()
     certain = [
-        None if alone and name in doubtful else stokes_of(name)
-        for name, alone in zip(names, columns.alone, strict=True)
+        None if column.alone and column.name in doubtful else stokes_of(column.name)
+        for column in columns
     ]
     if given is not None:
         stated = [""] * len(names) if isinstance(given, str) and not given else parse_stokes(given)
         if len(stated) != len(names):
             raise InputError(
-                f"{where}: argument `stokes` names {len(stated)} columns, but {len(names)} are "
-                f"read, {', '.join(names)}."
+                f"{first.where}: argument `stokes` names {len(stated)} columns, but {len(names)} "
+                f"are read, {', '.join(names)}."
             )
-        for name, one, found in zip(names, stated, certain, strict=True):
+        for column, one, found in zip(columns, stated, certain, strict=True):
             if not _agree(one, found):
                 raise InputError(
-                    f"{where}: argument `stokes` says {one} of column {name}, whose name says "
-                    f"{found or 'that it has no Stokes parameter'}."
+                    f"{column.where}: argument `stokes` says {one} of column {column.name}, whose "
+                    f"name says {found or 'that it has no Stokes parameter'}."
                 )
         return list(stated)
-    if None in certain and (frame != "G" or columns.polarization == "IAU"):
-        why = "has the IAU sign of U" if frame == "G" else "is not in Galactic coordinates"
+    if None in certain and (first.coordinates != "G" or first.polarization == "IAU"):
+        galactic = first.coordinates == "G"
+        why = "has the IAU sign of U" if galactic else "is not in Galactic coordinates"
         raise InputError(
-            f"{where}: the file {why}, and the name of column {names[certain.index(None)]} does "
-            'not say which Stokes parameter it holds; give `stokes`, such as "QU" or "I", one '
-            f"letter for each of {', '.join(names)}."
+            f"{first.where}: the file {why}, and the name of column "
+            f"{names[certain.index(None)]} does not say which Stokes parameter it holds; give "
+            f'`stokes`, such as "QU" or "I", one letter for each of {", ".join(names)}.'
         )
     return certain
 
@@ -236,26 +235,26 @@ def read_maps(
     ValueError
         If `unit` is unknown.
     """
-    unit = None if unit is None else unit_name(unit)
-    found = read_columns(path, hdu, fields, unit, ordering, coordinates, polarization)
-    if nside is not None and nside != found.nside:
-        raise InputError(f"{found.where}: nside is {found.nside}, but {nside} is expected.")
-    names, frame = found.names, found.coordinates
-    kinds = _kinds(found, stokes)
-    rows = None if frame == "G" else _blocks(found.where, names, kinds)
-    mark_missing(found, missing, zeros_are_data)
-    maps = np.empty((len(names), healpy.nside2npix(found.nside)))
+    stated = {"ordering": ordering, "coordinates": coordinates, "polarization": polarization}
+    columns = read_columns(path, hdu, fields, None if unit is None else unit_name(unit), stated)
+    first, where, names = columns[0], columns[0].where, tuple(column.name for column in columns)
+    if nside not in (None, first.nside):
+        raise InputError(f"{where}: nside is {first.nside}, but {nside} is expected.")
+    kinds = _kinds(columns, stokes)
+    rows = None if first.coordinates == "G" else _blocks(where, names, kinds)
+    mark_missing(columns, missing, zeros_are_data)
+    maps = np.empty((len(names), first.values.size))
     for row in range(len(names)):
-        maps[row] = found.values.pop(0)  # and given back: maps may be large
+        maps[row] = columns.pop(0).values  # and given back: maps may be large
     mask = np.asarray(np.isfinite(maps).all(axis=0))
     if not mask.any():
-        raise InputError(f"{found.where}: no pixel has values in {', '.join(names)}.")
+        raise InputError(f"{where}: no pixel has values in {', '.join(names)}.")
     maps[:, ~mask] = 0
-    if found.polarization == "IAU":
+    if first.polarization == "IAU":
         maps *= np.array([[(-1.0) ** (kind or "").count("U")] for kind in kinds])
     if rows is not None:
-        maps, mask = _to_galactic(maps, mask, rows, frame)
-    return Maps(maps, mask, found.unit, tuple(names), tuple(kinds))
+        maps, mask = _to_galactic(maps, mask, rows, first.coordinates)
+    return Maps(maps, mask, first.unit, names, tuple(kinds))
 
 
 def _check_written(

@@ -9,14 +9,12 @@ from jaxtyping import Bool
 
 from jaxsky.io.columns import default_fields
 from jaxsky.io.files import InputError, check_file
-from jaxsky.io.tables import COORDINATES, ORDERINGS, HealpixTable, equals, from_nested, open_fits
+from jaxsky.io.tables import HealpixTable, equals, from_nested, open_fits, spelled
 
 
 def _read_npz(path: Path, key: str | None, ordering: str | None) -> np.ndarray:
     """The values of a mask in an archive, in RING order."""
-    order = ORDERINGS.get((ordering or "RING").upper())
-    if order is None:
-        raise InputError(f"Argument `ordering` must be RING or NESTED, not {ordering!r}.")
+    order = spelled("ordering", ordering or "RING")
     check_file(path)
     try:
         with np.load(path) as archive:
@@ -90,8 +88,8 @@ def read_mask(
         with open_fits(path) as hdus:
             table = HealpixTable(path, hdus, hdu)
             column = default_fields(table, "key")[0] if key is None else table.index(key)
-            order = table.state("ordering", ordering, ("ORDERING",), ORDERINGS)
-            frame = table.state("coordinates", None, ("COORDSYS", "SKYCOORD"), COORDINATES, "G")
+            order = table.state("ordering", ordering)
+            frame = table.state("coordinates", None, "G")
             values = table.values(column, order, logical=True)
             others = [name for name in table.names if name != table.names[column]]
     found = healpy.npix2nside(values.size)

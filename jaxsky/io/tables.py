@@ -3,7 +3,7 @@
 import gzip
 import warnings
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -17,15 +17,20 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsky.io.files import InputError, check_file
 
-#: Spellings in headers and arguments, upper case -> the package's.
-ORDERINGS = {"RING": "RING", "NESTED": "NESTED", "NEST": "NESTED"}
-COORDINATES = {
-    **dict.fromkeys(("G", "GAL", "GALACTIC"), "G"),
-    **dict.fromkeys(("C", "Q", "CEL", "CELESTIAL", "EQUATORIAL", "ICRS", "FK5"), "C"),
-    **dict.fromkeys(("E", "ECL", "ECLIPTIC"), "E"),
+#: What a header says of maps, by the argument that stands in for it: keywords, and spellings in
+#: upper case -> the package's.
+_SAID = {
+    "ordering": (("ORDERING",), {"RING": "RING", "NESTED": "NESTED", "NEST": "NESTED"}),
+    "coordinates": (
+        ("COORDSYS", "SKYCOORD"),
+        {
+            **dict.fromkeys(("G", "GAL", "GALACTIC"), "G"),
+            **dict.fromkeys(("C", "Q", "CEL", "CELESTIAL", "EQUATORIAL", "ICRS", "FK5"), "C"),
+            **dict.fromkeys(("E", "ECL", "ECLIPTIC"), "E"),
+        },
+    ),
+    "polarization": (("POLCCONV",), {"COSMO": "COSMO", "IAU": "IAU"}),
 }
-
-
 #: Names of the column of pixel numbers in a table with explicit indexing, the usual ones first.
 PIXELS = ("PIXEL", "PIX", "PIXELS", "IPIX", "PIXNUM", "PIXEL_NUMBER", "HPX_PIX", "HEALPIX_PIX")
 #: Formats of columns with real numbers, and what others hold.
@@ -120,6 +125,15 @@ def select_hdu(
     if not isinstance(found, kinds):
         kind = "table" if kinds is TABLES else "binary table"
         raise InputError(f"{path}: HDU {hdu!r} holds no {kind}.")
+    return found
+
+
+def spelled(argument: str, given: str) -> str:
+    """The package's spelling of an argument about maps."""
+    spellings = _SAID[argument][1]
+    if (found := spellings.get(str(given).upper())) is None:
+        choices = ", ".join(dict.fromkeys(spellings.values()))
+        raise InputError(f"Argument `{argument}` must be one of {choices}, not {given!r}.")
     return found
 
 
@@ -331,24 +345,14 @@ class HealpixTable:
         column[bad] = np.nan
         return column
 
-    def state(
-        self,
-        argument: str,
-        given: str | None,
-        keywords: Sequence[str],
-        spellings: dict[str, str],
-        default: str | None = None,
-    ) -> str:
-        """What a header says by some keywords, or the argument that stands in for it.
+    def state(self, argument: str, given: str | None, default: str | None = None) -> str:
+        """What the header says, or the argument, which must not contradict it.
 
-        `spellings` give the package's for those in upper case. Unless there is a default, it is an
-        error if neither says anything.
+        Unless there is a default, it is an error if neither says anything.
         """
+        keywords, spellings = _SAID[argument]
         choices = ", ".join(dict.fromkeys(spellings.values()))
-        if given is not None:
-            if str(given).upper() not in spellings:
-                raise InputError(f"Argument `{argument}` must be one of {choices}, not {given!r}.")
-            given = spellings[str(given).upper()]
+        given = None if given is None else spelled(argument, given)
         text = self.keyword(*keywords)
         found = None if text is None else spellings.get(text)
         if text is not None and found is None and given is None:

@@ -102,14 +102,9 @@ def _to_galactic(
 class Maps:
     """Maps in the package's conventions: RING, Galactic, COSMO sign of U, float64.
 
-    Parameters
-    ----------
-    maps : values, 0 in pixels that are not used, shape (field, pix)
-    mask : True in pixels where every field has a value, shape (pix,)
-    unit : unit of all fields, a name of `jaxsky.units`, its square ("K_CMB^2"), "" or "K"
-    names : names of the columns
-    stokes : their Stokes parameters, as given or as the names say for certain: one, two of a
-        covariance, "" for none, None where it is not known
+    They are 0 where `mask` is False, for not every field has a value there. `unit` is as
+    `unit_name` has it. `stokes` of each column are those given, or as its name says for certain:
+    one, two of a covariance, "" for none, None where it is not known.
     """
 
     maps: Float[np.ndarray, "field pix"]

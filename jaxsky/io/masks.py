@@ -112,14 +112,7 @@ def read_mask(
 def degrade_mask(
     mask: Bool[np.ndarray, " pix"], nside: int, threshold: float = 0.5
 ) -> Bool[np.ndarray, " pix"]:
-    """A mask at lower resolution: pixels of which at least a fraction is used.
-
-    Parameters
-    ----------
-    mask : True in used pixels, RING, shape (pix,)
-    nside : resolution of the result
-    threshold : smallest used fraction of a pixel, 0 < threshold <= 1
-    """
+    """A mask in RING order at lower resolution: pixels of which at least a fraction is used."""
     found = healpy.npix2nside(np.size(mask))
     if not healpy.isnsideok(found, nest=True):
         raise ValueError(f"Argument `mask` must have nside 1, 2, 4, ..., but has nside {found}.")

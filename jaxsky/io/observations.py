@@ -1,8 +1,8 @@
 """How a simulated map was observed, kept in its file: bandpass, beam, noise, leakage, truth."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,23 +13,26 @@ from jaxsky.bandpass import Bandpass
 from jaxsky.io.files import InputError
 from jaxsky.io.tables import open_fits
 
-#: Whose maps have these tables.
+#: Whose maps have the tables.
 CREATOR = "jaxsky"
-NOISE = ("QQ", "QU", "UU")
+#: Columns of numbers in each.
+TABLES = {
+    "BANDPASS": ("NU", "WEIGHT"),
+    "BEAM": ("BEAM",),
+    "NOISE_SPECTRUM": ("N_L",),
+    "NOISE": ("QQ", "QU", "UU"),
+    "LEAKAGE": ("Q", "U"),
+    "TRUTH": ("VALUE",),
+}
 
 
 class Observed(NamedTuple):
-    """How a map was observed; maps and noise in uK_RJ.
+    """How a map was observed.
 
-    Parameters
-    ----------
-    bandpass : of the band
-    beam : FWHM of a Gaussian [arcmin], or a table b_l
-    level : of uniform noise [uK_RJ arcmin], None where it is not
-    spectrum : N_l of noise that was smoothed with the map [uK_RJ^2], None where it was not
-    covariance : of Q and U in each pixel [uK_RJ^2], None where noise is uniform
-    leakage : Q and U that leaked from the intensity [uK_RJ], with the beam of the map
-    truth : spectral parameters of the sky, by dotted name
+    `beam` is the FWHM of a Gaussian [arcmin], or a table b_l. Noise is uniform, of a `level`
+    [uK_RJ arcmin], or was smoothed with the map, to a `spectrum` N_l [uK_RJ^2], or has a
+    `covariance` of Q and U in each pixel [uK_RJ^2]. `leakage` is Q and U that leaked from the
+    intensity [uK_RJ], with the beam of the map; `truth` has spectral parameters by dotted name.
     """
 
     bandpass: Bandpass
@@ -44,29 +47,26 @@ class Observed(NamedTuple):
 def observed_tables(observed: Observed) -> list[pyfits.BinTableHDU]:
     """Tables of a FITS file that `read_observed` reads back, exactly."""
     band = observed.bandpass
-    columns: dict[str, dict[str, np.ndarray]] = {
-        "BANDPASS": {"NU": np.asarray(band.nu), "WEIGHT": np.asarray(band.weights)}
-    }
+    rows: dict[str, list[Any]] = {"BANDPASS": [band.nu, band.weights]}
     if np.ndim(observed.beam):
-        columns["BEAM"] = {"BEAM": np.asarray(observed.beam)}
+        rows["BEAM"] = [observed.beam]
     if observed.spectrum is not None:
-        columns["NOISE_SPECTRUM"] = {"N_L": np.asarray(observed.spectrum)}
+        rows["NOISE_SPECTRUM"] = [observed.spectrum]
     if observed.covariance is not None:
-        matrix = np.asarray(observed.covariance)[-2:, -2:]
-        parts = matrix[0, 0], matrix[0, 1], matrix[1, 1]
-        columns["NOISE"] = dict(zip(NOISE, parts, strict=True))
+        (QQ, QU), (_, UU) = np.asarray(observed.covariance)[-2:, -2:]
+        rows["NOISE"] = [QQ, QU, UU]
     if observed.leakage is not None:
-        columns["LEAKAGE"] = dict(zip("QU", np.asarray(observed.leakage), strict=True))
+        rows["LEAKAGE"] = list(observed.leakage)
     if observed.truth:
-        names = np.array(list(observed.truth))
-        columns["TRUTH"] = {"NAME": names, "VALUE": np.array(list(observed.truth.values()))}
+        rows["TRUTH"] = [list(observed.truth.values())]
     tables = []
-    for name, rows in columns.items():
-        made = [
-            pyfits.Column(n, f"{v.dtype.itemsize // 4}A" if v.dtype.kind == "U" else "D", array=v)
-            for n, v in rows.items()
-        ]
-        tables.append(pyfits.BinTableHDU.from_columns(made, name=name))
+    for name, values in rows.items():
+        named = zip(TABLES[name], map(np.asarray, values), strict=True)
+        columns = [pyfits.Column(n, "D", array=array) for n, array in named]
+        if name == "TRUTH":
+            length = max(map(len, observed.truth))
+            columns.insert(0, pyfits.Column("NAME", f"{length}A", array=list(observed.truth)))
+        tables.append(pyfits.BinTableHDU.from_columns(columns, name=name))
     header = tables[0].header
     header["CREATOR"] = CREATOR
     header["CONVENT"] = (band.convention, "convention of the weights")
@@ -83,46 +83,36 @@ def read_observed(path: Path) -> Observed | None:
         tables = {hdu.name: hdu for hdu in hdus[1:]}
         if "BANDPASS" not in tables or tables["BANDPASS"].header.get("CREATOR") != CREATOR:
             return None
-        header = tables["BANDPASS"].header
-
-        def column(table: str, name: str) -> np.ndarray:
-            values = np.array(tables[table].data[name], float)
-            if not np.isfinite(values).all():
-                raise InputError(f"{path}: the column {name} of its table {table} is not finite.")
-            return values
-
-        def number(key: str) -> float | None:
-            if (value := header.get(key)) is not None and not 0 <= float(value) < np.inf:
-                raise InputError(f"{path}: {key} of its table BANDPASS is {value}.")
-            return None if value is None else float(value)
-
-        def maps(table: str, names: Sequence[str]) -> list[np.ndarray] | None:
+        header, npix = tables["BANDPASS"].header, hdus[1].header["NAXIS2"]
+        found: dict[str, np.ndarray] = {}
+        for table, names in TABLES.items():
             if table not in tables:
-                return None
-            found, npix = [column(table, name) for name in names], hdus[1].header["NAXIS2"]
-            if found[0].size != npix:
+                continue
+            values = found[table] = np.array([tables[table].data[n] for n in names], float)
+            if not np.isfinite(values).all():
+                raise InputError(f"{path}: its table {table} has values that are not finite.")
+            if table in ("NOISE", "LEAKAGE") and values.shape[1] != npix:
                 raise InputError(
-                    f"{path}: its table {table} has {found[0].size} pixels, its map {npix}."
+                    f"{path}: its table {table} has {values.shape[1]} pixels, its map {npix}."
                 )
-            return found
-
-        beam: float | Array | None = number("FWHM")
-        if beam is None and "BEAM" in tables:
-            beam = jnp.asarray(column("BEAM", "BEAM"))
-        if beam is None:
+        stated = {key: float(header[key]) for key in ("FWHM", "NOISE") if key in header}
+        for key, value in stated.items():
+            if not 0 <= value < np.inf:
+                raise InputError(f"{path}: {key} of its table BANDPASS is {value}.")
+        if "FWHM" not in stated and "BEAM" not in found:
             raise InputError(f"{path}: the table of its beam is missing.")
-        spectral = "NOISE_SPECTRUM" in tables
-        noise, leakage = maps("NOISE", NOISE), maps("LEAKAGE", "QU")
         truth: dict[str, float] = {}
         if "TRUTH" in tables:
-            names = [str(name) for name in tables["TRUTH"].data["NAME"]]
-            truth = dict(zip(names, column("TRUTH", "VALUE").tolist(), strict=True))
+            parameters = map(str, tables["TRUTH"].data["NAME"])
+            truth = dict(zip(parameters, found["TRUTH"][0].tolist(), strict=True))
+        nu, weights = found["BANDPASS"]
+        spectrum, noise = found.get("NOISE_SPECTRUM"), found.get("NOISE")
         return Observed(
-            Bandpass(column("BANDPASS", "NU"), column("BANDPASS", "WEIGHT"), header["CONVENT"]),
-            beam,
-            number("NOISE"),
-            column("NOISE_SPECTRUM", "N_L") if spectral else None,
-            np.array([noise[:2], noise[1:]]) if noise else None,
-            np.array(leakage) if leakage else None,
+            Bandpass(nu, weights, header["CONVENT"]),
+            stated["FWHM"] if "FWHM" in stated else jnp.asarray(found["BEAM"][0]),
+            stated.get("NOISE"),
+            None if spectrum is None else spectrum[0],
+            None if noise is None else np.array([noise[:2], noise[1:]]),
+            found.get("LEAKAGE"),
             truth,
         )

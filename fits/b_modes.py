@@ -7,13 +7,11 @@ import healpy
 import numpy as np
 from jaxtyping import Float
 
-from fits.pseudo_cl import MaskedSpectra, band_powers
+from fits.pseudo_cl import PIVOT, MaskedSpectra, band_powers
 from jaxsky import Bandpass, Sky, observe_band
 from jaxsky.harmonics import beam_ratio
 from jaxsky.observation import ObservedBand
 
-#: Multipole at which amplitudes are given: where primordial B modes of recombination peak.
-PIVOT = 80
 #: Bins whose middle is up to this multipole are taken for the bump of reionisation.
 REIONISATION = 10
 
@@ -30,11 +28,7 @@ def foreground_powers(
 ) -> dict[str, Float[np.ndarray, "2 bin"]]:
     """Band powers D_b of EE and BB of a sky as each band sees it [uK_CMB^2].
 
-    Parameters
-    ----------
-    sky : foregrounds, all with the beam that is in the window of `spectra`
-    bands : by name
-    spectra : from `fits.pseudo_cl.masked_spectra`
+    All foregrounds have the beam that is in the window of `spectra`.
     """
     return {
         name: band_powers(spectra, observe_band(sky, band) * band.conversion("uK_RJ", "uK_CMB"))
@@ -80,12 +74,7 @@ def fit_law(
 ) -> BandLaw:
     """A straight line through log D_b against log l, bins counted as they have modes.
 
-    Parameters
-    ----------
-    spectra : from which the band powers are
-    powers : D_b
-    fit : first and last multipole of the bins that are fitted
-    what : name of the powers, for messages
+    `fit` has the first and last multipole of the bins that are fitted; messages name `what` it is.
     """
     inside = _inside(spectra, fit, what)
     D, ell = powers[inside], spectra.centers[inside]
@@ -106,13 +95,7 @@ def band_correlation(
     second: Float[np.ndarray, " bin"],
     fit: tuple[int, int],
 ) -> float:
-    """Mean correlation coefficient of two fields: that of the bins, counted as they have modes.
-
-    Parameters
-    ----------
-    spectra, fit : see `fit_law`
-    cross, first, second : band powers of both, and of each
-    """
+    """Mean correlation coefficient of two fields: that of the bins, counted as they have modes."""
     inside = _inside(spectra, fit, "correlated components")
     coefficients = cross[inside] / np.sqrt(first[inside] * second[inside])
     return float(np.average(coefficients, weights=_modes(spectra)[inside]))
@@ -127,14 +110,8 @@ def equal_r(
     """The r whose primordial BB equals a band's foregrounds, at l = 80 and at reionisation.
 
     At l = 80 the foregrounds are those of the power law; at reionisation the band powers of the
-    lowest bins against those that tensors have in them.
-
-    Parameters
-    ----------
-    spectra : from which the powers are
-    powers : D_b of EE and BB [uK_CMB^2]
-    law : fitted to BB
-    tensors : spectra C_l of TT, EE, BB, TE for r = 1 [uK_CMB^2], up to `spectra.lmax` and 80
+    lowest bins against those that tensors have in them. `tensors` are C_l of TT, EE, BB, TE for
+    r = 1 [uK_CMB^2], up to `spectra.lmax` and 80; `law` was fitted to BB.
     """
     primordial = PIVOT * (PIVOT + 1) / (2 * np.pi) * tensors[2, PIVOT]
     found = {f"l = {PIVOT}": float(law.amplitude / primordial)}

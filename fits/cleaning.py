@@ -13,7 +13,7 @@ from fits.noise_response import Realisation, Response, SimulatedNoise, widened
 from fits.optimize import best_fit
 from fits.priors import priors_of
 from fits.profile_likelihood import SpectralLikelihood
-from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra
+from fits.pseudo_cl import LEAST_WINDOW, MaskedSpectra, band_powers, bin_edges, masked_spectra
 from fits.results import FitResult, misfit
 from fits.sampling import sample
 from fits.separated_data import MultipoleData, PixelData
@@ -29,30 +29,17 @@ from jaxsky.settings import Experiment, SettingsError, at_key
 WALKERS = 32
 #: The posterior of more parameters is not sampled.
 SAMPLED = 500
-#: Spectra are corrected for the beam down to this window.
-LEAST_WINDOW = 0.05
 
 
 class Separation(NamedTuple):
     """What a separation finds; spectra are of the cleaned CMB [uK_CMB^2].
 
-    Parameters
-    ----------
-    data : what was separated
-    like : the likelihood of the spectral parameters
-    fit : the most probable ones, with the errors that the likelihood gives
-    sigma : their standard deviations, by name: in pixels those of the simulations, since the
-        likelihood takes smoothed noise as independent between pixels
-    covariance : likewise, in the order of `fit.labels`; None for too many parameters
-    found : the components with all that is known of them
-    maps : the components (component, stokes, pix) at one beam
-    degradation : noise of the CMB over that of a sky without foregrounds
-    residuals : data less components, maps (band, stokes, pix)
-    simulated : noise through the same separation
-    spectra : how band powers were taken
-    tensors : the tensor-to-scalar ratio
-    left : band powers of the foregrounds that are left in the CMB; None where they are not known
-    chain : samples of the posterior, None if none were asked for
+    `fit` has the most probable spectral parameters with the errors that the likelihood gives. In
+    pixels that takes smoothed noise as independent between pixels, so `sigma`, by name, and
+    `covariance`, in the order of `fit.labels` and None for too many parameters, are those of the
+    simulations. `found` are the components with all that is known of them, and `maps` they at one
+    beam. `residuals` are maps of the data less components, and `left` the band powers of the
+    foregrounds that are left in the CMB, None where they are not known.
     """
 
     data: PixelData | MultipoleData
@@ -62,7 +49,6 @@ class Separation(NamedTuple):
     covariance: Float[np.ndarray, "par par"] | None
     found: Any
     maps: Float[np.ndarray, "component stokes pix"]
-    degradation: Float[np.ndarray, "stokes _"]
     residuals: Float[np.ndarray, "band stokes pix"]
     simulated: SimulatedNoise
     spectra: MaskedSpectra
@@ -74,6 +60,11 @@ class Separation(NamedTuple):
     def components(self) -> tuple[str, ...]:
         """Their names, in order."""
         return tuple(self.like.sky)
+
+    @property
+    def degradation(self) -> float:
+        """Mean noise of the CMB over that of a sky without foregrounds."""
+        return float(np.nanmean(self.found.degradation("cmb")))
 
     def of_pixel(self, name: str, values: Mapping[str, Any]) -> Float[np.ndarray, " pix"]:
         """The map of a parameter with regions, from its values; NaN where masked."""
@@ -164,7 +155,6 @@ def separate(
         covariance=covariance,
         found=found,
         maps=maps,
-        degradation=data.degradation(like, best),
         residuals=data.residuals(like, best, found),
         simulated=simulated,
         spectra=spectra,

@@ -200,7 +200,7 @@ def _fluctuations(
         for band, own in zip(bands, kept, strict=True)
     )
     correlated = tuple(
-        _prepared_spectrum(band.correlated, op, lmax)
+        prepared_spectrum(band.correlated, op, lmax)
         for op, band in zip(operators, bands, strict=True)
     )
     return Fluctuations(
@@ -269,7 +269,7 @@ def _common_holes(maps: Sequence[Bool[np.ndarray, " pix"]]) -> dict[int, np.ndar
     }
 
 
-def _prepared_spectrum(
+def prepared_spectrum(
     spectrum: Float[Array, " ell"] | None, preparation: Preparation, lmax: int
 ) -> Float[Array, " ell"] | None:
     """Spectrum of a prepared map, from that before."""
@@ -279,4 +279,4 @@ def _prepared_spectrum(
     if window is None:
         pixels = pixel_window(preparation.nside, lmax) / pixel_window(preparation.nside_in, lmax)
         window = jnp.asarray(pixels)
-    return spectrum[: lmax + 1] * window**2
+    return spectrum[: lmax + 1] * window[: lmax + 1] ** 2

@@ -1,27 +1,38 @@
 """Observed maps against the model of foregrounds, CMB and noise: the paper's section 4.
 
 Pixel by pixel: the slope of the observed maps against the model, with an honest error. How far
-from the model maps may be by chance is seen in simulated noise and CMB.
+from the model maps may be by chance is seen in simulated noise and CMB. And on small patches, as
+in the paper's figure 10: their power laws against those of the model.
 """
 
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 from jaxtyping import Array, Bool, Float
 
-from fits.common import CommonMaps
-from fits.discs import EDGES
+from fits.common import CommonMaps, common_maps, prepared_spectrum
+from fits.discs import EDGES, PreparedPatches, paper_patches, prepare_patches
 from fits.full_sky import LMIN, BandSpectra, compare_spectra, polarization_alms
+from fits.inputs import Band, Inputs
 from fits.kept import fingerprint, kept_realisations
+from fits.patches import PatchFits, fit_patches
 from fits.pseudo_cl import bin_edges
 from fits.writing import probability
-from jaxsky.harmonics import power_spectrum
+from jaxsky.harmonics import (
+    average_pixels,
+    beam_ratio,
+    gaussian_beam,
+    pixel_window,
+    power_spectrum,
+)
+from jaxsky.keys import realisation_key, stream
 from jaxsky.progress import QUIET
 from jaxsky.settings import Experiment, SettingsError
 
@@ -33,12 +44,8 @@ LEAST_PIXELS = 10
 class ComparisonRealisations(NamedTuple):
     """Of each realisation, what is compared with the data.
 
-    Parameters
-    ----------
-    chi2 : of the residual maps, for Q, U and both
-    squares : sum of their squares [uK_RJ^2]
-    spectra : C_l of EE and BB of the complete model: foregrounds, CMB, noise [uK_RJ^2]
-    noise : C_l of the noise alone
+    chi^2 of the residual maps and the sum of their squares [uK_RJ^2], for Q, U and both; C_l of EE
+    and BB of the complete model of foregrounds, CMB, and noise, and of the noise alone [uK_RJ^2].
     """
 
     chi2: Float[np.ndarray, "sim band region 3"]
@@ -50,17 +57,11 @@ class ComparisonRealisations(NamedTuple):
 class Scatter(NamedTuple):
     """Observed against modelled pixels of a band, in one region.
 
-    Parameters
-    ----------
-    band, region, stokes : which pixels
-    pixels : how many, of Q and U together for both
-    slope, error : of the observed maps on the model, weighted by 1/sigma^2, through the origin;
-        the error is that of noise and CMB together, correlated as they are between pixels
-    correlation : Pearson's coefficient
-    rms, expected : rms of observed - model, and that of noise and CMB [uK_RJ]
-    chi2 : sum of (observed - model)^2 / sigma^2, sigma that of the noise
-    pte : probability that noise and CMB alone give a larger chi2, from simulations; never below
-        `floor`, one in their number
+    The slope is that of the observed maps on the model, weighted by 1/sigma^2, through the origin,
+    and its error that of noise and CMB together, correlated as they are between pixels; Pearson's
+    `correlation`; the rms of observed - model, and that `expected` of noise and CMB [uK_RJ]; chi2
+    with the sigma of the noise, and the probability that noise and CMB alone give a larger one,
+    from simulations: never below `floor`, one in their number.
     """
 
     band: str
@@ -90,15 +91,9 @@ class Scatter(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """Observed maps, the model, and how they compare.
+    """Observed maps, the model of foregrounds in each band [uK_RJ], and how they compare.
 
-    Parameters
-    ----------
-    prepared : templates and maps at the common resolution
-    model : foregrounds of each band [uK_RJ]
-    regions : pixels of each region that are used
-    scatters : by band, region and Stokes parameter
-    spectra : by band; none if pixels are missing
+    `regions` are the pixels of each that are used; there are no `spectra` if pixels are missing.
     """
 
     prepared: CommonMaps
@@ -200,22 +195,9 @@ def simulated_fluctuations(
     model: Float[Array, "band stokes pix"],
     regions: Mapping[str, Bool[np.ndarray, " pix"]],
     lmax: int,
-    nsims: int,
-    seed: int,
-    path: Path | None = None,
-    mark: str = "",
-    report: Callable[[int, int], None] = QUIET.advance,
+    *kept: Any,
 ) -> ComparisonRealisations:
-    """Realisations of noise and CMB on top of the model's foregrounds.
-
-    Parameters
-    ----------
-    prepared : templates and maps at the common resolution
-    model : foregrounds of each band [uK_RJ]
-    regions : pixels of each region
-    lmax : largest multipole of the spectra
-    nsims, seed, path, mark, report : see `fits.kept.kept_realisations`
-    """
+    """Noise and CMB on top of the model's foregrounds; `kept` is for `kept_realisations`."""
     foregrounds = polarization_alms(model, lmax)
     inside = jnp.asarray(np.stack(list(regions.values())))
 
@@ -229,7 +211,7 @@ def simulated_fluctuations(
         return chi2, squares, spectra, power_spectrum(noise_alms)
 
     names = ComparisonRealisations._fields
-    return ComparisonRealisations(*kept_realisations(make, names, nsims, seed, path, mark, report))
+    return ComparisonRealisations(*kept_realisations(make, names, *kept))
 
 
 @jax.jit
@@ -270,21 +252,13 @@ def compare_pixels(
     regions: Mapping[str, Bool[np.ndarray, " pix"]],
     simulated: ComparisonRealisations,
 ) -> list[Scatter]:
-    """The observed maps against the model, in each region, for Q, U and both.
-
-    Parameters
-    ----------
-    prepared : templates and maps at the common resolution
-    model : foregrounds of each band [uK_RJ]
-    regions : pixels of each region that are used
-    simulated : realisations of noise and CMB, with the same regions
-    """
+    """The observed maps against the model, in each region, for Q, U and both."""
     inside = jnp.asarray(np.stack(list(regions.values())))
     slopes, errors = _slopes(prepared, model, inside)
     residual = prepared.data - model
     found = np.asarray(_sums_of_squares(residual / prepared.sigma, inside))
-    exceeding = (simulated.chi2 >= found).sum(axis=0)
-    pte = (1 + exceeding) / (1 + len(simulated.chi2))
+    floor = 1 / (1 + len(simulated.chi2))
+    pte = floor * (1 + (simulated.chi2 >= found).sum(axis=0))
     squares = simulated.squares.mean(axis=0)
     rows = []
     for b, band in enumerate(prepared.bands):
@@ -306,7 +280,110 @@ def compare_pixels(
                         math.sqrt(float(squares[b, r, s]) / x.size),
                         float(found[b, r, s]),
                         float(pte[b, r, s]),
-                        1 / (1 + len(simulated.chi2)),
+                        floor,
                     )
                 )
     return rows
+
+
+class PatchComparison(NamedTuple):
+    """A and alpha of the patches in one band.
+
+    Fits to the map, and to the model: foregrounds with a realisation of CMB and noise. `overlap` is
+    the fraction of modes that patches have in common.
+    """
+
+    band: str
+    observed: PatchFits
+    model: PatchFits
+    overlap: Float[np.ndarray, "patch patch"]
+
+    def detected(self, index: int) -> np.ndarray:
+        """Patches that show EE (0) or BB (1) in both."""
+        return self.observed.detected[:, index] & self.model.detected[:, index]
+
+    def ratio(self, index: int) -> tuple[float, float]:
+        """Mean logarithm of A observed over A of the model, as a factor, and its error.
+
+        The error is that of the scatter over the patches that show EE (0) or BB (1), with what
+        these have in common.
+        """
+        both = self.detected(index)
+        logs = np.log(self.observed.A[both, index] / self.model.A[both, index])
+        mean, error = self._mean(logs, both)
+        return float(np.exp(mean)), float(np.exp(mean)) * error
+
+    def _mean(self, values: np.ndarray, patches: np.ndarray) -> tuple[float, float]:
+        """Mean over patches, and its error; NaN for less than two."""
+        if (count := len(values)) < 2:
+            return float("nan"), float("nan")
+        shared = self.overlap[np.ix_(patches, patches)].sum() / count
+        return float(values.mean()), float(values.std(ddof=1) * np.sqrt(shared / count))
+
+    def slope_difference(self, index: int) -> tuple[float, float]:
+        """Mean of alpha observed less alpha of the model, and its error, over the same patches."""
+        both = self.detected(index)
+        difference = (self.observed.alpha - self.model.alpha)[both, index]
+        return self._mean(difference, both)
+
+    def correlation(self, index: int) -> tuple[float, float]:
+        """Pearson's coefficient of log A and of alpha between map and model."""
+        both = self.detected(index)
+        if both.sum() < 3:
+            return float("nan"), float("nan")
+        pairs = (
+            np.log([self.observed.A[both, index], self.model.A[both, index]]),
+            [self.observed.alpha[both, index], self.model.alpha[both, index]],
+        )
+        A, alpha = (float(np.corrcoef(*pair)[0, 1]) for pair in pairs)
+        return A, alpha
+
+
+def _patch_noise(
+    band: Band, prepared: CommonMaps, patches: PreparedPatches
+) -> Float[np.ndarray, "patch 2 ell"]:
+    """Spectrum of the noise in the prepared maps, on each patch that of its own pixels."""
+    (preparation,), lmax = prepared.fluctuations.preparations, patches.spectra[0].lmax
+    variance = average_pixels(jnp.stack([band.noise[0, 0], band.noise[1, 1]]), preparation.nside)
+    weights = np.stack([one.mask**2 for one in patches.spectra])
+    # Q and U turn into each other on a patch, and E and B have the mean of both.
+    mean = np.asarray(variance).mean(axis=0) @ weights.T / weights.sum(axis=1)
+    white = mean * healpy.nside2pixarea(preparation.nside_in)
+    total = white[:, None] * np.asarray(prepared_spectrum(jnp.ones(lmax + 1), preparation, lmax))
+    if (correlated := prepared.fluctuations.correlated[0]) is not None:
+        total[:, : correlated.size] += np.asarray(correlated)[: lmax + 1]
+    return np.repeat(total[:, None], 2, axis=1)
+
+
+def compare_patches(settings: Experiment, inputs: Inputs) -> PatchComparison:
+    """The paper's 48 discs and the field of BICEP2, in the band that the settings name."""
+    name, nside = str(settings.compare.patches), settings.compare.patches_nside
+    fwhm = settings.common.fwhm
+    band = inputs.bands[name]
+    prepared = common_maps(inputs._replace(bands={name: band}), nside, fwhm)
+    window = beam_ratio(fwhm or band.beam, 0.0, 2 * nside)
+    if not fwhm:  # averages of pixels, with the beam of the map
+        window = window * pixel_window(nside, 2 * nside)
+    patches = prepare_patches(paper_patches(nside), np.asarray(window))
+    # Correlations of the powers of a field that has all scales alike, 1 for a patch itself.
+    squares = np.stack([one.mask**2 for one in patches.spectra])
+    squares /= np.linalg.norm(squares, axis=1, keepdims=True)
+    noise = _patch_noise(band, prepared, patches)
+    # Realisations of their own, unlike those of what is observed.
+    key = stream(realisation_key(settings.seed), "patches")
+    model = prepared.model()[0]
+    fluctuations = prepared.fluctuations
+    model = model + fluctuations.noise_realisation(key)[0] + fluctuations.cmb_realisation(key)[0]
+    return PatchComparison(
+        name,
+        fit_patches(prepared.data[0], patches, noise=noise),
+        fit_patches(model, patches, noise=noise),
+        squares @ squares.T,
+    )
+
+
+def template_patches(maps: Float[Array, "2 pix"], fwhm: float) -> PatchFits:
+    """The same patches in Q and U of a template, at its own beam, taken to be without noise."""
+    nside = healpy.npix2nside(maps.shape[-1])
+    patches = prepare_patches(paper_patches(nside), np.asarray(gaussian_beam(fwhm, 2 * nside)))
+    return fit_patches(maps, patches)

@@ -23,14 +23,7 @@ SAME = 2e-3
 
 
 class Patch(NamedTuple):
-    """A part of the sky.
-
-    Parameters
-    ----------
-    name : for tables and pictures
-    lon, lat : Galactic coordinates of its middle [deg]
-    mask : weight of each pixel, RING
-    """
+    """A part of the sky: Galactic coordinates of its middle [deg], and a weight of each pixel."""
 
     name: str
     lon: float
@@ -50,7 +43,7 @@ def disc_centers(nside: int = 4, latitude: float = 45.0) -> Float[np.ndarray, "2
 
 def _smoothed_disc(radius: float, fwhm: float, angle: np.ndarray) -> np.ndarray:
     """A disc of ones smoothed by a Gaussian, at angles from its middle [deg]; closed form."""
-    lmax = int(np.ceil(6.0 / np.radians(fwhm) * np.sqrt(8 * np.log(2)))) if fwhm else 0
+    lmax = int(np.ceil(6.0 / np.radians(fwhm) * np.sqrt(8 * np.log(2))))
     ell = np.arange(lmax + 2)
     legendre = np.polynomial.legendre.legvander(np.array([np.cos(np.radians(radius))]), lmax + 2)[0]
     # 2 pi int P_l over the disc, times (2l+1)/4 pi of the sum over harmonics
@@ -64,14 +57,9 @@ def _smoothed_disc(radius: float, fwhm: float, angle: np.ndarray) -> np.ndarray:
 def disc_mask(
     nside: int, lon: float, lat: float, radius: float = RADIUS, fwhm: float = APODIZATION
 ) -> Float[np.ndarray, " pix"]:
-    """A disc smoothed by a Gaussian.
+    """A disc about Galactic coordinates, smoothed by a Gaussian, all in degrees.
 
-    Parameters
-    ----------
-    nside : resolution
-    lon, lat : Galactic coordinates of its middle [deg]
-    radius : of the disc [deg]
-    fwhm : of the Gaussian [deg]; what it leaves below 1e-5 is zero
+    What that leaves below 1e-5 is zero.
     """
     if not (np.isfinite(lon) and -90 <= lat <= 90):
         raise ValueError(
@@ -117,13 +105,8 @@ def paper_patches(nside: int) -> Iterator[Patch]:
 class PreparedPatches(NamedTuple):
     """Patches with all that does not depend on the maps; from `prepare_patches`.
 
-    Attributes
-    ----------
-    names : for tables and pictures
-    lon, lat : Galactic coordinates of the middles [deg]
-    spectra : how spectra are taken on each
-    shapes : the first patch with the same mask but for its place
-    window : window b_l of the maps
+    `lon` and `lat` are Galactic coordinates of the middles [deg], `shapes` is the first patch with
+    the same mask but for its place, and `window` is b_l of the maps.
     """
 
     names: tuple[str, ...]

@@ -28,8 +28,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.b_modes import PIVOT
 from fits.mixing import Mixing, SpectralBands
+from fits.pseudo_cl import PIVOT
 from jaxsky import Bandpass, Sky, get_parameters, parameter_names, set_parameters
 from jaxsky.bandpass import stack_bands
 from jaxsky.checks import check_double
@@ -47,15 +47,9 @@ ROUNDING = 1e-12
 class ForecastModel(eqx.Module):
     """What the covariance of bands depends on next to its parameters.
 
-    Parameters
-    ----------
-    mixing : of foregrounds of amplitude 1 in one pixel (`unit_sky`), in uK_CMB
-    weights : b_l over the noise [1 / (uK_CMB rad)], shape (ell, band)
-    tensors : C_l of tensors for r = 1 [uK_CMB^2], a row for each field, shape (field, ell)
-    scalars : C_l of lensed scalars [uK_CMB^2], shape (field, ell)
-    ell : multipoles
-    sky_fraction : fraction of the sky, as it has modes
-    fields : "EE", "BB" or both
+    `mixing` is that of foregrounds of amplitude 1 in one pixel (`unit_sky`), in uK_CMB, `weights`
+    are b_l over the noise [1 / (uK_CMB rad)], `tensors` (for r = 1) and lensed `scalars` C_l
+    [uK_CMB^2] of the fields, "EE", "BB" or both, and `sky_fraction` counts modes.
     """
 
     mixing: Mixing
@@ -79,15 +73,10 @@ class ForecastModel(eqx.Module):
 
 
 class Errors(NamedTuple):
-    """Errors of a forecast.
+    """Errors of a forecast of the free parameters about their fiducial values.
 
-    Parameters
-    ----------
-    free : names of the free parameters, in the order of the covariance
-    fiducial : their values
-    covariance : shape (par, par), priors included
-    known : error of each, were all others known
-    priors : those that were given, by name
+    The covariance, in the order of `free`, has the priors in it; `known` is the error of each, were
+    all others known.
     """
 
     free: tuple[str, ...]
@@ -108,13 +97,7 @@ class Errors(NamedTuple):
 
 
 def unit_sky(sky: Sky, mask: Float[np.ndarray, " pix"]) -> Sky:
-    """The laws of a sky: amplitude 1 in one pixel, parameters that are maps at their mean.
-
-    Parameters
-    ----------
-    sky : foregrounds
-    mask : weight of each pixel
-    """
+    """The laws of a sky: amplitude 1 in one pixel, parameters that are maps at their mean."""
 
     def reduced(leaf):
         if leaf.ndim == 2:
@@ -129,12 +112,8 @@ def foreground_names(
 ) -> tuple[str, ...]:
     """Names of parameters of foreground spectra, such as "BB.dust.amplitude".
 
-    Parameters
-    ----------
-    components : names, in order
-    fields : "EE", "BB" or both
-    kinds : of "amplitude" (D_l at l = 80, uK_RJ^2 at the reference frequency), "slope" (of C_l)
-        and "correlation" (of a pair, "BB.dust.synchrotron.correlation")
+    Kinds are "amplitude" (D_l at l = 80, uK_RJ^2 at the reference frequency), "slope" (of C_l) and
+    "correlation" (of a pair, "BB.dust.synchrotron.correlation").
     """
     singles = list(components)
     pairs = [".".join(pair) for pair in itertools.combinations(singles, 2)]
@@ -159,12 +138,8 @@ def fiducial(
 ) -> dict[str, float]:
     """All parameters of the covariance by name, with their values.
 
-    Parameters
-    ----------
-    sky : from `unit_sky`
-    foregrounds : parameters of their spectra of all kinds; see `foreground_names`
-    r : tensor-to-scalar ratio
-    A_lens : fraction of the lensing BB that is left
+    `foregrounds` are those of their spectra of all kinds (`foreground_names`), and `A_lens` is the
+    fraction of the lensing BB that is left.
     """
     components = list(sky)
     for field in sorted({name.split(".")[0] for name in foregrounds}):
@@ -210,16 +185,6 @@ def _spectra(
         cmb = params["r"] * tensors + lensing * scalars
         found.append(jnp.pad(foregrounds, ((0, 0), (0, 1), (0, 1))).at[:, -1, -1].set(cmb))
     return jnp.stack(found)
-
-
-@jax.jit
-def covariance_of_bands(
-    params: Mapping[str, Array], model: ForecastModel
-) -> Float[Array, "field ell band band"]:
-    """The covariance C_l of bands, their beams taken out [uK_CMB^2]: the formula above."""
-    laws = _laws(params, model)
-    noise = jax.vmap(jnp.diag)(model.weights**-2)
-    return jnp.einsum("ic,flcd,jd->flij", laws, _spectra(params, model), laws) + noise
 
 
 def _columns(weights, modes, spectra, d_spectra, laws, d_laws):

@@ -7,7 +7,6 @@ those parameters, so that residual foregrounds appear with the noise that caused
 """
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import NamedTuple
 
 import healpy
@@ -19,13 +18,13 @@ from jaxtyping import Array, Float
 from fits.posterior import Likelihood, Posterior, value_and_gradient
 from fits.priors import Gaussian, Prior
 from fits.profile_likelihood import SpectralLikelihood
-from fits.pseudo_cl import MaskedSpectra, band_powers
+from fits.pseudo_cl import MaskedSpectra, band_powers, mean_spectrum
 from fits.results import FitResult
 from fits.separated_data import MultipoleData, PixelData
 from fits.systems import Factor
 from jaxsky.checks import Numeric
 from jaxsky.cmb import realisation
-from jaxsky.harmonics import analysis, expand, power_spectrum, synthesis
+from jaxsky.harmonics import expand, synthesis
 from jaxsky.keys import stream
 
 
@@ -128,13 +127,6 @@ class SimulatedNoise(NamedTuple):
     spectrum: Float[np.ndarray, "sim ell"]
 
 
-@partial(jax.jit, static_argnames="lmax")
-def _mean_spectrum(mask, maps, lmax):
-    """C_l of a masked map, the mean of EE and BB."""
-    power = power_spectrum(analysis(mask * jnp.where(mask > 0, maps, 0.0), lmax, 0))
-    return power.mean(axis=0) / jnp.mean(mask**2)
-
-
 class Realisation(NamedTuple):
     """What a realisation is made of: simulated noise on top of the foregrounds that were found.
 
@@ -173,5 +165,5 @@ class Realisation(NamedTuple):
         sky, E = synthesis(alm, nside), synthesis(alm.at[1].set(0.0), nside)
         every = (alone, both - alone, both, both + sky, E)
         powers = [band_powers(self.spectra, jnp.asarray(maps))[1] for maps in every]
-        spectrum = _mean_spectrum(self.spectra.mask, both, self.spectra.lmax)
+        spectrum = mean_spectrum(self.spectra.mask, both, self.spectra.lmax)
         return [moved - self.response.theta, *powers, spectrum]

@@ -22,10 +22,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from fits.discs import PreparedPatches
 from fits.power_covariance import covariance_terms
-from fits.pseudo_cl import band_powers
-from jaxsky.harmonics import analysis, power_spectrum
+from fits.pseudo_cl import PIVOT, band_powers, mean_spectrum
+from jaxsky.checks import check_shape
 
-PIVOT = 80.0
 #: The root of the variance of a power never falls below this part of what it is expected to be:
 #: where a law predicts nothing in a band, that band alone would decide.
 FLOOR = 0.3
@@ -41,18 +40,11 @@ LEAST = 0.1
 class PatchFits(NamedTuple):
     """A and alpha of each patch, for EE and BB (in this order); from `fit_patches`.
 
-    Attributes
-    ----------
-    names : of the patches
-    A : amplitude D_80, in the square of the maps' unit; may be negative where it is lost in noise
-    alpha : slope of C_l
-    covariance : of A and alpha, in this order, shape (patch, 2, 2, 2), for a law of the prior's
-        slope with the amplitude that fits it best
-    chi2, pte : of the band powers about the fit, and the probability to exceed it
-    detected : whether A is at least twice its error; where not, alpha says little
-    converged : whether the solver found a minimum
-    powers, errors : band powers, noise subtracted, and their errors by the same law
-    centers : middle multipole of each bin
+    The amplitude A = D_80, in the square of the maps' unit, may be negative where it is lost in
+    noise; alpha is the slope of C_l. Their `covariance` is that of a law of the prior's slope with
+    the amplitude that fits it best, and so are the `errors` of the band powers, of which noise is
+    subtracted. `detected` is A of at least twice its error; where it is not, alpha says little.
+    `pte` is the probability to exceed chi2 of the powers about the fit.
     """
 
     names: tuple[str, ...]
@@ -132,8 +124,7 @@ def fit_patches(
 def _checked(name: str, maps: Float[Array, "2 pix"], patches: PreparedPatches) -> Array:
     maps = jnp.asarray(maps, float)
     npix = patches.spectra[0].mask.size
-    if maps.shape != (2, npix):
-        raise ValueError(f"Argument `{name}` must have shape (2, {npix}), not {maps.shape}.")
+    check_shape(name, maps, maps.shape == (2, npix), f"have shape (2, {npix})")
     bad = ~np.isfinite(maps).all(axis=0) | (np.asarray(maps) == healpy.UNSEEN).any(axis=0)
     for patch, one in zip(patches.names, patches.spectra, strict=True):
         if count := int(np.sum(bad & (one.mask > 0))):
@@ -152,21 +143,17 @@ def _noise_spectra(
     if noise is None:
         rows = np.zeros((shape[0], 1, lmax + 1))
         if other is not None:
-            half = jnp.where(jnp.isfinite(maps - other), maps - other, 0.0) / math.sqrt(2)
-            for row, one in zip(rows, patches.spectra, strict=True):
-                power = np.asarray(power_spectrum(analysis(one.mask * half, lmax, 0)))
-                row[:] = power.mean(axis=0) / np.mean(one.mask**2)
+            half = (maps - other) / math.sqrt(2)
+            rows[:, 0] = [mean_spectrum(one.mask, half, lmax) for one in patches.spectra]
         return np.broadcast_to(rows, shape)
     values = np.asarray(noise, float)
     if not np.isfinite(values).all() or values.min() < 0:
         raise ValueError("Argument `noise` has values that are negative or not finite.")
     if not values.ndim:
         return np.full(shape, (values * math.radians(1 / 60)) ** 2)
-    if values.shape[-1] <= lmax or values.shape[:-1] not in ((), (2,), shape[:2]):
-        raise ValueError(
-            f"Argument `noise` must be a level or have shape (ell,), (2, ell) or ({shape[0]}, 2, "
-            f"ell) and reach l = {lmax}, but has shape {values.shape}."
-        )
+    good = values.shape[-1] > lmax and values.shape[:-1] in ((), (2,), shape[:2])
+    known = f"(ell,), (2, ell) or ({shape[0]}, 2, ell) and reach l = {lmax}"
+    check_shape("noise", values, good, f"be a level or have shape {known}")
     return np.broadcast_to(values[..., : lmax + 1], shape)
 
 

@@ -34,15 +34,9 @@ def bandpower_covariance(
 
     Exact for masks that do not depend on longitude about their middle, purified or not. For others
     it is an approximation (`covariance_terms`), good to some 10 % but for purified B: in the lowest
-    bands, of the size of the mask, its errors are up to 50 % larger, which simulations correct.
-
-    Parameters
-    ----------
-    spectra : from `masked_spectra`
-    EE, BB : spectra C_l of the maps, window and noise included, up to `spectra.lmax` at least
-    simulations : number of Gaussian skies from which the standard deviations are taken, while the
-        correlations stay; 200 measure them to 5 %. By default none
-    key : of jax.random, for the simulations
+    bands, of the size of the mask, its errors are up to 50 % larger, which simulations correct:
+    standard deviations are taken from so many Gaussian skies, while the correlations stay; 200
+    measure them to 5 %. EE and BB are C_l of the maps, window and noise included.
     """
     covariance = 2 * covariance_terms(spectra, np.stack([EE, BB])[None])[0, 0]
     if not simulations:
@@ -68,15 +62,12 @@ def covariance_terms(
 ) -> Float[np.ndarray, "field field 2 bin 2 bin"]:
     """Half the covariance of band powers of independent Gaussian fields, for each pair of them.
 
+    `fields` are their spectra EE, BB, window included, up to `spectra.lmax` at least.
+
     The covariance of the sum of fields with p_i times the spectra is 2 sum_ij p_i p_j terms[i, j].
     Exact for symmetric masks (`zonal`). For others pseudo-spectra are correlated as modes of the
     squared mask, and the spectra taken to vary little over the width of the mask's own spectrum
     (Efstathiou 2004; Challinor & Chon 2005).
-
-    Parameters
-    ----------
-    spectra : from `masked_spectra`
-    fields : spectra EE, BB of each, window included, up to `spectra.lmax` at least
     """
     given = np.asarray(fields, float)[..., : spectra.lmax + 1]
     reach = min(2 * spectra.lmax, 2 * healpy.npix2nside(spectra.mask.size))
@@ -104,12 +95,7 @@ def _narrow_products(
 
 
 def zonal(alm: Float[np.ndarray, " alm"]) -> Float[np.ndarray, " ell"] | None:
-    """Coefficients a_l0 of a mask about its own middle, or None if it depends on longitude, too.
-
-    Parameters
-    ----------
-    alm : packed coefficients of the mask
-    """
+    """Coefficients a_l0 of a mask about its own middle, or None if it depends on longitude, too."""
     lmax = lmax_of(alm)
     # The middle is where the dipole points to; a mask without one has none.
     x, y, z = -alm[lmax + 1], alm[lmax + 2], alm[1]
@@ -129,13 +115,6 @@ def ring_functions(
 
     The maps of E = 1 are the first times exp(i m phi), and i times the second. Those of spin 0
     have the first only.
-
-    Parameters
-    ----------
-    spin : of the maps, 0, 1 or 2
-    lmax : largest multipole
-    theta : colatitudes [rad]
-    orders : orders m
     """
     values = np.zeros((2, orders.size, lmax + 1, theta.size))
     starts = np.arange(orders.size) * (lmax + 1)
@@ -161,13 +140,9 @@ def zonal_products(
 
     Such a mask does not mix orders m. With K_m from the E and B of the sky to those of the masked
     map, G = K C K^T is their covariance at one order, and that of pseudo-spectra sum_m 2 G^2 /
-    ((2 l + 1) (2 l' + 1)). Nothing is neglected but power beyond the last multipole.
-
-    Parameters
-    ----------
-    mask : coefficients a_l0 of the mask and of its derivatives, as maps of spin 0, 1, 2
-    fields : spectra EE, BB of each field
-    factors : of the three terms of purified B; None leaves it as it is
+    ((2 l + 1) (2 l' + 1)). Nothing is neglected but power beyond the last multipole. `mask` has
+    a_l0 of the mask and of its derivatives, as maps of spin 0, 1, 2, `fields` the spectra EE, BB of
+    each, and `factors` those of the three terms of purified B, None to leave it as it is.
     """
     lmax, reach = fields.shape[-1] - 1, mask.shape[1] - 1
     nodes = (2 * lmax + reach) // 2 + 1

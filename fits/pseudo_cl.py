@@ -22,23 +22,21 @@ from jaxtyping import Array, Float
 from jaxsky.checks import check_finite, is_concrete
 from jaxsky.harmonics import analysis, expand, lmax_of, power_spectrum, synthesis
 
+#: Multipole at which amplitudes are given: where primordial B modes of recombination peak.
+PIVOT = 80
+#: Spectra are corrected for beams down to this window.
+LEAST_WINDOW = 0.05
 #: Fewest modes of a field in a bin that a mean power can be taken of.
 LEAST_MODES = 4.0
 
 
 class MaskedSpectra(NamedTuple):
-    """How spectra are taken on part of the sky; from `masked_spectra`.
+    """How spectra are taken on part of the sky, up to lmax; from `masked_spectra`.
 
-    Parameters
-    ----------
-    mask : weight of each pixel, 0 to 1
-    edges : first multipole of each bin, and the one after the last
-    lmax : largest multipole that is taken into account
-    derivatives : of the mask, spin 1 and 2, where B is purified; shape (4, pix)
-    inverse : from pseudo-spectra EE, BB to band powers D_b, shape (2, bin, 2, ell)
-    windows : band powers of the sky's C_l, shape (2, bin, 2, ell); the beam is in it
-    spread : correlation of pseudo-spectra within and between E and B, shape (2, ell, ell)
-    mixing : pseudo-spectra EE, BB of the sky's, without window, shape (2, 2, ell, ell)
+    `edges` are the first multipole of each bin, and the one after the last; `derivatives` those of
+    the mask, spin 1 and 2, where B is purified. From pseudo-spectra EE, BB `inverse` makes band
+    powers D_b; `windows` makes them of the sky's C_l, the beam in it, and `mixing` pseudo-spectra,
+    without it. `spread` correlates pseudo-spectra within and between E and B.
     """
 
     mask: Float[np.ndarray, " pix"]
@@ -72,10 +70,7 @@ def coupling_matrices(
 ) -> Float[np.ndarray, "2 ell ell"]:
     """What a mask does to spectra: pseudo-EE = M[0] EE + M[1] BB, and with E and B exchanged.
 
-    Parameters
-    ----------
-    power : spectrum C_l of the mask, at best up to 2 lmax
-    lmax : largest multipole of the spectra
+    `power` is C_l of the mask, at best up to 2 lmax, with lmax that of the spectra.
     """
     spectrum = np.zeros(2 * lmax + 1)
     kept = min(len(power), len(spectrum))
@@ -113,11 +108,6 @@ def pure_coupling_matrices(
     In place of the mask times a harmonic of spin 2 stands the second derivative of the mask times
     a scalar harmonic, three terms with a Wigner symbol each. M[1] is zero but for rounding, where
     all multipoles of the mask are given: that is what purifying is for.
-
-    Parameters
-    ----------
-    power : spectrum C_l of the mask, at best up to 2 lmax
-    lmax : largest multipole of the spectra
     """
     count = min(len(power), 2 * lmax + 1)
     weights = power[:count] * (2 * np.arange(count) + 1) / (4 * math.pi)
@@ -142,11 +132,9 @@ def pure_coupling_matrices(
 def _all_edges(edges: Sequence[int], lmax: int) -> np.ndarray:
     """The bins, and as wide ones below and above, whose power is in the masked maps, too."""
     first, last = edges[1] - edges[0], edges[-1] - edges[-2]
-    below = np.arange(edges[0], 2, -first)[::-1]
+    below = np.arange(edges[0], 2, -first)
     above = np.arange(edges[-1], lmax + 1, last)
-    inner = edges[1:-1]
-    every = np.concatenate([[2], below[below > 2], inner, above[above < lmax + 1], [lmax + 1]])
-    return np.unique(every)
+    return np.unique([2, *below, *edges[1:-1], *above, lmax + 1])
 
 
 def masked_spectra(
@@ -298,3 +286,12 @@ def band_powers(
         for m in (maps, maps if other is None else other)
     ]
     return np.einsum("ibjl,jl->ib", spectra.inverse, power_spectrum(*alms))
+
+
+@partial(jax.jit, static_argnames="lmax")
+def mean_spectrum(
+    mask: Float[Array, " pix"], maps: Float[Array, "2 pix"], lmax: int
+) -> Float[Array, " ell"]:
+    """C_l of a masked map, the mean of EE and BB, over the mean square of the mask."""
+    power = power_spectrum(analysis(mask * jnp.where(mask > 0, maps, 0.0), lmax, 0))
+    return power.mean(axis=0) / jnp.mean(mask**2)

@@ -38,15 +38,7 @@ def region_masks(settings: Experiment, names: Sequence[str]) -> dict[str, Bool[n
 def region_mask(
     settings: Experiment, name: str, nside: int, *, coarser: bool = False
 ) -> Bool[np.ndarray, " pix"]:
-    """Pixels of a region that the common mask leaves.
-
-    Parameters
-    ----------
-    settings : of the experiment, with its regions
-    name : of one of them
-    nside : resolution
-    coarser : take a coarser mask for all pixels inside of its own, instead of refusing it
-    """
+    """Pixels of a region that the common mask leaves; `coarser` masks are refused, or refined."""
     region, inside = settings.regions[name], np.ones(healpy.nside2npix(nside), bool)
     masks = {"common.mask": settings.common.mask}
     if isinstance(region, MaskFile):
@@ -235,11 +227,8 @@ def check_labels(name: str, labels: object, npix: int, used: np.ndarray) -> np.n
 class Cells(NamedTuple):
     """Intersections of regions: sets of pixels in which all parameters are constant.
 
-    Parameters
-    ----------
-    of_pixel : cell of each pixel; None if there is a single one. Pixels that are not used have -1.
-    labels : label of each parameter in each cell, by name
-    number : of cells
+    `of_pixel` is the cell of each pixel, -1 where not used, and None if there is a single cell.
+    `labels` are those of each parameter in each of the `number` of cells, by name.
     """
 
     of_pixel: Int[np.ndarray, " pix"] | None

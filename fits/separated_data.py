@@ -18,7 +18,7 @@ from fits.common import prepared_maps
 from fits.fluctuations import Fluctuations, uniform_level
 from fits.inputs import Inputs, inputs_of
 from fits.mixing import NOMINAL
-from fits.multipoles import harmonic_coefficients, harmonic_likelihood, multipoles_of
+from fits.multipoles import harmonic_coefficients, harmonic_likelihood
 from fits.noise import Noise, as_noise
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.regions import apodize, parameter_labels, region_mask
@@ -28,7 +28,6 @@ from fits.separated_maps import (
     component_maps,
     emission_maps,
     harmonic_component_maps,
-    noise_degradation,
 )
 from jaxsky import Bandpass, Component, Sky, set_parameters
 from jaxsky.components import component_class
@@ -45,20 +44,11 @@ UNIFORM = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class _Data:
-    """What both kinds have.
+    """What both kinds have: the laws and bands, start values by name, and the data in `unit`.
 
-    Parameters
-    ----------
-    sky : the laws
-    bands : bandpasses by name
-    start : start values of the free parameters
-    unit : of data and noise
-    used : pixels that the results are of
-    mask : weight of each pixel in spectra, 0 to 1, its edges smooth
-    observed : the data
-    foregrounds : those of a simulation alone, likewise; None for real maps
-    truth : parameters of a simulation that are numbers, "r" among them; None for real maps
-    description : what the maps are
+    `used` are the pixels that the results are of, and `mask` the weight of each in spectra, 0 to 1,
+    its edges smooth. Of a simulation `foregrounds` are those alone, like the data, and `truth` its
+    parameters that are numbers, "r" among them; both are None for real maps.
     """
 
     sky: Sky
@@ -77,12 +67,9 @@ class _Data:
 class PixelData(_Data):
     """Maps that are separated pixel by pixel, all at one resolution.
 
-    Parameters
-    ----------
-    labels : regions of the free parameters that have them
-    noise : of the data, infinite where masked
-    fluctuations : what noise there is, correlated between pixels as it is [uK_RJ]
-    factors : `unit` per uK_RJ in each band
+    `labels` are the regions of the free parameters that have them, `noise` is infinite where
+    masked, `fluctuations` are the noise there is, correlated between pixels as it is [uK_RJ], and
+    `factors` what `unit` is per uK_RJ in each band.
     """
 
     labels: dict[str, np.ndarray]
@@ -109,10 +96,6 @@ class PixelData(_Data):
         """Amplitudes as maps."""
         return found.amplitude
 
-    def degradation(self, like: SpectralLikelihood, params: Mapping) -> np.ndarray:
-        """Noise of the CMB over that of a sky without foregrounds, (stokes, 1 or pix)."""
-        return noise_degradation(like, params, self.noise, self.used.size)
-
     def residuals(self, like: SpectralLikelihood, params: Mapping, found: ComponentMaps):
         """Maps (band, stokes, pix) of the data less the components; NaN in masked pixels."""
         return self.observed - emission_maps(like, params, found.amplitude)
@@ -126,14 +109,10 @@ class PixelData(_Data):
 class MultipoleData(_Data):
     """Coefficients that are separated multipole by multipole, each band with its own beam.
 
-    Parameters
-    ----------
-    fwhms : of the bands [arcmin]
-    noise : N_l of the maps as observed [unit^2 sr]
-    covariance : of Q and U in each pixel of the bands [unit^2], each at its own nside
-    levels : of the noise of the bands [unit arcmin] where it is uniform, else None
-    correlated : N_l of noise that is correlated between pixels, part of `noise`; zero where none
-    nside, fwhm : of the maps that are made [arcmin]
+    `fwhms` are those of the bands [arcmin], and `noise` is N_l of the maps as observed [unit^2 sr].
+    To draw it there are the `covariance` of Q and U in each pixel of the bands [unit^2], each at
+    its own nside, the `levels` where it is uniform [unit arcmin], else None, and the part of N_l
+    that is `correlated` between pixels. Maps of components have `nside` and `fwhm` [arcmin].
     """
 
     fwhms: Float[np.ndarray, " band"]
@@ -172,12 +151,6 @@ class MultipoleData(_Data):
     def maps(self, found: HarmonicMaps) -> Float[np.ndarray, "component stokes pix"]:
         """Amplitudes as maps."""
         return found.maps(self.nside, self.fwhm)
-
-    def degradation(self, like: SpectralLikelihood, params: Mapping) -> np.ndarray:
-        """Noise of the CMB over that of a sky without foregrounds, (stokes, ell)."""
-        components = len(self.sky.components)
-        sigma = multipoles_of(self.observed, self.noise, self.fwhms, components, 2, None).sigma
-        return noise_degradation(like, params, Noise(sigma), sigma.shape[-1])
 
     def residuals(self, like: SpectralLikelihood, params: Mapping, found: HarmonicMaps):
         """Maps (band, stokes, pix) of the data less the components, each with its own beam."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import ArrayLike, Float
 
 from fits import amplitudes
 from fits.amplitudes import Pixels
@@ -17,28 +17,25 @@ from fits.compress import Layout, used_pixels
 from fits.multipoles import check_alm, multipoles_of
 from fits.noise import Noise, as_noise, bare, chunks
 from fits.profile_likelihood import SpectralLikelihood
-from jaxsky.checks import Numeric, as_array, check_finite
+from jaxsky.checks import Numeric, as_array, check_finite, check_shape
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
 
 
 class ComponentMaps(NamedTuple):
     """Maps of the components; NaN in masked pixels.
 
-    Attributes
-    ----------
-    components : their names
-    amplitude : generalised least-squares estimates, uK at the reference frequency of each law;
-        CMB in uK_CMB
-    covariance : of the components in each pixel for each Stokes parameter; a single pixel if it
-        is the same in all; None if not asked for
-    chi2, dof : sum over bands and Stokes parameters of the weighted residuals squared, and their
-        number less that of amplitudes
-    probability : to exceed chi2, the spectral parameters taken as known
+    `amplitude` are generalised least-squares estimates, uK at the reference frequency of each law,
+    CMB in uK_CMB. `covariance` is that of the components in each pixel for each Stokes parameter,
+    and `alone` the variance of each were there no others; both are of a single pixel if they are
+    the same in all, and None if not asked for. `chi2` is the sum of the weighted residuals squared
+    over bands and Stokes parameters, `dof` their number less that of amplitudes, and `probability`
+    that to exceed chi2, the spectral parameters taken as known.
     """
 
     components: tuple[str, ...]
     amplitude: Float[np.ndarray, "component stokes pix"]
     covariance: Float[np.ndarray, "component component stokes #pix"] | None
+    alone: Float[np.ndarray, "component stokes #pix"] | None
     chi2: Float[np.ndarray, " pix"]
     dof: Float[np.ndarray, " pix"]
     probability: Float[np.ndarray, " pix"]
@@ -54,70 +51,49 @@ class ComponentMaps(NamedTuple):
         i = self.components.index(name)
         return np.sqrt(self.covariance[i, i])
 
+    def degradation(self, name: str) -> Float[np.ndarray, "stokes ..."]:
+        """Noise of a component over that of a sky without other components; at least 1."""
+        sigma = self.sigma(name)
+        assert self.alone is not None  # made with the covariance
+        return sigma / np.sqrt(self.alone[self.components.index(name)])
+
 
 @jax.jit
 def _matrices(like, params):
     return like.matrices(like.flat(params)[like.index])
 
 
-def _of_pixel(like: SpectralLikelihood, matrix: Array, part: slice) -> Array:
-    """The matrix of all pixels, (1, row, unknown), or of each."""
-    if like.of_pixel is None:
-        return matrix
-    return matrix[jnp.maximum(like.of_pixel[part], 0)]
+@partial(jax.jit, static_argnames="errors")
+def _separated(matrix, pixels, errors):
+    """Amplitudes and chi^2, with a matrix for all pixels or for each.
 
+    With errors, too, the covariance of the amplitudes and the variance of each by itself.
+    """
 
-def _by_pixel(function, matrix, pixels):
-    """A function of (matrix, pixels) whose results end in pixels, with a matrix for each."""
+    def separated(m, p):
+        found = amplitudes.explained(m, p)
+        if not errors:
+            return found
+        single = [amplitudes.inverse_gram(column[:, None], p)[:, 0, 0] for column in m.T]
+        return *found, amplitudes.inverse_gram(m, p), jnp.stack(single, axis=1)
+
     if len(matrix) == 1:
-        return function(matrix[0], pixels)
-    npix = len(matrix)
-    wide = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], npix)), pixels)
-    alone = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0)[..., None], wide)
-    results = jax.vmap(function)(matrix, alone)
+        return separated(matrix[0], pixels)
+    wide = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], len(matrix))), pixels)
+    apart = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0)[..., None], wide)
+    results = jax.vmap(separated)(matrix, apart)
     return jax.tree.map(lambda x: jnp.moveaxis(x[..., 0], 0, -1), results)
 
 
-@jax.jit
-def _explained(matrix, pixels):
-    return _by_pixel(amplitudes.explained, matrix, pixels)
-
-
-def _covariance(matrix: Array, pixels: Pixels) -> np.ndarray:
-    """Covariance of the amplitudes; the weights are in the place of data, which do not count."""
-    return np.asarray(_inverse(matrix, pixels._replace(data=pixels.weights)))
-
-
-@jax.jit
-def _inverse(matrix, pixels):
-    return _by_pixel(amplitudes.inverse_gram, matrix, pixels)
-
-
-@partial(jax.jit, static_argnames="unknowns")
-def _alone(matrix, pixels, unknowns):
-    """Variance of one component if there were no other."""
-
-    def variances(m, p):
-        single = [amplitudes.inverse_gram(m[:, u : u + 1], p)[:, 0, 0] for u in unknowns]
-        return jnp.stack(single, axis=1)
-
-    return _by_pixel(variances, matrix, pixels)
-
-
 def _pixels(
-    layout: Layout, noise: Noise, used: np.ndarray, part: slice, data: np.ndarray | None = None
+    layout: Layout, noise: Noise, used: np.ndarray, part: slice, data: np.ndarray
 ) -> Pixels:
-    """Data and weights of some pixels; masked ones are zero and have unit weight.
-
-    Without data, the weights are in their place.
-    """
-    mask = used[part]
-    weights = noise.weights(part)
+    """Data and weights of some pixels; masked ones are zero and have unit weight."""
+    mask, weights = used[part], noise.weights(part)
     if weights.shape[-1] > 1 or not mask.all():
         weights = np.where(mask, weights, 1.0)
-    weights = values = weights.swapaxes(0, 1)
-    if data is not None:
-        values = np.where(mask & (weights > 0), np.asarray(data[..., part], float), 0.0)
+    weights = weights.swapaxes(0, 1)
+    values = np.where(mask & (weights > 0), np.asarray(data[..., part], float), 0.0)
     cross = noise.cross(part) if layout.joint else None
     return Pixels(
         jnp.asarray(layout.rows(values)),
@@ -127,21 +103,19 @@ def _pixels(
 
 
 def _passes(like: SpectralLikelihood, params: Mapping[str, Numeric], npix: int) -> Iterator:
-    """(layout, slice of pixels, matrices) for all maps."""
-    known = _matrices(like, like.check(params)) if like.start else _matrices(like, {})
+    """(layout, slice of pixels, matrix of all pixels (1, row, unknown) or of each) for all maps."""
+    known = _matrices(like, like.check(params) if like.start else {})
     for layout, matrix in zip(like.layout, known, strict=True):
         for part in chunks(npix):
-            yield layout, part, _of_pixel(like, matrix, part)
+            own = matrix if like.of_pixel is None else matrix[jnp.maximum(like.of_pixel[part], 0)]
+            yield layout, part, own
 
 
 def _check_data(like: SpectralLikelihood, data: Numeric) -> np.ndarray:
     data = bare("data", data)
     wanted = (len(like.bands.names), len(like.bands.stokes))
-    if data.ndim != 3 or data.shape[:2] != wanted:
-        raise ValueError(
-            f"Argument `data` must have shape (band, stokes, pix) = {(*wanted, 'pix')}, "
-            f"but has shape {data.shape}."
-        )
+    good = data.ndim == 3 and data.shape[:2] == wanted
+    check_shape("data", data, good, f"have shape (band, stokes, pix) = {(*wanted, 'pix')}")
     return data
 
 
@@ -171,35 +145,34 @@ def component_maps(
     names, (_, stokes, npix) = tuple(like.sky), data.shape
     noise = as_noise(noise, data.shape)
     used = used_pixels(noise, npix, len(names))
-    amplitude = np.full((len(names), stokes, npix), np.nan)
+    amplitude = np.empty((len(names), stokes, npix))
     square, count = np.zeros(npix), np.zeros(npix)
     uniform = noise.separable and noise.pixel_sigma is None and like.of_pixel is None
-    blocks = np.full((len(names), len(names), stokes, 1 if uniform else npix), np.nan)
+    blocks = np.empty((len(names), len(names), stokes, 1 if uniform else npix))
+    alone = np.empty(blocks.shape[1:])
     for layout, part, matrix in _passes(like, params, npix):
         own = list(layout.stokes)
-        pixels = _pixels(layout, noise, used, part, data)
-        solved, squares = map(np.asarray, _explained(matrix, pixels))
-        found = layout.maps(solved)
-        amplitude[:, own, part] = np.where(used[part], found, np.nan)
+        errors = covariance and not (uniform and part.start)
+        found = _separated(matrix, _pixels(layout, noise, used, part, data), errors)
+        solved, squares, *variances = map(np.asarray, found)
+        amplitude[:, own, part] = layout.maps(solved)
         square[part] += squares
         count[part] += (noise.weights(part) > 0)[own].sum(axis=(0, 1)) - len(names) * len(own)
-        if covariance and not (uniform and part.start):
-            inverse = _covariance(matrix, pixels)
-            where = slice(0, 1) if uniform else part
-            for k, s in enumerate(own):
-                group, first = (0, k * len(names)) if layout.joint else (k, 0)
-                rows = slice(first, first + len(names))
-                block = inverse[group, rows, rows]
-                blocks[:, :, s, where] = block if uniform else np.where(used[part], block, np.nan)
-    square, count = np.where(used, square, np.nan), np.where(used, count, np.nan)
-    return ComponentMaps(
-        names,
-        amplitude,
-        blocks if covariance else None,
-        square,
-        count,
-        scipy.special.chdtrc(count, square),
-    )
+        if not errors:
+            continue
+        inverse, single = variances
+        where = slice(0, 1) if uniform else part
+        for k, s in enumerate(own):
+            group, first = (0, k * len(names)) if layout.joint else (k, 0)
+            rows = slice(first, first + len(names))
+            blocks[:, :, s, where] = inverse[group, rows, rows]
+            alone[:, s, where] = single[group, rows]
+    for values in (amplitude, square, count, *(() if uniform else (blocks, alone))):
+        values[..., ~used] = np.nan
+    probability = scipy.special.chdtrc(count, square)
+    if not covariance:
+        return ComponentMaps(names, amplitude, None, None, square, count, probability)
+    return ComponentMaps(names, amplitude, blocks, alone, square, count, probability)
 
 
 def emission_maps(
@@ -207,13 +180,7 @@ def emission_maps(
     params: Mapping[str, Numeric],
     amplitude: Float[np.ndarray, "component stokes pix"],
 ) -> Float[np.ndarray, "band stokes pix"]:
-    """What components show in the bands, in the unit of the data.
-
-    Parameters
-    ----------
-    like, params : as for `component_maps`
-    amplitude : maps of all components, or their coefficients
-    """
+    """What components show in the bands, in the unit of the data, from maps or coefficients."""
     result = np.empty((len(like.bands.names), *amplitude.shape[1:]))
     for layout, part, matrix in _passes(like, params, amplitude.shape[-1]):
         rows = layout.rows(amplitude[..., part])
@@ -240,48 +207,6 @@ def residual_maps(
     amplitude : from `component_maps`
     """
     return _check_data(like, data) - emission_maps(like, params, amplitude)
-
-
-def noise_degradation(
-    like: SpectralLikelihood,
-    params: Mapping[str, Numeric],
-    noise: Noise | Numeric,
-    npix: int,
-    component: str = "cmb",
-) -> Float[np.ndarray, "stokes ..."]:
-    """Noise of a component's map over that of a sky without other components; at least 1.
-
-    Parameters
-    ----------
-    like, params : as for `component_maps`
-    noise : as it was given to `spectral_likelihood`
-    npix : number of pixels of the maps
-    component : name of the component
-
-    Returns
-    -------
-    Ratio of standard deviations; a single pixel if it is the same in all.
-    """
-    names = tuple(like.sky)
-    if component not in names:
-        raise KeyError(f"Unknown component {component!r}; known are {', '.join(names)}.")
-    c, stokes = names.index(component), len(like.bands.stokes)
-    noise = as_noise(noise, (len(like.bands.names), stokes, npix))
-    used = used_pixels(noise, npix, len(names))
-    uniform = noise.separable and like.of_pixel is None
-    result = np.full((stokes, 1 if uniform else npix), np.nan)
-    for layout, part, matrix in _passes(like, params, npix):
-        if uniform and part.start:
-            continue
-        pixels = _pixels(layout, noise._replace(pixel_sigma=None) if uniform else noise, used, part)
-        inverse = _covariance(matrix, pixels)
-        own = [c + k * len(names) for k in range(len(layout.groups[0]))]
-        alone = np.asarray(_alone(matrix, pixels, tuple(own)))
-        ratio = np.sqrt(np.stack([inverse[:, u, u] for u in own], axis=1) / alone)
-        where = slice(0, 1) if uniform else part
-        flat = ratio.reshape(len(layout.stokes), -1)
-        result[list(layout.stokes), where] = flat[:, :1] if uniform else flat
-    return result if uniform else np.where(used, result, np.nan)
 
 
 class HarmonicMaps(ComponentMaps):
@@ -356,18 +281,20 @@ def harmonic_component_maps(
     of_alm = Noise(sigma[..., ell])
     found = component_maps(like, params, multipoles.without_beams(alm), of_alm, covariance=False)
     if covariance:
-        nothing = np.zeros(sigma.shape)
-        blocks = component_maps(like, params, nothing, Noise(sigma)).covariance
+        of_noise = component_maps(like, params, np.zeros(sigma.shape), Noise(sigma))
+        found = found._replace(covariance=of_noise.covariance, alone=of_noise.alone)
     used = np.arange(ell.max() + 1) >= lmin
     square, count = (
         np.where(used, np.bincount(ell, np.nan_to_num(each)), np.nan)
         for each in (found.chi2, found.dof)
     )
+    probability = np.where(count > 0, scipy.special.chdtrc(count, square), np.nan)
     return HarmonicMaps(
         names,
         np.where(ell >= lmin, found.amplitude, 0.0),
-        blocks if covariance else None,
+        found.covariance,
+        found.alone,
         square,
         count,
-        np.where(count > 0, scipy.special.chdtrc(count, square), np.nan),
+        probability,
     )

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from fits.power_covariance import covariance_terms
 from fits.pseudo_cl import MaskedSpectra
+from jaxsky.checks import check_shape
 
 #: Steps of the search, and the change in standard deviations at which it ends.
 STEPS, CLOSE = 50, 1e-6
@@ -23,14 +24,10 @@ WIDTHS, POINTS = 8.0, 2001
 
 
 class PowerModel(NamedTuple):
-    """Band powers D_b of BB and their covariance, as functions of r; from `power_model`.
+    """Band powers D_b of BB [uK_CMB^2] and their covariance, as functions of r.
 
-    Parameters
-    ----------
-    tensors : of r = 1 [uK_CMB^2]
-    lensing : with A_lens
-    additive : noise and residuals
-    terms : of the covariance: sum_xy p_x p_y terms[x, y] with p = (r, 1)
+    `tensors` are those of r = 1, `lensing` has A_lens in it, `additive` are noise and residuals,
+    and the covariance is sum_xy p_x p_y terms[x, y] with p = (r, 1).
     """
 
     tensors: Float[np.ndarray, " bin"]
@@ -51,17 +48,11 @@ class PowerModel(NamedTuple):
 class TensorFit(NamedTuple):
     """The tensor-to-scalar ratio; see `fit_tensors`.
 
-    Attributes
-    ----------
-    r, sigma : estimate, which may be negative, and its standard deviation: cosmic variance of
-        tensors and lensing, noise, and residuals as far as the model has them
-    upper_95 : below it lie 95 % of the posterior for r >= 0
-    grid, posterior : values of r >= 0 and the posterior, largest value 1
-    chi2, dof, probability : of the powers, and the probability to exceed it
-    powers, covariance : D_b of BB that were fitted, noise and residuals in them, and their
-        covariance at r
-    model : what they were fitted with
-    weights : r changes by weights @ powers
+    The estimate may be negative. Its standard deviation has cosmic variance of tensors and lensing,
+    noise, and residuals as far as the model has them. Below `upper_95` lie 95 % of the posterior,
+    which is given on a grid of r >= 0 with the largest value 1. The probability is that to exceed
+    chi2 of the powers, which were fitted with noise and residuals in them; their covariance is that
+    at r, and r changes by weights @ powers.
     """
 
     r: float
@@ -109,41 +100,35 @@ def power_model(
         and for uniform noise only
     """
     lmax, bins = spectra.lmax, len(spectra.edges) - 1
-    for name, rows in (("lensed", lensed), ("tensors", tensors)):
-        if np.ndim(rows) != 2 or np.shape(rows)[-1] <= lmax:
-            raise ValueError(
-                f"Argument `{name}` must have shape (4, ell) up to l = {lmax}, "
-                f"but has shape {np.shape(rows)}."
-            )
-    for name, row in (("window", window), ("noise", noise)):
-        if np.ndim(row) != 1 or len(row) <= lmax:
-            raise ValueError(
-                f"Argument `{name}` must reach l = {lmax}, but has shape {np.shape(row)}."
-            )
-    if np.shape(additive) != (bins,):
-        raise ValueError(
-            f"Argument `additive` must have a value for each of {bins} bins, but has shape "
-            f"{np.shape(additive)}."
-        )
-    scalars = np.asarray(lensed)[1:3, : lmax + 1] * np.array([[1.0], [A_lens]])
-    primordial = np.asarray(tensors)[1:3, : lmax + 1]
-    squared = np.asarray(window)[: lmax + 1] ** 2
-    fields = np.stack([primordial * squared, scalars * squared + np.asarray(noise)[: lmax + 1]])
+    given = {"lensed": lensed, "tensors": tensors, "window": window, "noise": noise}
+    rows = {name: np.asarray(values) for name, values in given.items()}
+    for name in ("lensed", "tensors"):
+        good = rows[name].ndim == 2 and rows[name].shape[1] > lmax
+        check_shape(name, rows[name], good, f"have shape (4, ell) up to l = {lmax}")
+    for name in ("window", "noise"):
+        good = rows[name].ndim == 1 and rows[name].size > lmax
+        check_shape(name, rows[name], good, f"reach l = {lmax}")
+    additive = np.asarray(additive, float)
+    of_bins = f"have a value for each of {bins} bins"
+    check_shape("additive", additive, additive.shape == (bins,), of_bins)
+    scalars = rows["lensed"][1:3, : lmax + 1] * np.array([[1.0], [A_lens]])
+    primordial = rows["tensors"][1:3, : lmax + 1]
+    squared = rows["window"][: lmax + 1] ** 2
+    fields = np.stack([primordial * squared, scalars * squared + rows["noise"][: lmax + 1]])
     terms = 2 * covariance_terms(spectra, fields)[:, :, 1, :, 1]
     windows = spectra.windows[1]
     model = PowerModel(
         np.einsum("bjl,jl->b", windows, primordial),
         np.einsum("bjl,jl->b", windows, scalars),
-        np.asarray(additive, float),
+        additive,
         terms,
     )
     if simulated is None:
         return model
-    if np.ndim(simulated) != 2 or np.shape(simulated)[1] != bins or len(simulated) < 2:
-        raise ValueError(
-            f"Argument `simulated` must have shape (sim, {bins}) with two simulations at least, "
-            f"but has shape {np.shape(simulated)}."
-        )
+    simulated = np.asarray(simulated)
+    good = simulated.ndim == 2 and simulated.shape[1] == bins and len(simulated) > 1
+    two = f"have shape (sim, {bins}) with two simulations at least"
+    check_shape("simulated", simulated, good, two)
     scale = np.std(simulated, axis=0, ddof=1) / np.sqrt(np.diagonal(model.covariance(0.0)))
     return model._replace(terms=terms * scale[:, None] * scale)
 

@@ -10,9 +10,9 @@ import pytest
 
 from fits.commands.compare_pictures import plot_patches, plot_template_patches
 from fits.common import common_maps
+from fits.comparison import _patch_noise, compare_patches, template_patches
 from fits.discs import paper_patches, prepare_patches
 from fits.inputs import inputs_of
-from fits.patch_comparison import _noise, compare_patches, template_patches
 from fits.patches import fit_patches
 from fits.pseudo_cl import band_powers
 from jaxsky.harmonics import gaussian_beam
@@ -54,7 +54,7 @@ def test_noise_is_that_of_each_patch(inputs):
     )
     assert (patches.lat > 0).any()
     assert (patches.lat < 0).any()
-    noise = _noise(uneven, prepared, patches)
+    noise = _patch_noise(uneven, prepared, patches)
     keys = jax.random.split(jax.random.key(1), 40)
     maps = [prepared.fluctuations.noise_realisation(key)[0] for key in keys]
     for one, row in zip(patches.spectra, noise, strict=True):

@@ -12,7 +12,6 @@ from fits import fisher
 from fits.b_modes import noise_level, noise_weights
 from fits.fisher import (
     ForecastModel,
-    covariance_of_bands,
     fiducial,
     fisher_errors,
     foreground_names,
@@ -65,6 +64,14 @@ def values(system: ForecastModel, r=0.01, amplitudes=(0.1, 1.0), rho=0.4) -> dic
             foregrounds |= {f"{field}.{name}.amplitude": amplitude, f"{field}.{name}.slope": slope}
         foregrounds[f"{field}.dust.synchrotron.correlation"] = rho
     return fiducial(system.sky, foregrounds, r, 0.7)
+
+
+@jax.jit
+def covariance_of_bands(params, system: ForecastModel):
+    """The covariance C_l of bands, their beams taken out [uK_CMB^2]: the formula of the module."""
+    laws, spectra = fisher._laws(params, system), fisher._spectra(params, system)
+    noise = jax.vmap(jnp.diag)(system.weights**-2)
+    return jnp.einsum("ic,flcd,jd->flij", laws, spectra, laws) + noise
 
 
 def modes() -> np.ndarray:

@@ -194,7 +194,7 @@ def test_refusals():
     maps = np.asarray(sky(jax.random.key(6), *jnp.asarray(SEEN)))
     hole = np.where(disc.mask == 1, healpy.UNSEEN, maps)
     for given, options, words in (
-        (maps[:1], {}, "Argument `maps` must have shape (2, 49152), not (1, 49152)"),
+        (maps[:1], {}, "Argument `maps` must have shape (2, 49152), but has shape (1, 49152)"),
         (hole, {}, "Argument `maps` has no value in"),
         (maps, {"other": np.where(disc.mask > 0, np.nan, maps)}, "Argument `other` has no value"),
         (maps, {"noise": -1.0}, "Argument `noise` has values that are negative or not finite"),

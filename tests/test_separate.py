@@ -105,7 +105,7 @@ def test_both_domains_find_the_sky(domain):
     assert abs(found.tensors.r - given.truth["r"]) < 4 * found.tensors.sigma
     assert found.tensors.probability > 1e-3
     assert abs(found.tensors.shift(found.left)) < 0.5 * found.tensors.sigma
-    assert np.nanmin(found.degradation) > 1
+    assert np.nanmin(found.found.degradation("cmb")) > 1
     # What is left of the data is noise, less what the amplitudes have taken up.
     noise = given.noise_realisation(jax.random.key(0))
     if domain == "pixel":

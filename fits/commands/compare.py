@@ -7,10 +7,15 @@ from fits.commands import compare_pictures as pictures
 from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
 from fits.common import prepared_maps
-from fits.comparison import Comparison, check_comparison, compare
+from fits.comparison import (
+    Comparison,
+    PatchComparison,
+    check_comparison,
+    compare,
+    compare_patches,
+)
 from fits.full_sky import FIELDS
 from fits.inputs import inputs_of
-from fits.patch_comparison import PatchComparison, compare_patches
 from fits.regions import region_masks
 from fits.writing import leaks, probability, with_error, write_json, write_log
 from jaxsky.settings import Experiment

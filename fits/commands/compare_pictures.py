@@ -9,9 +9,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 
-from fits.comparison import Comparison, Scatter
+from fits.comparison import Comparison, PatchComparison, Scatter
 from fits.full_sky import FIELDS, BandSpectra
-from fits.patch_comparison import PatchComparison
 from fits.patches import PatchFits
 from fits.plots import (
     COLORS,

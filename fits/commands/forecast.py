@@ -16,7 +16,15 @@ from fits.commands.run import Command, Report, Run
 from fits.common import prepare_component
 from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors, foreground_names, unit_sky
 from fits.plots import spread
-from fits.pseudo_cl import MaskedSpectra, band_powers, bin_edges, masked_spectra, sky_fraction
+from fits.pseudo_cl import (
+    LEAST_WINDOW,
+    PIVOT,
+    MaskedSpectra,
+    band_powers,
+    bin_edges,
+    masked_spectra,
+    sky_fraction,
+)
 from fits.regions import apodize, region_mask
 from fits.writing import write_json, write_log
 from jaxsky import Sky
@@ -37,21 +45,12 @@ RESULTS = ("forecast.json", "log.json", "bb.png", "fisher.png")
 FIELDS = ("EE", "BB")
 #: Spectra are taken in so many bands, if the settings name none.
 SHOWN = 5
-#: Spectra are corrected for beams down to this window.
-LEAST_WINDOW = 0.05
 
 
 class ForecastInputs(NamedTuple):
-    """What is forecast.
+    """What is forecast: foregrounds with one beam [arcmin] and one nside, and the bands.
 
-    Parameters
-    ----------
-    sky : foregrounds, with one beam and one nside
-    fwhm : their beam [arcmin]
-    mask : weight of each pixel, 0 to 1
-    bands : all bands
-    shown : names of those of which spectra are taken
-    description : what the foregrounds are
+    Spectra are taken of those that are shown, with the mask, 0 to 1, as the weight of each pixel.
     """
 
     sky: Sky
@@ -63,20 +62,12 @@ class ForecastInputs(NamedTuple):
 
 
 class Forecast(NamedTuple):
-    """What a forecast finds.
+    """What a forecast finds; spectra C_l and band powers D_b are in uK_CMB^2.
 
-    Parameters
-    ----------
-    inputs : what was forecast
-    spectra : how band powers were taken
-    powers : band powers D_b of EE and BB by band [uK_CMB^2]
-    laws : power laws fitted to BB, by band
-    equal_r : r whose BB equals the foregrounds, by band and range of multipoles
-    tensors : C_l of TT, EE, BB, TE for r = 1 [uK_CMB^2]
-    lensed : those of lensed scalars
-    parameters : all parameters of the bands' covariance, with their values
-    errors : from the Fisher matrix
-    without_foregrounds : error of r without any, None where r is not free
+    By band there are the `powers` of EE and BB, power `laws` fitted to BB, and the r whose BB
+    equals the foregrounds, by range of multipoles. `tensors` (r = 1) and `lensed` are of TT, EE,
+    BB, TE; `parameters` are all those of the bands' covariance, `errors` come from the Fisher
+    matrix, and `without_foregrounds` is the error of r without any, None where r is not free.
     """
 
     inputs: ForecastInputs
@@ -173,7 +164,7 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
             name: b_modes.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
             for name, D in powers.items()
         }
-    highest = max(spectra.lmax, spec.fisher_lmax, b_modes.PIVOT)
+    highest = max(spectra.lmax, spec.fisher_lmax, PIVOT)
     with at_key("cmb.cosmology"):
         tensors = tensor_spectra(highest, **settings.cmb.cosmology)
         lensed = camb_spectra(highest, **settings.cmb.cosmology)
@@ -320,7 +311,7 @@ def _tables(found: Forecast) -> list[ResultTable]:
         ResultTable(
             ("band", "D_l / uK_CMB^2", "slope of C_l", *ranges),
             tuple(bands),
-            caption=f"BB of foregrounds at l = {b_modes.PIVOT}, and the r that has as much",
+            caption=f"BB of foregrounds at l = {PIVOT}, and the r that has as much",
         ),
         ResultTable(
             ("parameter", "value", "error", "others known", "prior"),

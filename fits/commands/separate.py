@@ -58,7 +58,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
         "message": fit.message,
         "solver": {key: fit.details[key] for key in ("solver", "steps", "distance")},
         "pixels_with_small_probability": _pixel_probability(found),
-        "cmb_noise_degradation": float(np.nanmean(found.degradation)),
+        "cmb_noise_degradation": found.degradation,
         "residual_rms": dict(zip(bands, np.nanstd(found.residuals, axis=(1, 2)), strict=True)),
         "r": {
             "best_fit": ratio.r,
@@ -113,7 +113,7 @@ def separation_tables(found: Separation) -> list[ResultTable]:
     ]
     if found.left is not None:
         rows.append(("r, shift by foregrounds left", f"{ratio.shift(found.left):+.1e}", ""))
-    degradation = f"{float(np.nanmean(found.degradation)):.2f}"
+    degradation = f"{float(np.nanmean(found.found.degradation('cmb'))):.2f}"
     rows.append(("noise of CMB, times that without foregrounds", degradation, ""))
     columns = 3 if truth else 2
     return [

@@ -7,10 +7,9 @@ import numpy as np
 
 from fits.commands import compare_pictures as pictures
 from fits.common import prepared_maps
-from fits.comparison import Comparison
+from fits.comparison import Comparison, compare_patches, template_patches
 from fits.paper.items import TEXTS, Impossible, Item, Number, described, filled, listed
 from fits.paper.sources import Sources
-from fits.patch_comparison import compare_patches, template_patches
 from fits.posterior_plots import plot_grids
 from fits.regions import region_masks, region_words
 from fits.spectral_index import fit_regions, known_truth

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.b_modes import PIVOT
 from fits.commands.forecast import forecast
 from fits.commands.forecast_pictures import plot_b_modes
 from fits.commands.page import ResultTable
@@ -27,7 +26,7 @@ from fits.plots import (
     plot_maps,
     with_powers,
 )
-from fits.pseudo_cl import sky_fraction
+from fits.pseudo_cl import PIVOT, sky_fraction
 from fits.regions import region_words
 from fits.writing import with_error
 from jaxsky.experiment import cmb_spectra

@@ -277,7 +277,7 @@ def _read_leakage(folder: Path, spec: BandTable, bandpass: Bandpass) -> Leakage:
     check_stokes(f"bands.{spec.name}.leakage", found, "QU")
     factor = uK_RJ_per(found.unit, bandpass, f"bands.{spec.name}.leakage")
     maps = narrow(found.maps[-2:] * factor)
-    return Leakage(maps, np.asarray(found.mask), spec.leakage.fwhm)
+    return Leakage(maps, np.asarray(found.mask), spec.leakage.fwhm or 0.0)
 
 
 def _estimated_noise(noise, maps, used):

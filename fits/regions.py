@@ -19,7 +19,7 @@ from jaxsky.io import degrade_mask, read_mask
 from jaxsky.settings import (
     Experiment,
     MapFile,
-    MaskFile,
+    MapKeys,
     RegionsTable,
     SettingsError,
     at_key,
@@ -41,7 +41,7 @@ def region_mask(
     """Pixels of a region that the common mask leaves; `coarser` masks are refused, or refined."""
     region, inside = settings.regions[name], np.ones(healpy.nside2npix(nside), bool)
     masks = {"common.mask": settings.common.mask}
-    if isinstance(region, MaskFile):
+    if isinstance(region, MapFile):
         masks[f"regions.{name}"] = region
     elif (said := parse_region(region)) is not None:
         latitude = healpy.pix2ang(nside, np.arange(inside.size), lonlat=True)[1]
@@ -49,8 +49,10 @@ def region_mask(
     for where, mask in masks.items():
         if mask is None:
             continue
-        path = find_file(Path(settings.data_dir), mask.file)
-        found = read_mask(path, key=mask.key, ordering=mask.ordering)
+        path = find_file(Path(settings.data_dir), mask.files[0])
+        assert not isinstance(mask.hdu, list)  # as the settings see to
+        field = mask.fields[0] if mask.fields else None
+        found = read_mask(path, field=field, hdu=mask.hdu or 1, ordering=mask.ordering)
         if coarser and found.size < inside.size:
             found = healpy.ud_grade(found.astype(float), nside) > 0
         with at_key(where):
@@ -61,7 +63,7 @@ def region_mask(
 def region_words(settings: Experiment, name: str) -> str:
     """What a region is, after the word "in" of a sentence."""
     region = settings.regions[name]
-    if isinstance(region, MaskFile):
+    if isinstance(region, MapFile):
         return f"the mask {name}"
     return "the full sky" if parse_region(region) is None else f"{region} deg"
 
@@ -169,7 +171,7 @@ def clusters(
 
 
 def _map(
-    folder: Path, spec: MapFile, nside: int, where: str, used: Bool[np.ndarray, " pix"]
+    folder: Path, spec: MapKeys, nside: int, where: str, used: Bool[np.ndarray, " pix"]
 ) -> Float[np.ndarray, " pix"]:
     """A map of one column at the resolution of the separation, with values where it is used."""
     found = read(folder, spec, stokes="", zeros_are_data=True)
@@ -199,9 +201,9 @@ def _regions(
     if regions.latitudes is not None:
         return latitude_bands(nside, regions.latitudes)
     if regions.file is not None:
-        values = _map(folder, regions.file, nside, f"{where}.file", used)
+        values = _map(folder, regions, nside, where, used)
         if not np.array_equal(values[used], np.round(values[used])):
-            raise SettingsError(f"{where}.file: labels must be whole numbers.")
+            raise SettingsError(f"{where}: labels must be whole numbers.")
         return np.where(used, values, 0).astype(int)
     assert regions.clusters is not None  # one of them is given
     # Without maps, pixels are alike that lie close together.

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
         write_maps,
     )
     from jaxsky.observation import Observation, ObservedBand, Source
-    from jaxsky.presets import preset
     from jaxsky.simulation import simulate
     from jaxsky.sky import (
         Sky,
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
         set_parameters,
     )
     from jaxsky.small_scales import SmallScales
+    from jaxsky.templates import preset
 
 __version__ = "0.1.0"
 
@@ -54,11 +54,11 @@ _NAMES = {
     "io": "from_quantity read_bandpass read_beam read_maps read_mask read_spectra unit_factor "
     "write_maps",
     "observation": "Observation ObservedBand Source",
-    "presets": "preset",
     "simulation": "simulate",
     "sky": "Sky get_parameters observe observe_band observe_components parameter_names "
     "set_parameters",
     "small_scales": "SmallScales",
+    "templates": "preset",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = sorted(_MODULES)

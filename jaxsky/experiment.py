@@ -19,7 +19,7 @@ from jaxsky.io.observations import Observed
 from jaxsky.keys import realisation_key
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import DTYPES, Observation, ObservedBand, Source
-from jaxsky.settings import BandTable, Experiment, SettingsError, at_key, find_file
+from jaxsky.settings import BandTable, ColumnKeys, Experiment, SettingsError, at_key, find_file
 from jaxsky.sky import Sky, get_parameters, observe_band, parameter_names
 from jaxsky.small_scales import SmallScales
 
@@ -284,7 +284,7 @@ def _noise_unit(spec: BandTable, where: str) -> str:
     assert noise is not None  # as called
     if noise.estimate_above is not None:
         raise SettingsError(f"{where}.estimate_above: is of a map, but here none is read.")
-    own = noise.map or noise.covariance
+    own = isinstance(noise.rms, ColumnKeys) or noise.covariance
     if unit := noise.unit or spec.unit or ("uK_CMB" if own or spec.file is None else None):
         return unit
     raise SettingsError(f"{where}.unit: is missing; it is that of the map, which is not read here.")

@@ -187,14 +187,10 @@ def embedded_galaxy(settings: Experiment) -> EmbeddedSky:
     """The embedded model of the Galaxy that the settings describe."""
     embedded = settings.sky.embedded
     assert embedded is not None  # as called
-    known = GalaxyModel.__dataclass_fields__
-    for name in embedded.model:
-        if name not in known:
-            raise SettingsError(f"sky.embedded.model: {name!r} is none of {', '.join(known)}.")
-    numbers: dict[str, Any] = embedded.model
-    with at_key("sky.embedded.model"):
+    numbers: dict[str, Any] = embedded.numbers
+    with at_key("sky.embedded"):
         model = GalaxyModel(**numbers)
-    if embedded.model or embedded.seed or embedded.nside > KEPT_NSIDE:
+    if numbers or embedded.seed or embedded.nside > KEPT_NSIDE:
         return embedded_sky(embedded.nside, embedded.seed, model)
     return default_galaxy(embedded.nside)
 
@@ -272,7 +268,7 @@ def _read_template(
             if padded:
                 maps = jnp.pad(maps[:1], ((0, 2), (0, 0)))
             component = law(maps[-len(stokes) :], **parameters)
-    return Template(component, spec.fwhm, used, found.unit)
+    return Template(component, spec.fwhm or 0.0, used, found.unit)
 
 
 def set_parameters_of(
@@ -320,7 +316,7 @@ def read_bandpass_spec(folder: Path, spec: BandpassSpec, samples: int = 51) -> B
             return Bandpass.delta(spec.center)
         return Bandpass.top_hat(spec.center, spec.width, spec.convention or "RJ", samples)
     options = spec.model_dump(exclude={"file", "center", "width"})
-    return read_bandpass(find_file(folder, str(spec.file)), **options)
+    return read_bandpass(find_file(folder, spec.files[0]), **options)
 
 
 def bandpass_of(folder: Path, spec: BandTable) -> Bandpass:

@@ -50,19 +50,7 @@ class Channel(eqx.Module):
 
 
 class Instrument(eqx.Module):
-    """Channels in order, looked up by name.
-
-    Parameters
-    ----------
-    name : name of the instrument
-    channels : channels with different names
-
-    Raises
-    ------
-    TypeError
-        If an entry of `channels` is no `Channel`.
-    ValueError
-        If there is no channel, or two have one name.
+    """Channels in order, looked up by their names, which differ.
 
     Examples
     --------
@@ -138,23 +126,12 @@ def _presets() -> dict[str, dict[str, Any]]:
     return tomllib.loads((files("jaxsky") / "instruments.toml").read_text())
 
 
-def instrument_names() -> list[str]:
-    """Names that `load_instrument` takes.
-
-    Examples
-    --------
-    >>> instrument_names()
-    ['planck', 'wmap', 'core', 'litebird']
-    """
-    return list(_presets())
-
-
 def load_instrument(name: str) -> Instrument:
     """An instrument of `instruments.toml`, where the source of every figure is given.
 
     Parameters
     ----------
-    name : one of `instrument_names()`
+    name : "planck", "wmap", "core" or "litebird"
 
     Raises
     ------
@@ -180,12 +157,9 @@ def load_instrument(name: str) -> Instrument:
 def band_tables(
     name: str, channels: Sequence[str] | None = None, folder: Path = Path()
 ) -> list[dict[str, Any]]:
-    """Bands of an instrument, as tables of an experiment file.
+    """Bands of an instrument, all or some, as tables of an experiment file.
 
-    Parameters
-    ----------
-    name : one of `instrument_names()`, or a file with a list `bands`, relative to `folder`
-    channels : names of the bands wanted, by default all
+    Its name is that of a preset, or of a file with a list `bands`, relative to `folder`.
     """
     presets, path = _presets(), folder / name
     if name in presets:

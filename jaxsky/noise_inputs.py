@@ -92,14 +92,14 @@ def _covariance(folder, noise, at, nside, stokes, where, unit, own):
     if noise.level is not None:
         level = noise.level * unit_factor(unit, "uK_RJ", at)
         return uniform_covariance(level, nside, n), np.ones(npix, bool)
-    if noise.rms is not None:
-        rms = noise.rms * unit_factor(unit, "uK_RJ", at)
-        return rms_covariance(narrow(np.full((n, npix), rms))), np.ones(npix, bool)
+    if isinstance(noise.rms, float):
+        value = noise.rms * unit_factor(unit, "uK_RJ", at)
+        return rms_covariance(narrow(np.full((n, npix), value))), np.ones(npix, bool)
     kind = next(
-        k for k in ("map", "covariance", "hits", "weights") if getattr(noise, k) is not None
+        k for k in ("rms", "covariance", "hits", "weights") if getattr(noise, k) is not None
     )
     spec, where = getattr(noise, kind), f"{where}.{kind}"
-    if noise.unit and spec.unit is None and kind in ("map", "covariance"):
+    if noise.unit and spec.unit is None and kind in ("rms", "covariance"):
         squared = "^2" if kind == "covariance" else ""
         spec = spec.model_copy(update={"unit": noise.unit + squared})
     found = _read_columns(folder, _file(spec, own, kind, where), kind, where)
@@ -108,7 +108,7 @@ def _covariance(folder, noise, at, nside, stokes, where, unit, own):
     given, known = found.unit, np.asarray(found.mask)
     maps = narrow(found.maps)
     del found  # as large as all else
-    if kind == "map":
+    if kind == "rms":
         _check_number(f"{where}.fields", len(maps), stokes)
         rms = maps[-n:] * float(unit_factor(given, "uK_RJ", at))
         return rms_covariance(jnp.broadcast_to(rms, (n, npix))), known
@@ -137,18 +137,18 @@ def _read_columns(folder: Path, spec: MapFile, kind: str, where: str) -> Maps:
     tables = max(len(spec.files), len(spec.hdu) if isinstance(spec.hdu, list) else 1)
     fields = spec.fields or []
     number = max(tables, len(fields))
-    if kind == "map" and not fields and tables == 1:
+    if kind == "rms" and not fields and tables == 1:
         number = len(read(folder, spec).names)
     six = ("II", "IQ", "IU", "QQ", "QU", "UU")
     pairs: dict[str, dict[int, tuple[str, ...]]] = {
-        "map": {2: ("QQ", "UU"), 3: ("II", "QQ", "UU")},
+        "rms": {2: ("QQ", "UU"), 3: ("II", "QQ", "UU")},
         "covariance": {3: six[3:], 6: six},
         "weights": {3: six[3:]},
     }
     wanted = pairs.get(kind, {}).get(number, ())
     said = [stokes_of(name) if isinstance(name, str) else None for name in fields]
     if any(s is not None and w not in (s, s * 2) for s, w in zip(said, wanted, strict=False)):
-        listed = ", ".join(w[0] if kind == "map" else w for w in wanted)
+        listed = ", ".join(w[0] if kind == "rms" else w for w in wanted)
         raise SettingsError(
             f"{where}.fields: {', '.join(map(str, fields))} are not {listed} by their names."
         )

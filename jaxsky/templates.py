@@ -1,4 +1,4 @@
-"""Templates from published maps, as the paper makes them.
+"""Templates from published maps, as the paper makes them, and components with published laws.
 
 Its synchrotron is Commander's Q and U at 30 GHz, brought from 40 arcmin at nside 256 to 1 degree
 at nside 512; its dust the one at 353 GHz, at 10 arcmin as it comes; the index of its dust that
@@ -9,16 +9,20 @@ how the paper compares the two.
 """
 
 import math
-from functools import partial
-from typing import NamedTuple, TypeAlias
+import tomllib
+from collections.abc import Callable
+from functools import cache, partial
+from importlib.resources import files
+from typing import Any, NamedTuple, TypeAlias
 
 import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxsky.checks import Numeric, as_array, check_finite, check_positive, check_shape, is_concrete
+from jaxsky.components import Component, component_class
 from jaxsky.harmonics import beam_ratio, resample, shortened
 
 #: First and last frequency of an interval [GHz].
@@ -57,17 +61,9 @@ def polarization_template(
 ) -> Float[Array, "stokes pix"]:
     """Q, U or I, Q, U at another resolution, without the artefacts of their pixels.
 
-    The section on foreground templates of the paper, which upgrades its synchrotron from nside
-    256 to 512 pixel by pixel and then smooths it from 40 to 60 arcmin. Here both are one
-    transform: Q and U are analysed as the spin-2 field they are, up to 2 nside, multiplied by
-    the ratio of the beams, and synthesised. Differentiable in the maps and the widths.
-
-    Parameters
-    ----------
-    maps : Q, U or I, Q, U in any unit, RING, shape (stokes, pix)
-    own_fwhm, fwhm : beam of the maps and of the result, full width at half maximum [arcmin];
-        where they are equal only the pixels change
-    nside : resolution of the result; below that of the maps, multipoles above 2 nside are cut
+    The paper upgrades its synchrotron from nside 256 to 512 pixel by pixel and then smooths it from
+    `own_fwhm`, 40 arcmin, to `fwhm`, 60. Here both are one transform up to 2 nside, of the coarser
+    of both resolutions. Differentiable in the maps, shape (stokes, pix), and the widths [arcmin].
     """
     maps, nside_in = _healpix("maps", maps, rows=(2, 3))
     check_finite("maps", maps)
@@ -85,16 +81,9 @@ def dust_index(
 ) -> Float[Array, " pix"]:
     """A noisy map of spectral indices, smoothed: beta_dust of the paper from 7.5' to 3 degrees.
 
-    The paper's section on spatially-varying spectral indices. With a mask the result is the
-    mean of the used pixels under the beam, smooth(mask beta) / smooth(mask). It holds the
-    values at the pixel centres, and is not cut at a multipole that the new pixels resolve.
-
-    Parameters
-    ----------
-    beta : index, RING, shape (pix,)
-    own_fwhm, fwhm : resolution of the map and of the result [arcmin]
-    nside : resolution of the result
-    mask : True in used pixels, shape (pix,), by default all; what is in the others is ignored
+    With a mask, True in used pixels, the result is their mean under the beam, smooth(mask beta) /
+    smooth(mask). It holds the values at the pixel centres, and is not cut at a multipole that the
+    new pixels resolve. Widths in arcmin.
     """
     beta, nside_in = _healpix("beta", beta)
     _check_nside(nside)
@@ -123,21 +112,8 @@ def steepening(
     """By how much a spectrum T ~ nu^-beta is steeper in one interval of frequency than in another.
 
     beta = -ln(T_2/T_1) / ln(nu_2/nu_1) between the ends of each interval, where T is
-    interpolated in ln T against ln nu. The paper finds 0.13 for GALPROP's synchrotron (section
-    on spatially-varying spectral indices). Differentiable in all arguments.
-
-    Parameters
-    ----------
-    nu : frequencies [GHz], shape (sample,), strictly increasing
-    temperature : antenna temperature of the spectrum in any unit, shape (sample,)
-    low, high : the two intervals, first and last frequency [GHz]; high minus low is returned
-
-    Examples
-    --------
-    >>> nu = jnp.geomspace(0.4, 40.0, 100)
-    >>> T = jnp.where(nu < 5, (nu / 5) ** -2.7, (nu / 5) ** -3.0)
-    >>> round(float(steepening(nu, T)), 3)
-    0.3
+    interpolated in ln T against ln nu; high minus low is returned. The paper finds 0.13 for
+    GALPROP's synchrotron. Frequencies in GHz, strictly increasing; differentiable in all arguments.
     """
     nu, temperature = as_array("nu", nu), as_array("temperature", temperature)
     if nu.ndim != 1 or nu.shape != temperature.shape or nu.size < 2:
@@ -170,28 +146,6 @@ def steepening(
     return index("high", high) - index("low", low)
 
 
-def synchrotron_index(
-    beta: ArrayLike,
-    nu: ArrayLike,
-    temperature: ArrayLike,
-    low: Interval = LOW,
-    high: Interval = HIGH,
-) -> Float[Array, " pix"]:
-    """beta_syn from a map of it at radio frequencies, made steeper as a spectrum says.
-
-    The paper's section on spatially-varying spectral indices: the map of Giardino et al. (2002)
-    plus the `steepening` of GALPROP's spectrum.
-
-    Parameters
-    ----------
-    beta : index at radio frequencies, T ~ nu^-beta and so positive, shape (pix,)
-    nu, temperature, low, high : see `steepening`
-    """
-    beta = as_array("beta", beta)
-    check_positive("beta", beta)
-    return beta + steepening(nu, temperature, low, high)
-
-
 class Correlation(NamedTuple):
     """Pearson's correlation coefficient and its jackknife error."""
 
@@ -199,37 +153,14 @@ class Correlation(NamedTuple):
     error: Float[Array, ""]
 
 
-def coarse_pixels(nside: int, nside_coarse: int) -> Int[np.ndarray, " pix"]:
-    """Number of the pixel of a coarser grid that each pixel lies in (both RING).
-
-    Blocks for a jackknife over the sky.
-    """
-    if not healpy.isnsideok(nside_coarse, nest=True) or nside_coarse > nside:
-        raise ValueError(
-            f"Argument `nside_coarse` must be a power of 2 up to {nside}, but is {nside_coarse}."
-        )
-    nest = healpy.ring2nest(nside, np.arange(healpy.nside2npix(nside)))
-    return healpy.nest2ring(nside_coarse, nest // (nside // nside_coarse) ** 2)
-
-
 def correlation(x: ArrayLike, y: ArrayLike, blocks: ArrayLike | None = None) -> Correlation:
     """Pearson's correlation of two maps, with its error from a jackknife over blocks.
 
     The error is that of leaving one of B blocks out after another, [(B - 1)/B sum_b (r_b -
-    mean r)^2]^(1/2), from the sums over each block. Differentiable in the maps.
-
-    Parameters
-    ----------
-    x, y : two maps, or the pixels of them to compare, shape (pix,)
-    blocks : label of the block of each pixel, shape (pix,); by default each pixel is one. That
-        takes neighbours as independent, which they are not on a smooth sky: blocks wider than
-        its structures (`coarse_pixels`) give the honest, larger error.
-
-    Examples
-    --------
-    >>> x = jnp.arange(6.0)
-    >>> [round(float(v), 4) for v in correlation(x, x**2)]
-    [0.9599, 0.0218]
+    mean r)^2]^(1/2), from the sums over each block. Differentiable in the maps, shape (pix,).
+    `blocks` are labels of pixels, by default one for each. That takes neighbours as independent,
+    which they are not on a smooth sky: blocks wider than its structures (`fits.superpixels`) give
+    the honest, larger error.
     """
     x, y = as_array("x", x), as_array("y", y)
     labels = np.arange(x.size) if blocks is None else np.asarray(blocks)
@@ -271,3 +202,52 @@ def _jackknife(x: Array, y: Array, labels: Array, number: int) -> tuple[Array, A
     error = jnp.sqrt((number - 1) * jnp.var(without))
     least = jnp.minimum((left[0] / full[0]).min(), (left[1] / full[1]).min())
     return coefficient(*full), error, least
+
+
+@cache
+def _presets() -> dict[str, dict[str, Any]]:
+    return tomllib.loads((files("jaxsky") / "presets.toml").read_text())
+
+
+def from_pysm_beta(beta: ArrayLike) -> Float[Array, "..."]:
+    """beta_syn of this package, T ~ nu^-beta_syn, from PySM's T ~ nu^beta."""
+    return -as_array("beta", beta)
+
+
+def preset(name: str, amplitude: ArrayLike, **maps: ArrayLike) -> Component:
+    """A component with the law and the constants of a preset.
+
+    Parameters
+    ----------
+    name : "baseline_dust" and "baseline_synchrotron" are the paper's, "d0", "d1", "s0", "s1" and
+        "s3" PySM's
+    amplitude : template [uK_RJ] at the preset's reference frequency (353 GHz for dust, 23 GHz
+        for PySM's synchrotron, 30 GHz for the paper's), shape (stokes, pix); PySM's I templates
+        refer to other frequencies and have to be scaled first
+    **maps : the parameters that are maps in this preset, shape (pix,) or numbers: `beta_dust`
+        and `T_dust` [K] of d1, `beta_syn` of s1 and s3 (PySM's BETA_S has the other sign:
+        `from_pysm_beta`)
+
+    Examples
+    --------
+    >>> import jax.numpy as jnp
+    >>> dust = preset("d1", jnp.ones((2, 12)), beta_dust=jnp.full(12, 1.6), T_dust=20.0)
+    >>> float(dust.nu_ref)
+    353.0
+    """
+    presets = _presets()
+    if name not in presets:
+        raise KeyError(f"Unknown preset {name!r}; known are {', '.join(presets)}.")
+    constants = dict(presets[name])
+    component: Callable[..., Component] = component_class(constants.pop("law"))
+    needed = constants.pop("maps", [])
+    for key in needed:
+        if key not in maps:
+            raise TypeError(f"Preset {name!r} needs the map `{key}` as an argument.")
+    for key in maps:
+        if key not in needed:
+            takes = ", ".join(f"`{k}`" for k in needed) or "no maps"
+            raise TypeError(f"Preset {name!r} has no argument `{key}`; it takes {takes}.")
+    if "pysm_beta" in constants:
+        constants["beta_syn"] = from_pysm_beta(constants.pop("pysm_beta"))
+    return component(amplitude, **constants, **maps)

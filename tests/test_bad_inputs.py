@@ -584,7 +584,7 @@ def of_pixels(values: Any, unit: str | None = "1", name: str = "MAP") -> dict[st
 
 BETA = {"sky/dust/parameters": {"beta_dust": {"file": "beta.fits"}}}
 LEVELS = 1.5 + 0.1 * RNG.random(NPIX)
-RMS = {"bands/0/noise": {"map": {"file": "rms.fits"}}}
+RMS = {"bands/0/noise": {"rms": {"file": "rms.fits"}}}
 PIXEL = healpy.nside2resol(NSIDE, arcmin=True)
 BAND_44 = Bandpass.top_hat(44.1, 10.72)
 rms_of = lambda found: np.sqrt(found.bands["44"].noise[0, 0])  # noqa: E731
@@ -604,7 +604,7 @@ TOGETHER = [
     sky("beta_syn = -3.1", {"sky/synchrotron/parameters": {"beta_syn": -3.1}}, "beta_syn", "3.1"),
     sky("a parameter that is not there", {"sky/dust/parameters": {"beta": 1.5}}, "dust", "beta"),
     sky("no such file", {"bands/0/file": "none.fits"}, "none.fits"),
-    sky("noise of a map without a file", {"bands/0/noise": {"map": {"hdu": 1}}}, "noise.map.file"),
+    sky("noise of a map without a file", {"bands/0/noise": {"rms": {"hdu": 1}}}, "noise.rms.file"),
     sky("a rms of 160 K", {"bands/0/noise/rms": 160.0}, "44", "160", "K_CMB"),
     sky("a rms of 1e-9 K", {"bands/0/noise/rms": 1e-9}, "44", "1e-09", "K_CMB"),
     sky("a rms of 160 K that is meant", {"bands/0/noise": {"rms": 160.0, "plausible": True}}),

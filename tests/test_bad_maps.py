@@ -482,9 +482,9 @@ def test_masks_with_other_values_say_which(tmp_path):
     # WMAP's: the mask is N_OBS, and the column TEMPERATURE is zero.
     columns = {"TEMPERATURE": np.zeros(NPIX), "N_OBS": (I > 0).astype(float)}
     wmap = save(tmp_path / "w.fits", columns, None)
-    with refused("leaves no pixel; give `key` out of N_OBS"):
+    with refused("leaves no pixel; give `field` out of N_OBS"):
         read_mask(wmap)
-    np.testing.assert_array_equal(read_mask(wmap, key="N_OBS"), I > 0)
+    np.testing.assert_array_equal(read_mask(wmap, field="N_OBS"), I > 0)
     for array in (np.full(NPIX, "a"), np.ones(NPIX, complex), np.ones((4, NPIX))):
         np.savez(tmp_path / "m.npz", a=array)
         with refused(r"m.npz: a is no mask, but has type"):

@@ -514,7 +514,7 @@ def test_keys_of_instruments_and_of_the_embedded_sky(folder, monkeypatch):
     assert made(('"core"', '"core"\nsamples = 7')).bands[0].nu.size == 7
     assert made(("nside = 8", "nside = 8\nstokes = 'IQU'")).stokes == "IQU"
     assert len(made(('channels = ["45", "105"]', "")).names) == 15
-    made(("{ nside = 8 }", "{ nside = 16, seed = 2, model = { p0 = 0.1 } }"))
+    made(("{ nside = 8 }", "{ nside = 16, seed = 2, p0 = 0.1 }"))
     numbers = [(nside, seed, float(model.p0)) for nside, seed, model in asked]
     assert numbers == [(8, 0, 0.2)] * 4 + [(16, 2, 0.1)]
 
@@ -594,7 +594,7 @@ RMS = '{ rms = 1.0, unit = "uK_RJ" }'
         ([("fwhm = 800.0", 'fwhm = 800.0\nbeam = "beam.txt"')], "give the beam either as fwhm"),
         ([('"beam.txt"', '"cmb.dat"')], "cmb.dat"),
         ([("width = 6.0", "width = 70.0")], "bands.30.bandpass: Argument `nu` must be positive"),
-        ([(RMS, '{ map = { file = "coarse.fits" } }')],
+        ([(RMS, '{ rms = { file = "coarse.fits" } }')],
          "bands.143.noise.map: nside is 4, but that of the map is 8"),
         ([(RMS, '{ hits = { file = "hits.fits", fields = ["HITS"], sigma0 = 1.0 } }')],
          "bands.143.noise: 5 pixels have no noise; a simulation takes maps of the full sky"),
@@ -613,10 +613,10 @@ def test_refusals(folder, tmp_path, monkeypatch, capsys, changes, words):
     [
         (('"core"', '"cor"'), "Unknown instrument 'cor'; known are planck, wmap, core, litebird"),
         (('"105"', '"106"'), "core has no channel '106'; it has 45, 75, 105"),
-        (("{ nside = 8 }", "{ nside = 8, model = { height = 1.0 } }"),
-         "sky.embedded.model: 'height' is none of psi0, psi1"),
-        (("{ nside = 8 }", "{ nside = 8, model = { dust_height = -1.0 } }"),
-         "sky.embedded.model: Argument `dust_height` must be positive"),
+        (("{ nside = 8 }", "{ nside = 8, height = 1.0 }"),
+         "sky.embedded.height: is none of nside, seed, psi0, psi1"),
+        (("{ nside = 8 }", "{ nside = 8, dust_height = -1.0 }"),
+         "sky.embedded: Argument `dust_height` must be positive"),
         (("{ nside = 8 }", "{ nside = 4 }"),
          "sky.dust: its resolution, 1.32e+03 arcmin, 1.5 pixels of nside 4, is coarser"),
     ],

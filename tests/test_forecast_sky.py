@@ -192,7 +192,7 @@ file = "synchrotron.fits"
 nu_ref = 30.0
 fwhm = 120.0
 [regions]
-used = { file = "masks.npz", key = "half" }
+used = { file = "masks.npz", fields = ["half"] }
 [free]
 "dust.beta_dust" = { gaussian = [1.5, 0.5] }
 "synchrotron.beta_syn" = {}
@@ -289,8 +289,9 @@ def test_settings_that_come_along():
     default = load(DEFAULTS / "forecast.toml")
     assert [band.name for band in default.bands] == list(load_instrument("core").names)
     assert default.forecast.bands == ["45", "105", "315"]
-    assert default.forecast.free + list(default.free_in("forecast")) == [
-        "r", "dust.beta_dust", "dust.T_dust", "synchrotron.beta_syn", "synchrotron.curvature",
+    assert default.forecast.free == ["r", "amplitude", "slope", "correlation"]
+    assert list(default.free_in("forecast")) == [
+        "dust.beta_dust", "dust.T_dust", "synchrotron.beta_syn", "synchrotron.curvature",
     ]  # fmt: skip
 
 
@@ -306,13 +307,13 @@ def test_settings_that_come_along():
         ('fwhm = 60.0\nnoise = { level = 20.0 }',
          'fwhm = 60.0\nfile = "dust.fits"\nnoise = { estimate_above = 30.0 }',
          "bands.40.noise.estimate_above: is of a map"),
-        ("level = 20.0", 'map = { file = "dust.fits" }, unit = "K_CMB"',
+        ("level = 20.0", 'rms = { file = "dust.fits" }, unit = "K_CMB"',
          "argument `unit` is K_CMB, but column Q_STOKES is in uK_RJ"),
         ("level = 20.0", "level = 0.0", "bands.0.noise: must be greater than 0"),
         ('file = "dust.fits"\n', "", "fwhm, angles and noise are of a map, but"),
         ('file = "dust.fits"\nnu_ref = 353.0\nfwhm = 60.0', "", "sky.dust: file is missing"),
         ('file = "masks.npz", ', "", "regions.used.file: is missing"),
-        ('{ file = "masks.npz", key = "half" }', '"|b| > 89.9"',
+        ('{ file = "masks.npz", fields = ["half"] }', '"|b| > 89.9"',
          "forecast.region: leaves no pixel"),
         ("apodization = 6.0", "apodization = -1.0", "forecast.apodization: input should be"),
         ("lmax = 60", "lmax = 64", "lmax: 64 is beyond what templates of nside 32 resolve, 63"),
@@ -320,7 +321,7 @@ def test_settings_that_come_along():
         ("fit = [2, 60]", "fit = [2, 20]", "takes three bins, but 2 of those"),
         ("fit = [2, 60]", "fit = [60, 2]", "forecast: fit must increase, but is 60, 2"),
         ("lmax = 60", 'lmax = 60\nbands = ["44"]', "forecast.bands: '44' is none of 40, 100, 300"),
-        ("lmax = 60", 'lmax = 60\nfree = ["q"]', "forecast.free.0: input should be 'r' or"),
+        ("lmax = 60", 'lmax = 60\nfree = ["q"]', "forecast.free.0: input should be 'r', 'A_lens'"),
         ('"synchrotron.beta_syn"', '"q"', "free: Unknown parameter 'q'; known"),
         ("lmax = 60", 'lmax = 60\npriors = { "dust.T_dust" = 0.5 }',
          "forecast: The prior of 'dust.T_dust' has no effect"),

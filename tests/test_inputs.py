@@ -114,7 +114,7 @@ def test_rms_is_in_the_unit_of_the_map(folder, stokes):
     ],
 )
 def test_rms_maps(folder, fields, stokes, used):
-    spec = {"map": {"file": "rms.fits", "fields": fields}}
+    spec = {"rms": {"file": "rms.fits", "fields": fields}}
     covariance, known = noise_of(folder, spec, stokes)
     np.testing.assert_array_equal(known, others() if "Q_RMS" in fields else np.ones(NPIX, bool))
     table = pyfits.getdata(folder / "rms.fits")
@@ -171,13 +171,13 @@ def test_hits_in_another_file_with_a_unit_of_sigma0(folder):
 @pytest.mark.parametrize(
     ("spec", "stokes", "own", "words"),
     [
-        ({"map": {"file": "wide.fits"}}, "QU", None,
-         r"noise.map: nside is 2, but that of the map is 4\."),
-        ({"map": {"file": "rms.fits", "fields": ["Q_RMS", "U_RMS"]}}, "IQU", None,
-         r"noise.map.fields: one or 3 are needed, not 2\."),
-        ({"map": {"file": "rms.fits", "fields": ["MINUS"]}}, "QU", None,
+        ({"rms": {"file": "wide.fits"}}, "QU", None,
+         r"noise.rms: nside is 2, but that of the map is 4\."),
+        ({"rms": {"file": "rms.fits", "fields": ["Q_RMS", "U_RMS"]}}, "IQU", None,
+         r"noise.rms.fields: one or 3 are needed, not 2\."),
+        ({"rms": {"file": "rms.fits", "fields": ["MINUS"]}}, "QU", None,
          r"noise: Argument `rms` has 384 of 384 values that are negative"),
-        ({"map": {"file": "planck.fits", "fields": ["QQ_COV"]}}, "QU", None,
+        ({"rms": {"file": "planck.fits", "fields": ["QQ_COV"]}}, "QU", None,
          r"noise: Unit 'K_CMB\^2' does not convert to 'uK_RJ'"),
         ({"covariance": SIX[3:]}, "IQU", PLANCK, r"noise.covariance: I, Q and U need six columns"),
         ({"covariance": SIX[3:]}, "QU", None, r"noise.covariance: file is missing\."),
@@ -197,7 +197,7 @@ def test_mistakes_in_noise_are_one_sentence(folder, spec, stokes, own, words):
 
 def test_files_that_cannot_be_read_are_named_once(folder):
     with pytest.raises(InputError, match=r"^[^:]*none.fits: no such file, and none in [^:]*\.$"):
-        noise_of(folder, {"map": {"file": "none.fits"}})
+        noise_of(folder, {"rms": {"file": "none.fits"}})
     with pytest.raises(InputError, match=r"no column 'XX'"):
         noise_of(folder, {"covariance": ["XX", *SIX[4:]]}, own=PLANCK)
 
@@ -205,7 +205,7 @@ def test_files_that_cannot_be_read_are_named_once(folder):
 @pytest.mark.parametrize(
     ("noise", "words"),
     [
-        ("{ }", "one of level, rms, map, covariance, hits, weights, estimate_above, not none."),
+        ("{ }", "one of level, rms, covariance, hits, weights, estimate_above, not none."),
         ("{ rms = 1.0, covariance = ['a', 'b', 'c'] }", "not rms, covariance."),
         ("{ level = 1.0, rms = 2.0 }", "not level, rms."),
         ("{ white = 1.0 }", "noise.white: unknown key"),

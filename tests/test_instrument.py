@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsky.instrument import Channel, Instrument, instrument_names, load_instrument
+from jaxsky.instrument import Channel, Instrument, load_instrument
 
 CHANNEL = {"name": "30", "center": 30.0, "width": 6.0, "fwhm": 32.0, "noise": 200.0}
 
 
-@pytest.mark.parametrize("name", instrument_names())
+@pytest.mark.parametrize("name", ["planck", "wmap", "core", "litebird"])
 def test_presets_are_sound(name):
     instrument = load_instrument(name)
     centers = [float(channel.center) for channel in instrument]
@@ -62,7 +62,9 @@ def test_numbers_are_traced():
 
 
 def test_unknown_names():
-    with pytest.raises(KeyError, match="Unknown instrument 'spt'; known are planck, wmap, core"):
+    with pytest.raises(
+        KeyError, match="Unknown instrument 'spt'; known are planck, wmap, core, litebird"
+    ):
         load_instrument("spt")
     wmap = load_instrument("wmap")
     with pytest.raises(KeyError, match="has no channel '44'; it has K, Ka, Q, V, W"):

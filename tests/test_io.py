@@ -288,7 +288,7 @@ def test_masks(tmp_path, rng):
     nested = save(tmp_path / "n.fits", {"GAL": healpy.reorder(mask, r2n=True)}, ORDERING="NEST")
     np.testing.assert_array_equal(read_mask(nested, nside=NSIDE), mask)
     np.savez(tmp_path / "m.npz", A=mask, B=~mask)
-    np.testing.assert_array_equal(read_mask(tmp_path / "m.npz", key="B"), ~mask)
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.npz", field="B"), ~mask)
     np.savez(tmp_path / "one.npz", A=healpy.reorder(mask, r2n=True).astype(np.uint8))
     np.testing.assert_array_equal(read_mask(tmp_path / "one.npz", ordering="NESTED"), mask)
     # A disc about the celestial pole, which lies at b = 27 degrees.
@@ -308,15 +308,15 @@ def test_bad_masks(tmp_path):
     (tmp_path / "bad.npz").write_bytes(b"PK not really")
     for path, arguments, words in [
         (half, {}, r"h.fits: a mask has values 0 and 1, but 768 of 768 pixels have others"),
-        (two, {}, r"no column is named .* give `key` out of A, B"),
-        (two, {"key": "C"}, "no column 'C'; it has A, B"),
-        (two, {"key": "A"}, "no ORDERING; give `ordering`"),
-        (two, {"key": "B", "ordering": "RING"}, r"two.fits: the mask leaves no pixel"),
-        (two, {"key": "A", "ordering": "RING", "nside": 4}, "nside is 8, but 4 is expected"),
-        (tmp_path / "m.npz", {}, "give `key`, as it has several masks; it has A, B"),
-        (tmp_path / "m.npz", {"key": "C"}, "no mask 'C'; it has A, B"),
-        (tmp_path / "m.npz", {"key": "B"}, r"100 is not 12 nside\^2 pixels"),
-        (tmp_path / "m.npz", {"key": "A", "ordering": "up"}, "one of RING, NESTED, not 'up'"),
+        (two, {}, r"no column is named .* give `field` out of A, B"),
+        (two, {"field": "C"}, "no column 'C'; it has A, B"),
+        (two, {"field": "A"}, "no ORDERING; give `ordering`"),
+        (two, {"field": "B", "ordering": "RING"}, r"two.fits: the mask leaves no pixel"),
+        (two, {"field": "A", "ordering": "RING", "nside": 4}, "nside is 8, but 4 is expected"),
+        (tmp_path / "m.npz", {}, "give `field`, as it has several masks; it has A, B"),
+        (tmp_path / "m.npz", {"field": "C"}, "no mask 'C'; it has A, B"),
+        (tmp_path / "m.npz", {"field": "B"}, r"100 is not 12 nside\^2 pixels"),
+        (tmp_path / "m.npz", {"field": "A", "ordering": "up"}, "one of RING, NESTED, not 'up'"),
         (tmp_path / "bad.npz", {}, r"bad.npz: not a readable .npz archive"),
         (tmp_path / "none.npz", {}, r"none.npz: no such file"),
         (tmp_path / "none.fits", {}, r"none.fits: no such file"),
@@ -340,7 +340,7 @@ def test_degrade_mask(rng):
 
 def test_real_masks(data_dir):
     path = data_dir / "masks" / "GAL_PlanckMasks_64.npz"
-    assert read_mask(path, key="GAL040").mean() == pytest.approx(0.4, abs=0.01)
+    assert read_mask(path, field="GAL040").mean() == pytest.approx(0.4, abs=0.01)
     path = data_dir / "wmap7" / "wmap_temperature_analysis_mask_r9_7yr_v4_udgraded32.fits"
     assert 0.5 < read_mask(path, nside=32).mean() < 0.8
 

@@ -48,7 +48,7 @@ def test_spass_with_files_of_its_noise(tmp_path):
     }.items():
         unit = "K_RJ^2" if name == "squ" else "K_RJ"
         write(tmp_path / f"{name}.fits", table({"UNKNOWN1": values}, [unit], form="D", **keys))
-    entry = {"file": ["q.fits", "u.fits"], "noise": {"map": {"file": ["sq.fits", "su.fits"]}}}
+    entry = {"file": ["q.fits", "u.fits"], "noise": {"rms": {"file": ["sq.fits", "su.fits"]}}}
     with pytest.raises(InputError, match=r"q.fits.*UNKNOWN1.*give `stokes`"):
         band(tmp_path, entry)
     values, found = band(tmp_path, entry | {"stokes": "QU"}, "K_RJ")
@@ -72,12 +72,12 @@ def test_noise_in_celestial_coordinates(tmp_path):
     columns = {"Q_RMS": 1 + Q**2, "U_RMS": 1 + U**2}
     write(tmp_path / "rms.fits", table(columns, ["uK_RJ"] * 2, COORDSYS="C"))
     write(tmp_path / "m.fits", table({"Q": Q, "U": U}, ["uK_RJ"] * 2))
-    entry = {"file": "m.fits", "noise": {"map": {"file": "rms.fits", "fields": ["Q_RMS", "U_RMS"]}}}
+    entry = {"file": "m.fits", "noise": {"rms": {"file": "rms.fits", "fields": ["Q_RMS", "U_RMS"]}}}
     with pytest.raises(InputError, match=r"rms.fits.*Q_RMS cannot be turned"):
         band(tmp_path, entry)
     columns = {"Q_RMS": np.full(NPIX, 2.0)}
     write(tmp_path / "rms.fits", table(columns, ["uK_RJ"], COORDSYS="C"))
-    entry["noise"]["map"]["fields"] = ["Q_RMS"]
+    entry["noise"]["rms"]["fields"] = ["Q_RMS"]
     np.testing.assert_allclose(band(tmp_path, entry)[1].noise[1, 1], 4.0, rtol=1e-6)
 
 
@@ -344,9 +344,9 @@ def test_maps_of_parameters_in_separations(folder):
             with_(**entry)
     found = with_("T_dust", fields=["HOLES"], unit="K")
     assert not found.used[:40].any()
-    regions = {"file": {"file": "p.fits", "fields": ["HOLES"], "unit": "K"}}
+    regions = {"file": "p.fits", "fields": ["HOLES"], "unit": "K"}
     free = {"dust.beta_dust": {"start": 1.5, "regions": regions}}
-    words = r"free.dust.beta_dust.regions.file: 40 of 768 used pixels have no value"
+    words = r"free.dust.beta_dust.regions: 40 of 768 used pixels have no value"
     with pytest.raises(SettingsError, match=words):
         separation_data(separation(folder, free=free))
     dust = {"law": "dust", "nu_ref": 353.0, "parameters": {"nu_ref": 545.0}}

@@ -11,7 +11,7 @@ from pysm3.models import dust, power_law
 
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe_band
 from jaxsky.io import read_maps
-from jaxsky.presets import baseline, from_pysm_beta, preset, preset_names
+from jaxsky.templates import from_pysm_beta, preset
 
 NPIX = 48
 RNG = np.random.default_rng(0)
@@ -109,10 +109,10 @@ def test_the_sign_of_beta():
 
 
 def test_baseline():
-    sky = baseline(MAPS[1:], 2 * MAPS[1:])
-    assert isinstance(sky["dust"], Dust)
-    assert isinstance(sky["synchrotron"], Synchrotron)
-    dust, synchrotron = sky["dust"], sky["synchrotron"]
+    dust = preset("baseline_dust", MAPS[1:])
+    synchrotron = preset("baseline_synchrotron", 2 * MAPS[1:])
+    assert isinstance(dust, Dust)
+    assert isinstance(synchrotron, Synchrotron)
     assert [float(x) for x in (dust.beta_dust, dust.T_dust, dust.nu_ref)] == [1.53, 21.0, 353.0]
     assert [float(x) for x in (synchrotron.beta_syn, synchrotron.nu_ref)] == [3.1, 30.0]
     assert float(synchrotron.curvature) == 0
@@ -120,9 +120,12 @@ def test_baseline():
 
 
 def test_names_and_maps():
-    assert preset_names() == ["baseline_dust", "baseline_synchrotron", "d0", "d1", "s0", "s1", "s3"]
     for arguments, error, words in [
-        ({"name": "d9"}, KeyError, "Unknown preset 'd9'; known are baseline_dust"),
+        (
+            {"name": "d9"},
+            KeyError,
+            "known are baseline_dust, baseline_synchrotron, d0, d1, s0, s1, s3",
+        ),
         ({"name": "d1", "beta_dust": 1.5}, TypeError, "Preset 'd1' needs the map `T_dust`"),
         ({"name": "s3"}, TypeError, "Preset 's3' needs the map `beta_syn`"),
         ({"name": "d0", "beta_dust": 1.5}, TypeError, "has no argument `beta_dust`; .* no maps"),

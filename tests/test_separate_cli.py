@@ -79,7 +79,7 @@ def folder(tmp_path_factory):
     return folder
 
 
-def settings(folder, name, regions="{ file = { file = 'labels.fits' } }", noise=None, **replace):
+def settings(folder, name, regions="{ file = 'labels.fits' }", noise=None, **replace):
     noise = noise or "{ covariance = ['QQ_COV', 'QU_COV', 'UU_COV'] }"
     bands = "".join(BAND.format(name=band, fwhm=fwhm) for band, fwhm in BANDS.items())
     text = (SETTINGS + bands).replace("REGIONS", regions).replace("NOISE", noise)
@@ -208,7 +208,7 @@ def test_noise_that_varies(folder, tmp_path, monkeypatch):
     path = settings(
         folder,
         "varying",
-        noise="{ map = { file = 'rms.fits', fields = ['RMS'] } }",
+        noise="{ rms = { file = 'rms.fits', fields = ['RMS'] } }",
         **{'sampler = "emcee"': 'sampler = "none"'},
     )
     out = tmp_path / "out"

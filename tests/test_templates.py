@@ -9,18 +9,17 @@ import pytest
 from astropy.io import fits as pyfits
 from jax.test_util import check_grads
 
+from fits import superpixels
 from jaxsky import AME, Dust, Synchrotron
 from jaxsky.harmonics import analysis, beam_ratio, gaussian_beam, power_spectrum
 from jaxsky.io import read_maps, write_maps
 from jaxsky.templates import (
     HIGH,
     LOW,
-    coarse_pixels,
     correlation,
     dust_index,
     polarization_template,
     steepening,
-    synchrotron_index,
 )
 
 
@@ -204,16 +203,6 @@ def test_steepening_gradients():
     np.testing.assert_allclose(jax.jit(steepening)(nu, T, *ends), steepening(nu, T), rtol=1e-12)
 
 
-def test_synchrotron_index_is_the_map_and_the_steepening():
-    beta = np.array([2.6, 2.8])
-    T = np.exp(-2.9 * np.log(NU) - 0.03 * np.log(NU) ** 2)
-    for interval in ({}, {"low": (0.408, 1.42)}, {"high": (23.0, 33.0)}):
-        shifted = synchrotron_index(beta, NU, T, **interval)
-        np.testing.assert_allclose(shifted, beta + float(steepening(NU, T, **interval)))
-    index = jax.jit(lambda beta, log_T: synchrotron_index(beta, NU, jnp.exp(log_T)))
-    check_grads(index, (beta, np.log(T)), order=1, rtol=1e-5)
-
-
 def brute_force(x, y, blocks):
     """Correlation with one block left out after another."""
     names = np.unique(blocks)
@@ -228,7 +217,7 @@ def test_correlation_against_brute_force():
     x = 1e4 + rng.normal(size=768)
     y = 0.5 * x + rng.normal(size=768)
     strange = rng.choice([-3, 5, 100, 7], size=768)
-    for blocks in (coarse_pixels(8, 2), strange):
+    for blocks in (superpixels(8, 2), strange):
         expected = brute_force(x, y, blocks)
         np.testing.assert_allclose(correlation(x, y, blocks), expected, rtol=1e-8)
     np.testing.assert_allclose(correlation(x, y), brute_force(x, y, np.arange(768)), rtol=1e-8)
@@ -254,13 +243,13 @@ def test_error_of_the_correlation_is_that_of_gaussian_draws():
     assert error == pytest.approx((1 - rho**2) / np.sqrt(n), rel=0.03)
     assert abs(r - rho) < 4 * error
     # Independent pixels need no blocks: 768 of them give the same, known to 1/sqrt(2 * 768).
-    assert float(correlation(x, y, coarse_pixels(64, 8)).error) == pytest.approx(error, rel=0.1)
+    assert float(correlation(x, y, superpixels(64, 8)).error) == pytest.approx(error, rel=0.1)
 
 
 def test_blocks_find_the_error_of_a_smooth_sky():
     """Unrelated skies correlate by chance, by [sum (2l+1) C^2]^(1/2) / sum (2l+1) C."""
     nside, lmax, fwhm = 32, 64, 300.0
-    blocks = coarse_pixels(nside, 2)
+    blocks = superpixels(nside, 2)
     flat = (1 + healpy.Alm.getlm(lmax)[0]) ** 1.2
     pixelwise, by_blocks = [], []
     for seed in range(8):
@@ -279,14 +268,8 @@ def test_blocks_find_the_error_of_a_smooth_sky():
 
 def test_correlation_gradients():
     x, y = np.random.default_rng(1).normal(size=(2, 48))
-    blocks = coarse_pixels(2, 1)
+    blocks = superpixels(2, 1)
     check_grads(jax.jit(lambda x, y: correlation(x, y, blocks)), (x, y), order=1, rtol=1e-5)
-
-
-def test_coarse_pixels_against_directions():
-    directions = healpy.pix2ang(16, np.arange(12 * 16**2))
-    np.testing.assert_array_equal(coarse_pixels(16, 4), healpy.ang2pix(4, *directions))
-    np.testing.assert_array_equal(coarse_pixels(16, 16), np.arange(12 * 16**2))
 
 
 def test_ame_and_dust_of_the_real_sky(data_dir):
@@ -299,7 +282,7 @@ def test_ame_and_dust_of_the_real_sky(data_dir):
     made = AME.from_dust_angles(ame[0], dust[1:], 0.02).template
     np.testing.assert_allclose(made, ame[1:], atol=1e-3 * ame[1:].std())
     smooth = [polarization_template(maps, 0.0, 60.0, 64) for maps in (dust[1:], made)]
-    blocks = coarse_pixels(64, 8)
+    blocks = superpixels(64, 8)
     for x, y in zip(*smooth, strict=True):
         r, error = correlation(x, y)
         # Other maps of the same emission, from another separation and with other small scales.
@@ -375,7 +358,7 @@ def test_synchrotron_index_from_a_map_of_giardino(tmp_path):
     beta = 2.75 + 0.1 * np.sin(theta) * np.cos(phi)
     path = save(tmp_path / "synchrotron_index.fits", {"BETA": beta}, None)
     T = np.where(NU < 5, (NU / 5) ** -2.7, (NU / 5) ** -2.83)
-    index = synchrotron_index(read_maps(path, unit="").maps[0], NU, T)
+    index = read_maps(path, unit="").maps[0] + steepening(NU, T)
     # Single precision in the file.
     np.testing.assert_allclose(index, beta + 0.13, rtol=1e-6)
     assert Synchrotron(np.ones((2, 768)), index).beta_syn.shape == (768,)
@@ -420,7 +403,7 @@ def test_refused_resolutions():
         with pytest.raises(ValueError, match="`nside` must be a power of 2, but is 12"):
             call()
     with pytest.raises(ValueError, match="`nside_coarse` must be a power of 2 up to 8, but is 16"):
-        coarse_pixels(8, 16)
+        superpixels(8, 16)
 
 
 @pytest.mark.parametrize("shape", [(192,), (1, 192), (4, 192), (2, 100), (2, 108), (2, 12), ()])
@@ -476,11 +459,6 @@ def test_holes_wider_than_the_beam_are_refused():
 def test_refused_spectra(arguments, message):
     with pytest.raises(ValueError, match=message):
         steepening(*arguments)
-
-
-def test_refused_index_of_synchrotron():
-    with pytest.raises(ValueError, match=r"`beta` must be positive, .* value is -2\.9"):
-        synchrotron_index(np.array([-2.7, -2.9]), NU, T)
 
 
 def test_refused_correlations():

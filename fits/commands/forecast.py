@@ -43,6 +43,8 @@ from jaxsky.sky import unknown_parameter
 #: What is in the folder of the results.
 RESULTS = ("forecast.json", "log.json", "bb.png", "fisher.png")
 FIELDS = ("EE", "BB")
+#: Of the foregrounds' spectra, what may be free.
+KINDS = ("amplitude", "slope", "correlation")
 #: Spectra are taken in so many bands, if the settings name none.
 SHOWN = 5
 
@@ -224,7 +226,8 @@ def _errors(
 ) -> tuple[Errors, float | None]:
     """Errors of all that is free, and that of r without foregrounds."""
     spec = settings.forecast
-    nuisance = foreground_names(model.sky, model.fields, spec.foregrounds)
+    kinds = [kind for kind in spec.free if kind in KINDS]
+    nuisance = foreground_names(model.sky, model.fields, kinds)
     spectral = settings.free_in("forecast")
     widths = {n: one.gaussian[1] for n, one in spectral.items() if one.gaussian is not None}
     for name in spec.priors:
@@ -235,7 +238,8 @@ def _errors(
             if name not in parameters:
                 raise unknown_parameter(name, parameters)
     with at_key("forecast"):
-        free = list(dict.fromkeys((*spec.free, *spectral, *nuisance)))
+        own = [name for name in spec.free if name not in KINDS]
+        free = list(dict.fromkeys((*own, *spectral, *nuisance)))
         errors = fisher_errors(model, parameters, free, widths | spec.priors)
     if "r" not in spec.free:
         return errors, None

@@ -27,7 +27,7 @@ from fits.plots import (
     with_powers,
 )
 from fits.pseudo_cl import PIVOT, sky_fraction
-from fits.regions import region_words
+from fits.regions import region_words, superpixels
 from fits.writing import with_error
 from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import analysis, expand, gaussian_beam, lmax_of, power_spectrum, synthesis
@@ -43,11 +43,10 @@ from jaxsky.observation import (
     harmonic_sources,
     plan_terms,
 )
-from jaxsky.presets import preset
 from jaxsky.settings import BandTable, Experiment
 from jaxsky.simulation import observe_bands
 from jaxsky.small_scales import DUST, SYNCHROTRON
-from jaxsky.templates import coarse_pixels, correlation, polarization_template, steepening
+from jaxsky.templates import correlation, polarization_template, preset, steepening
 
 NAMES = ("synchrotron", "dust")
 #: Blocks of the honest jackknife: pixels of 15 degrees.
@@ -122,7 +121,7 @@ def figure_ame(sources: Sources, picture: Path) -> Item:
         each if nside == own else polarization_template(each, 0.0, 0.0, nside)
         for each in (ame.dust, ame.maps)
     ]
-    blocks, numbers = coarse_pixels(nside, NSIDE_BLOCKS), []
+    blocks, numbers = superpixels(nside, NSIDE_BLOCKS), []
     for stokes, x, y in zip("QU", *maps, strict=True):
         r, error = correlation(x, y)
         wide = correlation(x, y, blocks).error

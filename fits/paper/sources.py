@@ -32,17 +32,17 @@ from jaxsky.inputs import (
 from jaxsky.io import InputError
 from jaxsky.io.text import read_text
 from jaxsky.keys import realisation_key, stream
-from jaxsky.presets import from_pysm_beta
 from jaxsky.settings import (
+    BeamedMap,
     ComponentTable,
     Experiment,
-    IndexFile,
+    RadioIndexMap,
     SettingsError,
     at_key,
     find_file,
 )
 from jaxsky.small_scales import Continued, SmallScales, continue_templates
-from jaxsky.templates import dust_index, polarization_template, steepening
+from jaxsky.templates import dust_index, from_pysm_beta, polarization_template, steepening
 
 #: Beams of the paper's templates [arcmin].
 PAPER_FWHM = {"dust": 10.0, "synchrotron": 60.0}
@@ -294,9 +294,8 @@ class Sources:
                 )
             if missing := int(np.sum(~np.asarray(found.mask))):
                 raise SettingsError(f"paper.ame: {missing} pixels have no value.")
-            factor = uK_RJ_per(found.unit, float(spec.nu_ref or NU_AME), "paper.ame")
-            intensity = jnp.asarray(found.maps[0] * factor)
-            nu_ref, own = float(spec.nu_ref or NU_AME), spec.fwhm
+            nu_ref, own = spec.nu_ref, spec.fwhm or 0.0
+            intensity = jnp.asarray(found.maps[0] * uK_RJ_per(found.unit, nu_ref, "paper.ame"))
             origin = f"the intensity of AME is {spec.label}"
             origin += f", from {nu_ref:g} to 23 GHz by the paper's law" * (nu_ref != NU_AME)
         else:
@@ -322,7 +321,7 @@ class Sources:
         """The map of beta_dust or beta_syn: of a file, of the template, or drawn."""
         layer = self.template("dust" if name == "beta_dust" else "synchrotron")
         held = getattr(layer.component, name)
-        spec: IndexFile | None = getattr(self.settings.paper, name)
+        spec: BeamedMap | None = getattr(self.settings.paper, name)
         if spec is not None:
             return _read_index(self.folder, name, spec)
         if not isinstance(held, tuple) and held.ndim == 1:
@@ -344,18 +343,19 @@ def _drawn_index(key: Array, name: str, nside: int) -> Index:
     return Index(values, fwhm, None, origin)
 
 
-def _read_index(folder: Path, name: str, spec: IndexFile) -> Index:
+def _read_index(folder: Path, name: str, spec: BeamedMap) -> Index:
     """The index of a file, smoothed; that of the synchrotron made steeper, if so wished."""
     pure = spec if spec.unit is not None else spec.model_copy(update={"unit": ""})
     where, found = f"paper.{name}", read(folder, pure, stokes="", zeros_are_data=True)
-    origin, fwhm, by = f"{SYMBOLS[name]} is that of {spec.label}", max(FWHM[name], spec.fwhm), 0.0
+    own, by = spec.fwhm or 0.0, 0.0
+    origin, fwhm = f"{SYMBOLS[name]} is that of {spec.label}", max(FWHM[name], own)
     if name == "beta_syn" and bool(np.all(found.maps[:, found.mask] < 0)):
         found = dataclasses.replace(found, maps=np.asarray(from_pysm_beta(found.maps)))
         origin = f"{origin} with the other sign"
     stated = spec.missing is not None
     values, used = parameter_map(found, name, found.nside, where, stated=stated)
-    smooth = dust_index(values, spec.fwhm, fwhm, found.nside, None if used.all() else used)
-    if name == "beta_syn":
+    smooth = dust_index(values, own, fwhm, found.nside, None if used.all() else used)
+    if isinstance(spec, RadioIndexMap):
         given = spec.steepening
         by = _of_spectrum(folder, given) if isinstance(given, str) else given
         origin += f", made steeper by {by:.2f}" if by else ", not made steeper"

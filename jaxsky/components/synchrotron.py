@@ -25,7 +25,7 @@ class Synchrotron(Component, law="synchrotron"):
         within=(0.0, 10.0),
         symbol=r"\beta_{\rm syn}",
         zero=False,
-        hint="T ~ nu^-beta_syn, so jaxsky.presets.from_pysm_beta makes 3.1 of an index of -3.1",
+        hint="T ~ nu^-beta_syn, so jaxsky.templates.from_pysm_beta makes 3.1 of an index of -3.1",
     )
     curvature: Parameter = parameter(0.0, symbol="C")
     nu_piv: Parameter = parameter(23.0, positive=True, symbol=r"\nu_{\rm piv}", unit="GHz")

@@ -12,16 +12,20 @@ from jaxsky.io.files import InputError, check_file
 from jaxsky.io.tables import HealpixTable, equals, from_nested, open_fits, spelled
 
 
-def _read_npz(path: Path, key: str | None, ordering: str | None) -> np.ndarray:
+def _read_npz(path: Path, field: str | int | None, ordering: str | None) -> np.ndarray:
     """The values of a mask in an archive, in RING order."""
     order = spelled("ordering", ordering or "RING")
     check_file(path)
     try:
         with np.load(path) as archive:
             known = list(archive)
-            name = known[0] if key is None and len(known) == 1 else key
+            name = known[0] if field is None and len(known) == 1 else field
             if name not in known:
-                what = "give `key`, as it has several masks" if key is None else f"no mask {key!r}"
+                what = (
+                    "give `field`, as it has several masks"
+                    if field is None
+                    else f"no mask {field!r}"
+                )
                 raise InputError(f"{path}: {what}; it has {', '.join(known)}.")
             found = np.squeeze(archive[name])
     except InputError:
@@ -49,7 +53,7 @@ def _in_galactic(mask: np.ndarray, coordinates: str) -> np.ndarray:
 def read_mask(
     path: str | Path,
     *,
-    key: str | None = None,
+    field: str | int | None = None,
     hdu: int | str = 1,
     nside: int | None = None,
     ordering: str | None = None,
@@ -62,7 +66,7 @@ def read_mask(
     Parameters
     ----------
     path : FITS file or .npz archive
-    key : column of the table or array of the archive, for example "GAL040"; may be left out
+    field : column of the table or array of the archive, for example "GAL040"; may be left out
         where there is only one, or an I column (the WMAP masks)
     hdu : number or name of the FITS table
     nside : resolution that is expected
@@ -83,11 +87,11 @@ def read_mask(
     path = Path(path)
     frame, others = "G", []
     if path.suffix == ".npz":
-        values = _read_npz(path, key, ordering)
+        values = _read_npz(path, field, ordering)
     else:
         with open_fits(path) as hdus:
             table = HealpixTable(path, hdus, hdu)
-            column = default_fields(table, "key")[0] if key is None else table.index(key)
+            column = default_fields(table, "field")[0] if field is None else table.index(field)
             order = table.state("ordering", ordering)
             frame = table.state("coordinates", None, "G")
             values = table.values(column, order, logical=True)
@@ -104,7 +108,7 @@ def read_mask(
         )
     mask = values == 1
     if not mask.any():
-        hint = f"; give `key` out of {', '.join(others)}" if key is None and others else ""
+        hint = f"; give `field` out of {', '.join(others)}" if field is None and others else ""
         raise InputError(f"{path}: the mask leaves no pixel{hint}.")
     return mask if frame == "G" else _in_galactic(mask, frame)
 

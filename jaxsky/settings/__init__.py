@@ -1,13 +1,12 @@
 """The experiment file: its tables, a sentence for each mistake, and the files that it names."""
 
-from jaxsky.settings.experiment import CommonTable, Experiment, IndexFile, parse_region
+from jaxsky.settings.experiment import CommonTable, Experiment, RadioIndexMap, parse_region
 from jaxsky.settings.files import (
     BandpassSpec,
     BeamedMap,
     ColumnKeys,
     MapFile,
     MapKeys,
-    MaskFile,
     NoiseColumns,
     NoiseTable,
 )

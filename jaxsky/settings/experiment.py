@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
 from jaxsky.instrument import band_tables
-from jaxsky.settings.files import BeamedMap, MaskFile
+from jaxsky.settings.files import BeamedMap, MapFile
 from jaxsky.settings.tables import (
     BandTable,
     CMBTable,
@@ -42,7 +42,7 @@ from jaxsky.settings.types import (
 from jaxsky.small_scales import DUST, SYNCHROTRON
 
 #: Regions that need not be named.
-REGIONS: dict[str, str | MaskFile] = {"strip": "|b| <= 20", "outside": "|b| > 20", "full": "full"}
+REGIONS: dict[str, str | MapFile] = {"strip": "|b| <= 20", "outside": "|b| > 20", "full": "full"}
 
 
 def parse_region(text: str) -> tuple[str, float] | None:
@@ -69,6 +69,16 @@ def _latitudes(value: str) -> str:
     return value
 
 
+def _mask(value: MapFile) -> MapFile:
+    if others := value.changed(set(MapFile.model_fields) - {"file", "hdu", "fields", "ordering"}):
+        raise MistakeAt(others[0], "is not of a mask")
+    if len(value.files) != 1 or len(value.fields or [0]) != 1 or isinstance(value.hdu, list):
+        raise ValueError("a mask is one of the fields of one file")
+    return value
+
+
+#: A mask, 1 where a pixel is used: a column of a FITS table, or one entry of an .npz file.
+MaskFile = Annotated[MapFile, AfterValidator(_mask)]
 Region = Annotated[str, AfterValidator(_latitudes)] | MaskFile
 
 
@@ -110,35 +120,43 @@ class FitTable(SettingsTable):
     nsteps: int = Field(3000, ge=1)
 
 
-class CompareTable(SettingsTable):
+class BinsTable(SettingsTable):
+    """Spectra in bins of some multipoles: of compare, separate and forecast."""
+
+    width: int = Field(10, ge=1)
+
+
+class SimulationsTable(BinsTable):
+    """Spectra with errors from simulations: of compare and separate."""
+
+    nsims: int = Field(100, ge=20)
+
+
+class CompareTable(SimulationsTable):
     """How maps are compared with the model."""
 
     regions: Several[Word] = Field(["strip", "outside", "full"])
-    nsims: int = Field(100, ge=30)
     lmax: int = Field(100, ge=10)
-    width: int = Field(10, ge=1)
     panel_nside: Nside = 32
     patches: str | None = None
     patches_nside: Nside = 256
 
 
-class SeparateTable(SettingsTable):
+class SeparateTable(SimulationsTable):
     """How components are separated, and r taken from the cleaned BB."""
 
     domain: Literal["pixel", "harmonic"] = "pixel"
     region: Word = "full"
     unit: Literal["uK_CMB", "uK_RJ"] = "uK_CMB"
-    nsims: int = Field(100, ge=20)
     sampler: Literal["nuts", "emcee", "none"] = "nuts"
     nsteps: int | None = Field(None, ge=100)
     lmin: Multipole = 2
     lmax: Multipole | None = None
-    width: int = Field(10, ge=1)
     apodization: float = Field(15.0, ge=0, lt=90)
     purify: bool = True
 
 
-class ForecastTable(SettingsTable):
+class ForecastTable(BinsTable):
     """Spectra of the foregrounds outside of a mask, and the Fisher matrix."""
 
     region: Word = "outside"
@@ -146,12 +164,10 @@ class ForecastTable(SettingsTable):
     bands: Annotated[Several[Word], Field(max_length=7)] | None = None
     lmin: Multipole = 2
     lmax: Multipole = 250
-    width: int = Field(10, ge=1)
     fit: Pair[Multipole] = (20, 200)
     show_r: Several[Positive] = Field([0.1, 0.01, 0.001], max_length=4)
-    free: Distinct[Literal["r", "A_lens"]] = Field(["r"])
-    foregrounds: Distinct[Literal["amplitude", "slope", "correlation"]] = Field(
-        ["amplitude", "slope", "correlation"]
+    free: Distinct[Literal["r", "A_lens", "amplitude", "slope", "correlation"]] = Field(
+        ["r", "amplitude", "slope", "correlation"]
     )
     priors: dict[str, Positive] = Field(default={})
     spectra: Several[Literal["EE", "BB"]] = Field(["BB"])
@@ -167,14 +183,19 @@ class ForecastTable(SettingsTable):
         return self
 
 
-class IndexFile(BeamedMap):
-    """A map of spectral indices, beta_syn in either sign; or an intensity, at `nu_ref` [GHz].
+class IntensityMap(BeamedMap):
+    """An intensity at `nu_ref` [GHz]."""
 
-    A map of beta_syn at radio frequencies is made steeper: by a number, the paper's is 0.13, or as
-    a spectrum says, a file with a table of frequency [GHz] and antenna temperature.
+    nu_ref: Positive
+
+
+class RadioIndexMap(BeamedMap):
+    """A map of beta_syn, which is made steeper if it is one at radio frequencies.
+
+    By a number, the paper's is 0.13, or as a spectrum says, a file with a table of frequency [GHz]
+    and antenna temperature.
     """
 
-    nu_ref: Positive | None = None
     steepening: float | FileName = 0.0
 
 
@@ -185,19 +206,12 @@ class PaperTable(SettingsTable):
     center: Pair[float] = (180.0, 30.0)
     dust: SmallScalesTable = SmallScalesTable(EE=DUST.EE, BB=DUST.BB)
     synchrotron: SmallScalesTable = SmallScalesTable(EE=SYNCHROTRON.EE, BB=SYNCHROTRON.BB)
-    ame: IndexFile | None = None
-    beta_dust: IndexFile | None = None
-    beta_syn: IndexFile | None = None
+    ame: IntensityMap | None = None
+    beta_dust: BeamedMap | None = None
+    beta_syn: RadioIndexMap | None = None
 
     @model_validator(mode="after")
     def _plausible(self) -> "PaperTable":
-        if self.ame is not None and self.ame.nu_ref is None:
-            raise MistakeAt("ame.nu_ref", "is missing")
-        keys = {"ame": "steepening", "beta_dust": "nu_ref steepening", "beta_syn": "nu_ref"}
-        for key, others in keys.items():
-            one: IndexFile | None = getattr(self, key)
-            if one and (wrong := one.changed(others.split())):
-                raise MistakeAt(f"{key}.{wrong[0]}", "unknown key")
         if self.ame is not None:
             check_reference("ame", self.ame.nu_ref, {})
         return self

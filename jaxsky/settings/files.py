@@ -6,7 +6,6 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from jaxsky.settings.types import (
-    FileName,
     Files,
     Hdus,
     MistakeAt,
@@ -19,20 +18,12 @@ from jaxsky.settings.types import (
 from jaxsky.units import UNITS
 
 
-class ColumnKeys(SettingsTable):
-    """Columns of a FITS table, or of several with a column each.
-
-    What a header says need not be given; see `jaxsky.io.read_maps`.
-    """
+class TableKeys(SettingsTable):
+    """Columns of a table in a file, and their unit."""
 
     file: Files | None = None
-    hdu: Hdus | None = None
     fields: list[str | int] | None = None
     unit: str | None = None
-    ordering: Literal["RING", "NESTED"] | None = None
-    coordinates: Literal["G", "C", "E"] | None = None
-    polarization: Literal["COSMO", "IAU"] | None = None
-    missing: float | list[float] | None = None
 
     @property
     def files(self) -> list[str]:
@@ -43,6 +34,19 @@ class ColumnKeys(SettingsTable):
     def label(self) -> str:
         """Names of the files without folders, to be shown."""
         return ", ".join(Path(file).name for file in self.files)
+
+
+class ColumnKeys(TableKeys):
+    """Columns of HEALPix maps in a FITS table, or in several with a column each.
+
+    What a header says need not be given; see `jaxsky.io.read_maps`.
+    """
+
+    hdu: Hdus | None = None
+    ordering: Literal["RING", "NESTED"] | None = None
+    coordinates: Literal["G", "C", "E"] | None = None
+    polarization: Literal["COSMO", "IAU"] | None = None
+    missing: float | list[float] | None = None
 
 
 class MapKeys(ColumnKeys):
@@ -63,29 +67,22 @@ class MapFile(MapKeys):
     file: Files
 
 
-class BeamedMap(MapFile):
+class BeamedKeys(MapKeys):
+    """A map where there may be none, and the FWHM of its Gaussian beam [arcmin]."""
+
+    fwhm: float | None = Field(None, ge=0)
+
+
+class BeamedMap(BeamedKeys, MapFile):
     """A map and the FWHM of its Gaussian beam [arcmin]."""
 
-    fwhm: float = Field(0.0, ge=0)
 
-
-class MaskFile(SettingsTable):
-    """A mask, 1 where a pixel is used: FITS, or one entry of an .npz file."""
-
-    file: FileName
-    key: str | None = None
-    ordering: Literal["RING", "NESTED"] | None = None
-
-
-class BandpassSpec(SettingsTable):
+class BandpassSpec(TableKeys):
     """A bandpass: a table in a file, or a top-hat."""
 
-    file: FileName | None = None
     band: str | None = None
     detectors: Several[Word] | None = None
     convention: Literal["RJ", "power", "CMB"] | None = None
-    unit: str | None = None
-    fields: list[str | int] | None = None
     center: Positive | None = None
     width: float | None = Field(None, ge=0)
 
@@ -93,6 +90,8 @@ class BandpassSpec(SettingsTable):
     def _one_kind(self) -> "BandpassSpec":
         if (self.file is None) == (self.center is None):
             raise ValueError("give a bandpass either as file or as center and width")
+        if len(self.files) > 1:
+            raise MistakeAt("file", f"a bandpass is in one file, not in {self.label}")
         of_file = self.changed(("band", "detectors", "unit", "fields"))
         if self.file is None and of_file:
             raise ValueError(f"{', '.join(of_file)}: of the file of a bandpass, not of center")
@@ -124,14 +123,14 @@ class NoiseTable(SettingsTable):
     A level is white noise [unit arcmin]; that of a template is seen through its beam. The others
     are of a pixel of the map as it is in the file: rms, a number or a map; a covariance; hits, the
     number of observations; weights, the inverse of Q and U's covariance in units of sigma0, as in
-    the second table of WMAP's maps. `unit` is that of level, rms, map, covariance (squared) and
+    the second table of WMAP's maps. `unit` is that of level, rms, covariance (squared) and
     sigma0, by default that of the map, or uK_CMB where there is no map. `plausible` says that noise
     is meant which is far from the rms of its map; `correlated`, that noise estimated from a map has
     a spectrum.
     """
 
     KINDS: ClassVar[tuple[str, ...]] = (
-        "level", "rms", "map", "covariance", "hits", "weights", "estimate_above"
+        "level", "rms", "covariance", "hits", "weights", "estimate_above"
     )  # fmt: skip
     #: Columns that have to be named.
     COLUMNS: ClassVar[dict[str, str]] = {
@@ -141,8 +140,7 @@ class NoiseTable(SettingsTable):
     }
 
     level: float | None = Field(None, ge=0)
-    rms: float | None = Field(None, ge=0)
-    map: NoiseColumns | None = None
+    rms: Annotated[float, Field(ge=0)] | NoiseColumns | None = None
     covariance: NoiseColumns | None = None
     hits: NoiseColumns | None = None
     weights: NoiseColumns | None = None
@@ -163,19 +161,19 @@ class NoiseTable(SettingsTable):
         self.one_of("noise", self.KINDS)
         if self.correlated and self.estimate_above is None:
             raise ValueError("correlated goes with estimate_above only")
-        for kind in ("map", *self.COLUMNS):
-            if (spec := getattr(self, kind)) is not None:
+        for kind in ("rms", *self.COLUMNS):
+            if isinstance(spec := getattr(self, kind), NoiseColumns):
                 self._check_columns(kind, spec)
         return self
 
     def _check_columns(self, kind: str, spec: NoiseColumns) -> None:
         numbered = kind in ("hits", "weights")
         if numbered != bool(spec.sigma0):
-            words = "is missing" if numbered else f"is of hits and weights, not of a {kind}"
+            words = "is missing" if numbered else f"is of hits and weights, not of {kind}"
             raise MistakeAt(f"{kind}.sigma0", words)
-        if kind == "map":
+        if kind == "rms":
             if spec.file is None and not spec.fields:
-                raise MistakeAt("map.file", "is missing, or fields of the map's own file")
+                raise MistakeAt("rms.file", "is missing, or fields of the map's own file")
             return
         choices = self.COLUMNS[kind].split(" or ")
         if len(spec.fields or []) not in [len(choice.split(", ")) for choice in choices]:

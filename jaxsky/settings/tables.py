@@ -8,7 +8,8 @@ from typing import Any, Literal
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from jaxsky.components import AME, component_class
-from jaxsky.settings.files import BandpassSpec, BeamedMap, MapFile, MapKeys, NoiseTable
+from jaxsky.galaxy import GalaxyModel
+from jaxsky.settings.files import BandpassSpec, BeamedKeys, BeamedMap, MapFile, MapKeys, NoiseTable
 from jaxsky.settings.types import (
     BandName,
     FileName,
@@ -89,11 +90,26 @@ EMBEDDED = ("dust", "synchrotron")
 
 
 class EmbeddedTable(SettingsTable):
-    """The embedded model of the Galaxy; `model` are numbers of `jaxsky.galaxy.GalaxyModel`."""
+    """The embedded model of the Galaxy; its other keys are those of `jaxsky.galaxy.GalaxyModel`."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, float] = Field(init=False)
 
     nside: Nside = 128
     seed: Seed = 0
-    model: dict[str, float] = Field(default={})
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Numbers of the model that are not as by default."""
+        return self.__pydantic_extra__ or {}
+
+    @model_validator(mode="after")
+    def _known(self) -> "EmbeddedTable":
+        known = GalaxyModel.__dataclass_fields__
+        for name in self.numbers:
+            if name not in known:
+                raise MistakeAt(name, f"is none of nside, seed, {', '.join(known)}")
+        return self
 
 
 class SmallScalesTable(SettingsTable):
@@ -115,7 +131,7 @@ class SmallScalesTable(SettingsTable):
         return self
 
 
-class ComponentTable(MapKeys):
+class ComponentTable(BeamedKeys):
     """A component: its law, parameters that are not default, and its map at `nu_ref` [GHz].
 
     Maps may take the place of parameters. `angles` names the component along which an intensity
@@ -125,7 +141,6 @@ class ComponentTable(MapKeys):
 
     law: Law | None = None
     nu_ref: Positive | None = None
-    fwhm: float = Field(0.0, ge=0)
     angles: str | None = None
     parameters: dict[str, float | list[float] | MapFile] = Field(default={})
     noise: NoiseTable | None = None
@@ -237,7 +252,7 @@ class CMBTable(SettingsTable):
         return self
 
 
-class BandTable(MapKeys):
+class BandTable(BeamedKeys):
     """A band: how it observes, and its map; without a map it is simulated."""
 
     name: BandName | None = None
@@ -245,7 +260,6 @@ class BandTable(MapKeys):
     channels: Several[Word] | None = None
     bandpass: BandpassSpec | None = None
     samples: int = Field(51, ge=2)
-    fwhm: float | None = Field(None, ge=0)
     beam: FileName | None = None
     noise: NoiseTable | None = None
     leakage: BeamedMap | None = None
@@ -298,14 +312,13 @@ class BandTable(MapKeys):
         return bands
 
 
-class RegionsTable(SettingsTable):
-    """Where a parameter has values of its own: exactly one of these."""
+class RegionsTable(MapKeys):
+    """Where a parameter has values of its own: exactly one of these, or the file of a map."""
 
     nside: Nside | None = None
     latitudes: list[float] | None = Field(None, min_length=1)
     clusters: int | None = Field(None, ge=1)
     of: list[MapFile] = Field(default=[])
-    file: MapFile | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> "RegionsTable":

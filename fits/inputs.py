@@ -86,14 +86,10 @@ def inputs_of(
     foregrounds: bool = False,
     galaxy: EmbeddedSky | None = None,
 ) -> Inputs:
-    """Templates and maps: from files, or simulated where the settings name none.
+    """Templates of what is modelled, and maps: from files, or simulated where there is none.
 
-    Parameters
-    ----------
-    settings : of the experiment
-    templates : read those of the components that are modelled
-    foregrounds : give the foregrounds alone as well, where all bands are simulated
-    galaxy : the embedded model, if it is made already
+    With the `foregrounds` alone, if that is asked for and all bands are simulated. `galaxy` is the
+    embedded model, if it is made already.
     """
     folder = Path(settings.data_dir)
     if not settings.bands:
@@ -153,8 +149,8 @@ def _simulated(
     used = np.ones(healpy.nside2npix(observation.nside), bool)
     bands = {}
     for name, maps in observe_bands(key, sky, observation, setup.cmb):
-        observed, total, where = setup.observed(name), maps["total"], f"bands.{name}"
-        noise, correlated = _noise_of(observed, used.size, where)
+        observed, total = setup.observed(name), maps["total"]
+        noise, correlated = _noise_of(observed, used.size, f"bands.{name}.noise")
         if (leakage := _leakage_of(observed, used)) is not None:
             total = total + leakage.maps
         band, beam = observed.bandpass, observed.beam
@@ -177,7 +173,7 @@ def _noise_of(
         return uniform_covariance(observed.level, nside), None
     if observed.spectrum is None:
         raise SettingsError(
-            f"{where}.noise: is missing, or is of pixels that were smoothed with the map."
+            f"{where}: is missing, or is of pixels that were smoothed with the map."
         )
     beyond = max(0, 4 * nside + 1 - observed.spectrum.size)
     return uniform_covariance(0.0, nside), jnp.asarray(np.pad(observed.spectrum, (0, beyond)))
@@ -247,28 +243,20 @@ def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -
     leakage = _leakage_of(observed, used)
     if spec.leakage is not None:
         leakage = _read_leakage(folder, spec, bandpass)
+    where, correlated = f"{where}.noise", None
     if spec.noise is None:
         if observed is None:
-            raise SettingsError(f"{where}.noise: is missing.")
+            raise SettingsError(f"{where}: is missing.")
         noise, correlated = _noise_of(observed, used.size, where)
-        return Band(maps, used, bandpass, beam, noise, correlated, leakage)
-    if spec.noise.estimate_above is not None:
-        with at_key(f"{where}.noise.estimate_above"):
+    elif spec.noise.estimate_above is not None:
+        with at_key(f"{where}.estimate_above"):
             noise, correlated = _estimated_noise(spec.noise, maps, used)
-        return Band(maps, used, bandpass, beam, noise, correlated, leakage)
-    noise, known = read_noise(
-        folder,
-        spec.noise,
-        bandpass,
-        nside,
-        where=f"{where}.noise",
-        unit=unit,
-        own=spec,
-        maps=maps,
-        used=used,
-    )
-    maps = maps if known.all() else jnp.where(known, maps, 0)
-    return Band(maps, used & known, bandpass, beam, noise, leakage=leakage)
+    else:
+        noise, known = read_noise(
+            folder, spec.noise, bandpass, nside, where, unit, own=spec, maps=maps, used=used
+        )
+        maps, used = maps if known.all() else jnp.where(known, maps, 0), used & known
+    return Band(maps, used, bandpass, beam, noise, correlated, leakage)
 
 
 def _read_leakage(folder: Path, spec: BandTable, bandpass: Bandpass) -> Leakage:

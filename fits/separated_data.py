@@ -32,7 +32,7 @@ from fits.separated_maps import (
 from jaxsky import Bandpass, Component, Sky, set_parameters
 from jaxsky.components import component_class
 from jaxsky.harmonics import analysis, expand, gaussian_beam, lmax_of, synthesis
-from jaxsky.inputs import read_parameter
+from jaxsky.inputs import read_parameters
 from jaxsky.keys import stream
 from jaxsky.noise import draw, uniform_alm
 from jaxsky.settings import Experiment, MapFile, SettingsError, at_key
@@ -322,14 +322,8 @@ def _sky(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
     components: dict[str, Component] = {"cmb": component_class("cmb")(amplitude)}
     known = np.ones(12 * nside**2, bool)
     for name, spec in laws.items():
-        numbers: dict = {} if spec.nu_ref is None else {"nu_ref": spec.nu_ref}
-        for key, value in spec.parameters.items():
-            if isinstance(value, MapFile):
-                place = f"sky.{name}.parameters.{key}"
-                column, has = read_parameter(folder, value, key, nside, place, "common.nside")
-                numbers[key], known = jnp.asarray(column), known & has
-            else:
-                numbers[key] = tuple(value) if isinstance(value, list) else value
+        numbers, has = read_parameters(folder, name, spec, nside, "common.nside")
+        known &= has
         with at_key(f"sky.{name}"):
             assert spec.law is not None  # as the settings see to
             components[name] = component_class(spec.law)(amplitude, **numbers)

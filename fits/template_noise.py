@@ -67,16 +67,9 @@ def read_template_noise(
         unit = noise.unit or template.unit
         return TemplateNoise(noise.level * float(conversion(unit, "uK_RJ", nu_ref)))
     maps = template.component.amplitude
+    nside, used = healpy.npix2nside(template.used.size), template.used
     covariance, _ = read_noise(
-        folder,
-        noise,
-        nu_ref,
-        healpy.npix2nside(template.used.size),
-        where=where,
-        unit=template.unit,
-        own=spec,
-        maps=maps,
-        used=template.used,
+        folder, noise, nu_ref, nside, where, template.unit, own=spec, maps=maps, used=used
     )
     return TemplateNoise(covariance=covariance)
 

@@ -32,15 +32,9 @@ UNSEEN_WINDOW = 1e-8
 class SimulationInputs(NamedTuple):
     """What is simulated, ready for `jaxsky.simulate`.
 
-    Parameters
-    ----------
-    sources : components by name, as they are
-    observation : the experiment
-    cmb : spectra TT, EE, BB, TE [uK_CMB^2], or None
-    leakage : Q and U [uK_RJ] that have leaked from the intensity, by band, with its beam
-    truth : parameters of the sky that are numbers, by dotted name
-    small_scales_seed : of small scales that are the same for all realisations
-    description : what the templates are
+    `cmb` are spectra TT, EE, BB, TE [uK_CMB^2]; `leakage` is Q and U [uK_RJ] that have leaked from
+    the intensity, by band, with its beam; `truth` the sky's parameters that are numbers, by dotted
+    name; `small_scales_seed` that of small scales which are the same for all realisations.
     """
 
     sources: dict[str, Source]
@@ -89,15 +83,11 @@ def simulation_inputs(
     written: bool = True,
     galaxy: EmbeddedSky | None = None,
 ) -> SimulationInputs:
-    """Read what the settings name, and check that it can work.
+    """Read what the settings name of some bands, by default all, and check that it can work.
 
-    Parameters
-    ----------
-    settings : of the experiment
-    names : of the bands, by default all; what they show does not depend on it
-    written : for files, in Stokes parameters and precision of the settings, and in pixels that
-        resolve all beams; else Q and U in double precision, to be smoothed
-    galaxy : the embedded model, if it is made already
+    Maps that are `written` have Stokes parameters and precision of the settings, and pixels that
+    resolve all beams; others are Q and U in double precision, to be smoothed. What bands show does
+    not depend on the others. `galaxy` is the embedded model, if it is made already.
     """
     spec = settings.simulate
     stokes, precision = (spec.stokes, spec.precision) if written else ("QU", "double")
@@ -259,15 +249,9 @@ def read_channel(
             with at_key(f"{where}.noise"):
                 noise = spec.noise.level * band.conversion(unit, "uK_RJ")
         else:
+            own = None if spec.file is None else spec
             noise, known = read_noise(
-                folder,
-                spec.noise,
-                band,
-                nside,
-                stokes,
-                where=f"{where}.noise",
-                unit=unit,
-                own=None if spec.file is None else spec,
+                folder, spec.noise, band, nside, f"{where}.noise", unit, stokes, own=own
             )
             if missing := int(np.sum(~known)):
                 raise SettingsError(
@@ -291,14 +275,7 @@ def _noise_unit(spec: BandTable, where: str) -> str:
 
 
 def cmb_spectra(settings: Experiment, lmax: int, r: float | None = None) -> np.ndarray:
-    """Spectra TT, EE, BB, TE of the CMB [uK_CMB^2] up to lmax, of shape (4, ell).
-
-    Parameters
-    ----------
-    settings : of the experiment, with its r
-    lmax : largest multipole
-    r : in place of that; only for spectra that CAMB makes
-    """
+    """TT, EE, BB, TE of the CMB [uK_CMB^2], shape (4, ell); another r is for those of CAMB only."""
     spec = settings.cmb
     if spec.spectra is None:
         with at_key("cmb.cosmology"):

@@ -19,7 +19,6 @@ from jaxsky.io import Maps, read_bandpass, read_beam, read_maps, unit_factor
 from jaxsky.io.columns import sentinels
 from jaxsky.io.folders import kept
 from jaxsky.settings import (
-    BandpassSpec,
     BandTable,
     ComponentTable,
     Experiment,
@@ -27,7 +26,7 @@ from jaxsky.settings import (
     MapKeys,
     SettingsError,
     at_key,
-    check_sign,
+    check_signs,
     find_file,
 )
 from jaxsky.sky import Sky, set_parameters
@@ -47,10 +46,9 @@ def parameter_map(
     of: str = "that of the template",
     stated: bool = False,
 ) -> tuple[Float[np.ndarray, " pix"], Bool[np.ndarray, " pix"]]:
-    """The map of a spectral parameter in its unit, and where it is known.
+    """The map of a spectral parameter in its unit, with the median where it is not known.
 
-    Elsewhere it is the median. `of` says whose nside it must have; if it is `stated` which values
-    are missing, zeros are data.
+    `of` says whose nside it must have; if it is `stated` which values are missing, zeros are data.
     """
     values, used = one_column(found, nside, where, of), np.asarray(found.mask)
     unit = parameter_unit(name)
@@ -72,7 +70,7 @@ def parameter_map(
             "or `missing = []` if all are data."
         )
     try:
-        check_sign(name, float(np.median(known)))
+        check_signs({name: float(np.median(known))})
     except ValueError as error:
         raise SettingsError(f"{where}: {error}.") from None
     return np.where(used, values, np.median(known)), used
@@ -109,11 +107,7 @@ def read(
     stokes: str | Sequence[str] | None = None,
     zeros_are_data: bool = False,
 ) -> Maps:
-    """The maps of a file; see `jaxsky.io.read_maps`.
-
-    `stokes` are the Stokes parameters where the use of the file tells them, in place of the
-    settings.
-    """
+    """The maps of a file; `stokes` where its use tells the Stokes parameters, not the settings."""
     keys = {"hdu", "fields", "unit", "ordering", "coordinates", "polarization", "missing", "stokes"}
     options = spec.model_dump(include=keys, exclude_none=True)
     if stokes is not None:
@@ -122,17 +116,21 @@ def read(
     return read_maps(paths, zeros_are_data=zeros_are_data, **options)
 
 
-def read_parameter(
-    folder: Path,
-    spec: MapFile,
-    name: str,
-    nside: int,
-    where: str,
-    of: str = "that of the template",
-) -> tuple[Float[np.ndarray, " pix"], Bool[np.ndarray, " pix"]]:
-    """The map of a spectral parameter in a file, and where it is known; see `parameter_map`."""
-    found = read(folder, spec, stokes="", zeros_are_data=True)
-    return parameter_map(found, name, nside, where, of=of, stated=spec.missing is not None)
+def read_parameters(
+    folder: Path, name: str, spec: ComponentTable, nside: int, of: str = "that of the template"
+) -> tuple[dict[str, Any], Bool[np.ndarray, " pix"]]:
+    """Parameters of a component's law, maps among them, and where these are known."""
+    parameters: dict[str, Any] = {} if spec.nu_ref is None else {"nu_ref": spec.nu_ref}
+    used = np.ones(healpy.nside2npix(nside), bool)
+    for key, value in spec.parameters.items():
+        if isinstance(value, MapFile):
+            place, stated = f"sky.{name}.parameters.{key}", value.missing is not None
+            found = read(folder, value, stokes="", zeros_are_data=True)
+            column, known = parameter_map(found, key, nside, place, of=of, stated=stated)
+            parameters[key], used = jnp.asarray(column), used & known
+        else:
+            parameters[key] = tuple(value) if isinstance(value, list) else value
+    return parameters, used
 
 
 def narrow(values: ArrayLike) -> Array:
@@ -152,13 +150,8 @@ def read_sky(
 ) -> tuple[dict[str, Template], str]:
     """Components of the sky that have maps [uK_RJ], in order, and what they are in a sentence.
 
-    Parameters
-    ----------
-    settings : whose fixed parameters are set
-    stokes : "QU" for the last two columns of each file, "IQU" for the last three
-    dtype : of the templates from files; parameters that are maps are always in double precision
-    names : of components, by default all
-    galaxy : the embedded model, if it is made already
+    Templates from files are the last two or three columns, and have the `dtype`; parameters that
+    are maps are always in double precision. `galaxy` is the embedded model, if it is made already.
     """
     tables, folder = settings.sky.components, Path(settings.data_dir)
     wanted = [name for name in tables if names is None or name in names]
@@ -210,30 +203,13 @@ def default_galaxy(nside: int) -> EmbeddedSky:
 
 def _embedded(folder: Path, name: str, spec: ComponentTable, component: Component) -> Template:
     """A component of the embedded model, with parameters of the settings."""
-    used = np.ones(component.template.shape[-1], bool)
-    if spec.parameters:
-        parameters, known = _parameters(folder, name, spec, healpy.npix2nside(used.size))
+    nside = healpy.npix2nside(component.template.shape[-1])
+    parameters, used = read_parameters(folder, name, spec, nside)
+    if parameters:
         with at_key(f"sky.{name}"):
-            own = {"nu_ref": component.nu_ref}  # type: ignore[attr-defined]
-            component = type(component)(component.amplitude, **own | parameters)
-        used &= known
+            parameters["nu_ref"] = component.nu_ref  # type: ignore[attr-defined]
+            component = type(component)(component.amplitude, **parameters)
     return Template(component, 0.0, used)
-
-
-def _parameters(
-    folder: Path, name: str, spec: ComponentTable, nside: int
-) -> tuple[dict[str, Any], Bool[np.ndarray, " pix"]]:
-    """Parameters of a law, maps among them, and where these are known."""
-    parameters: dict[str, Any] = {}
-    used = np.ones(healpy.nside2npix(nside), bool)
-    for key, value in spec.parameters.items():
-        if isinstance(value, MapFile):
-            place = f"sky.{name}.parameters.{key}"
-            column, known = read_parameter(folder, value, key, nside, place)
-            parameters[key], used = jnp.asarray(column), used & known
-        else:
-            parameters[key] = tuple(value) if isinstance(value, list) else value
-    return parameters, used
 
 
 def _read_template(
@@ -254,8 +230,7 @@ def _read_template(
         )
     padded = not law.polarized and stokes == "IQU"
     check_stokes(f"sky.{name}", found, "I" if spec.angles or padded else stokes)
-    parameters, known = _parameters(folder, name, spec, found.nside)
-    parameters.setdefault("nu_ref", spec.nu_ref)
+    parameters, known = read_parameters(folder, name, spec, found.nside)
     factor = uK_RJ_per(found.unit, parameters["nu_ref"], f"sky.{name}")
     maps = jnp.asarray((found.maps * factor).astype(dtype))
     used = np.asarray(found.mask) & known
@@ -309,23 +284,18 @@ def check_stokes(where: str, found: Maps, wanted: str) -> None:
         raise SettingsError(f"{where}.fields: {names} are not {listed} by their names.")
 
 
-def read_bandpass_spec(folder: Path, spec: BandpassSpec, samples: int = 51) -> Bandpass:
-    """The bandpass of a file, or a top-hat of so many samples."""
-    if spec.center is not None:
-        if not spec.width:
-            return Bandpass.delta(spec.center)
-        return Bandpass.top_hat(spec.center, spec.width, spec.convention or "RJ", samples)
-    options = spec.model_dump(exclude={"file", "center", "width"})
-    return read_bandpass(find_file(folder, spec.files[0]), **options)
-
-
 def bandpass_of(folder: Path, spec: BandTable) -> Bandpass:
-    """The bandpass that the settings of a band name."""
-    where = f"bands.{spec.name}.bandpass"
-    if spec.bandpass is None:
+    """The bandpass of a band: of a file, or a top-hat."""
+    where, given = f"bands.{spec.name}.bandpass", spec.bandpass
+    if given is None:
         raise SettingsError(f"{where}: is missing.")
     with at_key(where):
-        return read_bandpass_spec(folder, spec.bandpass, spec.samples)
+        if given.center is None:
+            options = given.model_dump(exclude={"file", "center", "width"})
+            return read_bandpass(find_file(folder, given.files[0]), **options)
+        if not given.width:
+            return Bandpass.delta(given.center)
+        return Bandpass.top_hat(given.center, given.width, given.convention or "RJ", spec.samples)
 
 
 def beam_of(folder: Path, spec: BandTable, lmax: int) -> Float[Array, " ell"] | float | None:

@@ -24,10 +24,7 @@ from jaxsky.components import Component
 
 
 class NodeCounts(NamedTuple):
-    """Counts, one for each parameter of a component that is a map, and the error to check.
-
-    `tolerance` is None where the counts are known to do.
-    """
+    """Counts for each parameter that is a map, and the error to check, if any has to be."""
 
     counts: tuple[int, ...]
     tolerance: float | None = None
@@ -133,17 +130,9 @@ def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
 
 
 def choose_nodes(component: Component, bands: tuple[Bandpass, ...], tolerance: float) -> Nodes:
-    """Node counts with which the band averages of a component are right to `tolerance`.
+    """Node counts with which the band averages of a component are right to a relative tolerance.
 
-    Parameters
-    ----------
-    component : a component with any number of parameters that are maps
-    bands : the bands
-    tolerance : relative error of the band-averaged law
-
-    Returns
-    -------
-    Node counts; None where the direct sum is the better way, or there is no map.
+    None where the direct sum is the better way, or there is no map.
     """
     maps, _ = _split(component)
     if not maps or len(maps) > MAX_DIMENSIONS or tolerance <= 0:
@@ -197,11 +186,8 @@ def _points(component: Component) -> list[Float[Array, " pix"]]:
 class Terms(NamedTuple):
     """Combinations of Chebyshev polynomials that the band averages of a component are made of.
 
-    Parameters
-    ----------
-    vectors : orthonormal combinations, shape (term, node); no node where no parameter is a map
-    counts : node counts
-    sizes : what each adds to the maps at most, relative to the maps
+    `vectors` are orthonormal combinations of the nodes, whose `counts` are those of each map;
+    `sizes` what each adds to the maps at most, relative to the maps.
     """
 
     vectors: Float[np.ndarray, "term node"]
@@ -222,19 +208,10 @@ def choose_terms(
     """The fewest maps from which a component's emission in all bands can be summed up.
 
     The law's matrix (band, node) has singular values that fall fast, so a few combinations of
-    polynomials serve all bands, and what is linear (a transform) is done to these only.
-
-    Parameters
-    ----------
-    component, bands : concrete, not being traced
-    importance : what the template, times its law, is multiplied by to be relative to the maps;
-        not needed where no parameter is a map
-    tolerance : error relative to the maps
-
-    Returns
-    -------
-    The terms, one and constant if no parameter is a map; None where bands are better averaged
-    one by one.
+    polynomials serve all bands, and what is linear (a transform) is done to these only. The
+    `importance` is what the template, times its law, is multiplied by to be relative to the maps,
+    as is the tolerance; not needed where no parameter is a map, which makes one constant term. None
+    where bands are better averaged one by one.
     """
     if not _split(component)[0]:
         return Terms(np.ones((1, 1)), (), (1.0,))
@@ -271,10 +248,7 @@ def band_sed(
 ) -> Float[Array, ""] | Float[Array, " pix"]:
     """Band-averaged law of a component: a number, or a map if a parameter is one.
 
-    Parameters
-    ----------
-    component, band : what is observed, and with what
-    nodes : from `choose_nodes`; None sums directly over the band in every pixel
+    The nodes are those of `choose_nodes`; None sums directly over the band in every pixel.
     """
     if nodes is None:
         return average(component.sed, band)
@@ -303,14 +277,7 @@ def _resolved(
 def band_seds(
     component: Component, samples: Samples, nodes: Nodes
 ) -> Float[Array, " band"] | Float[Array, "pix band"]:
-    """`band_sed` in many bands, as products of matrices: one small program for all of them.
-
-    Parameters
-    ----------
-    component : what is observed
-    samples : the bands, from `jaxsky.bandpass.stack_bands`
-    nodes : from `choose_nodes`; None sums directly over the bands in every pixel
-    """
+    """`band_sed` in many bands (`stack_bands`), as products of matrices: one small program."""
     maps, _ = _split(component)
     if not maps:
         return jax.vmap(lambda band: average(component.sed, band))(samples)

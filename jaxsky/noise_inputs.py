@@ -37,27 +37,19 @@ def read_noise(
     noise: NoiseTable,
     at: Bandpass | float,
     nside: int,
-    stokes: str = "QU",
-    *,
     where: str,
     unit: str,
+    stokes: str = "QU",
+    *,
     own: MapKeys | None = None,
     maps: Float[Array, "stokes pix"] | None = None,
     used: Bool[np.ndarray, " pix"] | None = None,
 ) -> tuple[Float[Array, "stokes stokes pix"], Bool[np.ndarray, " pix"]]:
-    """Covariance of each pixel [uK_RJ^2], and where it is known; 0 elsewhere.
+    """Covariance of each pixel [uK_RJ^2], and where it is known (not without hits); 0 elsewhere.
 
-    Parameters
-    ----------
-    folder : of the files
-    noise : what the settings say; pixels without hits are not known
-    at : bandpass of the map, or its frequency [GHz]
-    nside : resolution of the map
-    stokes : "QU" or "IQU"
-    where : key of the noise in the settings, for the messages
-    unit : unit of the map, and so of level, rms and sigma0 unless the noise has its own
-    own : the map that has the noise, if its columns are in the same file
-    maps, used : the map that has the noise [uK_RJ] and its pixels, against whose rms it is checked
+    The map that has the noise is `at` a frequency [GHz] or in a band. Its `unit` is that of level,
+    rms and sigma0 unless the noise has its own; `own` is its file, in which columns may be; against
+    the rms of its `maps` [uK_RJ] in `used` pixels the noise is checked. `where` is the key.
     """
     unit = noise.unit or unit
     with at_key(where):

@@ -595,7 +595,7 @@ RMS = '{ rms = 1.0, unit = "uK_RJ" }'
         ([('"beam.txt"', '"cmb.dat"')], "cmb.dat"),
         ([("width = 6.0", "width = 70.0")], "bands.30.bandpass: Argument `nu` must be positive"),
         ([(RMS, '{ rms = { file = "coarse.fits" } }')],
-         "bands.143.noise.map: nside is 4, but that of the map is 8"),
+         "bands.143.noise.rms: nside is 4, but that of the map is 8"),
         ([(RMS, '{ hits = { file = "hits.fits", fields = ["HITS"], sigma0 = 1.0 } }')],
          "bands.143.noise: 5 pixels have no noise; a simulation takes maps of the full sky"),
     ],

@@ -8,14 +8,14 @@ from astropy.io import fits as pyfits
 from fits.inputs import inputs_of
 from jaxsky.bandpass import Bandpass
 from jaxsky.inputs import (
+    bandpass_of,
     read,
-    read_bandpass_spec,
     read_sky,
     set_parameters_of,
 )
 from jaxsky.io import InputError
 from jaxsky.noise_inputs import read_noise
-from jaxsky.settings import BandpassSpec, Experiment, MapFile, NoiseTable, SettingsError, load
+from jaxsky.settings import BandTable, Experiment, MapFile, NoiseTable, SettingsError, load
 from mapfiles import table, write
 
 NSIDE = 4
@@ -85,7 +85,7 @@ WMAP = MapFile(
 
 def noise_of(folder, spec, stokes="QU", unit="K_CMB", own=None):
     noise = NoiseTable.model_validate(spec)
-    return read_noise(folder, noise, BAND, NSIDE, stokes, where="noise", unit=unit, own=own)
+    return read_noise(folder, noise, BAND, NSIDE, "noise", unit, stokes, own=own)
 
 
 def others():
@@ -322,14 +322,18 @@ def test_parameters_are_set_in_a_copy(folder):
             templates_of(folder, specs("qu.fits"), fixed={fixed: 3.0})
 
 
+def band(**keys):
+    return BandTable.model_validate({"name": "b", "bandpass": keys})
+
+
 def test_bandpasses_of_settings(folder):
-    assert read_bandpass_spec(folder, BandpassSpec(center=70.0)).nu.tolist() == [70.0]
-    top_hat = read_bandpass_spec(folder, BandpassSpec(center=70.0, width=14.0, convention="power"))
+    assert bandpass_of(folder, band(center=70.0)).nu.tolist() == [70.0]
+    top_hat = bandpass_of(folder, band(center=70.0, width=14.0, convention="power"))
     assert (float(top_hat.nu[0]), float(top_hat.nu[-1])) == (63.0, 77.0)
     assert top_hat.convention == "power"
     table = np.array([[60.0, 0.0], [70.0, 1.0], [80.0, 0.0]])
     np.savetxt(folder / "band.txt", table)
-    read_in = read_bandpass_spec(folder, BandpassSpec(file="band.txt", convention="RJ"))
+    read_in = bandpass_of(folder, band(file="band.txt", convention="RJ"))
     np.testing.assert_array_equal(read_in.nu, table[:, 0])
 
 
@@ -362,7 +366,6 @@ def test_fits_take_hits_and_six_columns(folder, matrices, hits):
 def test_bandpasses_with_unit_and_columns_from_settings(tmp_path):
     (tmp_path / "b.txt").write_text("0 28000 1\n1 30000 1\n")
     spec = {"file": "b.txt", "convention": "RJ", "unit": "MHz", "fields": [1, 2]}
-    band = read_bandpass_spec(tmp_path, BandpassSpec(**spec))
-    np.testing.assert_allclose(band.nu, [28, 30])
+    np.testing.assert_allclose(bandpass_of(tmp_path, band(**spec)).nu, [28, 30])
     with pytest.raises(ValueError, match="unit, fields: of the file of a bandpass, not of center"):
-        BandpassSpec(center=30.0, unit="MHz", fields=[1, 2])
+        band(center=30.0, unit="MHz", fields=[1, 2])

@@ -350,7 +350,9 @@ def test_maps_of_parameters_in_separations(folder):
     with pytest.raises(SettingsError, match=words):
         separation_data(separation(folder, free=free))
     dust = {"law": "dust", "nu_ref": 353.0, "parameters": {"nu_ref": 545.0}}
-    with pytest.raises(ValueError, match="nu_ref is given twice"):
+    with pytest.raises(
+        ValueError, match="nu_ref belongs next to law; here parameters have it, 545"
+    ):
         separation(folder, sky={"dust": dust})
 
 

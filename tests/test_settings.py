@@ -191,7 +191,7 @@ def test_set_replaces_a_key_and_nothing_else(tmp_path):
     ("assignment", "words"),
     [
         ("fixed = { 'dust.nu_ref' = 545.0 }", "fixed.dust.nu_ref: is that of the embedded map"),
-        ("sky.dust.parameters = { nu_ref = 545.0 }", "sky.dust: law and nu_ref are those of the"),
+        ("sky.dust.parameters = { nu_ref = 545.0 }", "sky.dust: nu_ref belongs next to law"),
         ("sky.dust.noise = { level = 3.0 }", "sky.dust: fwhm, angles and noise are of a map"),
         (
             "sky.dust.small_scales = { EE = [9, 3], BB = [3, 9] }",

@@ -402,8 +402,6 @@ def test_refused_resolutions():
     ):
         with pytest.raises(ValueError, match="`nside` must be a power of 2, but is 12"):
             call()
-    with pytest.raises(ValueError, match="`nside_coarse` must be a power of 2 up to 8, but is 16"):
-        superpixels(8, 16)
 
 
 @pytest.mark.parametrize("shape", [(192,), (1, 192), (4, 192), (2, 100), (2, 108), (2, 12), ()])

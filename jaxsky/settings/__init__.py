@@ -18,4 +18,4 @@ from jaxsky.settings.tables import (
     leakage_warning,
 )
 from jaxsky.settings.toml import at_key, find_file, found_files, load, named_files, of_file
-from jaxsky.settings.types import SettingsError, check_sign
+from jaxsky.settings.types import SettingsError, check_signs

@@ -9,9 +9,8 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, ValidationInfo, model_validator
+from pydantic import Field, ValidationInfo, model_validator
 
-from jaxsky.instrument import band_tables
 from jaxsky.settings.files import BeamedMap, MapFile
 from jaxsky.settings.tables import (
     BandTable,
@@ -38,6 +37,7 @@ from jaxsky.settings.types import (
     check_names,
     check_reference,
     check_signs,
+    valid,
 )
 from jaxsky.small_scales import DUST, SYNCHROTRON
 
@@ -46,13 +46,7 @@ REGIONS: dict[str, str | MapFile] = {"strip": "|b| <= 20", "outside": "|b| > 20"
 
 
 def parse_region(text: str) -> tuple[str, float] | None:
-    """The comparison and the latitude [deg] of "|b| > 20" and its like; None for the full sky.
-
-    Examples
-    --------
-    >>> parse_region("|b| <= 20")
-    ('<=', 20.0)
-    """
+    """The comparison and the latitude [deg] of "|b| > 20" and its like; None for the full sky."""
     if text == "full":
         return None
     match = re.fullmatch(r"\|b\|\s*(<=|<|>=|>)\s*(\d+(?:\.\d*)?)", text.strip())
@@ -64,22 +58,16 @@ def parse_region(text: str) -> tuple[str, float] | None:
     return match[1], float(match[2])
 
 
-def _latitudes(value: str) -> str:
-    parse_region(value)
-    return value
-
-
-def _mask(value: MapFile) -> MapFile:
+def _mask(value: MapFile) -> None:
     if others := value.changed(set(MapFile.model_fields) - {"file", "hdu", "fields", "ordering"}):
         raise MistakeAt(others[0], "is not of a mask")
     if len(value.files) != 1 or len(value.fields or [0]) != 1 or isinstance(value.hdu, list):
         raise ValueError("a mask is one of the fields of one file")
-    return value
 
 
 #: A mask, 1 where a pixel is used: a column of a FITS table, or one entry of an .npz file.
-MaskFile = Annotated[MapFile, AfterValidator(_mask)]
-Region = Annotated[str, AfterValidator(_latitudes)] | MaskFile
+MaskFile = Annotated[MapFile, valid(_mask)]
+Region = Annotated[str, valid(parse_region)] | MaskFile
 
 
 class CommonTable(SettingsTable):
@@ -213,22 +201,14 @@ class PaperTable(SettingsTable):
     @model_validator(mode="after")
     def _plausible(self) -> "PaperTable":
         if self.ame is not None:
-            check_reference("ame", self.ame.nu_ref, {})
+            check_reference("ame", self.ame.nu_ref)
         return self
 
 
 class Experiment(SettingsTable):
     """All settings: a sky, the bands in which it is observed, and what is done with them.
 
-    Parameters
-    ----------
-    title, data_dir : name of the experiment; folder of its files, relative to that of this one
-    seed : of all that is random, but for the model of the Galaxy
-    sky, bands, cmb : what is observed, and how; bands without a map are simulated
-    common, regions : the resolution at which maps are compared, and parts of the sky by name
-    free, fixed : parameters by dotted name, free ones with start and prior
-    truth : parameters of the simulated sky where they differ from those that are modelled
-    simulate, fit, compare, separate, forecast, paper : of the command of this name
+    `truth` are parameters of the simulated sky where they differ from those that are modelled.
     """
 
     title: str = ""
@@ -252,18 +232,23 @@ class Experiment(SettingsTable):
     @model_validator(mode="after")
     def _consistent(self, info: ValidationInfo) -> "Experiment":
         folder = Path((info.context or {}).get("folder", "."))
-        self.bands = [
-            band for i, entry in enumerate(self.bands) for band in _bands(entry, i, folder)
-        ]
+        bands: list[BandTable] = []
+        for i, entry in enumerate(self.bands):
+            try:
+                bands += entry.bands(folder)
+            except (KeyError, ValueError, OSError) as error:
+                what = error.args[0] if isinstance(error, KeyError) else str(error)
+                raise MistakeAt(f"bands.{i}.instrument", what) from None
+        self.bands = bands
         self.regions = REGIONS | self.regions
-        names = [str(band.name) for band in self.bands]
+        names = [str(band.name) for band in bands]
         check_names("bands", names)
         check_names("regions", self.regions)
         if both := set(self.free) & set(self.fixed):
             raise ValueError(f"{', '.join(sorted(both))} cannot be both free and fixed")
-        check_signs("fixed", self.fixed)
-        check_signs("truth", self.truth)
-        check_signs("free", {name: one.numbers() for name, one in self.free.items()})
+        check_signs(self.fixed, "fixed")
+        check_signs(self.truth, "truth")
+        check_signs({name: one.numbers() for name, one in self.free.items()}, "free")
         for name, one in self.sky.components.items():
             own = one.file is None and name in self.sky.templates
             if (own or one.nu_ref is not None) and f"{name}.nu_ref" in self.fixed:
@@ -335,18 +320,6 @@ class Experiment(SettingsTable):
                 raise SettingsError(f"free.{name}: start is missing.")
             values[name] = value
         return values
-
-
-def _bands(entry: BandTable, index: int, folder: Path) -> list[BandTable]:
-    """The bands that an entry of the list stands for."""
-    if entry.instrument is None:
-        return [entry]
-    wanted = entry.channels if entry.name is None else [entry.name]
-    try:
-        return entry.merged(band_tables(entry.instrument, wanted, folder))
-    except (KeyError, ValueError, OSError) as error:
-        what = error.args[0] if isinstance(error, KeyError) else str(error)
-        raise MistakeAt(f"bands.{index}.instrument", what) from None
 
 
 Experiment.model_rebuild()

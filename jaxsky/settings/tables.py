@@ -1,14 +1,15 @@
 """Tables of an experiment file that describe the sky and the bands in which it is observed."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from jaxsky.components import AME, component_class
 from jaxsky.galaxy import GalaxyModel
+from jaxsky.instrument import band_tables
 from jaxsky.settings.files import BandpassSpec, BeamedKeys, BeamedMap, MapFile, MapKeys, NoiseTable
 from jaxsky.settings.types import (
     BandName,
@@ -150,13 +151,16 @@ class ComponentTable(BeamedKeys):
     def _plausible(self) -> "ComponentTable":
         if self.noise is not None and self.noise.estimate_above is not None:
             raise MistakeAt("noise.estimate_above", "is of bands")
-        check_signs("parameters", self.parameters)
+        check_signs(self.parameters, "parameters")
+        if "nu_ref" in self.parameters:
+            given = self.parameters["nu_ref"]
+            raise ValueError(f"nu_ref belongs next to law; here parameters have it, {given!r}")
         if self.file is None:
             if self.angles or self.fwhm or self.noise:
                 raise ValueError("fwhm, angles and noise are of a map, but file is missing")
             return self
         for key in ("law", "nu_ref"):
-            if getattr(self, key) is None and not (key == "nu_ref" and key in self.parameters):
+            if getattr(self, key) is None:
                 raise ValueError(f"{key} is missing")
         return self
 
@@ -171,7 +175,7 @@ class ComponentTable(BeamedKeys):
             raise MistakeAt("law", "the CMB is described in the table cmb")
         if self.angles and component_class(law) is not AME:
             raise ValueError("angles are for the law 'ame' only")
-        check_reference(law, self.nu_ref, self.parameters)
+        check_reference(law, self.nu_ref)
 
 
 class SkyTable(SettingsTable):
@@ -212,8 +216,7 @@ class SkyTable(SettingsTable):
                     raise ValueError("law is missing")
                 one.check(one.law)
                 own = one.file is None and name in self.templates
-                given = one.nu_ref is not None or "nu_ref" in one.parameters
-                if own and (one.law != name or given):
+                if own and (one.law != name or one.nu_ref is not None):
                     raise ValueError("law and nu_ref are those of the embedded map; give a file")
             except ValueError as error:
                 raise MistakeAt(name, error) from None
@@ -287,16 +290,19 @@ class BandTable(BeamedKeys):
             _check_release(self.files, self.leakage.files, self.label, self.leakage.label)
         return self
 
-    def merged(self, channels: Sequence[Mapping[str, Any]]) -> list["BandTable"]:
+    def bands(self, folder: Path) -> list["BandTable"]:
         """The bands that this stands for: channels of an instrument, with what is given here.
 
         Levels of noise of an instrument are in uK_CMB, whatever the unit of a map that is given
         here.
         """
+        if self.instrument is None:
+            return [self]
+        channels = self.channels if self.name is None else [self.name]
         own = self.model_dump(exclude_unset=True, exclude={"instrument", "channels", "name"})
         beam = {"fwhm", "beam"} if {"fwhm", "beam"} & set(own) else set()
         bands = []
-        for channel in channels:
+        for channel in band_tables(self.instrument, channels, folder):
             raw = {k: v for k, v in channel.items() if k not in beam}
             noise = raw.get("noise")
             if "file" not in raw and isinstance(noise, dict) and {"level", "rms"} & set(noise):
@@ -354,12 +360,11 @@ class FreeParameter(SettingsTable):
 
     def first(self) -> float | None:
         """Where to start; None if that is not said."""
-        if self.start is not None or not (self.uniform or self.gaussian):
-            return self.start
-        return self.gaussian[0] if self.gaussian else sum(self.uniform or ()) / 2
+        if self.start is None and self.gaussian:
+            return self.gaussian[0]
+        return sum(self.uniform) / 2 if self.start is None and self.uniform else self.start
 
     def numbers(self) -> list[float]:
         """All values that it names, for a check of their sign."""
-        mean = [self.gaussian[0]] if self.gaussian else []
-        end = [self.uniform[1]] if self.uniform else []
-        return [*([] if self.start is None else [self.start]), *mean, *end]
+        said = (self.start, self.gaussian and self.gaussian[0], self.uniform and self.uniform[1])
+        return [number for number in said if number is not None]

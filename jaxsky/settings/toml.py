@@ -78,17 +78,10 @@ def _replaced(raw: Any, path: Sequence[str], value: Any) -> Any:
 
 
 def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
-    """An experiment from a TOML file.
+    """An experiment from a TOML file, with `data_dir` as an absolute path.
 
-    Parameters
-    ----------
-    path : the file; relative paths in it are relative to its `data_dir`, and that to its folder
-    assignments : `key=value` with a dotted key, such as "common.nside=32", "bands.0.fwhm=30" or
-        "free.'dust.beta_dust'.start=1.5", in place of what the file says; a table is replaced whole
-
-    Returns
-    -------
-    The settings, with `data_dir` as an absolute path.
+    Assignments are `key=value` with a dotted key, such as "common.nside=32", "bands.0.fwhm=30" or
+    "free.'dust.beta_dust'.start=1.5", in place of what the file says; a table is replaced whole.
     """
     try:
         raw = tomllib.loads(path.read_text())
@@ -135,16 +128,11 @@ def _expand(text: str) -> str:
 
 
 def find_file(folder: Path, name: str) -> Path:
-    """Find a file that settings name.
+    """Find a file that settings name; `folder` is their `data_dir`.
 
-    A name without a folder is looked for in `folder`, then in the cache of `jaxsky data fetch`;
-    with one, it is relative to `folder`. `~`, `$NAME` and `${NAME:-default}` are expanded, unless
-    a file has that very name.
-
-    Parameters
-    ----------
-    folder : the settings' `data_dir`
-    name : as in the settings
+    A name without a folder is looked for there, then in the cache of `jaxsky data fetch`; with one,
+    it is relative to it. `~`, `$NAME` and `${NAME:-default}` are expanded, unless a file has that
+    very name.
     """
     if not os.path.lexists(folder / name):
         try:

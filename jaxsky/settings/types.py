@@ -1,8 +1,9 @@
 """Types of values in settings, and checks of values; ValueError with the words after the key."""
 
+import math
 import re
 import reprlib
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, Any, TypeVar
 
@@ -83,30 +84,28 @@ class NamedFile(str):
     __slots__ = ()
 
 
-def _power_of_two(value: int) -> int:
+def _power_of_two(value: int) -> None:
     if value & (value - 1):
         raise ValueError(f"nside must be a power of two, not {value}")
-    return value
 
 
-def _distinct(values: list[T]) -> list[T]:
+def _distinct(values: list[Any]) -> None:
     for i, value in enumerate(values):
         if value in values[:i]:
             raise ValueError(f"has {value!r} twice")
-    return values
 
 
-def _law(value: str) -> str:
-    component_class(value)
-    return value
+def valid(check: Callable[[Any], object]) -> AfterValidator:
+    """Values of a type for which a check raises nothing."""
+
+    def kept(value: Any) -> Any:
+        check(value)
+        return value
+
+    return AfterValidator(kept)
 
 
-def _stokes(value: str | list[str]) -> str | list[str]:
-    parse_stokes(value)
-    return value
-
-
-def _name(value: str, characters: str, reserved: Collection[str] = ()) -> str:
+def _check_name(value: str, characters: str = "", reserved: Collection[str] = ()) -> None:
     if value.lower() in reserved:
         raise ValueError(f"the name {value!r} has a meaning of its own in results; choose another")
     if len(value) > LONGEST:
@@ -117,30 +116,29 @@ def _name(value: str, characters: str, reserved: Collection[str] = ()) -> str:
             f"a name consists of letters, digits and {others}, and begins with a letter or digit, "
             f"unlike {value!r}"
         )
-    return value
 
 
 Positive = Annotated[float, Field(gt=0)]
 Multipole = Annotated[int, Field(ge=2)]
 #: The largest leaves the tensors far above all else.
 TensorRatio = Annotated[float, Field(ge=0, le=1000)]
-Nside = Annotated[int, Field(gt=0, le=8192), AfterValidator(_power_of_two)]
+Nside = Annotated[int, Field(gt=0, le=8192), valid(_power_of_two)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Word = Annotated[str, Field(min_length=1)]
 FileName = Annotated[Word, AfterValidator(NamedFile)]
 Files = FileName | Annotated[list[FileName], Field(min_length=1)]
 _Hdu = Annotated[int, Field(ge=1)]
 Hdus = _Hdu | Annotated[list[_Hdu], Field(min_length=1)]
-Stokes = Annotated[str | list[str], AfterValidator(_stokes)]
+Stokes = Annotated[str | list[str], valid(parse_stokes)]
 #: A list without repetitions, and one that is not empty either.
-Distinct = Annotated[list[T], AfterValidator(_distinct)]
-Several = Annotated[list[T], Field(min_length=1), AfterValidator(_distinct)]
+Distinct = Annotated[list[T], valid(_distinct)]
+Several = Annotated[list[T], Field(min_length=1), valid(_distinct)]
 #: Two values; a list in TOML.
 Pair = Annotated[tuple[T, T], Strict(False)]
 #: The law of a component: a name, or "module:Class" (`jaxsky.components.component_class`).
-Law = Annotated[str, AfterValidator(_law)]
-BandName = Annotated[str, AfterValidator(lambda value: _name(value, "."))]
-RegionName = Annotated[str, AfterValidator(lambda value: _name(value, ""))]
+Law = Annotated[str, valid(component_class)]
+BandName = Annotated[str, valid(lambda value: _check_name(value, "."))]
+RegionName = Annotated[str, valid(_check_name)]
 
 
 def _key(raw: Any, place: Sequence[str | int], missing: bool) -> str:
@@ -213,46 +211,34 @@ def check_component_names(names: Collection[str]) -> None:
     check_names("components", names)
     for name in names:
         try:
-            _name(name, "", RESERVED)
+            _check_name(name, "", RESERVED)
         except ValueError as error:
             raise MistakeAt(name, error) from None
 
 
-def check_reference(law: str, nu_ref: float | None, parameters: Mapping[str, Any]) -> None:
-    """Raise ValueError for a reference frequency that is given twice, or not in GHz."""
-    if nu_ref is not None and "nu_ref" in parameters:
-        raise ValueError(
-            f"nu_ref is given twice, {nu_ref:g} and in parameters; leave one of them out"
-        )
-    given = parameters.get("nu_ref", nu_ref)
-    known = declared(component_class(law), "nu_ref")
-    if given is not None and not known:
-        raise ValueError(f"the law {law!r} has no nu_ref: its maps are in uK_CMB")
-    if not isinstance(given, int | float) or known["within"] is None:
+def check_reference(law: str, nu_ref: float | None) -> None:
+    """Raise ValueError for a reference frequency that is not in GHz, or that a law has not."""
+    if nu_ref is None:
         return
-    least, most = known["within"]
-    if not least <= given <= most:
+    known = declared(component_class(law), "nu_ref")
+    if not known:
+        raise ValueError(f"the law {law!r} has no nu_ref: its maps are in uK_CMB")
+    least, most = known["within"] or (0, math.inf)
+    if not least <= nu_ref <= most:
         raise ValueError(
-            f"nu_ref is in GHz, for the law {law!r} from {least:g} to {most:g}, not {given:g}"
+            f"nu_ref is in GHz, for the law {law!r} from {least:g} to {most:g}, not {nu_ref:g}"
         )
 
 
-def check_sign(name: str, *values: float) -> None:
-    """Raise ValueError for an index beta_syn in the sign of T ~ nu^beta, by its dotted name."""
-    negative = [value for value in values if value <= 0]
-    if name.split(".")[-1] == "beta_syn" and negative:
-        raise MistakeAt(
-            name,
-            "beta_syn is the index in T ~ nu^-beta_syn, positive and about 3, not "
-            f"{negative[0]:g}; that of T ~ nu^beta has the other sign",
-        )
-
-
-def check_signs(table: str, values: Mapping[str, Any]) -> None:
-    """`check_sign` of the numbers in a table of settings."""
+def check_signs(values: Mapping[str, Any], table: str = "") -> None:
+    """Raise ValueError for indices beta_syn in the sign of T ~ nu^beta, by their dotted names."""
     for name, value in values.items():
-        numbers = value if isinstance(value, list) else [value]
-        try:
-            check_sign(name, *(x for x in numbers if isinstance(x, int | float)))
-        except ValueError as error:
-            raise MistakeAt(table, error) from None
+        if name.split(".")[-1] != "beta_syn":
+            continue
+        for number in value if isinstance(value, list) else [value]:
+            if isinstance(number, int | float) and number <= 0:
+                raise MistakeAt(
+                    f"{table}.{name}" if table else name,
+                    "beta_syn is the index in T ~ nu^-beta_syn, positive and about 3, not "
+                    f"{number:g}; that of T ~ nu^beta has the other sign",
+                )

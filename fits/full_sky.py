@@ -21,21 +21,11 @@ FIELDS = ("EE", "BB")
 class BandSpectra(NamedTuple):
     """EE and BB of one band; C_l in uK_RJ^2 at all multipoles, D_l in bins.
 
-    Parameters
-    ----------
-    band : name
-    observed : C_l of the map
-    uncorrected : the same before leakage was subtracted, or None
-    foregrounds : C_l of the model's foregrounds
-    complete : C_l of foregrounds, and one realisation of CMB and noise
-    noise : mean C_l of realisations of the noise, the paper's N_l
-    cmb : C_l of the CMB
-    error : the paper's Delta C_l, sqrt(2 / (2l+1)) (C_l^CMB + N_l)
-    edges : of the bins
-    binned, binned_uncorrected : observed D_l in bins
-    mean, std : of realisations of the complete model, D_l in bins
-    chi2, pte : of the observed bins (`hotelling`), for EE and BB
-    pte_uncorrected : the same before leakage was subtracted
+    `uncorrected` is the observed map's before leakage was subtracted, or None, and so with its bins
+    and probability. `complete` is the model's foregrounds and one realisation of CMB and noise,
+    `noise` the mean of realisations, the paper's N_l, and `error` its Delta C_l, sqrt(2 / (2l+1))
+    (C_l^CMB + N_l). `mean` and `std` are those of realisations of the complete model, among which
+    chi2 and its probability are those of the observed bins (`hotelling`), for EE and BB.
     """
 
     band: str
@@ -93,11 +83,6 @@ def cosmic_error(power: Float[Array, "... ell"], signal: Numeric = 0.0) -> Float
 
     sqrt(2 / (2l+1)) C_l; where the field is added to a signal that does not vary, the chance
     correlation of both, which the paper leaves out, adds to it: sqrt(2 / (2l+1) C_l (C_l + 2 F_l)).
-
-    Parameters
-    ----------
-    power : mean spectrum C_l of the field (CMB and noise)
-    signal : spectrum F_l of what does not vary (foregrounds)
     """
     ell = jnp.arange(power.shape[-1])
     return jnp.sqrt(2 / (2 * ell + 1) * power * (power + 2 * signal))
@@ -110,11 +95,6 @@ def hotelling(
 
     Mean and covariance are those of the simulations, and so are uncertain; Hotelling's T^2, with
     its F distribution, is exact for Gaussian simulations in any number.
-
-    Parameters
-    ----------
-    observed : the measurement
-    simulated : independent simulations of it
     """
     n, p = simulated.shape
     if n <= p:
@@ -144,13 +124,8 @@ def compare_spectra(
     """Spectra of the observed maps against those of the complete model.
 
     They are those of the full sky, which the paper takes: no mode of E shows as B there.
-
-    Parameters
-    ----------
-    prepared : templates and maps at the common resolution, without missing pixels
-    model : foregrounds of each band [uK_RJ]
-    simulated, noises : spectra of realisations of the complete model, and of the noise alone
-    width : multipoles in a bin
+    `simulated` are spectra of realisations of the complete model, `noises` of the noise alone, and
+    `width` counts the multipoles in a bin.
     """
     if missing := int(np.sum(~prepared.used)):
         raise ValueError(

@@ -31,15 +31,7 @@ from jaxsky.keys import stream
 class Response:
     """-H^-1 of a fit, with H the curvature of -log posterior.
 
-    Parameters
-    ----------
-    like : the likelihood that was fitted
-    params : the best fit
-    priors : those of the fit
-
-    Attributes
-    ----------
-    theta : the best fit as a vector; start values in regions without a pixel
+    `theta` is the best fit as a vector, with start values in regions without a pixel.
     """
 
     def __init__(
@@ -57,14 +49,9 @@ class Response:
             raise ValueError("The best fit is no maximum of the posterior.")
 
     def moved(self, like: Likelihood, key: Array) -> Float[np.ndarray, " par"]:
-        """The best fit to other data, within the bounds of uniform priors.
+        """The best fit to the data of `like`, within the bounds of uniform priors.
 
         The means of Gaussian priors are drawn anew, too, since they were measured like the data.
-
-        Parameters
-        ----------
-        like : likelihood of data that are the best fit and noise
-        key : of jax.random, for the priors
         """
         gradient = np.array(value_and_gradient(like, self.theta)[1])
         draws = np.asarray(jax.random.normal(key, gradient.shape))
@@ -86,14 +73,8 @@ def widened(
 
     About the best fit by S L^-1, with L L^T = H^-1 and S S^T the covariance of the estimates: the
     open-faced sandwich of Shaby (2014, J. Comput. Graph. Stat. 23, 853). With too few simulations
-    for the covariance, each parameter by the ratio of its standard deviations.
-
-    Parameters
-    ----------
-    samples : of chains
-    center : the best fit, in their order
-    hessian : curvature of -log posterior there
-    errors : of estimates from simulations
+    for the covariance, each parameter by the ratio of its standard deviations. `center` is the best
+    fit in the order of the samples, with the `hessian` of -log posterior there.
     """
     inverse = np.linalg.inv(hessian)
     if len(errors) > 4 * len(center):
@@ -105,17 +86,11 @@ def widened(
 
 
 class SimulatedNoise(NamedTuple):
-    """Of each simulation; band powers are D_b of BB [uK_CMB^2].
+    """Of each simulation, the parameters less the best fit, and band powers D_b of BB [uK_CMB^2].
 
-    Parameters
-    ----------
-    theta : parameters, less the best fit
-    noise : band powers of the noise in the cleaned CMB
-    residual : those of the foregrounds that are left with these parameters
-    both : those of the sum
-    total : those of the sum and a CMB without tensors
-    leaked : those of that CMB without its B modes: E that pixels and mask turn into B
-    spectrum : C_l of the sum in the masked map, over the mean square of the mask
+    Those are of the noise in the cleaned CMB, the foregrounds that are left with these parameters,
+    both together, the sum with a CMB without tensors, and that CMB without its B modes: E that
+    pixels and mask turn into B. `spectrum` is C_l of noise and foregrounds in the masked map.
     """
 
     theta: Float[np.ndarray, "sim par"]
@@ -130,13 +105,8 @@ class SimulatedNoise(NamedTuple):
 class Realisation(NamedTuple):
     """What a realisation is made of: simulated noise on top of the foregrounds that were found.
 
-    Parameters
-    ----------
-    data : what is separated, and how
-    like, best, response : the likelihood, the best fit by name, and what noise does to it
-    emission : foregrounds in the bands, as they were found
-    spectra, window : how BB is taken, and the beam of the maps
-    lensed : spectra of a CMB without tensors, up to the end of the window [uK_CMB^2]
+    `response` is what noise does to the best fit, `emission` the foregrounds in the bands, `window`
+    the beam of the maps, and `lensed` C_l of a CMB without tensors up to its end [uK_CMB^2].
     """
 
     data: PixelData | MultipoleData

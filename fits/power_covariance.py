@@ -38,7 +38,8 @@ def bandpower_covariance(
     standard deviations are taken from so many Gaussian skies, while the correlations stay; 200
     measure them to 5 %. EE and BB are C_l of the maps, window and noise included.
     """
-    covariance = 2 * covariance_terms(spectra, np.stack([EE, BB])[None])[0, 0]
+    fields = np.stack([EE, BB])[None, :, : spectra.lmax + 1]
+    covariance = 2 * covariance_terms(spectra, fields)[0, 0]
     if not simulations:
         return covariance
     if simulations < 2 or key is None:
@@ -46,9 +47,7 @@ def bandpower_covariance(
             "Argument `simulations` must be 0, or 2 and more with a `key` of jax.random; "
             f"it is {simulations}, with key = {key}."
         )
-    nside, zero = healpy.npix2nside(spectra.mask.size), np.zeros(spectra.lmax + 1)
-    rows = [np.asarray(row)[: spectra.lmax + 1] for row in (EE, BB)]
-    matrix = jnp.array([[rows[0], zero], [zero, rows[1]]])
+    nside, matrix = healpy.npix2nside(spectra.mask.size), jnp.eye(2)[..., None] * fields[0]
     powers = [
         band_powers(spectra, synthesis(gaussian_fields(one, matrix), nside))
         for one in jax.random.split(key, simulations)

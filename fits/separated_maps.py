@@ -225,10 +225,8 @@ class HarmonicMaps(ComponentMaps):
     def maps(self, nside: int, beam: ArrayLike) -> Float[np.ndarray, "component stokes pix"]:
         """Maps of the components; their noise has the spectra `covariance` times b_l^2.
 
-        Parameters
-        ----------
-        nside : resolution; multipoles above 2 nside are cut
-        beam : of the maps: full width at half maximum [arcmin], or a table b_l from l = 0
+        Multipoles above 2 nside are cut; the beam is a full width at half maximum [arcmin], or a
+        table b_l from l = 0.
         """
         if not healpy.isnsideok(nside, nest=True):
             raise ValueError(f"Argument `nside` must be a power of 2, but is {nside}.")

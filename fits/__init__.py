@@ -3,10 +3,10 @@
 What users need is imported from here (`__all__`); each name when it is first asked for.
 """
 
-import importlib
 from typing import TYPE_CHECKING
 
-import jaxsky.bare
+import jaxsky.bare  # before all else
+from jaxsky.exports import exported
 
 if TYPE_CHECKING:
     from fits.cleaning import separate
@@ -31,39 +31,4 @@ if TYPE_CHECKING:
     from fits.template_likelihood import likelihood
     from fits.tensor_ratio import fit_tensors, power_model
 
-_NAMES = {
-    "cleaning": "separate",
-    "commands.forecast": "forecast",
-    "comparison": "compare",
-    "discs": "prepare_patches",
-    "fisher": "fisher_errors",
-    "grid": "grid_fit",
-    "multipoles": "harmonic_coefficients harmonic_likelihood white_spectrum",
-    "noise": "as_noise",
-    "optimize": "Newton best_fit",
-    "patches": "fit_patches",
-    "posterior": "chi2 fisher_matrix hessian",
-    "priors": "Gaussian Uniform",
-    "profile_likelihood": "spectral_likelihood",
-    "pseudo_cl": "band_powers bin_edges masked_spectra",
-    "regions": "apodize clusters latitude_bands superpixels",
-    "results": "FitError FitResult",
-    "sampling": "sample",
-    "separated_data": "separation_data",
-    "separated_maps": "component_maps harmonic_component_maps residual_maps",
-    "template_likelihood": "likelihood",
-    "tensor_ratio": "fit_tensors power_model",
-}
-_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
-__all__ = sorted(_MODULES)
-
-
-def __getattr__(name: str) -> object:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value = getattr(importlib.import_module(f"fits.{_MODULES[name]}"), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__all__, __getattr__, __dir__ = exported(__name__)

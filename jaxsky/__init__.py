@@ -4,10 +4,10 @@ What users need is imported from here (`__all__`); each name when it is first as
 `import jaxsky` is quick.
 """
 
-import importlib
 from typing import TYPE_CHECKING
 
-import jaxsky.bare
+import jaxsky.bare  # before all else
+from jaxsky.exports import exported
 
 if TYPE_CHECKING:
     from jaxsky.archive import fetch
@@ -43,33 +43,4 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_NAMES = {
-    "archive": "fetch",
-    "bandpass": "Bandpass",
-    "cmb": "camb_spectra",
-    "components": "AME CMB Component Dust FreeFree Synchrotron",
-    "galaxy": "embedded_sky",
-    "harmonics": "smooth",
-    "instrument": "load_instrument",
-    "io": "from_quantity read_bandpass read_beam read_maps read_mask read_spectra unit_factor "
-    "write_maps",
-    "observation": "Observation ObservedBand Source",
-    "simulation": "simulate",
-    "sky": "Sky get_parameters observe observe_band observe_components parameter_names "
-    "set_parameters",
-    "small_scales": "SmallScales",
-    "templates": "preset",
-}
-_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
-__all__ = sorted(_MODULES)
-
-
-def __getattr__(name: str) -> object:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value = getattr(importlib.import_module(f"jaxsky.{_MODULES[name]}"), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__all__, __getattr__, __dir__ = exported(__name__)

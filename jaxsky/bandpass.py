@@ -187,15 +187,9 @@ def stack_bands(bands: Sequence[Bandpass]) -> Samples:
 def average(sed: Callable[[Array], Array], band: Bandpass | Samples) -> Float[Array, "..."]:
     """Band average sum_k w_k S(nu_k) of a spectrum: the direct sum, and the reference.
 
-    Parameters
-    ----------
-    sed : function of one frequency [GHz] that returns a number or a map
-    band : the band
-
-    Returns
-    -------
-    Array of the shape that `sed` returns. Maps are summed one sample at a time, so that memory
-    does not grow with the number of samples, and gradients recompute rather than store them.
+    `sed` is a function of one frequency [GHz] that returns a number or a map; so is the result.
+    Maps are summed one sample at a time, so that memory does not grow with the number of samples,
+    and gradients recompute rather than store them.
     """
     shape = jax.eval_shape(sed, band.nu[0]).shape
     if shape == ():

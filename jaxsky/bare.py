@@ -70,30 +70,27 @@ def _guarded(function: Callable[..., Any]) -> Callable[..., Any]:
     return checked
 
 
-def _guard_class(cls: type) -> None:
-    """Guard the constructor and the public methods that a class defines itself."""
-    for name, member in list(vars(cls).items()):
-        method = getattr(member, "__func__", member)
+def _guard(holder: ModuleType | type) -> None:
+    """Guard what a module, or one of its classes, defines itself under a name without underscore.
+
+    Of classes the constructor, too.
+    """
+    of_module = isinstance(holder, ModuleType)
+    for name, member in list(vars(holder).items()):
         public = not name.startswith("_") or name in ("__init__", "__call__")
-        exempt = inspect.isclass(method) or hasattr(method, "takes_quantities")
-        if not public or not callable(method) or exempt:
+        foreign = of_module and getattr(member, "__module__", None) != holder.__name__
+        function = getattr(member, "__func__", member)
+        if not public or foreign or not callable(function):
             continue
-        guarded = _guarded(method)
-        wrap = type(member) if isinstance(member, classmethod | staticmethod) else None
-        setattr(cls, name, wrap(guarded) if wrap else guarded)
-
-
-def _guard(module: ModuleType) -> None:
-    """Guard what a module defines itself under a name without an underscore."""
-    for name, value in list(vars(module).items()):
-        if name.startswith("_") or getattr(value, "__module__", None) != module.__name__:
-            continue
-        if inspect.isclass(value):
+        if inspect.isclass(function):
             # Settings, of pydantic, have types of their own.
-            if not issubclass(value, BaseException) and not hasattr(value, "model_fields"):
-                _guard_class(value)
-        elif callable(value) and not hasattr(value, "takes_quantities"):
-            setattr(module, name, _guarded(value))
+            typed = issubclass(function, BaseException) or hasattr(function, "model_fields")
+            if of_module and not typed:
+                _guard(function)
+        elif not hasattr(function, "takes_quantities"):
+            guarded = _guarded(function)
+            static = isinstance(member, classmethod | staticmethod)
+            setattr(holder, name, type(member)(guarded) if static else guarded)
 
 
 class _Loader(SourceFileLoader):

@@ -63,12 +63,7 @@ def tensor_spectra(lmax: int, **cosmology: float) -> Float[np.ndarray, "4 ell"]:
     """Spectra C_l of TT, EE, BB, TE of tensors with r = 1 [uK_CMB^2], l = 0 ... lmax.
 
     For another r they are these times r. They are not lensed. See `camb_spectra` for their
-    primordial spectrum.
-
-    Parameters
-    ----------
-    lmax : largest multipole
-    **cosmology : of `camb.set_params`, in place of those in `PLANCK_2018`
+    primordial spectrum and the parameters of the cosmology.
     """
     return _joined(_tensors, TENSORS_END, lmax, cosmology)
 
@@ -142,11 +137,7 @@ def realisation(
 ) -> Float[Array, "stokes alm"]:
     """Packed coefficients (E, B or I, E, B) of a Gaussian realisation of spectra.
 
-    Parameters
-    ----------
-    key : of jax.random
-    spectra : C_l of TT, EE, BB, TE, in any unit squared
-    stokes : "QU" or "IQU"
+    `spectra` are C_l of TT, EE, BB, TE in any unit squared; `stokes` is "QU" or "IQU".
     """
     if stokes not in ("QU", "IQU"):
         raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")
@@ -201,14 +192,6 @@ def repair(
     Extrapolated cross-spectra may exceed what the auto-spectra allow. Such a matrix keeps its
     auto-spectra; of its correlation coefficients the negative eigenvalues are set to zero and
     the diagonal is scaled back to one. No multipole is left out. Differentiable in the spectra.
-
-    Parameters
-    ----------
-    spectra : auto- and cross-spectra C_l of each pair of fields, symmetric
-
-    Returns
-    -------
-    The spectra, and the number of multipoles that were repaired.
     """
     n = len(spectra)
     power = jnp.diagonal(spectra).T  # (field, ell)
@@ -229,12 +212,9 @@ def repair(
 def gaussian_fields(
     key: Array, spectra: Float[Array, "field field ell"]
 ) -> Float[Array, "field alm"]:
-    """Packed coefficients of Gaussian fields with given auto- and cross-spectra.
+    """Packed coefficients of Gaussian fields with given auto- and cross-spectra C_l.
 
-    Parameters
-    ----------
-    key : of jax.random
-    spectra : C_l of each pair of fields, positive semi-definite at each l (see `repair`)
+    The matrix of these has to be positive semi-definite at each l (see `repair`).
     """
     n, lmax = len(spectra), spectra.shape[-1] - 1
     lower = cholesky(spectra)

@@ -62,11 +62,6 @@ class GalaxyModel(eqx.Module):
         stretch as long as its distance s is the mean of about s / coherence cells, so the rms
         there is turbulence / sqrt(1 + s / coherence).
     slope : exponent of its power spectrum, C_l ~ l^slope for l >= 2
-
-    Examples
-    --------
-    >>> float(GalaxyModel(turbulence=0.5).psi0)
-    27.0
     """
 
     psi0: Parameter = 27.0
@@ -92,10 +87,8 @@ class GalaxyModel(eqx.Module):
 class EmbeddedSky(eqx.Module):
     """Maps of the model Galaxy, from `embedded_sky`.
 
-    Parameters
-    ----------
-    dust, synchrotron : I, Q, U at their reference frequencies [uK_RJ], shape (3, pix)
-    seed : of the turbulence
+    I, Q, U of dust and synchrotron at their reference frequencies [uK_RJ], and the seed of the
+    turbulence.
     """
 
     dust: Float[Array, "3 pix"]
@@ -121,9 +114,7 @@ class EmbeddedSky(eqx.Module):
     def sky(self, stokes: str = "QU") -> Sky:
         """A sky of dust and synchrotron with the paper's baseline spectral parameters.
 
-        Parameters
-        ----------
-        stokes : "QU" or "IQU"
+        `stokes` is "QU" or "IQU".
         """
         if stokes not in ("QU", "IQU"):
             raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")
@@ -139,19 +130,15 @@ class EmbeddedSky(eqx.Module):
 def magnetic_field(
     model: GalaxyModel, x: Float[Array, "..."], y: Float[Array, "..."], z: Float[Array, "..."]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
-    """Cartesian components of the regular field, of strength 1: logarithmic spiral arms.
+    """Cartesian components of the regular field, of strength 1, at a Galactocentric position [kpc].
 
+    Logarithmic spiral arms,
     sin psi(r) cos chi(z) r_hat + cos psi(r) cos chi(z) phi_hat + sin chi(z) z_hat, eq. 9 of Page
     et al. (2007) with the first two terms as the hammurabi code has them (Waelkens et al. 2009,
     A&A 495, 697). With sine and cosine exchanged the field near the Sun would point to
     l = 27 degrees; so it points to 63, near the 70 that Planck XLIV measured, and the maps at
     high latitude agree better with the observed ones. Within `CORE` of its axis, where a spiral
     has no direction, the field turns vertical.
-
-    Parameters
-    ----------
-    model : the parameters
-    x, y, z : Galactocentric position [kpc]; the Sun is at (-r_sun, 0, 0)
     """
     r2 = x**2 + y**2 + 1e-12
     psi = jnp.deg2rad(model.psi0 + model.psi1 * jnp.log(jnp.sqrt(r2) / model.r_sun))
@@ -299,7 +286,7 @@ def _check(nside: int, seed: int, steps: int) -> None:
 def line_of_sight(
     model: GalaxyModel, nside: int, seed: int = 0, *, steps: int = STEPS
 ) -> Float[Array, "2 3 pix"]:
-    """I, Q, U of dust and of synchrotron, integrated along the line of sight, not yet scaled.
+    """I, Q, U of dust and of synchrotron [kpc], integrated along the line of sight, not yet scaled.
 
     With B_t, B_p the components of the field along theta_hat and phi_hat (COSMO), alpha its
     angle to the line of sight, and the densities n in units of those at the Sun,
@@ -308,18 +295,8 @@ def line_of_sight(
     synchrotron  int n_e [B_t^2 + B_p^2, 3/4 (B_p^2 - B_t^2), -3/4 2 B_t B_p] ds
 
     the dust as in Planck int. results XX (2015), the synchrotron for electrons E^-3.
-    Differentiable in the parameters of the model.
-
-    Parameters
-    ----------
-    model : the parameters
-    nside : resolution; the maps are samples at the pixel centres
-    seed : of the turbulence; at another nside it is the same sky with more detail or less
-    steps : number of steps along the line of sight
-
-    Returns
-    -------
-    Maps [kpc], shape (2, 3, pix): dust and synchrotron, I, Q, U.
+    Differentiable in the parameters of the model. The maps are samples at the pixel centres; one
+    seed is one sky at every nside.
     """
     _check(nside, seed, steps)
     angles = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))

@@ -10,6 +10,8 @@ import gc
 import hashlib
 import os
 import platform
+import shutil
+from collections.abc import Iterable
 from pathlib import Path
 
 import jax
@@ -55,11 +57,8 @@ def keep_programs(folder: Path) -> None:
     """Keep compiled programs in a folder, and take those that are there.
 
     JAX's own settings go first: with $JAX_ENABLE_COMPILATION_CACHE=0 nothing is kept, and with
-    $JAX_COMPILATION_CACHE_DIR it is there. A folder that cannot be written is done without.
-
-    Parameters
-    ----------
-    folder : of the programs for all versions and processors; the oldest go when it is too large
+    $JAX_COMPILATION_CACHE_DIR it is there. A folder that cannot be written is done without. It is
+    that for all versions and processors; the oldest programs go when it is too large.
     """
     if not jax.config.jax_enable_compilation_cache:  # type: ignore[attr-defined]
         return
@@ -87,17 +86,15 @@ def forget_programs() -> None:
 
 def _prune(folder: Path) -> None:
     """Remove the oldest programs, and all of the kinds that were not used for longest."""
-    kinds = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime)
-    old = [path for kind in kinds[:-KINDS] for path in kind.iterdir()]
-    kept = [path for kind in kinds[-KINDS:] for path in kind.iterdir()]
-    sizes = {path: path.stat().st_size for path in kept}
-    excess = sum(sizes.values()) - LARGEST
-    for path in sorted(sizes, key=lambda path: path.stat().st_mtime):
-        if excess <= 0:
-            break
-        excess -= sizes[path]
-        old.append(path)
-    for path in old:
-        path.unlink(missing_ok=True)
-    for kind in kinds[:-KINDS]:
-        kind.rmdir()
+
+    def newest_first(paths: Iterable[Path]) -> list[Path]:
+        return sorted(paths, key=lambda path: path.stat().st_mtime, reverse=True)
+
+    kinds = newest_first(folder.iterdir())
+    for kind in kinds[KINDS:]:
+        shutil.rmtree(kind)
+    size = 0
+    for path in newest_first(path for kind in kinds[:KINDS] for path in kind.iterdir()):
+        size += path.stat().st_size
+        if size > LARGEST:
+            path.unlink(missing_ok=True)

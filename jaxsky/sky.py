@@ -186,16 +186,10 @@ def observe_components(
 OFFSET = ".offset"
 
 
-def _key_name(key: object) -> str:
-    for attribute in ("key", "name", "idx"):
-        if hasattr(key, attribute):
-            return str(getattr(key, attribute))
-    raise TypeError(f"A sky cannot hold {key!r}.")
-
-
 def _flatten(sky: Sky) -> tuple[dict[str, Array], "jax.tree_util.PyTreeDef"]:
     paths, structure = jax.tree_util.tree_flatten_with_path(sky)
-    return {".".join(map(_key_name, path[1:])): leaf for path, leaf in paths}, structure
+    names = [jax.tree_util.keystr(path[1:], simple=True, separator=".") for path, _ in paths]
+    return dict(zip(names, (leaf for _, leaf in paths), strict=True)), structure
 
 
 def parameter_names(sky: Sky) -> tuple[str, ...]:

@@ -111,12 +111,8 @@ class PowerLaw(NamedTuple):
 def fit_power_law(spectrum: Float[Array, " ell"], lmin: int, lmax: int) -> PowerLaw:
     """Straight line through log C_l against log l by least squares, every l counting alike.
 
-    The paper's fit; its errors come from the scatter about the line.
-
-    Parameters
-    ----------
-    spectrum : C_l, l = 0 ...
-    lmin, lmax : range of the fit, both included; lmax is the pivot of the result
+    The paper's fit, from lmin to lmax, both included; lmax is the pivot of the result. Its errors
+    come from the scatter about the line.
     """
     if not 2 <= lmin <= lmax - 3 or lmax >= len(spectrum):
         raise ValueError(
@@ -133,13 +129,10 @@ def fit_power_law(spectrum: Float[Array, " ell"], lmin: int, lmax: int) -> Power
 class Extrapolation(NamedTuple):
     """The spectra E, B of a template and of what continues it, without the target's beam.
 
-    Parameters
-    ----------
-    measured : spectra of the template divided by those of its beam, up to its own lmax
-    laws : the fitted power laws
-    target : power laws with the slope asked for
-    transfer : factors of the template's coefficients, by which its own beam is taken out
-    injected : spectra of what is added
+    `measured` are the template's divided by those of its beam, up to its own lmax, and `laws` the
+    power laws fitted to them; `target` are those with the slope asked for, and `injected` the
+    spectra of what is added. `transfer` are the factors of the template's coefficients by which
+    its own beam is taken out.
     """
 
     measured: Float[Array, "2 ell_in"]
@@ -152,14 +145,9 @@ class Extrapolation(NamedTuple):
 def extrapolate(
     alm: Float[Array, "2 alm"], own: ArrayLike, small: SmallScales, lmax: int
 ) -> Extrapolation:
-    """Spectra of a template and of the small scales that continue it.
+    """Spectra of a template and of the small scales that continue it up to `lmax`.
 
-    Parameters
-    ----------
-    alm : packed coefficients E, B of the template, as far as they are known
-    own : beam of the template [arcmin]
-    small : how it is continued
-    lmax : largest multipole of the small scales
+    `alm` are its packed coefficients E, B as far as they are known, `own` its beam [arcmin].
     """
     known = lmax_of(alm)
     beam = gaussian_beam(own, known)
@@ -189,14 +177,18 @@ def extrapolate(
     )
 
 
+def _root(values: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Square root of what is positive, else 0; there, its derivative is 0 as well."""
+    return jnp.where(values > 0, jnp.sqrt(jnp.where(values > 0, values, 1.0)), 0.0)
+
+
 def modulation(maps: Float[Array, "2 pix"], fwhm: ArrayLike, nside: int) -> Float[Array, " pix"]:
     """Polarized intensity of Q, U, smoothed by a beam [arcmin] and divided by its mean.
 
     Unlike Q over its mean, the paper's "normalised version of the template", it does not change
     sign.
     """
-    squared = jnp.sum(maps**2, axis=0)
-    intensity = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+    intensity = _root(jnp.sum(maps**2, axis=0))
     window = shortened(gaussian_beam(fwhm, 2 * healpy.npix2nside(maps.shape[-1])))
     return resample(intensity[None], window, nside)[0] / intensity.mean()
 
@@ -221,11 +213,6 @@ def _correlations(
     products = (alms * inside) @ alms.T
     scale = jnp.sqrt(jnp.diagonal(products))
     return products / (scale[:, None] * scale)
-
-
-def _root(values: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Square root of what is positive, else 0; there, its derivative is 0 as well."""
-    return jnp.where(values > 0, jnp.sqrt(jnp.where(values > 0, values, 1.0)), 0.0)
 
 
 def _correlated_parts(
@@ -268,11 +255,8 @@ def _correlated_parts(
 class Continued(NamedTuple):
     """Templates with their small scales.
 
-    Parameters
-    ----------
-    alms : packed coefficients E, B of each, without any beam
-    parts : the spectra that they follow
-    repaired : number of multipoles at which the matrix of spectra had to be repaired
+    Their packed coefficients E, B without any beam, the spectra that they follow, and the number of
+    multipoles at which the matrix of spectra had to be repaired.
     """
 
     alms: list[Float[Array, "2 alm"]]
@@ -288,7 +272,7 @@ def continue_templates(
     nside: int,
     lmax: int | None = None,
 ) -> Continued:
-    """Templates continued to small scales, correlated with each other if there are several.
+    """Templates (Q, U) continued to small scales, correlated with each other if there are several.
 
     With one key the result is differentiable in slopes, tilts, amplitudes, beams and maps. Of
     a single template E and B are independent; several keep their coefficients of correlation,
@@ -297,38 +281,29 @@ def continue_templates(
     than another, it is correlated with what is known. The spectra are divided by the mean
     square of the modulation, so that those of the modulated maps are the extrapolated ones.
 
-    Parameters
-    ----------
-    key : of jax.random; at another nside or lmax it gives other small scales
-    maps : Q, U of each template, RING
-    own : beam of each template [arcmin]
-    small : how each is continued
-    nside : resolution at which the small scales are modulated
-    lmax : largest multipole of the result, by default 2 nside
+    `own` are the beams of the templates [arcmin]; `nside` is that at which the small scales are
+    modulated, `lmax` the largest multipole of the result, by default 2 nside. With another nside
+    or lmax a key gives other small scales.
     """
-    for each in maps:
+    lmax = 2 * nside if lmax is None else lmax
+    parts, stay, gains = [], [], []
+    for each, beam, how in zip(maps, own, small, strict=True):
         if jnp.ndim(each) != 2 or len(each) != 2:
             raise ValueError(
                 "Small scales are added to maps of shape (2, pix), Q and U, not of shape "
                 f"{jnp.shape(each)}."
             )
-    lmax = 2 * nside if lmax is None else lmax
-    known = [_known(each, beam) for each, beam in zip(maps, own, strict=True)]
-    alms = [analysis(each, k) for each, k in zip(maps, known, strict=True)]
-    parts = [
-        extrapolate(alm, beam, how, lmax) for alm, beam, how in zip(alms, own, small, strict=True)
-    ]
-    stay = [
-        resize(alm * expand(part.transfer), lmax) for alm, part in zip(alms, parts, strict=True)
-    ]
+        # As far as its pixels and its beam let it through.
+        window = shortened(gaussian_beam(beam, 2 * healpy.npix2nside(each.shape[-1])))
+        alm = analysis(each, window.size - 1)
+        parts.append(extrapolate(alm, beam, how, lmax))
+        stay.append(resize(alm * expand(parts[-1].transfer), lmax))
+        gains.append(modulation(each, how.modulation_fwhm, nside))
     if len(maps) == 1:
         borrowed, matrix = jnp.zeros_like(stay[0]), jnp.eye(2)[..., None] * parts[0].injected
     else:
         ranges = [r for how in small for r in (how.EE, how.BB)]
         borrowed, matrix = _correlated_parts(jnp.concatenate(stay), parts, ranges)
-    gains = [
-        modulation(each, how.modulation_fwhm, nside) for each, how in zip(maps, small, strict=True)
-    ]
     # One for all: two that differ would make the maps less correlated than the fields.
     gain = sum(gains) / len(gains)
     matrix, repaired = repair(matrix / jnp.mean(gain**2))
@@ -339,30 +314,3 @@ def continue_templates(
         added = expand(_rise((how.EE[1], how.BB[1]), lmax)) * added
         result.append(template + how.amplitude * (added + borrowed[2 * i : 2 * i + 2]))
     return Continued(result, parts, repaired)
-
-
-def _known(maps: Float[Array, "2 pix"], own: ArrayLike) -> int:
-    """Largest multipole of a template that its pixels and its beam let through."""
-    return shortened(gaussian_beam(own, 2 * healpy.npix2nside(maps.shape[-1]))).size - 1
-
-
-def add_small_scales(
-    key: Array,
-    maps: Float[Array, "2 pix"],
-    own: ArrayLike,
-    fwhm: ArrayLike,
-    nside: int,
-    small: SmallScales,
-) -> Float[Array, "2 pix"]:
-    """A template with small scales, at a beam that may be finer than its own.
-
-    Parameters
-    ----------
-    key : of jax.random; another one gives other small scales
-    maps : Q, U, RING
-    own, fwhm : beam of the template, and of the result [arcmin]
-    nside : resolution of the result
-    small : how the template is continued
-    """
-    (alm,) = continue_templates(key, [maps], [own], [small], nside).alms
-    return synthesis(alm * expand(gaussian_beam(fwhm, lmax_of(alm))), nside)

@@ -26,13 +26,7 @@ UNITS: dict[str, tuple[float, str]] = {
 
 
 def parse_unit(unit: str) -> tuple[float, str]:
-    """Size and kind ("K_RJ", "K_CMB" or "MJy/sr") of a unit's name.
-
-    Examples
-    --------
-    >>> parse_unit("uK_CMB")
-    (1e-06, 'K_CMB')
-    """
+    """Size and kind ("K_RJ", "K_CMB" or "MJy/sr") of a unit's name."""
     try:
         return UNITS[unit]
     except KeyError:
@@ -59,18 +53,7 @@ def _ratio(
 
 
 def conversion(source: str, target: str, nu: Numeric) -> Float[Array, "..."]:
-    """Factor from one brightness unit to another at a frequency.
-
-    Parameters
-    ----------
-    source, target : names of units
-    nu : frequency [GHz], any shape
-
-    Examples
-    --------
-    >>> round(float(conversion("uK_CMB", "uK_RJ", 100.0)), 4)
-    0.7772
-    """
+    """Factor from one brightness unit to another at a frequency [GHz]."""
     nu = jnp.asarray(nu)
     return _ratio(source, target, nu, nu, lambda values: values)
 
@@ -86,14 +69,8 @@ def band_conversion(
     """Factor from one brightness unit to another over a band.
 
     A band reports the weighted mean of the antenna temperature, so 1 K_CMB reads sum w g(nu)
-    K_RJ, g being `cmb_derivative`. A value in MJy/sr is that at `nu_ref` of a spectrum
-    I ~ 1/nu (the IRAS convention, which Planck HFI follows: Planck 2013 results IX).
-
-    Parameters
-    ----------
-    source, target : names of units
-    nu : frequencies [GHz]
-    weights : weights on antenna temperature, summing to 1 (`Bandpass.quadrature`)
-    nu_ref : frequency at which a brightness in MJy/sr is quoted [GHz]
+    K_RJ, g being `cmb_derivative`. A value in MJy/sr is that at `nu_ref` [GHz] of a spectrum
+    I ~ 1/nu (the IRAS convention, which Planck HFI follows: Planck 2013 results IX). The weights
+    are those on antenna temperature, with sum 1 (`Bandpass.quadrature`).
     """
     return _ratio(source, target, nu, nu_ref, lambda values: jnp.sum(weights * values))

@@ -8,7 +8,7 @@ import pytest
 
 from fits.commands.forecast import forecast_inputs
 from fits.inputs import inputs_of
-from fits.paper.sources import Sources
+from fits.paper.sky import PaperSky
 from fits.regions import region_masks
 from fits.separated_data import separation_data
 from fits.writing import write_log
@@ -256,7 +256,7 @@ def fit(settings):
 
 
 def paper(settings):
-    sources = Sources(settings)
+    sources = PaperSky(settings)
     sources.template("dust")
     sources.index("beta_syn")
     sources.ame()

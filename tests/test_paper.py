@@ -14,8 +14,8 @@ from fits.commands.paper import NUMBERS, STEPS, Make, labels_of, make_figures
 from fits.commands.run import DEFAULTS
 from fits.paper import figures_model
 from fits.paper.figures_model import core_observation, figure_patch, prepared_templates
-from fits.paper.items import Impossible, Item, Number, picture_of
-from fits.paper.sources import Sources
+from fits.paper.items import Impossible, Item, Number, listed, picture_of
+from fits.paper.sky import PaperSky
 from jaxsky.harmonics import gaussian_beam, power_spectrum
 from jaxsky.io import read_maps
 from jaxsky.observation import Source, harmonic_sources
@@ -110,7 +110,7 @@ def check_items(out: Path, items: dict[str, Item]) -> None:
 
 def check_slopes(settings: Experiment, items: dict[str, Item]) -> None:
     """Against healpy's transform of the templates."""
-    sources, numbers = Sources(settings), numbers_of(items)
+    sources, numbers = PaperSky(settings), numbers_of(items)
     for name in ("dust", "synchrotron"):
         layer = sources.template(name)
         lmax = 2 * layer.nside
@@ -124,9 +124,9 @@ def check_slopes(settings: Experiment, items: dict[str, Item]) -> None:
 
 
 def check_correlations(settings: Experiment, items: dict[str, Item]) -> None:
-    ame, numbers = Sources(settings).ame(), numbers_of(items)
+    (ame, dust, *_), numbers = PaperSky(settings).ame(), numbers_of(items)
     for i, stokes in enumerate("QU"):
-        r = np.corrcoef(np.asarray(ame.maps[i]), np.asarray(ame.dust[i]))[0, 1]
+        r = np.corrcoef(np.asarray(ame[i]), np.asarray(dust[i]))[0, 1]
         shown = numbers[f"correlation of dust and AME, {stokes}"]
         assert value(shown) == pytest.approx(r, abs=6e-4)
 
@@ -169,7 +169,7 @@ def test_real_sky(real, data_dir, tmp_path):
 
 def test_patch_shows_the_small_scales_of_the_spectra(small):
     """Those that are there already are the ones that `harmonic_sources` makes."""
-    sources = Sources(small)
+    sources = PaperSky(small)
     observation = core_observation(sources)
     given = {name: Source(*sources.template(name)) for name in ("dust", "synchrotron")}
     expected = harmonic_sources(sources.key, given, observation)
@@ -302,6 +302,7 @@ def test_what_fails_removes_nothing(small, tmp_path):
 
 
 def test_labels():
+    assert [listed("abc"[:n]) for n in (0, 1, 3)] == ["", "a", "a, b and c"]
     assert labels_of([]) == list(STEPS)
     assert labels_of(["14", "Table  1", "figure 2"]) == ["Figure 2", "Table 1", "Figure 14"]
     assert [label for label in STEPS if label in LABELS] == LABELS
@@ -343,13 +344,13 @@ def test_settings_that_cannot_work(real):
     raw = real.model_dump()
     raw["paper"]["ame"] |= {"fields": ["I_STOKES", "Q_STOKES"]}
     with pytest.raises(ValueError, match=r"paper.ame.fields: must name one intensity map"):
-        Sources(Experiment.model_validate(raw)).ame()
+        PaperSky(Experiment.model_validate(raw)).ame()
     raw["paper"]["beta_syn"] |= {"steepening": "absent.txt"}
     with pytest.raises(ValueError, match=r"absent.txt"):
-        Sources(Experiment.model_validate(raw)).index("beta_syn")
+        PaperSky(Experiment.model_validate(raw)).index("beta_syn")
     del raw["sky"]["sky_synchrotron"]
     with pytest.raises(Impossible, match="one template of the law 'synchrotron', but there are 0"):
-        Sources(Experiment.model_validate(raw)).template("synchrotron")
+        PaperSky(Experiment.model_validate(raw)).template("synchrotron")
 
 
 def test_the_cmb_of_figure_13_is_that_of_the_settings(real, monkeypatch, tmp_path):
@@ -360,5 +361,5 @@ def test_the_cmb_of_figure_13_is_that_of_the_settings(real, monkeypatch, tmp_pat
         figures_model, "cmb_spectra", lambda s, lmax: asked.append(s) or spectra[:, :10]
     )
     with pytest.raises(ValueError, match=r"spectra of the CMB end at l = 9"):
-        figure_patch(Sources(real), tmp_path)
+        figure_patch(PaperSky(real), tmp_path)
     assert asked == [real]

@@ -11,7 +11,7 @@ from fits.common import common_maps
 from fits.comparison import compare
 from fits.inputs import inputs_of
 from fits.paper.figures_model import forecast_settings
-from fits.paper.sources import Sources
+from fits.paper.sky import PaperSky
 from fits.regions import region_masks
 from fits.writing import with_error
 from jaxsky.settings import Experiment, load
@@ -82,7 +82,7 @@ def test_indices_agree_with_the_truth(made):
 
 @pytest.mark.slow
 def test_b_modes_are_those_of_the_forecast(small, made):
-    found = forecast(forecast_settings(Sources(small)))
+    found = forecast(forecast_settings(PaperSky(small)))
     shown = numbers(made[1])
     for band, equal in found.equal_r.items():
         assert shown[f"r with as much BB at l = 80, {band} GHz"].ours == f"{equal['l = 80']:.3g}"

@@ -21,7 +21,6 @@ from jaxsky.io import read_maps
 from jaxsky.small_scales import (
     SYNCHROTRON,
     SmallScales,
-    add_small_scales,
     continue_templates,
     extrapolate,
     fit_power_law,
@@ -42,6 +41,12 @@ REAL = {
     "synchrotron": SmallScales((10, 100), (4, 40)),
     "ame": SmallScales((20, 100), (20, 100)),
 }
+
+
+def add_small_scales(key, maps, own, fwhm, nside, small):
+    """A template with small scales, at a beam that may be finer than its own."""
+    (alm,) = continue_templates(key, [maps], [own], [small], nside).alms
+    return synthesis(alm * expand(gaussian_beam(fwhm, lmax_of(alm))), nside)
 
 
 def laws(lmax):

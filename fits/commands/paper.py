@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from fits.commands.page import ResultTable, Section, write_page
 from fits.commands.run import PAGE, Command, Report, Run
 from fits.paper import figures_data, figures_model
 from fits.paper.items import Impossible, Item, described, picture_of
-from fits.paper.sources import Sources
+from fits.paper.sky import PaperSky
 from fits.writing import write_log
 from jaxsky.io import write_text
 from jaxsky.programs import forget_programs
@@ -27,9 +28,11 @@ PAPER = (
     "Hervías-Caimapo, Bonaldi & Brown (2016), “A new model of the microwave polarized sky for CMB "
     "experiments”"
 )
+#: Figures of observed maps.
+OBSERVED = {f"Figure {n}" for n in range(5, 12)}
 #: From what is shared between figures and the file of the picture, which is written whole, to an
 #: item; raises `Impossible` where the settings do not allow the figure.
-Make = Callable[[Sources, Path], Item]
+Make = Callable[[PaperSky, Path], Item]
 #: In the order of the paper.
 STEPS: dict[str, Make] = {
     "Figure 1": figures_model.figure_templates,
@@ -38,8 +41,8 @@ STEPS: dict[str, Make] = {
     "Figure 4": figures_model.figure_ame,
     "Figure 5": figures_data.figure_scatter,
     "Figure 6": figures_data.figure_maps,
-    "Figure 7": figures_data.figure_planck,
-    "Figure 8": figures_data.figure_wmap,
+    "Figure 7": partial(figures_data.figure_full_sky, "Planck"),
+    "Figure 8": partial(figures_data.figure_full_sky, "WMAP"),
     "Figure 9": figures_data.figure_leakage,
     "Figure 10": figures_data.figure_patches,
     "Figure 11": figures_data.figure_probability,
@@ -59,13 +62,7 @@ class Figures:
 
 
 def labels_of(words: Iterable[str], known: Iterable[str] = STEPS) -> list[str]:
-    """Labels of items by number or label, in order; all without any.
-
-    Examples
-    --------
-    >>> labels_of(["2", "table 1"])
-    ['Figure 2', 'Table 1']
-    """
+    """Labels of items by number or label, in order; all without any."""
     labels, wanted = {label.lower(): label for label in known}, set()
     for word in words:
         name = " ".join(word.lower().split())
@@ -90,20 +87,11 @@ def make_figures(
 ) -> list[Item]:
     """Make the figures and tables that are missing, and `index.html`, which shows all there are.
 
-    Parameters
-    ----------
-    settings : of the sky
-    out : folder of the results
-    only : numbers of figures or labels (`labels_of`); by default all
-    overwrite : make again what is wanted; what else is in the folder is kept if it is of these
-        settings, and removed when the first new figure is there if not
-    begin : called when nothing is wrong with what is wanted, before anything is written
-    progress : told of each item
-    steps : what makes each item, by label
-
-    Returns
-    -------
-    The items of the page, those that were there already among them.
+    `only` has numbers of figures or labels; `steps` is what makes each item. With `overwrite` what
+    is wanted is made again; what else is in the folder is kept if it is of these settings, and
+    removed when the first new figure is there if not. `begin` is called when nothing is wrong with
+    what is wanted, before anything is written. The items of the page are returned, those that
+    were there already among them.
     """
     started = time.perf_counter()
     wanted = labels_of(only, steps)
@@ -111,14 +99,17 @@ def make_figures(
     items, other = _kept(out, mark, overwrite)
     begin()
     out.mkdir(parents=True, exist_ok=True)
-    sources = Sources(settings)
-    todo = [label for label in wanted if overwrite or not _is_made(out, items.get(label))]
+    paper = PaperSky(settings)
+    made = {
+        i.label for i in items.values() if i.table or (i.picture and (out / i.picture).is_file())
+    }
+    todo = [label for label in wanted if overwrite or label not in made]
     for done, label in enumerate(todo):
         progress.step(label)
         progress.advance(done, len(todo))
         start, picture = time.perf_counter(), out / picture_of(label)
         try:
-            item = steps[label](sources, picture)
+            item = steps[label](paper, picture)
         except Impossible as reason:
             item = Item(label, "not made", "", f"Not made: {reason}")
         for name in other - {item.picture}:
@@ -127,12 +118,12 @@ def make_figures(
         items[label] = replace(item, seconds=round(time.perf_counter() - start, 1))
         kept = Figures(mark, list(items.values()))
         write_text(out / KEPT, TypeAdapter(Figures).dump_json(kept, indent=2).decode())
-        _write_page(sources, out, items, steps)
-        if not any(steps[later].__module__ == figures_data.__name__ for later in todo[done + 1 :]):
-            sources.forget_bands()
+        _write_page(paper, out, items, steps)
+        if OBSERVED.isdisjoint(todo[done + 1 :]):
+            paper.forget_bands()
         # No two figures have programs in common, and what these hold adds up.
         forget_programs()
-    shown = _write_page(sources, out, items, steps)
+    shown = _write_page(paper, out, items, steps)
     write_log(out / "log.json", settings, time.perf_counter() - started)
     return shown
 
@@ -158,15 +149,8 @@ def _kept(out: Path, settings: dict[str, Any], overwrite: bool) -> tuple[dict[st
     return {}, {item.picture for item in found.items if item.picture is not None}
 
 
-def _is_made(out: Path, item: Item | None) -> bool:
-    """True if an item could be made, and its picture is there."""
-    if item is None or (item.picture is None and item.table is None):
-        return False
-    return item.picture is None or (out / item.picture).is_file()
-
-
 def _write_page(
-    sources: Sources, out: Path, items: Mapping[str, Item], order: Iterable[str]
+    paper: PaperSky, out: Path, items: Mapping[str, Item], order: Iterable[str]
 ) -> list[Item]:
     """Write the page of all items in order and the table of their numbers; returns these."""
     shown = [items[label] for label in order if label in items]
@@ -177,12 +161,12 @@ def _write_page(
     )
     if rows:
         table = ResultTable(("quantity", "paper", "here", "about it", "see"), rows)
-        shown.append(described(NUMBERS, None, table=table))
+        shown.append(described(NUMBERS, table=table))
     seconds = sum(item.seconds or 0 for item in shown)
     write_page(
         out / PAGE,
-        f"A model of the microwave polarized sky: {sources.settings.title}",
-        [sources.description, f"Figures and tables of {PAPER}, made again and numbered as there."],
+        f"A model of the microwave polarized sky: {paper.settings.title}",
+        [paper.description, f"Figures and tables of {PAPER}, made again and numbered as there."],
         [_section(item) for item in shown],
         f"Written by `jaxsky paper` in {seconds:.0f} s,",
     )

@@ -9,14 +9,18 @@ from fits.commands import compare_pictures as pictures
 from fits.common import prepared_maps
 from fits.comparison import Comparison, compare_patches, template_patches
 from fits.paper.items import TEXTS, Impossible, Item, Number, described, filled, listed
-from fits.paper.sources import Sources
+from fits.paper.sky import PaperSky
 from fits.posterior_plots import plot_grids
 from fits.regions import region_masks, region_words
 from fits.spectral_index import fit_regions, known_truth
 from fits.writing import probability, with_error, with_errors
 from jaxsky.settings import SettingsError
 
-PLANCK, WMAP = ("30", "44", "70", "353"), ("K", "Ka", "Q", "V", "W")
+#: Spectra by experiment: figure, bands, and that of which the paper gives the largest error.
+FULL_SKY = {
+    "Planck": ("Figure 7", ("30", "44", "70", "353"), "70"),
+    "WMAP": ("Figure 8", ("K", "Ka", "Q", "V", "W"), "V"),
+}
 #: Bands of the paper's figures 5 and 6, and 11.
 SHOWN, FITTED = ("30", "44", "70", "353", "K", "W"), ("44", "70")
 
@@ -27,32 +31,30 @@ def _chosen(comparison: Comparison) -> list[str]:
     return list(SHOWN) if set(SHOWN) <= set(bands) else bands
 
 
-def _beam(sources: Sources) -> str:
-    fwhm = sources.settings.common.fwhm
+def _beam(paper: PaperSky) -> str:
+    fwhm = paper.settings.common.fwhm
     return f"smoothed to {fwhm:g} arcmin" if fwhm else "averaged, not smoothed"
 
 
 def _here(
-    sources: Sources, nside: str, bands: Sequence[str], wanted: Sequence[str], *more: str
+    paper: PaperSky, nside: str, bands: Sequence[str], wanted: Sequence[str], *more: str
 ) -> str:
     """What of the comparison is not as in the paper, in a sentence; or nothing."""
-    found = [nside] if nside else []
-    if set(wanted) - set(bands):
-        found.append(f"the bands are {listed(bands)}")
-    if sources.settings.common.fwhm != 60:
-        found.append(f"maps are {_beam(sources)} (the paper: to 60 arcmin)")
-    found += more
+    others = f"the bands are {listed(bands)}" if set(wanted) - set(bands) else ""
+    wide = paper.settings.common.fwhm != 60
+    beam = f"maps are {_beam(paper)} (the paper: to 60 arcmin)" if wide else ""
+    found = [words for words in (nside, others, beam, *more) if words]
     return f"Here, {listed(found)}." if found else ""
 
 
-def _pixels_here(sources: Sources, bands: Sequence[str]) -> str:
-    nside = sources.settings.common.nside
-    return _here(sources, f"nside is {nside} rather than 64" * (nside != 64), bands, SHOWN)
+def _pixels_here(paper: PaperSky, bands: Sequence[str]) -> str:
+    nside = paper.settings.common.nside
+    return _here(paper, f"nside is {nside} rather than 64" * (nside != 64), bands, SHOWN)
 
 
-def figure_scatter(sources: Sources, picture: Path) -> Item:
+def figure_scatter(paper: PaperSky, picture: Path) -> Item:
     """Figure 5: observed against modelled pixels along the plane."""
-    settings, found = sources.settings, sources.comparison()
+    settings, found = paper.settings, paper.comparison
     bands = _chosen(found)
     region = "strip" if "strip" in found.regions else next(iter(found.regions))
     pictures.plot_scatter(picture, found, region, bands, settings.title)
@@ -64,45 +66,28 @@ def figure_scatter(sources: Sources, picture: Path) -> Item:
         numbers.append(Number(f"slope, {band}, Q and U", slope, note))
     return described(
         "Figure 5",
-        picture,
         numbers,
         nside=settings.common.nside,
         region=region_words(settings, region),
-        beam=_beam(sources),
-        maps=sources.maps_differ,
-        here=_pixels_here(sources, bands),
+        beam=_beam(paper),
+        maps=paper.maps_differ,
+        here=_pixels_here(paper, bands),
     )
 
 
-def figure_maps(sources: Sources, picture: Path) -> Item:
+def figure_maps(paper: PaperSky, picture: Path) -> Item:
     """Figure 6: observed maps next to the model."""
-    settings, found = sources.settings, sources.comparison()
+    settings, found = paper.settings, paper.comparison
     nside = min(settings.compare.panel_nside, settings.common.nside)
     pictures.plot_model_maps(picture, found, "QU", _chosen(found), nside, settings.title)
-    here = _pixels_here(sources, list(found.prepared.bands))
-    return described("Figure 6", picture, nside=nside, maps=sources.maps_differ, here=here)
+    here = _pixels_here(paper, list(found.prepared.bands))
+    return described("Figure 6", nside=nside, maps=paper.maps_differ, here=here)
 
 
-def figure_planck(sources: Sources, picture: Path) -> Item:
-    """Figure 7: spectra of the Planck bands."""
-    return _spectra(sources, picture, "Figure 7", "Planck", PLANCK, "70")
-
-
-def figure_wmap(sources: Sources, picture: Path) -> Item:
-    """Figure 8: spectra of the WMAP bands."""
-    return _spectra(sources, picture, "Figure 8", "WMAP", WMAP, "V")
-
-
-def _spectra(
-    sources: Sources,
-    picture: Path,
-    label: str,
-    experiment: str,
-    wanted: Sequence[str],
-    largest: str,
-) -> Item:
-    """Spectra of the wanted bands; of the `largest` the paper gives the largest error."""
-    settings, found = sources.settings, sources.comparison()
+def figure_full_sky(experiment: str, paper: PaperSky, picture: Path) -> Item:
+    """Figures 7 and 8: spectra of Planck's or WMAP's bands."""
+    label, wanted, largest = FULL_SKY[experiment]
+    settings, found = paper.settings, paper.comparison
     spectra = [s for s in found.spectra if s.band in wanted]
     if not found.spectra:
         raise Impossible("Spectra of the full sky take maps without missing pixels.")
@@ -111,37 +96,31 @@ def _spectra(
     pictures.plot_full_sky(picture, spectra, settings.title)
     numbers = []
     for s in spectra:
-        EE, BB = (probability(p) for p in s.pte)
+        EE, BB = map(probability, s.pte)
         numbers.append(Number(f"PTE of the spectra, {s.band}", f"EE {EE}, BB {BB}"))
-    for s in spectra:
-        if s.band == largest:
-            EE, BB = (f"{100 * error:.0f} %" for error in s.largest_error)
-            what = f"largest error of a spectrum, {s.band}"
-            numbers.append(Number(what, f"EE {EE}, BB {BB}"))
+    for s in (s for s in spectra if s.band == largest):
+        EE, BB = (f"{100 * error:.0f} %" for error in s.largest_error)
+        numbers.append(Number(f"largest error of a spectrum, {s.band}", f"EE {EE}, BB {BB}"))
     nside, lmax, r = settings.common.nside, settings.compare.lmax, settings.cmb.r
-    more = [f"they end at l = {lmax} rather than 100"] if lmax != 100 else []
-    if not settings.cmb.include:
-        more.append("there is no CMB")
-    elif r != 0.1:
-        more.append(f"r is {r:g} rather than 0.1")
+    end = f"they end at l = {lmax} rather than 100" * (lmax != 100)
+    cmb = f"r is {r:g} rather than 0.1" * (r != 0.1) if settings.cmb.include else "there is no CMB"
     first = f"the spectra are of maps of nside {nside} rather than 256"
     return described(
         label,
-        picture,
         numbers,
         texts="Figures 7 and 8",
         experiment=experiment,
         lmax=lmax,
         nsims=settings.compare.nsims,
-        maps=sources.maps_differ,
-        here=_here(sources, first, [s.band for s in spectra], wanted, *more),
+        maps=paper.maps_differ,
+        here=_here(paper, first, [s.band for s in spectra], wanted, end, cmb),
     )
 
 
-def figure_leakage(sources: Sources, picture: Path) -> Item:
+def figure_leakage(paper: PaperSky, picture: Path) -> Item:
     """Figure 9: BB at 70 GHz before and after leakage is subtracted."""
-    settings, texts, numbers = sources.settings, TEXTS["Figure 9"], []
-    leaky = [s for s in sources.comparison().spectra if s.uncorrected is not None]
+    settings, texts, numbers = paper.settings, TEXTS["Figure 9"], []
+    leaky = [s for s in paper.comparison.spectra if s.uncorrected is not None]
     if not leaky:
         raise Impossible("No band has a map of leakage to subtract.")
     pictures.plot_leakage(picture, leaky, settings.title)
@@ -149,22 +128,22 @@ def figure_leakage(sources: Sources, picture: Path) -> Item:
         if s.pte_uncorrected is not None:
             before, after = probability(s.pte_uncorrected[1]), probability(s.pte[1])
             numbers.append(Number(f"PTE of BB, {s.band}", f"before {before}, after {after}"))
-    leakage = sources.sky_differs
-    if sources.simulated:
+    leakage = paper.sky_differs
+    if paper.simulated:
         fractions = listed(
             filled(texts["fraction"], percent=100 * fraction, name=name)
             for name, fraction in settings.simulate.leakage.items()
         )
         leakage = filled(texts["simulated"], fractions=fractions)
-    return described("Figure 9", picture, numbers, leakage=leakage)
+    return described("Figure 9", numbers, leakage=leakage)
 
 
-def figure_patches(sources: Sources, picture: Path) -> Item:
+def figure_patches(paper: PaperSky, picture: Path) -> Item:
     """Figure 10: power laws on small patches."""
-    settings, numbers = sources.settings, []
+    settings, numbers = paper.settings, []
     if settings.compare.patches is None:
-        return _template_patches(sources, picture)
-    found = compare_patches(settings, sources.inputs())
+        return _template_patches(paper, picture)
+    found = compare_patches(settings, paper.inputs)
     pictures.plot_patches(picture, found, settings.title)
     for i, name in enumerate(("EE", "BB")):
         A, alpha = found.correlation(i)
@@ -173,14 +152,14 @@ def figure_patches(sources: Sources, picture: Path) -> Item:
             Number(f"A observed / model, {name}", ratio, f"correlation {A:.2f}"),
             Number(f"alpha observed - model, {name}", difference, f"correlation {alpha:.2f}"),
         ]
-    return described("Figure 10", picture, numbers, band=found.band, maps=sources.maps_differ)
+    return described("Figure 10", numbers, band=found.band, maps=paper.maps_differ)
 
 
-def _template_patches(sources: Sources, picture: Path) -> Item:
+def _template_patches(paper: PaperSky, picture: Path) -> Item:
     """Figure 10 without a band to compare with: BB against EE of the dust."""
-    dust = sources.template("dust")
+    dust = paper.template("dust")
     found = template_patches(dust.maps, dust.fwhm)
-    pictures.plot_template_patches(picture, found, sources.settings.title)
+    pictures.plot_template_patches(picture, found, paper.settings.title)
     both = found.detected.all(axis=1)
     slopes = ", ".join(f"{slope:.2f}" for slope in np.median(found.alpha[both], axis=0))
     ratio = np.median(found.A[both, 1] / found.A[both, 0])
@@ -188,13 +167,13 @@ def _template_patches(sources: Sources, picture: Path) -> Item:
         Number("median A of BB / EE", f"{ratio:.2f}"),
         Number("median alpha, EE, BB", slopes),
     ]
-    texts, sky = "Figure 10 of the template", sources.sky_differs
-    return described("Figure 10", picture, numbers, texts=texts, sky=sky)
+    texts, sky = "Figure 10 of the template", paper.sky_differs
+    return described("Figure 10", numbers, texts=texts, sky=sky)
 
 
-def figure_probability(sources: Sources, picture: Path) -> Item:
+def figure_probability(paper: PaperSky, picture: Path) -> Item:
     """Figure 11: the probability of beta_dust and beta_syn on a grid, from Q and from U."""
-    settings, inputs = sources.settings, sources.inputs()
+    settings, inputs = paper.settings, paper.inputs
     bands = {name: inputs.bands[name] for name in FITTED if name in inputs.bands} or inputs.bands
     if len(settings.free_in("fit")) != 2:
         raise Impossible("A grid takes two free parameters, in the table `free`.")
@@ -223,9 +202,8 @@ def figure_probability(sources: Sources, picture: Path) -> Item:
     simulated = TEXTS["Figure 11"]["simulated"]
     return described(
         "Figure 11",
-        picture,
         numbers,
         bands=listed(bands),
         region=region_words(settings, "strip"),
-        maps=simulated if sources.simulated else sources.sky_differs,
+        maps=simulated if paper.simulated else paper.sky_differs,
     )

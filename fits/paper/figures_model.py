@@ -1,19 +1,19 @@
 """Figures of the model: templates, indices, AME, small scales, B modes, and a sky seen by COrE."""
 
-import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import healpy
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from fits.commands.forecast import forecast
 from fits.commands.forecast_pictures import plot_b_modes
 from fits.commands.page import ResultTable
 from fits.paper.items import TEXTS, Impossible, Item, Number, described, filled, listed
-from fits.paper.sources import NSIDE, PAPER_FWHM, SYMBOLS, Index, Sources
+from fits.paper.sky import NSIDE, PAPER_FWHM, SYMBOLS, PaperSky
 from fits.plots import (
     COLORS,
     COLUMN,
@@ -34,7 +34,6 @@ from jaxsky.harmonics import analysis, expand, gaussian_beam, lmax_of, power_spe
 from jaxsky.instrument import band_tables, load_instrument
 from jaxsky.interpolation import term_weights
 from jaxsky.io import InputError
-from jaxsky.keys import stream
 from jaxsky.observation import (
     HarmonicSource,
     Observation,
@@ -45,7 +44,7 @@ from jaxsky.observation import (
 )
 from jaxsky.settings import BandTable, Experiment
 from jaxsky.simulation import observe_bands
-from jaxsky.small_scales import DUST, SYNCHROTRON
+from jaxsky.small_scales import DUST, SYNCHROTRON, Continued
 from jaxsky.templates import correlation, polarization_template, preset, steepening
 
 NAMES = ("synchrotron", "dust")
@@ -63,92 +62,88 @@ BANDS = ("45", "105", "315")
 NSIDE_FORECAST, LMAX = 128, 250
 
 
-def figure_templates(sources: Sources, picture: Path) -> Item:
+def _row(title: str, Q: Float[ArrayLike, " pix"]) -> list[MapPanel]:
+    """A map of Q [uK_RJ], alone in its row."""
+    Q = np.asarray(Q)
+    return [MapPanel(title, Q, color_limit(Q), UNITS["uK_RJ"])]
+
+
+def figure_templates(paper: PaperSky, picture: Path) -> Item:
     """Figure 1: Q of both templates."""
     rows, beams = [], {}
     for name in ("dust", "synchrotron"):
-        layer = sources.template(name)
+        layer = paper.template(name)
         beams[name] = layer.fwhm
         title = f"{name}, $Q$, {float(layer.component.nu_ref):g} GHz"
-        Q = np.asarray(layer.maps[0])
-        rows.append([MapPanel(title, Q, color_limit(Q), UNITS["uK_RJ"])])
+        rows.append(_row(title, layer.maps[0]))
     plot_maps(picture, rows)
-    return described("Figure 1", picture, beams=beams, sky=sources.sky_differs)
+    return described("Figure 1", beams=beams, sky=paper.sky_differs)
 
 
-def figure_indices(sources: Sources, picture: Path) -> Item:
+def figure_indices(paper: PaperSky, picture: Path) -> Item:
     """Figure 3: maps of both spectral indices."""
     rows, origins, numbers = [], [], []
     for name, word, symbol in (("beta_dust", "dust", "d"), ("beta_syn", "synchrotron", "s")):
-        index = sources.index(name)
-        values = np.asarray(index.values)
+        index, fwhm, steeper, origin = paper.index(name)
+        values = np.asarray(index)
         mean, spread = float(values.mean()), float(values.std())
-        middle, title = round(mean, 2), f"{word}, {index.fwhm / 60:g}° beam"
+        middle, title = round(mean, 2), f"{word}, {fwhm / 60:g}° beam"
         limit, label = color_limit(values - middle), rf"$\beta_{{\rm {symbol}}}$"
         rows.append([MapPanel(title, values, limit, label, middle)])
-        origins.append(index.origin)
-        note = "by construction" if index.steepening is None else ""
+        origins.append(origin)
+        note = "by construction" if steeper is None else ""
         numbers += [
             Number(f"mean of {SYMBOLS[name]}", f"{mean:.3f}", note),
             Number(f"scatter of {SYMBOLS[name]}", f"{spread:.3f}", note),
         ]
-    numbers.append(_steepening(sources.index("beta_syn")))
+        if name == "beta_syn":
+            numbers.append(_steepening(steeper))
     plot_maps(picture, rows)
-    return described("Figure 3", picture, numbers, origins=" and ".join(origins))
+    return described("Figure 3", numbers, origins=" and ".join(origins))
 
 
-def _steepening(index: Index) -> Number:
-    """How much steeper the index was made, and what a published curved law would say."""
+def _steepening(by: float | None) -> Number:
+    """How much steeper beta_syn was made, and what a published curved law would say."""
     curved, text = preset("s3", np.zeros((2, 12)), beta_syn=3.0), TEXTS["Figure 3"]
     nu = jnp.geomspace(0.4, 40.0, 200)
     said = filled(text["steepening"], curved=float(steepening(nu, curved.sed(nu))))
     return Number(
         "steepening of β_syn from 0.49 ... 2.12 to 20 ... 30 GHz",
-        f"{index.steepening:.2f}" if index.steepening else "none",
-        (text["drawn"] if index.steepening is None else "") + said,
+        f"{by:.2f}" if by else "none",
+        (text["drawn"] if by is None else "") + said,
     )
 
 
-def figure_ame(sources: Sources, picture: Path) -> Item:
+def figure_ame(paper: PaperSky, picture: Path) -> Item:
     """Figure 4: Q of AME, and Pearson's correlation with the dust, with jackknife errors."""
-    ame = sources.ame()
-    Q = np.asarray(ame.maps[0])
-    title = "AME, $Q$, 23 GHz, 1 % polarized"
-    plot_maps(picture, [[MapPanel(title, Q, color_limit(Q), UNITS["uK_RJ"])]])
-    own = healpy.npix2nside(Q.size)
+    ame, dust, resolution, origin = paper.ame()
+    plot_maps(picture, [_row("AME, $Q$, 23 GHz, 1 % polarized", ame[0])])
+    own, numbers = healpy.npix2nside(ame.shape[-1]), []
     nside = min(NSIDE, own)
-    maps = [
-        each if nside == own else polarization_template(each, 0.0, 0.0, nside)
-        for each in (ame.dust, ame.maps)
-    ]
-    blocks, numbers = superpixels(nside, NSIDE_BLOCKS), []
-    for stokes, x, y in zip("QU", *maps, strict=True):
-        r, error = correlation(x, y)
-        wide = correlation(x, y, blocks).error
-        note = f"jackknife over pixels of nside {nside}; over blocks of 15° the error is "
-        numbers.append(
-            Number(
-                f"correlation of dust and AME, {stokes}",
-                with_error(float(r), float(error)),
-                f"{note}{float(wide):.2g}",
-            )
-        )
+    if nside != own:
+        dust, ame = (polarization_template(each, 0.0, 0.0, nside) for each in (dust, ame))
+    blocks = superpixels(nside, NSIDE_BLOCKS)
+    for stokes, x, y in zip("QU", dust, ame, strict=True):
+        r, error = map(float, correlation(x, y))
+        wide = float(correlation(x, y, blocks).error)
+        note = f"jackknife over pixels of nside {nside}; over blocks of 15° the error is {wide:.2g}"
+        what = f"correlation of dust and AME, {stokes}"
+        numbers.append(Number(what, with_error(r, error), note))
     return described(
         "Figure 4",
-        picture,
         numbers,
-        sky=sources.sky_differs,
-        origin=ame.origin[:1].upper() + ame.origin[1:],
-        resolution=ame.resolution,
+        sky=paper.sky_differs,
+        origin=origin[:1].upper() + origin[1:],
+        resolution=resolution,
     )
 
 
-def figure_spectra(sources: Sources, picture: Path) -> Item:
+def figure_spectra(paper: PaperSky, picture: Path) -> Item:
     """Figure 2: EE of both templates, of what continues them, and of both together."""
-    fwhm, numbers = sources.settings.paper.fwhm, []
+    fwhm, numbers = paper.settings.paper.fwhm, []
     with draw_panels(picture, "", (COLUMN, 5.2), 2, sharex=True) as panels:
         for axes, name in zip(panels[:, 0], NAMES, strict=True):
-            layer, continued = sources.template(name), sources.continued(name)
+            layer, continued = paper.template(name), paper.continued(name)
             (alm,), (part,), small = continued.alms, continued.parts, layer.small_scales
             (start, join), lmax = small.EE, lmax_of(alm)
             original = analysis(layer.maps, part.measured.shape[-1] - 1)
@@ -167,32 +162,27 @@ def figure_spectra(sources: Sources, picture: Path) -> Item:
             axes.legend(frameon=False, loc="lower left", handlelength=1.4)
             for i, kind in enumerate(("EE", "BB")):
                 slope, error = part.laws[i].slope, jnp.sqrt(part.laws[i].covariance[1, 1])
-                used, paper = getattr(small, kind), getattr(RANGES[name], kind)
+                used, theirs = getattr(small, kind), getattr(RANGES[name], kind)
                 note = f"l = {used[0]} to {used[1]}"
-                note += "" if used == paper else f"; the paper: {paper[0]} to {paper[1]}"
+                note += "" if used == theirs else f"; the paper: {theirs[0]} to {theirs[1]}"
                 ours = with_error(float(slope), float(error))
                 numbers.append(Number(f"slope of {name} {kind}", ours, note))
         panels[0, 0].set_xlabel("")
-    sky, ranges = sources.sky_differs, _ranges(sources)
-    return described("Figure 2", picture, numbers, fwhm=fwhm, sky=sky, ranges=ranges)
+    sky, ranges = paper.sky_differs, _ranges(paper)
+    return described("Figure 2", numbers, fwhm=fwhm, sky=sky, ranges=ranges)
 
 
-def _ranges(sources: Sources) -> str:
+def _ranges(paper: PaperSky) -> str:
     """What is to be said about the ranges of the fits."""
     texts = TEXTS["Figure 2"]["ranges"]
-    used, wanted = (
-        [(tuple(one.EE), tuple(one.BB)) for one in each]
-        for each in (
-            [sources.template(name).small_scales for name in NAMES],
-            [getattr(sources.settings.paper, name) for name in NAMES],
-        )
-    )
-    if used != wanted:
-        ends = sorted({sources.template(name).nside for name in NAMES})
+    layers, wanted = [paper.template(name) for name in NAMES], paper.settings.paper
+    used = [(one.small_scales.EE, one.small_scales.BB) for one in layers]
+    if used != [(tuple(one.EE), tuple(one.BB)) for one in (wanted.synchrotron, wanted.dust)]:
+        ends = sorted({layer.nside for layer in layers})
         return filled(texts["clipped"], ends=listed(f"l = {2 * n}" for n in ends))
     if used == [(RANGES[name].EE, RANGES[name].BB) for name in NAMES]:
         return filled(texts["paper"])
-    return filled(texts["model" if sources.embedded else "other"])
+    return filled(texts["model" if paper.embedded else "other"])
 
 
 def _disc(
@@ -217,21 +207,15 @@ def _draw_patches(
             axes.label_outer()
 
 
-def figure_randomised(sources: Sources, picture: Path) -> Item:
+def figure_randomised(paper: PaperSky, picture: Path) -> Item:
     """Figure 14: a patch of the synchrotron, its small scales, and two others."""
-    layer, nside = sources.template("synchrotron"), sources.nside_fine
-    fwhm, center = sources.settings.paper.fwhm, sources.settings.paper.center
-    small = layer.small_scales
-    steeper = dataclasses.replace(small, tilt=small.tilt + TILT)
-    other = stream(sources.key, "other small scales", "synchrotron")
-    own = sources.small_scales_key("synchrotron")
+    layer, nside = paper.template("synchrotron"), paper.nside_fine
+    fwhm, center = paper.settings.paper.fwhm, paper.settings.paper.center
     # Made one after the other: each takes as much memory as all the rest of the figure.
-    makers = {
-        f"with small scales, {fwhm:g}'": lambda: sources.continued("synchrotron"),
-        "another realisation": lambda: sources.with_small_scales(layer, other),
-        f"steeper by {-TILT:g}": lambda: sources.with_small_scales(
-            layer._replace(small_scales=steeper), own
-        ),
+    makers: dict[str, Callable[[str], Continued]] = {
+        f"with small scales, {fwhm:g}'": paper.continued,
+        "another realisation": partial(paper.with_small_scales, kind="other small scales"),
+        f"steeper by {-TILT:g}": partial(paper.with_small_scales, tilt=TILT),
     }
 
     def Q_of(maps: Float[Array, "2 pix"]) -> Float[np.ndarray, " pix"]:
@@ -241,7 +225,7 @@ def figure_randomised(sources: Sources, picture: Path) -> Item:
     panels = {f"template, {layer.fwhm / 60:.2g}°": Q_of(wide)}
     del wide
     for title, make in makers.items():
-        (alm,) = make().alms
+        (alm,) = make("synchrotron").alms
         beam = gaussian_beam(fwhm, lmax_of(alm))
         panels[title] = Q_of(synthesis(alm * expand(beam), nside))
     template, *rest = [_disc(values, center, SIZE) for values in panels.values()]
@@ -251,26 +235,25 @@ def figure_randomised(sources: Sources, picture: Path) -> Item:
     _draw_patches(picture, shifted, center, SIZE)
     return described(
         "Figure 14",
-        picture,
         size=SIZE,
         center=center,
         mean=middle,
         fwhm=fwhm,
         steeper=-TILT,
         rms=listed(f"{float((values - template).std()):.2f}" for values in rest),
-        sky=sources.sky_differs,
+        sky=paper.sky_differs,
     )
 
 
-def forecast_settings(sources: Sources) -> Experiment:
+def forecast_settings(paper: PaperSky) -> Experiment:
     """Those of a forecast with COrE and the sky of the figures."""
-    settings, lmax = sources.settings, LMAX
+    settings, lmax = paper.settings, LMAX
     sky = settings.sky
     if sky.embedded is not None:
         embedded = sky.embedded.model_copy(update={"nside": NSIDE_FORECAST})
         sky = sky.model_copy(update={"embedded": embedded})
-    if not sources.embedded:
-        lmax = min(LMAX, 2 * min(sources.template(name).nside for name in NAMES) - 8)
+    if not paper.embedded:
+        lmax = min(LMAX, 2 * min(paper.template(name).nside for name in NAMES) - 8)
     fit = (20, min(200, lmax - 10))
     spec = settings.forecast.model_copy(update={"bands": list(BANDS), "lmax": lmax, "fit": fit})
     bands = [BandTable.model_validate(band) for band in band_tables("core")]
@@ -279,18 +262,18 @@ def forecast_settings(sources: Sources) -> Experiment:
     return settings.model_copy(update=changes)
 
 
-def figure_b_modes(sources: Sources, picture: Path) -> Item:
+def figure_b_modes(paper: PaperSky, picture: Path) -> Item:
     """Figure 12: BB of the foregrounds in three bands of COrE, and of gravitational waves."""
     try:
-        settings = forecast_settings(sources)
+        settings = forecast_settings(paper)
         found = forecast(settings)
     except InputError:
         raise
     except ValueError as reason:
         raise Impossible(str(reason)) from None
     plot_b_modes(picture, found, settings)
-    where, sky = f"l = {PIVOT}", sources.sky_differs
-    if sources.embedded:
+    where, sky = f"l = {PIVOT}", paper.sky_differs
+    if paper.embedded:
         sky = filled(TEXTS["Figure 12"]["model"], nside=NSIDE_FORECAST)
     numbers = [
         Number(f"r with as much BB at {where}, {name} GHz", f"{equal[where]:.3g}")
@@ -298,29 +281,29 @@ def figure_b_modes(sources: Sources, picture: Path) -> Item:
     ]
     region, percent = settings.forecast.region, 100 * sky_fraction(found.inputs.mask)
     words = region_words(settings, region)
-    return described("Figure 12", picture, numbers, region=words, percent=percent, sky=sky)
+    return described("Figure 12", numbers, region=words, percent=percent, sky=sky)
 
 
-def core_observation(sources: Sources) -> Observation:
+def core_observation(paper: PaperSky) -> Observation:
     """Three of COrE's bands; beams are COrE's, or that of the small scales if it is wider."""
-    fwhm = sources.settings.paper.fwhm
+    fwhm = paper.settings.paper.fwhm
     channels = {
         name: ObservedBand(one.band, max(float(one.beam), fwhm), noise=one.noise)
         for name, one in load_instrument("core").select(BANDS).observed().items()
     }
-    return Observation(channels, sources.nside_fine, finest=fwhm, precision="single")
+    return Observation(channels, paper.nside_fine, finest=fwhm, precision="single")
 
 
-def prepared_templates(sources: Sources, observation: Observation) -> dict[str, HarmonicSource]:
+def prepared_templates(paper: PaperSky, observation: Observation) -> dict[str, HarmonicSource]:
     """Both foregrounds; where their laws are constant, with the small scales that there are."""
-    given = {name: Source(*sources.template(name)) for name in PAPER_FWHM}
+    given = {name: Source(*paper.template(name)) for name in PAPER_FWHM}
     terms = plan_terms(given, observation)
     constant = {name: one for name, one in terms.items() if one is not None and not one.counts}
     if len(constant) < len(terms):
-        return harmonic_sources(sources.key, given, observation, terms)
+        return harmonic_sources(paper.key, given, observation, terms)
     return {
         name: HarmonicSource(
-            tuple(alm.astype(observation.dtype) for alm in sources.continued(name).alms),
+            tuple(alm.astype(observation.dtype) for alm in paper.continued(name).alms),
             term_weights(given[name].component, observation.bands, one),
             None,
             None,
@@ -330,14 +313,14 @@ def prepared_templates(sources: Sources, observation: Observation) -> dict[str, 
     }
 
 
-def figure_patch(sources: Sources, picture: Path) -> Item:
+def figure_patch(paper: PaperSky, picture: Path) -> Item:
     """Figure 13: Q of the CMB and of three bands in a patch."""
-    settings, center = sources.settings, sources.settings.paper.center
-    observation = core_observation(sources)
-    prepared = prepared_templates(sources, observation)
+    settings, center = paper.settings, paper.settings.paper.center
+    observation = core_observation(paper)
+    prepared = prepared_templates(paper, observation)
     cmb = jnp.asarray(cmb_spectra(settings, observation.lmax))
     panels, numbers = {}, []
-    for name, maps in observe_bands(sources.key, prepared, observation, cmb, components=True):
+    for name, maps in observe_bands(paper.key, prepared, observation, cmb, components=True):
         channel = observation.channels[name]
         Q = {which: np.asarray(values[0]) for which, values in maps.items()}
         inside = {which: _disc(values, center, SIZE_CORE) for which, values in Q.items()}
@@ -352,12 +335,11 @@ def figure_patch(sources: Sources, picture: Path) -> Item:
     spectra = settings.cmb.spectra
     return described(
         "Figure 13",
-        picture,
         numbers,
         size=SIZE_CORE,
         center=center,
         cmb=f"r = {settings.cmb.r:g}" if spectra is None else f"spectra of {spectra}",
-        sky=sources.sky_differs,
+        sky=paper.sky_differs,
         fwhm=settings.paper.fwhm,
         nside=observation.nside,
     )
@@ -377,7 +359,7 @@ def _brightest(band: str, inside: Mapping[str, Float[np.ndarray, " inside"]]) ->
     )
 
 
-def table_core(sources: Sources, picture: Path) -> Item:
+def table_core(paper: PaperSky, picture: Path) -> Item:
     """Table 1: COrE."""
     channels = list(load_instrument("core"))
     header = ("Band [GHz]", *(f"{float(channel.center):g}" for channel in channels))
@@ -386,4 +368,4 @@ def table_core(sources: Sources, picture: Path) -> Item:
         ("Noise [µK_RJ arcmin]", *(f"{float(channel.noise):.2f}" for channel in channels)),
         ("Width [GHz]", *(f"{float(channel.width):.3g}" for channel in channels)),
     )
-    return described("Table 1", None, table=ResultTable(header, rows))
+    return described("Table 1", table=ResultTable(header, rows))

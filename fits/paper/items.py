@@ -31,18 +31,10 @@ class Number:
 
 @dataclass(frozen=True)
 class Item:
-    """A figure or a table.
+    """A figure or a table, by the paper's number ("Figure 1").
 
-    Parameters
-    ----------
-    label : as the paper numbers it, "Figure 1"
-    title : a few words
-    caption : what is shown
-    differs : one line on what differs from the paper, and why
-    picture : file in the folder of the page
-    table : what is shown instead of a picture, or below it
-    numbers : that the paper's text gives about it
-    seconds : that it took
+    `differs` is a line on what differs from the paper, and why. The table is shown instead of the
+    picture, a file in the folder of the page, or below it. The paper's text gives the numbers.
     """
 
     label: str
@@ -60,51 +52,32 @@ def filled(text: str, **words: Any) -> str:
     return " ".join(text.format_map(words).split())
 
 
+def picture_of(label: str) -> str:
+    """Name of the picture of a figure."""
+    return re.sub(r"\d+", lambda n: f"{int(n[0]):02d}", label.lower().replace(" ", "_")) + ".png"
+
+
 def described(
     label: str,
-    picture: Path | None,
     numbers: Sequence[Number] = (),
     *,
     table: ResultTable | None = None,
     texts: str | None = None,
     **words: Any,
 ) -> Item:
-    """An item with the words of `paper.toml`, and what the paper says of its numbers.
+    """An item with the texts of its label, words filled in, and what the paper says of its numbers.
 
-    Parameters
-    ----------
-    label : of the item
-    picture : its file
-    numbers, table : of the item
-    texts : their heading in `paper.toml`, by default the label
-    words : what is filled in
+    Other `texts` than those of the label are named by their heading in `paper.toml`.
     """
     own = TEXTS[texts or label]
     published, otherwise = own.get("published", {}), own.get("otherwise", "not given")
     title, caption, differs = (filled(own[key], **words) for key in ("title", "caption", "differs"))
-    file = None if picture is None else picture.name
+    picture = picture_of(label) if table is None else None
     said = [replace(one, paper=published.get(one.what, otherwise)) for one in numbers]
-    return Item(label, title, caption, differs, file, table, tuple(said))
-
-
-def picture_of(label: str) -> str:
-    """Name of the picture of a figure.
-
-    Examples
-    --------
-    >>> picture_of("Figure 1")
-    'figure_01.png'
-    """
-    return re.sub(r"\d+", lambda n: f"{int(n[0]):02d}", label.lower().replace(" ", "_")) + ".png"
+    return Item(label, title, caption, differs, picture, table, tuple(said))
 
 
 def listed(words: Iterable[str]) -> str:
-    """Words as a list in a sentence.
-
-    Examples
-    --------
-    >>> listed(["a", "b", "c"])
-    'a, b and c'
-    """
+    """Words as a list in a sentence: "a, b and c"."""
     first = list(words)
     return " and ".join(filter(None, (", ".join(first[:-1]), *first[-1:])))

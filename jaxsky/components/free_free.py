@@ -22,19 +22,9 @@ def amplitude_from_emission_measure(
 ) -> Float[Array, "..."]:
     """Antenna temperature of optically thin free-free emission [uK_RJ] from its emission measure.
 
-    0.05468 T_e^-3/2 nu^-2 EM g_ff is the optical depth of Draine (2011), with nu in GHz; times
-    T_e it is the temperature (Planck 2015 results X, table 4, to first order in the depth).
-
-    Parameters
-    ----------
-    EM : emission measure [cm^-6 pc]
-    T_e : electron temperature [K]
-    nu_ref : frequency [GHz]
-
-    Examples
-    --------
-    >>> round(float(amplitude_from_emission_measure(100.0, 7000.0, 30.0)), 2)
-    279.54
+    0.05468 T_e^-3/2 nu^-2 EM g_ff is the optical depth of Draine (2011), with nu in GHz and EM in
+    cm^-6 pc; times T_e it is the temperature (Planck 2015 results X, table 4, to first order in
+    the depth).
     """
     return jnp.asarray(1e6 * 0.05468 * EM * _emissivity(nu_ref, T_e))
 

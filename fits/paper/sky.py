@@ -1,10 +1,9 @@
-"""What the figures are drawn from: templates, AME, maps of indices; each made once, when needed."""
+"""The sky of the figures: templates, AME, maps of indices; made when they are needed."""
 
 import dataclasses
-import functools
-from collections.abc import Callable
+from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeAlias
 
 import healpy
 import jax.numpy as jnp
@@ -65,18 +64,13 @@ SLOPE = -2.0
 
 WORDS = TEXTS["sky"]
 
-F = TypeVar("F", bound=Callable[..., Any])
+#: Pixels of an index, its resolution [arcmin], by how much it was made steeper (None if it was
+#: drawn), and where it is from, as a part of a sentence.
+Index: TypeAlias = tuple[Float[Array, " pix"], float, float | None, str]
 
 
 class Layer(NamedTuple):
-    """A foreground at the resolution of the paper's template, as far as the map has it.
-
-    Parameters
-    ----------
-    component : template and law
-    fwhm : beam of the template [arcmin]
-    small_scales : how it is continued
-    """
+    """A `Source` of dust or synchrotron: of the paper's beam [arcmin] if its map has that."""
 
     component: Dust | Synchrotron
     fwhm: float
@@ -93,71 +87,21 @@ class Layer(NamedTuple):
         return healpy.npix2nside(self.maps.shape[-1])
 
 
-class Ame(NamedTuple):
-    """AME at 23 GHz.
-
-    Parameters
-    ----------
-    maps : Q, U [uK_RJ]
-    dust : Q, U of the dust at the same resolution [uK_RJ]
-    resolution : in words
-    origin : where the intensity is from, to be part of a sentence
-    """
-
-    maps: Float[Array, "2 pix"]
-    dust: Float[Array, "2 pix"]
-    resolution: str
-    origin: str
-
-
-class Index(NamedTuple):
-    """A map of a spectral index.
-
-    Parameters
-    ----------
-    values : the index, T ~ nu^-beta_syn for the synchrotron
-    fwhm : resolution [arcmin]
-    steepening : by how much it was made steeper; None if it is what was drawn
-    origin : where it is from, to be part of a sentence
-    """
-
-    values: Float[Array, " pix"]
-    fwhm: float
-    steepening: float | None
-    origin: str
-
-
-def once(method: F) -> F:
-    """A method of `Sources` whose results are made at the first call and kept."""
-
-    @functools.wraps(method)
-    def kept(self: "Sources", *names: str) -> Any:
-        key = (method.__name__, *names)
-        if key not in self._made:
-            self._made[key] = method(self, *names)
-        return self._made[key]
-
-    return kept  # type: ignore[return-value]
-
-
-class Sources:
-    """What is shared by the figures of one set of settings.
-
-    Parameters
-    ----------
-    settings : of the figures
-    """
+class PaperSky:
+    """What is shared by the figures of one set of settings."""
 
     def __init__(self, settings: Experiment) -> None:
         self.settings = settings
         self.folder = Path(settings.data_dir)
         self.key = realisation_key(settings.seed)
-        self._made: dict[tuple[str, ...], Any] = {}
+        # Made once, at the first call.
+        self.template = cache(self._template)
+        self.continued = cache(self.with_small_scales)
 
     def forget_bands(self) -> None:
         """Forget the maps of the bands, the largest of all that is kept."""
         for name in ("inputs", "comparison"):
-            self._made.pop((name,), None)
+            vars(self).pop(name, None)
 
     @property
     def embedded(self) -> bool:
@@ -199,23 +143,23 @@ class Sources:
         """The same for an item that shows observed maps."""
         return filled(WORDS["differs"]["simulated"]) if self.simulated else self.sky_differs
 
-    @once
+    @cached_property
     def galaxy(self) -> EmbeddedSky:
         """The embedded model; where templates come from files, at low resolution."""
         if self.settings.sky.embedded is not None:
             return embedded_galaxy(self.settings)
         return default_galaxy(NSIDE)
 
-    @once
+    @cached_property
     def inputs(self) -> Inputs:
         """Templates and maps of the bands."""
-        return inputs_of(self.settings, galaxy=self.galaxy() if self.embedded else None)
+        return inputs_of(self.settings, galaxy=self.galaxy if self.embedded else None)
 
-    @once
+    @cached_property
     def comparison(self) -> Comparison:
         """The maps against the model, at the common resolution."""
         masks = region_masks(self.settings, self.settings.compare.regions)
-        return compare(self.settings, prepared_maps(self.settings, self.inputs()), masks)
+        return compare(self.settings, prepared_maps(self.settings, self.inputs), masks)
 
     def _spec(self, law: str) -> tuple[str, ComponentTable]:
         found = [(n, spec) for n, spec in self.settings.sky.components.items() if spec.law == law]
@@ -225,20 +169,19 @@ class Sources:
             )
         return found[0]
 
-    @once
+    @cached_property
     def _templates(self) -> dict[str, Template]:
         names = {law: self._spec(law)[0] for law in PAPER_FWHM}
-        galaxy = None if self.settings.sky.embedded is None else self.galaxy()
+        galaxy = None if self.settings.sky.embedded is None else self.galaxy
         templates, _ = read_sky(self.settings, names=list(names.values()), galaxy=galaxy)
         return {law: templates[name] for law, name in names.items()}
 
-    @once
-    def template(self, name: str) -> Layer:
-        """The dust or the synchrotron at the resolution of the paper's, as far as its map has it.
+    def _template(self, name: str) -> Layer:
+        """Q, U of dust or synchrotron at the resolution of the paper's, as far as its map has it.
 
         Ranges of power laws that are beyond the multipoles of the map keep their ratio of ends.
         """
-        own = self._templates()[name]
+        own = self._templates[name]
         if missing := int(np.sum(~own.used)):
             raise SettingsError(
                 f"sky.{name}: {missing} pixels have no value; the figures of the paper take "
@@ -266,26 +209,25 @@ class Sources:
             nside *= 2
         return nside
 
-    def with_small_scales(self, layer: Layer, key: Array) -> Continued:
-        """A template with its small scales drawn with a key."""
-        return continue_templates(
-            key, [layer.maps], [layer.fwhm], [layer.small_scales], self.nside_fine
-        )
+    def with_small_scales(
+        self, name: str, tilt: float = 0.0, kind: str = "small scales"
+    ) -> Continued:
+        """Dust or synchrotron with small scales, also tilted or drawn with keys of another kind.
 
-    @once
-    def continued(self, name: str) -> Continued:
-        """The dust or the synchrotron with small scales, the same in all figures."""
-        return self.with_small_scales(self.template(name), self.small_scales_key(name))
+        `continued` has those that are the same in all figures.
+        """
+        layer = self.template(name)
+        small = dataclasses.replace(layer.small_scales, tilt=float(layer.small_scales.tilt) + tilt)
+        key = stream(self.key, kind, name)
+        return continue_templates(key, [layer.maps], [layer.fwhm], [small], self.nside_fine)
 
-    def small_scales_key(self, name: str) -> Array:
-        """The key of these."""
-        return stream(self.key, "small scales", name)
+    def ame(self) -> tuple[Float[Array, "2 pix"], Float[Array, "2 pix"], str, str]:
+        """Q, U of AME at 23 GHz and 1 degree, 1 % polarized along the dust, and those of the dust.
 
-    @once
-    def ame(self) -> Ame:
-        """AME at 1 degree, 1 % polarized along the dust."""
+        Then their resolution in words, and where the intensity is from, as a part of a sentence.
+        """
         dust, spec = self.template("dust"), self.settings.paper.ame
-        nu_ref, own = NU_AME, 0.0
+        nu_ref, own, nside = NU_AME, 0.0, dust.nside
         if spec is not None:
             found = read(self.folder, spec)
             if found.stokes not in (("I",), (None,), ("",)):
@@ -299,35 +241,34 @@ class Sources:
             origin = f"the intensity of AME is {spec.label}"
             origin += f", from {nu_ref:g} to 23 GHz by the paper's law" * (nu_ref != NU_AME)
         else:
-            intensity = self.galaxy().dust[0] / 2
+            intensity = self.galaxy.dust[0] / 2
             origin = (
                 "there is no intensity of AME, and half of that of the embedded model's dust at "
                 "353 GHz takes its place"
             )
-        fwhm, pixel = max(AME_FWHM, own, dust.fwhm), healpy.nside2resol(dust.nside, arcmin=True)
+        fwhm, pixel = max(AME_FWHM, own, dust.fwhm), healpy.nside2resol(nside, arcmin=True)
         resolution = f"a beam of {fwhm / 60:.3g}°"
         polarized = dust.maps
         if fwhm < PIXELS * pixel and intensity.size == polarized.shape[-1]:
             # Pixels are as wide as the beam; cut where they end, bright structures would ring.
             resolution = f"pixels of {pixel:.0f} arcmin"
         else:
-            polarized = polarization_template(polarized, dust.fwhm, fwhm, dust.nside)
-            intensity = dust_index(intensity, own, fwhm, dust.nside)
+            polarized = polarization_template(polarized, dust.fwhm, fwhm, nside)
+            intensity = dust_index(intensity, own, fwhm, nside)
         ame = AME.from_dust_angles(intensity, polarized, nu_ref=nu_ref)
-        return Ame(ame.template * ame.sed(NU_AME), polarized, resolution, origin)
+        return ame.template * ame.sed(NU_AME), polarized, resolution, origin
 
-    @once
     def index(self, name: str) -> Index:
         """The map of beta_dust or beta_syn: of a file, of the template, or drawn."""
         layer = self.template("dust" if name == "beta_dust" else "synchrotron")
-        held = getattr(layer.component, name)
+        held, nside = getattr(layer.component, name), layer.nside
         spec: BeamedMap | None = getattr(self.settings.paper, name)
         if spec is not None:
             return _read_index(self.folder, name, spec)
         if not isinstance(held, tuple) and held.ndim == 1:
-            smooth = dust_index(held, 0.0, FWHM[name], layer.nside)
-            return Index(smooth, FWHM[name], 0.0, f"{SYMBOLS[name]} is that of the template")
-        return _drawn_index(stream(self.key, "index", name), name, min(NSIDE, layer.nside))
+            smooth = dust_index(held, 0.0, FWHM[name], nside)
+            return smooth, FWHM[name], 0.0, f"{SYMBOLS[name]} is that of the template"
+        return _drawn_index(stream(self.key, "index", name), name, min(NSIDE, nside))
 
 
 def _drawn_index(key: Array, name: str, nside: int) -> Index:
@@ -340,7 +281,7 @@ def _drawn_index(key: Array, name: str, nside: int) -> Index:
     origin = (
         f"{SYMBOLS[name]} is a Gaussian field of mean {MEAN[name]:g} and scatter {SCATTER[name]:g}"
     )
-    return Index(values, fwhm, None, origin)
+    return values, fwhm, None, origin
 
 
 def _read_index(folder: Path, name: str, spec: BeamedMap) -> Index:
@@ -359,7 +300,7 @@ def _read_index(folder: Path, name: str, spec: BeamedMap) -> Index:
         given = spec.steepening
         by = _of_spectrum(folder, given) if isinstance(given, str) else given
         origin += f", made steeper by {by:.2f}" if by else ", not made steeper"
-    return Index(smooth + by, fwhm, by, origin)
+    return smooth + by, fwhm, by, origin
 
 
 def _of_spectrum(folder: Path, file: str) -> float:

@@ -18,7 +18,7 @@ from fits.commands.console import print_written, replace_unprintable
 from fits.commands.data import data_commands
 from fits.commands.endings import print_error, prompt
 from fits.commands.run import DEFAULTS, Options, run_command
-from jaxsky.io.folders import ALL, cache_folder
+from jaxsky.io.folders import cache_folder
 from jaxsky.programs import keep_programs
 
 #: Parameters of glibc's mallopt: M_ARENA_MAX, M_MMAP_THRESHOLD.
@@ -51,17 +51,9 @@ Overwrite = Annotated[
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 
 
-def _version(value: bool) -> None:
-    if value:
-        typer.echo(f"jaxsky {jaxsky.__version__}")
-        raise typer.Exit
-
-
 @app.callback()
 def _options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
-    ] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
 ) -> None:
     """A JAX-differentiable model of the polarized microwave sky, with the tools to fit it."""
 
@@ -115,8 +107,7 @@ def _simulate(
         raise ValueError(f"--only must be one of {', '.join(ONLY)}, not {only!r}.")
     indices = range(first, first + nsims)
     options = Options(settings_file, out, values, resume, overwrite)
-    # With --overwrite all realisations are removed, so nobody else may be making any.
-    run_command(simulate_command(indices, only), options, ALL if overwrite else indices)
+    run_command(simulate_command(indices, only), options, indices)
 
 
 def _analysis(name: str) -> Callable[..., None]:
@@ -203,8 +194,9 @@ def main() -> None:
             jax.config.update("jax_enable_x64", True)
             keep_programs(cache_folder() / "programs")
             if "--version" in sys.argv:  # after any command
-                sys.argv[1:] = ["--version"]
-            app()
+                print(f"jaxsky {jaxsky.__version__}")
+            else:
+                app()
     except Exception as error:
         print_error(error)
         sys.exit(2)

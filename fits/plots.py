@@ -109,14 +109,8 @@ def draw_panels(
 ) -> Iterator[np.ndarray]:
     """Panels to draw on, an array (rows, columns) of axes; at the end they are written to a file.
 
-    Parameters
-    ----------
-    path : picture to write
-    title : above all panels; may be empty
-    size : width and height [inch]
-    rows, columns : of the panels
-    fontsize : of the title
-    options : of `matplotlib.pyplot.subplots`
+    `size` is width and height [inch], `fontsize` that of the title above all panels, which may be
+    empty; `options` are those of `matplotlib.pyplot.subplots`.
     """
     with plt.rc_context(STYLE):
         figure, panels = plt.subplots(
@@ -152,24 +146,22 @@ def _image(
     pixels: np.ndarray,
     limit: float,
     label: str,
-    linear: bool = False,
-    middle: float = 0.0,
+    middle: float | None = None,
     **options: Any,
 ) -> None:
-    """Values about zero with a bar of colours, linear up to a tenth of the limit, then logarithmic.
+    """Values and a bar of colours: about zero, linear to a tenth of the limit, then logarithmic.
 
-    So the Galactic plane and high latitudes show in one picture. Or linear throughout, about any
-    value. The limit is rounded to one digit.
+    So the Galactic plane and high latitudes show in one picture. With a middle, linear throughout
+    about it. The limit is rounded to one digit.
     """
-    limit = float(f"{limit:.1g}")
-    norm: mpl.colors.Normalize
-    if linear:
+    limit, center = float(f"{limit:.1g}"), middle or 0.0
+    norm: mpl.colors.Normalize = mpl.colors.AsinhNorm(limit / 10, -limit, limit)
+    between = limit / 10
+    if middle is not None:
         norm, between = mpl.colors.Normalize(middle - limit, middle + limit), limit / 2
-    else:
-        norm, between = mpl.colors.AsinhNorm(limit / 10, -limit, limit), limit / 10
     image = axes.imshow(pixels, origin="lower", cmap="RdBu_r", norm=norm, **options)
     bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02, extend="both")
-    bar.set_ticks([middle + tick for tick in (-limit, -between, 0, between, limit)])
+    bar.set_ticks([center + tick for tick in (-limit, -between, 0, between, limit)])
     bar.ax.yaxis.set_major_formatter("{x:g}")
     bar.ax.minorticks_off()
     bar.set_label(label)
@@ -190,7 +182,7 @@ def draw_map(
     projector = healpy.projector.MollweideProj(xsize=600)
     pixels = projector.projmap(np.asarray(values), lambda x, y, z: healpy.vec2pix(nside, x, y, z))
     pixels = np.ma.masked_invalid(np.where(pixels == -np.inf, np.nan, pixels))
-    _image(axes, pixels, limit, label, middle is not None, middle or 0.0)
+    _image(axes, pixels, limit, label, middle)
     axes.axis("off")
 
 
@@ -241,19 +233,17 @@ def draw_patch(
     Unlike those of `draw_map`, its colours are linear, and where its pixels are finer than those
     of the map, values are interpolated between them.
     """
-    nside, values = healpy.npix2nside(values.size), np.asarray(values)
-    xsize = 300
-    projector = healpy.projector.GnomonicProj(
-        rot=(*center, 0.0), xsize=xsize, reso=size * 60 / xsize
-    )
-    if size * 60 / xsize < healpy.nside2resol(nside, arcmin=True):
+    nside, values, xsize = healpy.npix2nside(values.size), np.asarray(values), 300
+    step = size * 60 / xsize  # arcmin
+    projector = healpy.projector.GnomonicProj(rot=(*center, 0.0), xsize=xsize, reso=step)
+    if step < healpy.nside2resol(nside, arcmin=True):
         vectors = projector.xy2vec(projector.ij2xy())
-        theta, phi = healpy.vec2ang(np.stack(vectors, axis=-1).reshape(-1, 3))
-        pixels = healpy.get_interp_val(values, theta, phi).reshape(xsize, xsize)
+        angles = healpy.vec2ang(np.stack(vectors, axis=-1).reshape(-1, 3))
+        pixels = healpy.get_interp_val(values, *angles).reshape(xsize, xsize)
     else:
         pixels = projector.projmap(values, lambda x, y, z: healpy.vec2pix(nside, x, y, z))
     half = size / 2
-    _image(axes, pixels, limit, label, linear=True, extent=(half, -half, -half, half))
+    _image(axes, pixels, limit, label, 0.0, extent=(half, -half, -half, half))
     axes.set_xlabel(rf"$(l - {center[0]:g}^\circ)\,\cos b$ [deg]")
     axes.set_ylabel(rf"$b - {center[1]:g}^\circ$ [deg]")
 

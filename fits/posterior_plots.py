@@ -16,10 +16,6 @@ STOKES_COLORS = {"Q": COLORS[0], "U": COLORS[1], "QU": COLORS[6]}
 TRUTH = {"color": COLORS[3], "linewidth": 1.6}
 
 
-def _tex(name: str) -> str:
-    return f"${label(name)}$"
-
-
 def _levels(log_posterior: np.ndarray) -> list[float]:
     """Heights of the contours that hold 95.45 % and 68.27 % of the probability."""
     density = np.sort(np.exp(log_posterior).ravel())[::-1]
@@ -28,10 +24,7 @@ def _levels(log_posterior: np.ndarray) -> list[float]:
 
 
 def _by_region(fits: Sequence[RegionFit]) -> dict[str, list[RegionFit]]:
-    regions: dict[str, list[RegionFit]] = {}
-    for fit in fits:
-        regions.setdefault(fit.region, []).append(fit)
-    return regions
+    return {fit.region: [f for f in fits if f.region == fit.region] for fit in fits}
 
 
 def plot_grids(
@@ -45,101 +38,93 @@ def plot_grids(
     if not with_grid:
         return False
     regions = _by_region(with_grid)
-    x, y = with_grid[0].results["grid"].free
-    columns = max(len(r) for r in regions.values())
+    columns = max(map(len, regions.values()))
     size = 1.2 + 2.6 * columns, 0.8 + 2.4 * len(regions)
     with draw_panels(path, title, size, len(regions), columns) as panels:
-        for row, (region, members) in zip(panels, regions.items(), strict=True):
+        for row, members in zip(panels, regions.values(), strict=True):
             for axes in row[len(members) :]:
                 axes.set_visible(False)
             for axes, fit in zip(row, members, strict=False):
-                _grid_panel(axes, fit.results["grid"], truth)
+                x, y = fit.results["grid"].free
+                _draw_grid(axes, fit.results["grid"], truth)
                 alike = [f for f in with_grid if f.stokes == fit.stokes]
                 axes.set(xlim=_limits(alike, x), ylim=_limits(alike, y))
-                axes.set_title(plain(f"{region}, {' + '.join(fit.stokes)}"))
+                axes.set(xlabel=f"${label(x)}$", ylabel=f"${label(y)}$")
+                axes.set_title(plain(f"{fit.region}, {' + '.join(fit.stokes)}"))
         legend_below(panels[0, 0])
     return True
 
 
-def _shown(fit: RegionFit) -> FitResult:
-    """The result that says most of a posterior: that of a grid, a chain or another method."""
-    best = [r for r in fit.results.values() if "axes" in r.details or "chain" in r.details]
-    return min(best, key=lambda r: "chain" in r.details, default=next(iter(fit.results.values())))
+def _drawable(fits: Sequence[RegionFit], name: str) -> list[tuple[RegionFit, FitResult]]:
+    """Fits that have a parameter, with a finite error, and the result that says most of each.
 
-
-def _drawable(fits: Sequence[RegionFit], name: str) -> list[RegionFit]:
-    """Fits that have a parameter, with a finite error."""
-    shown = [(fit, _shown(fit)) for fit in fits]
-    return [fit for fit, r in shown if name in r.free and np.isfinite(r.sigma[name])]
+    That is the result of a grid, of a chain or of another method.
+    """
+    found = []
+    for fit in fits:
+        results = list(fit.results.values())
+        known = [r for r in results if "axes" in r.details or "chain" in r.details]
+        best = min(known, key=lambda r: "chain" in r.details, default=results[0])
+        if name in best.free and np.isfinite(best.sigma[name]):
+            found.append((fit, best))
+    return found
 
 
 def _limits(fits: Sequence[RegionFit], name: str) -> tuple[float, float] | None:
     """Range of a parameter that shows all fits to four standard deviations."""
-    results = [_shown(fit) for fit in _drawable(fits, name)]
-    if not results:
-        return None
-    low = min(r.best_fit[name] - 4 * r.sigma[name] for r in results)
-    high = max(r.best_fit[name] + 4 * r.sigma[name] for r in results)
-    return low, high
+    drawn = [result for _, result in _drawable(fits, name)]
+    ends = [r.best_fit[name] + away * r.sigma[name] for r in drawn for away in (-4, 4)]
+    return (min(ends), max(ends)) if ends else None
 
 
-def _grid_panel(axes: plt.Axes, result: FitResult, truth: Mapping[str, float] | None) -> None:
+def _draw_grid(axes: plt.Axes, result: FitResult, truth: Mapping[str, float] | None) -> None:
     x, y = result.free
     grid = [result.details["axes"][name] for name in (x, y)]
     log_posterior = result.details["log_posterior"]
     density = np.exp(log_posterior).T
     axes.pcolormesh(*grid, density, cmap="Greys", vmin=0, vmax=1.4, rasterized=True)
-    axes.contour(
-        *grid, log_posterior.T, _levels(log_posterior), colors=COLORS[0], linestyles=["--", "-"]
-    )
-    axes.plot([], [], color=COLORS[0], label=r"1$\sigma$")
-    axes.plot([], [], color=COLORS[0], linestyle="--", label=r"2$\sigma$")
+    levels, color = _levels(log_posterior), COLORS[0]
+    axes.contour(*grid, log_posterior.T, levels, colors=color, linestyles=["--", "-"])
+    axes.plot([], [], color=color, label=r"1$\sigma$")
+    axes.plot([], [], "--", color=color, label=r"2$\sigma$")
     axes.plot(result.best_fit[x], result.best_fit[y], "k+", ms=9, mew=1.5, label="best fit")
     if truth and x in truth and y in truth:
         axes.plot(truth[x], truth[y], "o", mfc="none", mec=TRUTH["color"], mew=1.6, label="truth")
-    axes.set(xlabel=_tex(x), ylabel=_tex(y))
     axes.spines[:].set_visible(True)
-
-
-def _density(fit: RegionFit, name: str) -> tuple[np.ndarray, np.ndarray, FitResult]:
-    """A marginal distribution from the best method there is: grid, chain or Gaussian."""
-    result = _shown(fit)
-    if "axes" in result.details:
-        return result.details["axes"][name], result.details["marginals"][name], result
-    if "chain" in result.details:
-        density = result.to_getdist(fit.stokes, label).get1DDensity(name)
-        return density.x, density.P, result
-    sigma = result.sigma[name]
-    x = result.best_fit[name] + sigma * np.linspace(-5, 5, 201)
-    return x, np.exp(-0.5 * ((x - result.best_fit[name]) / sigma) ** 2), result
 
 
 def plot_marginals(
     path: Path, fits: Sequence[RegionFit], truth: Mapping[str, float] | None, title: str
-) -> bool:
+) -> None:
     """Marginal probability of each parameter, for Q, U and both, with 68 % intervals."""
     free, regions = all_free(fits), _by_region(fits)
     size = 3.4 * len(free), 0.9 + 2.2 * len(regions)
     with draw_panels(path, title, size, len(regions), len(free), sharex="col") as panels:
         for row, (region, members) in zip(panels, regions.items(), strict=True):
             for axes, name in zip(row, free, strict=True):
-                for fit in _drawable(members, name):
-                    _marginal_curve(axes, fit, name)
+                for fit, result in _drawable(members, name):
+                    _draw_marginal(axes, fit.stokes, result, name)
                 if truth and name in truth:
                     axes.axvline(truth[name], **TRUTH, label="truth")
                 axes.set(ylim=(0, 1.12), ylabel="relative probability", title=plain(region))
                 axes.xaxis.set_tick_params(labelbottom=True)
         for axes, name in zip(panels[-1], free, strict=True):
-            axes.set(xlabel=_tex(name), xlim=_limits(fits, name))
+            axes.set(xlabel=f"${label(name)}$", xlim=_limits(fits, name))
         legend_below(panels[0, 0])
-    return True
 
 
-def _marginal_curve(axes: plt.Axes, fit: RegionFit, name: str) -> None:
-    x, density, result = _density(fit, name)
-    density = density / density.max()
-    color = STOKES_COLORS[fit.stokes]
-    axes.plot(x, density, color=color, label=f"{' + '.join(fit.stokes)}, 68 % shaded")
+def _draw_marginal(axes: plt.Axes, stokes: str, result: FitResult, name: str) -> None:
+    """A marginal distribution from a grid, a chain, or the Gaussian of another result."""
+    if "axes" in result.details:
+        x, density = result.details["axes"][name], result.details["marginals"][name]
+    elif "chain" in result.details:
+        smooth = result.to_getdist(stokes, label).get1DDensity(name)
+        x, density = smooth.x, smooth.P
+    else:
+        away = np.linspace(-5, 5, 201)
+        x, density = result.best_fit[name] + result.sigma[name] * away, np.exp(-0.5 * away**2)
+    density, color = density / density.max(), STOKES_COLORS[stokes]
+    axes.plot(x, density, color=color, label=f"{' + '.join(stokes)}, 68 % shaded")
     low, high = result.interval_68[name]
     inside = (x >= low) & (x <= high)
     axes.fill_between(x[inside], density[inside], color=color, alpha=0.22, linewidth=0)

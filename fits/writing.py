@@ -33,10 +33,20 @@ def leaks(settings: Experiment) -> list[str]:
     return list(filter(None, (leakage_warning(str(band.name), band.files) for band in bands)))
 
 
+def _digits(size: float) -> int:
+    """Digits behind the point with which a positive number has two in all; 4 for others."""
+    usable = np.isfinite(size) and size > 0
+    return max(0, 1 - int(np.floor(np.log10(size)))) if usable else 4
+
+
+def two_digits(value: float) -> str:
+    """A number in two significant digits, without an exponent."""
+    return f"{value:.{_digits(value)}f}"
+
+
 def with_error(value: float, error: float) -> str:
     """A value with its standard error, both to two digits of the error."""
-    usable = np.isfinite(error) and error > 0
-    digits = max(0, 1 - int(np.floor(np.log10(error)))) if usable else 4
+    digits = _digits(error)
     return f"{value:.{digits}f} \u00b1 {error:.{digits}f}"
 
 
@@ -47,9 +57,7 @@ def with_errors(best: float, low: float, high: float) -> str:
     """
     if not np.isfinite([low, high]).all():
         return f"{best:.4f}" if np.isfinite(best) else ""
-    smaller = min(abs(high - best), abs(best - low))
-    usable = np.isfinite(smaller) and smaller > 0
-    digits = max(0, 1 - int(np.floor(np.log10(smaller)))) if usable else 4
+    digits = _digits(min(abs(high - best), abs(best - low)))
     return f"{best:.{digits}f} {low - best:+.{digits}f} {high - best:+.{digits}f}"
 
 

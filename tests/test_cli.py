@@ -165,6 +165,8 @@ def test_options_replace_settings_and_results_are_kept(folder, tmp_path, monkeyp
         options += ["--set", value]
     assert jaxsky(monkeypatch, "fit", path, *options) == 0
     before = (out / "result.json").read_bytes()
+    parts = {"description", "warnings", "likelihood", "truth", "results"}
+    assert set(json.loads(before)) == parts
     assert set(json.loads(before)["results"]) == {"strip"}
     assert set(json.loads(before)["results"]["strip"]) == {"QU"}
     capsys.readouterr()

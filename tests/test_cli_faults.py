@@ -69,8 +69,8 @@ def test_errors_of_libraries_are_sentences(monkeypatch, capsys, tmp_path, fail, 
     code, said = run(monkeypatch, capsys, in_folder(out, fail))
     assert code == 2
     assert words in said
-    assert said.rstrip().endswith(f"Traceback: {out / endings.LOG}")
-    assert "Traceback (most recent call last)" in (out / endings.LOG).read_text()
+    assert said.rstrip().endswith(f"Traceback: {out / endings.ERROR_LOG}")
+    assert "Traceback (most recent call last)" in (out / endings.ERROR_LOG).read_text()
     code, said = run(monkeypatch, capsys, fail)
     assert code == 2
     assert words in said
@@ -81,10 +81,10 @@ def test_errors_of_libraries_are_sentences(monkeypatch, capsys, tmp_path, fail, 
 
 def test_a_log_is_that_of_the_last_run(monkeypatch, capsys, tmp_path):
     run(monkeypatch, capsys, in_folder(tmp_path, raises(TypeError("x"))))
-    assert (tmp_path / endings.LOG).exists()
+    assert (tmp_path / endings.ERROR_LOG).exists()
     with results_folder(tmp_path, resume=False, overwrite=False):
         pass
-    assert not (tmp_path / endings.LOG).exists()
+    assert not (tmp_path / endings.ERROR_LOG).exists()
 
 
 @pytest.mark.slow

@@ -59,6 +59,15 @@ def test_numbers_are_whole_however_narrow_the_terminal(capsys):
     assert capsys.readouterr().out.count("-1234567.89012") == 12
 
 
+def test_headings_of_sections_are_bold(monkeypatch, capsys):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    table = ResultTable(("name", "value"), (("section",), ("beta", "1.53")))
+    terminal.print_tables([table], width=40)
+    printed = capsys.readouterr().out
+    assert "\x1b[1msection" in printed
+    assert "\x1b[1mbeta" not in printed
+
+
 def test_page(tmp_path):
     table = ResultTable(("name", "value"), (("beta", "1.53"), (), ("T", "20")), title="A <table>")
     sections = [

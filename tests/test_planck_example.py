@@ -204,9 +204,8 @@ def test_a_band_without_weight_is_named_and_not_counted():
     assert (fit.dof, fit.dof_amplitudes) == (plain.dof, plain.dof_amplitudes) == (3070, 6)
     said = " ".join(fit_warnings(made, settings, [fit]))
     assert "Band 70 carries no weight (all QU)" in said
-    found = fit_numbers(made, settings, [fit])
+    found = fit_numbers(settings, [fit], None)
     assert found["results"]["all"]["QU"]["gradient"]["bands_without_weight"] == ["70"]
-    assert found["warnings"] == fit_warnings(made, settings, [fit])
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """`jaxsky compare`: observed maps against the model, from settings to a report."""
 
-from pathlib import Path
 from typing import Any
 
 from fits.commands import compare_pictures as pictures
@@ -17,7 +16,7 @@ from fits.comparison import (
 from fits.full_sky import FIELDS
 from fits.inputs import inputs_of
 from fits.regions import region_masks
-from fits.writing import leaks, probability, with_error, write_json, write_log
+from fits.writing import leaks, probability, with_error
 from jaxsky.settings import Experiment
 
 #: A comparison with a smaller probability is pointed out.
@@ -31,21 +30,21 @@ def _work(settings: Experiment, command: Run) -> Report:
     prepared = prepared_maps(settings, inputs)
     check_comparison(settings, prepared, regions)
     command.begin()
-    out, steps = command.out, command.steps
-    steps.step("realisations")
-    found = compare(settings, prepared, regions, out / "simulations.npz", steps.advance)
+    command.steps.step("realisations")
+    simulations, report = command.out / "simulations.npz", command.steps.advance
+    found = compare(settings, prepared, regions, simulations, report)
     patches = None
     if settings.compare.patches is not None:
-        steps.step("patches")
+        command.steps.step("patches")
         patches = compare_patches(settings, inputs)
-    steps.step("drawing")
     warnings = comparison_warnings(found, settings)
-    results = {"description": inputs.description, **_numbers(found, patches)}
-    write_json(out / "comparison.json", results | {"warnings": warnings})
-    drawn = _draw(out, found, settings, patches)
-    write_log(out / "log.json", settings, steps.seconds)
-    written = [out / "comparison.json", out / "log.json", *drawn]
-    return Report(inputs.description, [_table(found)], warnings, written)
+    return Report(
+        inputs.description,
+        [_table(found)],
+        warnings,
+        {"warnings": warnings, **_numbers(found, patches)},
+        _pictures(found, settings, patches),
+    )
 
 
 COMMAND = Command(
@@ -69,8 +68,8 @@ def _numbers(comparison: Comparison, patches: PatchComparison | None) -> dict[st
     pixels: dict[str, Any] = {}
     for s in comparison.scatters:
         numbers = s._asdict() | {"slope_pte": s.slope_pte}
-        here = pixels.setdefault(s.band, {}).setdefault(s.region, {})
-        here[s.stokes] = {k: v for k, v in numbers.items() if k not in ("band", "region", "stokes")}
+        band, region, stokes = (numbers.pop(key) for key in ("band", "region", "stokes"))
+        pixels.setdefault(band, {}).setdefault(region, {})[stokes] = numbers
     spectra = {
         s.band: s._asdict()
         | {"centers": s.centers, "chi2_bins": s.chi2_bins, "largest_error": s.largest_error}
@@ -144,26 +143,22 @@ def comparison_warnings(comparison: Comparison, settings: Experiment) -> list[st
     return sentences
 
 
-def _draw(
-    out: Path, comparison: Comparison, settings: Experiment, patches: PatchComparison | None
-) -> list[Path]:
-    """Draw what there is into a folder; returns the pictures."""
-    bands, title = list(comparison.prepared.bands), settings.title
-    written = []
-    for region in comparison.regions:
-        written.append(out / f"scatter_{region}.png")
-        pictures.plot_scatter(written[-1], comparison, region, bands, f"{title}\n{region}")
+def _pictures(
+    found: Comparison, settings: Experiment, patches: PatchComparison | None
+) -> dict[str, tuple[Any, ...]]:
+    """Pictures of what there is; see `fits.commands.run.Report`."""
+    bands, title = list(found.prepared.bands), settings.title
     nside = min(settings.compare.panel_nside, settings.common.nside)
+    drawn: dict[str, tuple[Any, ...]] = {
+        f"scatter_{region}.png": (pictures.plot_scatter, found, region, bands, f"{title}\n{region}")
+        for region in found.regions
+    }
     for stokes in "QU":
-        written.append(out / f"maps_{stokes}.png")
-        pictures.plot_model_maps(written[-1], comparison, stokes, bands, nside, title)
-    if comparison.spectra:
-        written.append(out / "spectra.png")
-        pictures.plot_full_sky(written[-1], comparison.spectra, title)
-    if leaky := [s for s in comparison.spectra if s.uncorrected is not None]:
-        written.append(out / "leakage.png")
-        pictures.plot_leakage(written[-1], leaky, title)
+        drawn[f"maps_{stokes}.png"] = pictures.plot_model_maps, found, stokes, bands, nside, title
+    if found.spectra:
+        drawn["spectra.png"] = pictures.plot_full_sky, found.spectra, title
+    if leaky := [s for s in found.spectra if s.uncorrected is not None]:
+        drawn["leakage.png"] = pictures.plot_leakage, leaky, title
     if patches is not None:
-        written.append(out / "patches.png")
-        pictures.plot_patches(written[-1], patches, title)
-    return written
+        drawn["patches.png"] = pictures.plot_patches, patches, title
+    return drawn

@@ -51,7 +51,8 @@ def print_tables(tables: Sequence[ResultTable], width: int | None = None) -> Non
         for i, word in enumerate(table.header):
             shown.add_column(word, justify="left" if i < table.words else "right", overflow="fold")
         for row in table.rows:
-            shown.add_row(*row) if row else shown.add_section()
+            heading = "bold" if len(row) < len(table.header) else ""
+            shown.add_row(*row, style=heading) if row else shown.add_section()
         least = Measurement.get(out, out.options.update(width=10_000), shown).minimum
         Console(width=max(out.width, least), **PLAIN).print(shown)
 

@@ -38,7 +38,7 @@ def _list(products: Words = None, folder: Folder = None) -> None:
     for product in find(products or []):
         if product.group != group:
             group = product.group
-            rows += [(), (group, product.title, "", "", "", "")]
+            rows += [(), (group, product.title)]
         path = folder / product.name
         here = path.is_file()
         known = product._replace(size=path.stat().st_size) if here else product
@@ -47,7 +47,7 @@ def _list(products: Words = None, folder: Folder = None) -> None:
         kept = "yes" if here else ""
         rows.append((product.name, product.what, nside, product.unit or "", size, kept))
     if not products:
-        rows += [(), ("sets", "files of an analysis", "", "", "", "")]
+        rows += [(), ("sets", "files of an analysis")]
         for name, group_of in product_sets().items():
             members = find([name])
             count = sum((folder / p.name).is_file() for p in members)

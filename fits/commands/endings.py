@@ -21,7 +21,7 @@ import jaxsky
 from fits.commands.console import console
 
 #: Where the traceback of an error is written, in the folder of the results.
-LOG = "error.log"
+ERROR_LOG = "error.log"
 #: Longest message of a library that is repeated.
 LONGEST = 500
 #: Ctrl-C is repeated after this time [s], in case a callback has swallowed it; and after so many
@@ -68,33 +68,23 @@ def _summary(error: BaseException) -> str:
     return f"{kind}: {first}." if first else f"{kind}."
 
 
-def _write(error: BaseException, path: Path) -> None:
-    text = "".join(traceback.format_exception(error))
-    path.write_text(f"jaxsky {jaxsky.__version__}\n{text}", encoding="utf-8", errors="replace")
-
-
-@contextmanager
-def logged(out: Path) -> Iterator[None]:
-    """Keep the traceback of an error in a folder, unless its message says enough."""
-    (out / LOG).unlink(missing_ok=True)
-    try:
-        yield
-    except Exception as error:
-        if _sentence(error) is None:
-            with suppress(OSError):
-                _write(error, out / LOG)
-                error.add_note(str(out / LOG))
-        raise
+def keep_traceback(error: Exception, path: Path) -> None:
+    """Write the traceback of an error to a file, unless its message says enough."""
+    if _sentence(error) is None:
+        text = f"jaxsky {jaxsky.__version__}\n{''.join(traceback.format_exception(error))}"
+        with suppress(OSError):
+            path.write_text(text, encoding="utf-8", errors="replace")
+            error.add_note(str(path))
 
 
 def print_error(error: Exception) -> None:
     """Print an error as one sentence, and where its traceback is if that may be of use."""
     if (message := _sentence(error)) is None:
         notes = getattr(error, "__notes__", [])
-        log = next((note for note in notes if note.endswith(LOG)), None)
+        log = next((note for note in notes if note.endswith(ERROR_LOG)), None)
         if log is None:
-            log = tempfile.mkstemp(f"-{LOG}", "jaxsky-")[1]
-            _write(error, Path(log))
+            log = tempfile.mkstemp(f"-{ERROR_LOG}", "jaxsky-")[1]
+            keep_traceback(error, Path(log))
         message = f"{_summary(error)} Traceback: {log}"
     console.print("jaxsky: ", style="red", end="")
     console.print(message, soft_wrap=True)

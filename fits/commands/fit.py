@@ -5,19 +5,26 @@ from typing import Any
 
 import numpy as np
 
-from fits import posterior_plots
 from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
 from fits.common import prepared_maps
 from fits.inputs import Inputs, inputs_of
+from fits.posterior_plots import plot_grids, plot_marginals, plot_posterior
 from fits.regions import region_masks
 from fits.spectral_index import RegionFit, all_free, fit_regions, known_truth
 from fits.template_noise import unknown_noise
-from fits.writing import leaks, with_errors, write_json, write_log
+from fits.writing import leaks, with_errors
 from jaxsky.settings import Experiment
 
 #: A fit with a smaller probability to exceed its chi^2 is pointed out.
 UNLIKELY = 0.01
+#: Pictures, each with what draws it, and the chains, from which a stopped run resumes.
+PICTURES = {
+    "grid.png": plot_grids,
+    "marginals.png": plot_marginals,
+    "posterior.png": plot_posterior,
+}
+CHAINS = "chain.h5"
 
 
 def _work(settings: Experiment, command: Run) -> Report:
@@ -27,38 +34,27 @@ def _work(settings: Experiment, command: Run) -> Report:
     prepared = prepared_maps(settings, inputs)
     inputs = inputs._replace(bands={})  # their maps have served
     command.begin()
-    out, steps, chains = command.out, command.steps, command.out / "chain.h5"
-    fits = fit_regions(settings, prepared, regions, chains, steps)
-    steps.step("drawing")
+    chains = command.out / CHAINS
+    fits = fit_regions(settings, prepared, regions, chains, command.steps)
     truth = known_truth(inputs, fits)
-    write_json(out / "result.json", fit_numbers(inputs, settings, fits))
-    written = [out / "result.json", out / "log.json"]
-    for name, plot in {
-        "grid.png": posterior_plots.plot_grids,
-        "marginals.png": posterior_plots.plot_marginals,
-        "posterior.png": posterior_plots.plot_posterior,
-    }.items():
-        # There is no picture of a grid of more than two parameters, or without a chain.
-        if plot(out / name, fits, truth, settings.title):
-            written.append(out / name)
-    write_log(out / "log.json", settings, steps.seconds)
-    if chains.exists():
-        written.append(chains)
     warnings = fit_warnings(inputs, settings, fits)
-    return Report(inputs.description, [_table(fits, truth)], warnings, written)
+    return Report(
+        inputs.description,
+        [_table(fits, truth)],
+        warnings,
+        {"warnings": warnings, **fit_numbers(settings, fits, truth)},
+        {name: (plot, fits, truth, settings.title) for name, plot in PICTURES.items()},
+        [chains] if chains.exists() else [],
+    )
 
 
-COMMAND = Command(
-    "fit",
-    _work,
-    ("result.json", "log.json", "grid.png", "marginals.png", "posterior.png", "chain.h5"),
-)
+COMMAND = Command("fit", _work, ("result.json", "log.json", *PICTURES, CHAINS))
 
 
 def _result(fit: RegionFit, method: str) -> dict[str, Any]:
     result = fit.results[method]
-    kept = ("free", "best_fit", "interval_68", "covariance", "converged", "message")
-    numbers = {key: result.to_dict()[key] for key in kept}
+    known, kept = result.to_dict(), ("free", "best_fit", "interval_68", "covariance", "converged")
+    numbers = {key: known[key] for key in (*kept, "message")}
     numbers |= {"chi2": fit.chi2[method], "dof": fit.dof}
     if fit.dof_amplitudes is not None:
         numbers |= {
@@ -76,19 +72,15 @@ def _result(fit: RegionFit, method: str) -> dict[str, Any]:
     return numbers
 
 
-def fit_numbers(inputs: Inputs, settings: Experiment, fits: Sequence[RegionFit]) -> dict[str, Any]:
+def fit_numbers(
+    settings: Experiment, fits: Sequence[RegionFit], truth: Mapping[str, float] | None
+) -> dict[str, Any]:
     """All numbers: `results` by region, then Stokes parameters, then method."""
     results: dict[str, Any] = {}
     for fit in fits:
         methods = {method: _result(fit, method) for method in fit.results}
         results.setdefault(fit.region, {})[fit.stokes] = methods
-    return {
-        "description": inputs.description,
-        "likelihood": settings.fit.likelihood,
-        "truth": known_truth(inputs, fits),
-        "warnings": fit_warnings(inputs, settings, fits),
-        "results": results,
-    }
+    return {"likelihood": settings.fit.likelihood, "truth": truth, "results": results}
 
 
 def _short_names(names: Sequence[str]) -> list[str]:
@@ -163,11 +155,10 @@ def _attenuated(fit: RegionFit) -> str | None:
     sentence = f"{fit.region}, {fit.stokes}: the noise of the templates attenuates {shares}"
     if not lost.shifts:
         return f"{sentence}; what this does to parameters with maps of values is not known."
-    result = next(iter(fit.results.values()))
     # What is at the edge of its prior stays there.
     shifts = ", ".join(
         f"{name} by {lost.shifts[name]:+.2g} ({lost.shifts[name] / error:+.1f} sigma)"
-        for name, error in result.sigma.items()
+        for name, error in next(iter(fit.results.values())).sigma.items()
         if np.isfinite(error)
     )
     moves = f", which moves {shifts}, to first order" if shifts else ""

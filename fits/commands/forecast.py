@@ -26,7 +26,6 @@ from fits.pseudo_cl import (
     sky_fraction,
 )
 from fits.regions import apodize, region_mask
-from fits.writing import write_json, write_log
 from jaxsky import Sky
 from jaxsky.checks import check_double
 from jaxsky.cmb import camb_spectra, tensor_spectra
@@ -251,7 +250,6 @@ def _numbers(found: Forecast, settings: Experiment) -> dict[str, Any]:
     """All numbers, D_l in uK_CMB^2 unless their key says otherwise."""
     errors, spectra, lmax = found.errors, found.spectra, settings.forecast.lmax
     results: dict[str, Any] = {
-        "description": found.inputs.description,
         "bands": list(found.inputs.bands),
         "sky_fraction": sky_fraction(found.inputs.mask),
         "bins": {"first": spectra.edges[:-1], "last": [e - 1 for e in spectra.edges[1:]]},
@@ -351,15 +349,17 @@ def _work(settings: Experiment, command: Run) -> Report:
     from fits.commands import forecast_pictures as pictures
 
     found = forecast(settings, command.steps)
-    command.steps.step("drawing")
     command.begin()
-    written = [command.out / name for name in RESULTS]
-    write_json(written[0], _numbers(found, settings))
-    write_log(written[1], settings, command.steps.seconds)
-    pictures.plot_b_modes(written[2], found, settings)
-    pictures.plot_errors(written[3], found)
-    warnings = [*forecast_warnings(found), *settings.left_out("forecast")]
-    return Report(found.inputs.description, _tables(found), warnings, written)
+    return Report(
+        found.inputs.description,
+        _tables(found),
+        [*forecast_warnings(found), *settings.left_out("forecast")],
+        _numbers(found, settings),
+        {
+            "bb.png": (pictures.plot_b_modes, found, settings),
+            "fisher.png": (pictures.plot_errors, found),
+        },
+    )
 
 
 COMMAND = Command("forecast", _work, RESULTS, resumable=False)

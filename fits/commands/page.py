@@ -33,12 +33,8 @@ a { color: #0072b2; }
 class ResultTable(NamedTuple):
     """A table as text, for the terminal and for a page.
 
-    Parameters
-    ----------
-    header : a word for each column
-    rows : cells; the first one is the heading of its row. Behind an empty row begins a new section
-    title, caption : above and below
-    words : columns that hold words rather than numbers, from the first on
+    The first cell is the heading of its row, the first `words` columns hold words rather than
+    numbers. Behind an empty row begins a new section; a row that is cut short is its heading.
     """
 
     header: tuple[str, ...]
@@ -49,14 +45,9 @@ class ResultTable(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A part of a page.
+    """A part of a page: a picture, which is a file in its folder, or a table, or both.
 
-    Parameters
-    ----------
-    title, caption : heading, and what is shown
-    picture : file in the folder of the page
-    table : what is shown instead of a picture, or below it
-    note : what is to be known about it; before the first colon, if there is one, in bold
+    The note is what is to be known about it; before its first colon, if there is one, in bold.
     """
 
     title: str
@@ -67,13 +58,7 @@ class Section(NamedTuple):
 
 
 def key_of(title: str) -> str:
-    """A title as an anchor.
-
-    Examples
-    --------
-    >>> key_of("Figure 1: the sky")
-    'figure-1'
-    """
+    """A title as an anchor: what is before its colon."""
     return title.partition(":")[0].lower().replace(" ", "-")
 
 
@@ -118,16 +103,7 @@ def _section(section: Section) -> str:
 def write_page(
     path: Path, title: str, intro: Sequence[str], sections: Sequence[Section], end: str
 ) -> None:
-    """Write the page, whole or not at all.
-
-    Parameters
-    ----------
-    path : of the page, in the folder of the pictures
-    title : its heading
-    intro : paragraphs below it
-    sections : in the order in which they are shown
-    end : a last line
-    """
+    """Write a page of sections, whole or not at all: intro, paragraphs; end, its last line."""
     links = "\n".join(
         f'<li><a href="#{escape(key_of(s.title))}">{escape(s.title)}</a></li>' for s in sections
     )

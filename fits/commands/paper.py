@@ -194,6 +194,7 @@ def paper_command(only: Sequence[str]) -> Command:
         )
         missing = [f"{i.label}: {i.differs}" for i in items if not (i.picture or i.table)]
         remark = f"{len(items)} figures and tables ({command.steps.seconds:.1f} s)."
-        return Report("", (), missing, [command.out / PAGE], remark, page=False)
+        page = [command.out / PAGE]
+        return Report("", warnings=missing, written=page, remark=remark, page=False)
 
     return Command("paper", work, (KEPT,))

@@ -5,21 +5,22 @@ A command is a function from its settings to a `Report`; the rest is here, once.
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from fits.commands.console import Steps, console, print_tables, print_written, warn
-from fits.commands.endings import interruptible, logged
+from fits.commands.endings import ERROR_LOG, interruptible, keep_traceback
 from fits.commands.page import ResultTable, Section, write_page
+from fits.writing import write_json, write_log
 from jaxsky.io.folders import ALL, Folder, occupied
 from jaxsky.settings import Experiment, load, of_file
 
 #: Steps and their times, and the page that shows the results, in every folder.
 LOG, PAGE = "log.txt", "index.html"
-#: Steps of a process that makes a part of the results, from its first one.
-PART_LOG = "log_{:05d}.txt"
+#: When, where and with what a command was run, next to its numbers.
+CIRCUMSTANCES = "log.json"
 #: Experiments that commands have without a file.
 DEFAULTS = Path(__file__).parents[1] / "defaults"
 
@@ -36,20 +37,18 @@ class Options(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What a command has found, to be shown.
+    """What a command has found: said on the terminal, and shown on a page unless `page` is False.
 
-    Parameters
-    ----------
-    description : what was looked at, in a sentence
-    tables, warnings : results, and what a user should know before using them
-    written : files, but for log and page
-    remark : what else is said at the end
-    page : whether a page of tables and pictures is made of it
+    `numbers` go to the first file of the command's results, with the description, next to a log.
+    `pictures` are names of files, each with a function and what it takes after the path; it returns
+    False if there is nothing to draw. `written` are other files.
     """
 
     description: str
     tables: Sequence[ResultTable] = ()
     warnings: Sequence[str] = ()
+    numbers: Mapping[str, Any] | None = None
+    pictures: Mapping[str, tuple[Any, ...]] = {}
     written: Sequence[Path] = ()
     remark: str = ""
     page: bool = True
@@ -69,28 +68,24 @@ class Run(NamedTuple):
         """Folder of the results."""
         return self.options.out
 
+    @property
+    def log(self) -> Path:
+        """File of the steps and their times; one for each process that makes a part of results."""
+        first = self.part.start
+        return self.out / (f"log_{first:05d}.txt" if first else LOG)
+
     def begin(self) -> None:
         """Nothing is wrong with the input: what is to be replaced goes, and the log begins."""
         if self.options.overwrite:
             self.folder.remove(self.results)
+            self.folder.narrow(self.part)  # others may make the rest
         self.steps.keep(self.log)
-
-    @property
-    def log(self) -> Path:
-        """File of the steps."""
-        whole = self.part.start == 0
-        return self.out / (LOG if whole else PART_LOG.format(self.part.start))
 
 
 class Command(NamedTuple):
-    """What a command is.
+    """What a command is; its name is also that of the settings that it takes without a file.
 
-    Parameters
-    ----------
-    name : of the command, and of the settings that it takes without a file
-    work : from settings to what was found; calls `Run.begin` before it writes
-    results : patterns of what is in the folder of the results
-    resumable : whether a stopped command can be gone on with
+    `work` calls `Run.begin` before it writes; `results` are patterns of what is in the folder then.
     """
 
     name: str
@@ -102,21 +97,23 @@ class Command(NamedTuple):
 def run_command(command: Command, options: Options, part: range = ALL) -> None:
     """Run a command with what the command line says.
 
-    `part` of the results is made, see `jaxsky.io.folders.occupied`.
+    `part` of the results is made, see `jaxsky.io.folders.occupied`. All of them are replaced, so
+    nobody else may be making any then.
     """
     path, out = options.settings_file or DEFAULTS / f"{command.name}.toml", options.out
     values = list(options.values or ())
     if options.maps is not None:
         values.append(f"common.maps={json.dumps(str(options.maps.resolve()))}")
     settings = load(path, values)
+    resume = options.resume if command.resumable else None
     with (
         of_file(path),
         results_folder(
             out,
             command.results,
-            resume=options.resume if command.resumable else None,
+            resume=resume,
             overwrite=options.overwrite,
-            part=part,
+            part=ALL if options.overwrite else part,
         ) as folder,
         Steps() as steps,
     ):
@@ -126,17 +123,31 @@ def run_command(command: Command, options: Options, part: range = ALL) -> None:
         running = Run(options, command.results, folder, steps, part)
         report = command.work(settings, running)
         report = report._replace(warnings=[*report.warnings, *_other_sky(settings)])
+        written = [*_write(settings, report, running), *report.written]
         if report.page:
-            _show(out, settings.title, report, steps.seconds)
+            written.insert(0, _show(out, settings.title, report, written, steps.seconds))
     if report.description:
         console.print(report.description)
     print_tables(report.tables)
     for sentence in report.warnings:
         warn(sentence)
-    pages = [out / PAGE] if report.page else []
-    print_written([*pages, *report.written, running.log])
+    print_written([*written, running.log])
     if report.remark:
         console.print(report.remark, soft_wrap=True)
+
+
+def _write(settings: Experiment, report: Report, command: Run) -> list[Path]:
+    """Write the numbers, a log and the pictures of a report."""
+    if report.numbers is None:
+        return []
+    command.steps.step("drawing")
+    written = [command.out / command.results[0], command.out / CIRCUMSTANCES]
+    write_json(written[0], {"description": report.description, **report.numbers})
+    for name, (draw, *drawn) in report.pictures.items():
+        if draw(command.out / name, *drawn) is not False:
+            written.append(command.out / name)
+    write_log(written[1], settings, command.steps.seconds)
+    return written
 
 
 @contextmanager
@@ -150,20 +161,16 @@ def results_folder(
 ) -> Iterator[Folder]:
     """The folder of the results, in which no other command writes the same meanwhile.
 
-    Parameters
-    ----------
-    out : the folder; made if it is not there, and removed again if nothing was written
-    results : patterns of what the command leaves in it
-    resume, overwrite : results that are there are kept or replaced, and refused if neither is
-        set. `resume` is None for commands that cannot be resumed.
-    part : what of the results is made, see `jaxsky.io.folders.occupied`
+    It is made if it is not there, and removed again if nothing was written. What `results` says is
+    kept, replaced, or refused if it is to be neither; `resume` is None for commands that cannot be
+    resumed. `part` of the results is made, see `jaxsky.io.folders.occupied`.
     """
     if resume and overwrite:
         raise ValueError("--resume and --overwrite exclude each other.")
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is not a folder; choose another --out.")
     stopped = interruptible("" if resume is None else "; resume with --resume")
-    with stopped, occupied(out, part) as folder, logged(out):
+    with stopped, occupied(out, part) as folder:
         if not folder.locked:
             warn(
                 f"{out}: this file system has no locks, so see to it that no other command writes "
@@ -176,11 +183,13 @@ def results_folder(
                 "another --out."
             )
         folder.clean()
+        (out / ERROR_LOG).unlink(missing_ok=True)
         try:
             yield folder
-        except Exception:
+        except Exception as error:
             if [path.name for path in out.glob("[!.]*")] == [LOG]:
                 (out / LOG).unlink()  # of nothing that would be in the folder
+            keep_traceback(error, out / ERROR_LOG)
             raise
 
 
@@ -199,7 +208,7 @@ def _other_sky(settings: Experiment) -> list[str]:
     ]
 
 
-def _show(out: Path, title: str, report: Report, seconds: float) -> None:
+def _show(out: Path, title: str, report: Report, written: Sequence[Path], seconds: float) -> Path:
     """Write the page of a command's tables and pictures."""
     tables = [
         Section(table.title or f"Results {i}", table.caption, table=table)
@@ -207,11 +216,10 @@ def _show(out: Path, title: str, report: Report, seconds: float) -> None:
     ]
     pictures = [
         Section(path.stem.replace("_", " "), picture=path.name)
-        for path in report.written
+        for path in written
         if path.suffix == ".png"
     ]
-    warnings = [f"(!) {sentence}" for sentence in report.warnings]
-    command = " ".join(["jaxsky", *sys.argv[1:2]])
-    end = f"Written by `{command}` in {seconds:.0f} s,"
-    intro = [report.description, *warnings]
+    intro = [report.description, *(f"(!) {sentence}" for sentence in report.warnings)]
+    end = f"Written by `{' '.join(['jaxsky', *sys.argv[1:2]])}` in {seconds:.0f} s,"
     write_page(out / PAGE, title or "jaxsky", intro, [*tables, *pictures], end)
+    return out / PAGE

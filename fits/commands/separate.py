@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from fits.cleaning import SAMPLED, Separation, separate
+from fits.commands import separate_pictures as pictures
 from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
-from fits.posterior_plots import plot_chains
 from fits.results import FitError
 from fits.separated_data import PixelData, separation_data
-from fits.writing import leaks, probability, with_error, write_json, write_log
+from fits.writing import leaks, probability, with_error
 from jaxsky.inputs import parameter_unit
 from jaxsky.io import write_maps
 from jaxsky.settings import Experiment
@@ -20,24 +20,19 @@ from jaxsky.settings import Experiment
 UNLIKELY = 1e-3
 #: As is E in B above this fraction of a power's standard deviation.
 LEAKED = 0.5
-PICTURES = ("components", "residuals", "spectra", "r")
-
-
-def _pixel_probability(found: Separation) -> dict[str, float] | None:
-    """How many pixels have a chi^2 that is too large."""
-    if not isinstance(found.data, PixelData):
-        return None
-    values = found.found.probability[np.isfinite(found.found.probability)]
-    return {f"below_{p:g}": float(np.mean(values < p)) for p in (0.05, 0.01, 0.001)}
+#: Name, unit and values of a column of a map's file.
+Column = tuple[str, str, np.ndarray]
 
 
 def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
     """All numbers; band powers are D_l of BB in uK_CMB^2."""
     fit, ratio, spectra = found.fit, found.tensors, found.spectra
     bands, truth, simulated = list(found.data.bands), found.data.truth or {}, found.simulated
+    small = None
+    if isinstance(found.data, PixelData):
+        values = found.found.probability[np.isfinite(found.found.probability)]
+        small = {f"below_{p:g}": float(np.mean(values < p)) for p in (0.05, 0.01, 0.001)}
     results: dict[str, Any] = {
-        "description": found.data.description,
-        "warnings": separation_warnings(found, settings),
         "domain": settings.separate.domain,
         "components": found.components,
         "bands": bands,
@@ -57,7 +52,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
         "converged": fit.converged,
         "message": fit.message,
         "solver": {key: fit.details[key] for key in ("solver", "steps", "distance")},
-        "pixels_with_small_probability": _pixel_probability(found),
+        "pixels_with_small_probability": small,
         "cmb_noise_degradation": found.degradation,
         "residual_rms": dict(zip(bands, np.nanstd(found.residuals, axis=(1, 2)), strict=True)),
         "r": {
@@ -97,7 +92,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
     return results
 
 
-def separation_tables(found: Separation) -> list[ResultTable]:
+def _table(found: Separation) -> ResultTable:
     """Parameters and r, with the truth if it is known."""
     fit, truth, ratio = found.fit, found.data.truth or {}, found.tensors
     rows: list[tuple[str, ...]] = []
@@ -113,16 +108,11 @@ def separation_tables(found: Separation) -> list[ResultTable]:
     ]
     if found.left is not None:
         rows.append(("r, shift by foregrounds left", f"{ratio.shift(found.left):+.1e}", ""))
-    degradation = f"{float(np.nanmean(found.found.degradation('cmb'))):.2f}"
+    degradation = f"{found.degradation:.2f}"
     rows.append(("noise of CMB, times that without foregrounds", degradation, ""))
-    columns = 3 if truth else 2
-    return [
-        ResultTable(
-            ("parameter", "best fit", "truth")[:columns],
-            tuple(row[:columns] for row in rows),
-            caption=f"standard deviations; chi2/dof {fit.chi2 / fit.dof:.4f}",
-        )
-    ]
+    header, columns = ("parameter", "best fit", "truth"), 3 if truth else 2
+    caption = f"standard deviations; chi2/dof {fit.chi2 / fit.dof:.4f}"
+    return ResultTable(header[:columns], tuple(row[:columns] for row in rows), caption=caption)
 
 
 def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
@@ -167,47 +157,61 @@ def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
 
 def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path]:
     """Maps of components, residuals, and parameters that have regions."""
-    mask, components = np.isfinite(found.maps).all(axis=(0, 1)), found.found
-    in_pixels = isinstance(found.data, PixelData)
-    names, units, columns = [], [], []
+    mask, in_pixels = np.isfinite(found.maps).all(axis=(0, 1)), isinstance(found.data, PixelData)
+    components: list[Column] = []
     for name, maps in zip(found.components, found.maps, strict=True):
-        unit = "uK_CMB" if name == "cmb" else "uK_RJ"
-        for stokes, values in zip("QU", maps[-2:], strict=True):
-            names.append(f"{name.upper()}_{stokes}")
-            units.append(unit)
-            columns.append(values)
+        unit, head = "uK_CMB" if name == "cmb" else "uK_RJ", name.upper()
+        components += [(f"{head}_{s}", unit, x) for s, x in zip("QU", maps[-2:], strict=True)]
         if in_pixels:
-            for stokes, values in zip("QU", components.sigma(name)[-2:], strict=True):
-                names.append(f"{name.upper()}_SIGMA_{stokes}")
-                units.append(unit)
-                columns.append(np.broadcast_to(values, mask.shape))
+            sigma = found.found.sigma(name)[-2:]
+            components += [(f"{head}_SIGMA_{s}", unit, x) for s, x in zip("QU", sigma, strict=True)]
     if in_pixels:
-        names += ["CHI2", "PROBABILITY"]
-        units += ["", ""]
-        columns += [components.chi2, components.probability]
-    written = [out / "components.fits", out / "residuals.fits"]
-    header = {"FWHM": (settings.common.fwhm, "[arcmin]")}
-    options: dict[str, Any] = {"mask": mask, "overwrite": True, "single": True}
-    write_maps(
-        written[0], np.stack(columns), names=names, unit=units, extra_header=header, **options
-    )
-    labels = [f"{band}_{stokes}" for band in found.data.bands for stokes in "QU"]
-    rest = found.residuals[:, -2:].reshape(len(labels), -1)
-    write_maps(written[1], rest, names=labels, unit=settings.separate.unit, **options)
-    varying = [name for name in found.fit.free if np.ndim(found.fit.best_fit[name])]
-    if varying:
-        written.append(out / "parameters.fits")
-        both = (found.fit.best_fit, found.sigma)
-        rows = [found.of_pixel(name, values) for name in varying for values in both]
-        titles = [t for n in varying for t in (n.upper(), f"{n.upper()}_SIGMA")]
-        units = [parameter_unit(name) for name in varying for _ in both]
-        write_maps(written[-1], np.stack(rows), names=titles, unit=units, **options)
+        tested = {"CHI2": found.found.chi2, "PROBABILITY": found.found.probability}
+        components += [(name, "", values) for name, values in tested.items()]
+    residuals: list[Column] = [
+        (f"{band}_{stokes}", settings.separate.unit, values)
+        for band, maps in zip(found.data.bands, found.residuals[:, -2:], strict=True)
+        for stokes, values in zip("QU", maps, strict=True)
+    ]
+    parameters: list[Column] = [
+        (name.upper() + end, parameter_unit(name), found.of_pixel(name, values))
+        for name in found.fit.free
+        if np.ndim(found.fit.best_fit[name])
+        for end, values in (("", found.fit.best_fit), ("_SIGMA", found.sigma))
+    ]
+    written = []
+    for file, columns in zip(MAPS, (components, residuals, parameters), strict=True):
+        if columns:
+            names, units, values = zip(*columns, strict=True)
+            beam = {"FWHM": (settings.common.fwhm, "[arcmin]")} if file == MAPS[0] else None
+            written.append(out / file)
+            write_maps(
+                written[-1],
+                np.stack([np.broadcast_to(each, mask.shape) for each in values]),
+                names=names,
+                unit=units,
+                mask=mask,
+                extra_header=beam,
+                overwrite=True,
+                single=True,
+            )
     return written
 
 
-def _work(settings: Experiment, command: Run) -> Report:
-    from fits.commands import separate_pictures as pictures
+#: Pictures, each with what draws it; maps; and what a stopped run resumes from.
+PICTURES = {
+    "components.png": pictures.plot_components,
+    "residuals.png": pictures.plot_residuals,
+    "spectra.png": pictures.plot_spectra,
+    "r.png": pictures.plot_ratio,
+    "parameters.png": pictures.plot_parameters,
+    "posterior.png": pictures.plot_posterior,
+}
+MAPS = ("components.fits", "residuals.fits", "parameters.fits")
+KEPT = ("simulations.npz", "chain.h5")
 
+
+def _work(settings: Experiment, command: Run) -> Report:
     command.steps.step("reading and preparing maps")
     data = separation_data(settings)
     command.begin()
@@ -215,36 +219,15 @@ def _work(settings: Experiment, command: Run) -> Report:
         found = separate(settings, data, command.out, command.steps)
     except FitError as error:
         raise ValueError(f"The spectral parameters were not found. {error}") from None
-    command.steps.step("drawing")
-    out, title, warnings = command.out, settings.title, separation_warnings(found, settings)
-    write_json(out / "result.json", _numbers(found, settings))
-    written = [out / "result.json", *_write_maps(out, found, settings)]
-    pictures.plot_components(out / "components.png", found, title)
-    pictures.plot_residuals(out / "residuals.png", found, settings.separate.unit, title)
-    pictures.plot_spectra(out / "spectra.png", found, title)
-    pictures.plot_ratio(out / "r.png", found, title)
-    written += [out / f"{name}.png" for name in PICTURES]
-    if pictures.plot_parameters(out / "parameters.png", found, title):
-        written.append(out / "parameters.png")
-    if (chain := found.chain) is not None:
-        plot_chains(out / "posterior.png", {chain.method: chain}, data.truth, title)
-        written.append(out / "posterior.png")
-    write_log(out / "log.json", settings, command.steps.seconds)
-    written.append(out / "log.json")
-    return Report(data.description, separation_tables(found), warnings, written)
+    warnings = separation_warnings(found, settings)
+    return Report(
+        data.description,
+        [_table(found)],
+        warnings,
+        {"warnings": warnings, **_numbers(found, settings)},
+        {name: (plot, found, settings) for name, plot in PICTURES.items()},
+        _write_maps(command.out, found, settings),
+    )
 
 
-COMMAND = Command(
-    "separate",
-    _work,
-    (
-        "result.json",
-        "log.json",
-        "components.fits",
-        "residuals.fits",
-        "parameters.fits",
-        *(f"{name}.png" for name in (*PICTURES, "parameters", "posterior")),
-        "simulations.npz",
-        "chain.h5",
-    ),
-)
+COMMAND = Command("separate", _work, ("result.json", "log.json", *MAPS, *PICTURES, *KEPT))

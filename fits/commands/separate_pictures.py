@@ -5,7 +5,6 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
 
 from fits.cleaning import Separation
 from fits.plots import (
@@ -21,7 +20,9 @@ from fits.plots import (
     spread,
     stokes_panels,
 )
-from fits.writing import with_error
+from fits.posterior_plots import plot_chains
+from fits.writing import two_digits, with_error
+from jaxsky.settings import Experiment
 
 #: Bands whose residuals are drawn.
 SHOWN = 4
@@ -35,26 +36,26 @@ def _title(found: Separation, name: str) -> str:
     return f"{name}, {float(component.nu_ref):g} GHz"
 
 
-def plot_components(path: Path, found: Separation, title: str) -> None:
+def plot_components(path: Path, found: Separation, settings: Experiment) -> None:
     """Q and U of the components, a row for each."""
     rows = [
         stokes_panels(_title(found, name), maps, color_limit(maps), found.like.sky[name].unit)
         for name, maps in zip(found.components, found.maps[:, -2:], strict=True)
     ]
-    plot_maps(path, rows, title)
+    plot_maps(path, rows, settings.title)
 
 
-def plot_residuals(path: Path, found: Separation, unit: str, title: str) -> None:
+def plot_residuals(path: Path, found: Separation, settings: Experiment) -> None:
     """Data less components in a few bands, Q beside U."""
-    names, rows = list(found.data.bands), []
+    names, rows, unit = list(found.data.bands), [], settings.separate.unit
     for name in spread(names, SHOWN):
         maps = found.residuals[names.index(name), -2:]
         limit = 3 * float(np.nanstd(maps))
         rows.append(stokes_panels(f"{name}, data less components", maps, limit, unit, 0.0))
-    plot_maps(path, rows, title)
+    plot_maps(path, rows, settings.title)
 
 
-def plot_parameters(path: Path, found: Separation, title: str) -> bool:
+def plot_parameters(path: Path, found: Separation, settings: Experiment) -> bool:
     """Maps of the parameters that have regions, their errors beside them.
 
     Returns False, without a picture, if none has.
@@ -64,106 +65,74 @@ def plot_parameters(path: Path, found: Separation, title: str) -> bool:
         if not np.ndim(found.fit.best_fit[name]):
             continue
         value, sigma = (found.of_pixel(name, x) for x in (found.fit.best_fit, found.sigma))
-        middle = float(np.nanmedian(value))
+        middle, symbol = float(np.nanmedian(value)), label(name)
         half = float(f"{np.nanquantile(sigma, 0.98) / 2:.1g}")
-        symbol, regions = label(name), len(found.fit.best_fit[name])
-        head, center = f"${symbol}$, {regions} regions", float(f"{middle:.3g}")
-        limit, error = color_limit(value - middle, 0.98), "its standard deviation"
-        rows.append(
-            [
-                MapPanel(head, value, limit, f"${symbol}$", center),
-                MapPanel(error, sigma, half, rf"$\sigma({symbol})$", half),
-            ]
-        )
+        head = f"${symbol}$, {len(found.fit.best_fit[name])} regions"
+        limit, center = color_limit(value - middle, 0.98), float(f"{middle:.3g}")
+        error = MapPanel("its standard deviation", sigma, half, rf"$\sigma({symbol})$", half)
+        rows.append([MapPanel(head, value, limit, f"${symbol}$", center), error])
     if rows:
-        plot_maps(path, rows, title)
+        plot_maps(path, rows, settings.title)
     return bool(rows)
 
 
-def _positive(values: np.ndarray) -> np.ndarray:
-    return np.where(values > 0, values, np.nan)
-
-
-def plot_spectra(path: Path, found: Separation, title: str) -> None:
+def plot_spectra(path: Path, found: Separation, settings: Experiment) -> None:
     """BB of the cleaned CMB, its noise and residual foregrounds, against the model."""
-    ratio, spectra = found.tensors, found.spectra
-    ell, edges = spectra.centers, np.array(spectra.edges)
-    width = np.stack([ell - edges[:-1], edges[1:] - 1 - ell])
-    signal = ratio.powers - ratio.model.additive
-    error = np.sqrt(np.diagonal(ratio.covariance))
-    with draw_panels(path, title, (COLUMN, 4.2), fontsize=8) as panels:
-        axes = panels[0, 0]
-        seen = signal > 0
-        axes.errorbar(
-            ell[seen],
-            signal[seen],
-            yerr=[np.minimum(error, 0.99 * np.abs(signal))[seen], error[seen]],
-            xerr=width[:, seen],
-            fmt="o",
-            ms=3,
-            lw=1.0,
-            color=CLEANED,
-            label="cleaned, noise subtracted",
-        )
+    model, edges, ell = found.tensors.model, np.array(found.spectra.edges), found.spectra.centers
+    signal = found.tensors.powers - model.additive
+    error = np.sqrt(np.diagonal(found.tensors.covariance))
+    noise, residual = found.simulated.noise.mean(axis=0), found.simulated.residual.mean(axis=0)
+    curves = [
+        ("lensing", model.lensing, LENSING, "-", 1.4),
+        ("$r = 0.01$", 0.01 * model.tensors, "k", "--", 1.1),
+        ("$r = 0.001$", 0.001 * model.tensors, "k", ":", 1.1),
+        ("noise", noise, NOISE, "-", 1.4),
+        ("residuals, from errors of laws", residual, RESIDUAL, "-", 1.4),
+    ]
+    if found.left is not None:
+        curves.append(("foregrounds left (known)", found.left, LEFT, "-.", 1.4))
+    with draw_panels(path, settings.title, (COLUMN, 4.2), fontsize=8) as panels:
+        axes, seen = panels[0, 0], signal > 0
+        yerr = np.stack([np.minimum(error, 0.99 * np.abs(signal)), error])[:, seen]
+        xerr = np.stack([ell - edges[:-1], edges[1:] - 1 - ell])[:, seen]
+        points: Any = {"fmt": "o", "ms": 3, "lw": 1.0, "label": "cleaned, noise subtracted"}
+        axes.errorbar(ell[seen], signal[seen], yerr, xerr, color=CLEANED, **points)
         if not seen.all():
-            upper = np.maximum(signal, 0) + 2 * error
-            axes.plot(
-                ell[~seen], upper[~seen], "v", ms=4, color=CLEANED, label=r"below 0: $2\sigma$"
-            )
-        axes.plot(ell, _positive(ratio.model.lensing), color=LENSING, lw=1.4, label="lensing")
-        for r, dashes in ((0.01, "--"), (0.001, ":")):
-            primordial = r * ratio.model.tensors
-            axes.plot(ell, primordial, color="k", ls=dashes, lw=1.1, label=f"$r = {r:g}$")
-        noise = found.simulated.noise.mean(axis=0)
-        axes.plot(ell, _positive(noise), color=NOISE, lw=1.4, label="noise")
-        residual = found.simulated.residual.mean(axis=0)
-        axes.plot(
-            ell, _positive(residual), color=RESIDUAL, lw=1.4, label="residuals, from errors of laws"
-        )
-        if found.left is not None:
-            axes.plot(
-                ell,
-                _positive(found.left),
-                "-.",
-                color=LEFT,
-                lw=1.4,
-                label="foregrounds left (known)",
-            )
+            upper, below = (np.maximum(signal, 0) + 2 * error)[~seen], r"below 0: $2\sigma$"
+            axes.plot(ell[~seen], upper, "v", ms=4, color=CLEANED, label=below)
+        for name, powers, color, dashes, width in curves:
+            positive = np.where(powers > 0, powers, np.nan)
+            axes.plot(ell, positive, dashes, color=color, lw=width, label=name)
         axes.set(
             yscale="log",
             xlim=(edges[0], edges[-1] - 1),
             xlabel=r"multipole $\ell$",
             ylabel=rf"$\ell(\ell+1)C_\ell^{{BB}}/2\pi$ [{UNITS['uK_CMB']}$^2$]",
         )
-        lowest = [residual] if found.left is None else [residual, found.left]
-        low = min(np.nanmin(_positive(values)) for values in lowest) / 3
-        axes.set_ylim(bottom=max(low, np.nanmax(ratio.model.lensing) * 1e-8))
+        lowest = min(x[x > 0].min(initial=np.inf) for x in (residual, found.left) if x is not None)
+        axes.set_ylim(bottom=max(lowest / 3, np.nanmax(model.lensing) * 1e-8))
         axes.yaxis.set_major_locator(mpl.ticker.LogLocator(numticks=20))
         legend_below(axes, 2, fontsize=7)
 
 
-def plot_ratio(path: Path, found: Separation, title: str) -> None:
-    """The posterior of the tensor-to-scalar ratio."""
+def plot_ratio(path: Path, found: Separation, settings: Experiment) -> None:
+    """The posterior of the tensor-to-scalar ratio, and above it the estimate with its error."""
     ratio = found.tensors
-    with draw_panels(path, title, (COLUMN, 3.2), fontsize=8) as panels:
-        axes = panels[0, 0]
-        axes.plot(ratio.grid, ratio.posterior, color=CLEANED, label=r"posterior, $r \geq 0$")
-        below = ratio.grid <= ratio.upper_95
+    r, sigma, grid, posterior = ratio.r, ratio.sigma, ratio.grid, ratio.posterior
+    with draw_panels(path, settings.title, (COLUMN, 3.2), fontsize=8) as panels:
+        axes, below = panels[0, 0], grid <= ratio.upper_95
+        axes.plot(grid, posterior, color=CLEANED, label=r"posterior, $r \geq 0$")
+        limit = f"95 %: $r < {two_digits(ratio.upper_95)}$"
         axes.fill_between(
-            ratio.grid[below],
-            ratio.posterior[below],
-            color=CLEANED,
-            alpha=0.2,
-            lw=0,
-            label=f"95 %: $r < {_two_digits(ratio.upper_95)}$",
+            grid[below], posterior[below], color=CLEANED, alpha=0.2, lw=0, label=limit
         )
-        _interval(axes, ratio.r, ratio.sigma)
+        marker: Any = {"fmt": "o", "color": "k", "ms": 3.5, "lw": 1.2, "capsize": 2}
+        axes.errorbar(r, 1.12, xerr=sigma, label=f"estimate {with_error(r, sigma)}", **marker)
         if (known := (found.data.truth or {}).get("r")) is not None:
             axes.axvline(known, color=TRUTH, lw=1.6, label="truth")
-        low = min(0.0, ratio.r - 1.3 * ratio.sigma)
-        shown = ratio.grid[ratio.posterior > 2e-3].max()
+        shown = grid[posterior > 2e-3].max()
         axes.set(
-            xlim=(low, max(shown, ratio.r + 1.5 * ratio.sigma)),
+            xlim=(min(0.0, r - 1.3 * sigma), max(shown, r + 1.5 * sigma)),
             ylim=(0, 1.25),
             xlabel="tensor-to-scalar ratio $r$",
             ylabel="relative probability",
@@ -172,22 +141,9 @@ def plot_ratio(path: Path, found: Separation, title: str) -> None:
         legend_below(axes, 2, fontsize=7)
 
 
-def _interval(axes: Axes, r: float, sigma: float) -> None:
-    """The estimate with its error, above the curve."""
-    axes.errorbar(
-        [r],
-        [1.12],
-        xerr=[sigma],
-        fmt="o",
-        color="k",
-        ms=3.5,
-        lw=1.2,
-        capsize=2,
-        label=f"estimate {with_error(r, sigma)}",
-    )
-
-
-def _two_digits(value: float) -> str:
-    """A number in two significant digits, without an exponent."""
-    digits = max(0, 1 - int(np.floor(np.log10(value)))) if value > 0 else 1
-    return f"{value:.{digits}f}"
+def plot_posterior(path: Path, found: Separation, settings: Experiment) -> bool:
+    """Samples of the posterior; returns False, without a picture, if there are none."""
+    if found.chain is None:
+        return False
+    plot_chains(path, {found.chain.method: found.chain}, found.data.truth, settings.title)
+    return True

@@ -2,6 +2,7 @@
 
 import statistics
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import healpy
@@ -26,13 +27,7 @@ def simulate_command(indices: range, only: str | None = None) -> Command:
 
     What is kept and what is replaced is seen to map by map.
     """
-
-    def work(settings: Experiment, command: Run) -> Report:
-        if only is not None:
-            settings = _restricted(settings, only)
-        return _work(settings, command, indices)
-
-    return Command("simulate", work)
+    return Command("simulate", partial(_work, indices=indices, only=only))
 
 
 def _restricted(settings: Experiment, only: str) -> Experiment:
@@ -47,47 +42,37 @@ def _restricted(settings: Experiment, only: str) -> Experiment:
     return settings.model_copy(update={"simulate": spec})
 
 
-def _work(settings: Experiment, command: Run, indices: range) -> Report:
+def _work(settings: Experiment, command: Run, *, indices: range, only: str | None) -> Report:
+    if only is not None:
+        settings = _restricted(settings, only)
     out, steps, options = command.out, command.steps, command.options
     steps.step("reading templates")
     montecarlo.check_folder(out, settings, options.resume, options.overwrite, indices)
     setup = experiment.simulation_inputs(settings)
-    names = setup.observation.names
-    seconds, notes, count = {}, dict[str, None](), len(indices) * len(names)
+    names, notes = setup.observation.names, list[str]()
+    seconds, count = [], len(indices) * len(names)
     steps.step("simulating")
-    for done, file in enumerate(
-        montecarlo.run(
-            settings,
-            setup,
-            out,
-            indices,
-            options.overwrite,
-            lambda note: notes.setdefault(note),
-            lambda: _begin(command, indices),
-        )
-    ):
-        steps.advance(done + 1, count)
+    files = montecarlo.run(
+        settings, setup, out, indices, options.overwrite, notes.append, command.begin
+    )
+    for done, file in enumerate(files, 1):
+        steps.advance(done, count)
         if file.seconds is not None:
-            seconds[file.path] = file.seconds
+            seconds.append(file.seconds)
     if settings.simulate.sheet:
         steps.step("drawing")
-        files = montecarlo.paths(out, names, indices.start)
-        sheet = out / f"sim_{indices.start:05d}.png"
-        _draw_sheet(sheet, files, setup.observation.lmax, settings)
+        shown = montecarlo.paths(out, names, indices.start)
+        _draw_sheet(out / f"sim_{indices.start:05d}.png", shown, setup.observation.lmax, settings)
     kept = count - len(seconds)
-    rate = f"{statistics.median(seconds.values()):.2g} s a band, " if seconds else ""
-    remark = (
-        f"{len(seconds)} maps in {out / 'sim_*'}"
-        + (f"; {kept} maps were there already" if kept else "")
-        + f" ({rate}{steps.seconds:.1f} s in all)."
+    there = f"; {kept} maps were there already" if kept else ""
+    rate = f"{statistics.median(seconds):.2g} s a band, " if seconds else ""
+    took = f"{rate}{steps.seconds:.1f} s in all"
+    return Report(
+        setup.description,
+        warnings=list(dict.fromkeys(notes)),
+        written=sorted(out.glob("sim_*.png")),
+        remark=f"{len(seconds)} maps in {out / 'sim_*'}{there} ({took}).",
     )
-    return Report(setup.description, (), list(notes), sorted(out.glob("sim_*.png")), remark)
-
-
-def _begin(command: Run, indices: range) -> None:
-    """The folder is this simulation's: others may make other realisations in it."""
-    command.folder.narrow(indices)
-    command.begin()
 
 
 def _draw_sheet(path: Path, files: Mapping[str, Path], lmax: int, settings: Experiment) -> None:

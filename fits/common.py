@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fits.fluctuations import Fluctuations, uniform_level
+from fits.fluctuations import Fluctuations
 from fits.inputs import Inputs
 from fits.kept import fingerprint
 from fits.template_likelihood import CovarianceOf, SkyLikelihood, likelihood
@@ -18,6 +18,7 @@ from jaxsky import Bandpass, Sky, observe
 from jaxsky.checks import Numeric
 from jaxsky.components import Component
 from jaxsky.harmonics import Preparation, beam_ratio, gaussian_beam, pixel_window
+from jaxsky.noise import pixel_covariance
 from jaxsky.settings import Experiment, at_key
 
 #: A pixel is used if no more than this fraction of what was smoothed or averaged was missing.
@@ -196,8 +197,8 @@ def _fluctuations(
             windows = windows * pixel_window(nside, lmax)
         spectra = jnp.asarray(inputs.cmb(lmax)[1:3])
     noise = tuple(
-        band.noise if own is None else band.noise * own
-        for band, own in zip(bands, kept, strict=True)
+        band.noise if own is None else pixel_covariance(band.noise, op.nside_in) * own
+        for op, band, own in zip(operators, bands, kept, strict=True)
     )
     correlated = tuple(
         prepared_spectrum(band.correlated, op, lmax)
@@ -211,7 +212,6 @@ def _fluctuations(
         windows,
         factors,
         tuple(inputs.bands),
-        tuple(map(uniform_level, noise)),
     )
 
 

@@ -33,6 +33,7 @@ from jaxsky.harmonics import (
     power_spectrum,
 )
 from jaxsky.keys import realisation_key, stream
+from jaxsky.noise import pixel_covariance
 from jaxsky.progress import QUIET
 from jaxsky.settings import Experiment, SettingsError
 
@@ -344,7 +345,8 @@ def _patch_noise(
 ) -> Float[np.ndarray, "patch 2 ell"]:
     """Spectrum of the noise in the prepared maps, on each patch that of its own pixels."""
     (preparation,), lmax = prepared.fluctuations.preparations, patches.spectra[0].lmax
-    variance = average_pixels(jnp.stack([band.noise[0, 0], band.noise[1, 1]]), preparation.nside)
+    covariance = pixel_covariance(band.noise, preparation.nside_in)
+    variance = average_pixels(jnp.stack([covariance[0, 0], covariance[1, 1]]), preparation.nside)
     weights = np.stack([one.mask**2 for one in patches.spectra])
     # Q and U turn into each other on a patch, and E and B have the mean of both.
     mean = np.asarray(variance).mean(axis=0) @ weights.T / weights.sum(axis=1)

@@ -6,8 +6,6 @@ rows with the data therefore have a covariance that follows exactly from a few t
 transforms of the rows; no simulation, no matrix over pixels.
 """
 
-from typing import Any
-
 import equinox as eqx
 import healpy
 import jax
@@ -15,10 +13,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxsky.checks import Numeric
 from jaxsky.cmb import realisation
-from jaxsky.harmonics import Preparation, adjoint_synthesis, alm_ell, expand, synthesis
+from jaxsky.harmonics import (
+    Preparation,
+    adjoint_synthesis,
+    alm_ell,
+    average_pixels,
+    expand,
+    map_variance,
+    synthesis,
+)
 from jaxsky.keys import stream
-from jaxsky.noise import draw, uniform_alm
+from jaxsky.noise import draw, pixel_covariance, white_alm
 
 #: Pixels whose products are added up at once; few enough to stay in cache.
 CHUNK = 1 << 16
@@ -30,24 +37,23 @@ class Fluctuations(eqx.Module):
     Parameters
     ----------
     preparations : operator with which each band was brought to the common resolution
-    noise : for each band, covariance of Q and U in each pixel before that [uK_RJ^2]
+    noise : for each band, before that, a level [uK_RJ arcmin] or the covariance of Q and U in each
+        pixel [uK_RJ^2]
     correlated : for each band, C_l of noise that is correlated between pixels, the same for E and
         B, in the prepared maps [uK_RJ^2], shape (ell,); None where there is none
     cmb_spectra : C_l of EE and BB [uK_CMB^2], shape (2, ell); None without CMB
     cmb_windows : beam and pixel window of the prepared maps of each band, shape (band, ell)
     cmb_factors : uK_RJ per uK_CMB in each band, shape (band,)
     names : of the bands; the random numbers of each come from its name
-    levels : of the noise of each band [uK_RJ arcmin] where it is uniform, else None
     """
 
     preparations: tuple[Preparation, ...]
-    noise: tuple[Float[Array, "stokes stokes pix"], ...]
+    noise: tuple[Numeric, ...]
     correlated: tuple[Float[Array, " ell"] | None, ...]
     cmb_spectra: Float[Array, "stokes ell"] | None
     cmb_windows: Float[Array, "band ell"] | None
     cmb_factors: Float[Array, " band"]
     names: tuple[str, ...] = eqx.field(static=True)
-    levels: tuple[float | None, ...]
 
     # Not one program: XLA would hold the maps of all rows and bands at once.
     def covariance(
@@ -80,18 +86,18 @@ class Fluctuations(eqx.Module):
     def noise_realisation(self, key: Array) -> Float[Array, "band stokes pix"]:
         """Noise of all bands at the common resolution [uK_RJ]."""
         maps = []
-        for b, (name, preparation) in enumerate(zip(self.names, self.preparations, strict=True)):
-            white = stream(key, "noise", name)
-            if (level := self.levels[b]) is not None and preparation.window is not None:
-                # Uniform noise has independent multipoles: no pixels finer than the result's.
-                alm = uniform_alm(white, level, preparation.window.size - 1)
-                total = synthesis(alm * expand(preparation.window), preparation.nside)
+        for name, preparation, noise, spectrum in zip(
+            self.names, self.preparations, self.noise, self.correlated, strict=True
+        ):
+            nside = preparation.nside
+            if preparation.window is None:
+                pixels = jnp.asarray(pixel_covariance(noise, preparation.nside_in), float)
+                total = average_pixels(draw(stream(key, "noise", name), pixels), nside)
+                if spectrum is not None:
+                    total = total + synthesis(_correlated_alm(key, name, spectrum), nside)
             else:
-                drawn = draw(white, jnp.asarray(self.noise[b], float))
-                total = preparation.of_noise(drawn)
-            if (spectrum := self.correlated[b]) is not None:
-                modes = jax.random.normal(stream(key, "correlated", name), (2, spectrum.size**2))
-                total = total + synthesis(modes * expand(jnp.sqrt(spectrum)), preparation.nside)
+                alm = noise_alm(key, name, noise, spectrum, preparation.window)
+                total = synthesis(alm, nside)
             maps.append(total)
         return jnp.stack(maps)
 
@@ -120,42 +126,54 @@ class Fluctuations(eqx.Module):
         NaN where it cannot be had: next to steps of the noise by more than a factor of some
         hundred, where the smoothed map of variances rings below zero.
         """
-        variances: list[Any] = []
+        variances = []
         for preparation, noise, spectrum in zip(
             self.preparations, self.noise, self.correlated, strict=True
         ):
-            variance = preparation.variance([noise[s, s] for s in range(len(noise))])
+            if jnp.ndim(noise):
+                pixels = jnp.asarray(noise)
+                variance = np.asarray(preparation.variance([pixels[s, s] for s in range(2)]))
+            else:
+                shape = (2, healpy.nside2npix(preparation.nside))
+                variance = np.full(shape, preparation.uniform_variance(float(noise)))
             if spectrum is not None:
-                modes = 2 * np.arange(spectrum.size) + 1
-                variance = np.asarray(variance) + np.sum(modes * np.asarray(spectrum)) / (4 * np.pi)
+                variance = variance + map_variance(spectrum)
             variances.append(variance)
         total = np.stack(variances)
         return jnp.asarray(np.sqrt(np.where(total > 0, total, np.nan)))
 
 
-def uniform_level(covariance: Float[Array, "stokes stokes pix"]) -> float | None:
-    """The level [u arcmin] of which `jaxsky.noise.uniform_covariance` makes this, if there is one.
+def noise_alm(
+    key: Array,
+    name: str,
+    noise: Numeric,
+    spectrum: Float[Array, " ell"] | None,
+    window: Float[Array, " ell"],
+) -> Float[Array, "2 alm"]:
+    """Coefficients E and B of a realisation of the noise of a band, by its name.
 
-    None for noise that varies, is correlated, or differs between Stokes parameters.
+    White noise of either kind (`jaxsky.noise`) times a window, and noise that is correlated
+    between pixels, in whose spectrum the window is already.
     """
-    values = np.asarray(covariance)
-    variance = values[0, 0, 0]
-    for s, t in np.ndindex(values.shape[:2]):
-        if not np.all(values[s, t] == (variance if s == t else 0.0)):
-            return None
-    nside = healpy.npix2nside(values.shape[-1])
-    return float(np.sqrt(variance) * healpy.nside2resol(nside, arcmin=True))
+    alm = white_alm(stream(key, "noise", name), noise, window.size - 1) * expand(window)
+    return alm if spectrum is None else alm + _correlated_alm(key, name, spectrum)
+
+
+def _correlated_alm(key: Array, name: str, spectrum: Float[Array, " ell"]) -> Float[Array, "2 alm"]:
+    white = jax.random.normal(stream(key, "correlated", name), (2, spectrum.size**2))
+    return white * expand(jnp.sqrt(spectrum))
 
 
 def _products(
     preparation: Preparation,
-    noise: Float[Array, "stokes stokes pix"],
+    noise: Numeric,
     rows: Float[Array, "row stokes pix"],
 ) -> Float[np.ndarray, "row row"]:
     """Covariance of the inner products of rows with the prepared noise of a band.
 
     The rows at the resolution of the noise are kept in its precision.
     """
+    noise = pixel_covariance(noise, preparation.nside_in)
     before = [
         np.asarray(preparation.transpose(row).astype(noise.dtype).block_until_ready())
         for row in rows

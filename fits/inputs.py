@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from fits.template_noise import TemplateNoise, read_template_noise
 from jaxsky import Bandpass
+from jaxsky.checks import Numeric
 from jaxsky.experiment import SimulationInputs, cmb_spectra, simulation_inputs
 from jaxsky.galaxy import EmbeddedSky
 from jaxsky.inputs import (
@@ -29,7 +30,7 @@ from jaxsky.inputs import (
 from jaxsky.io import MissingFileError
 from jaxsky.io.observations import Observed, read_observed
 from jaxsky.keys import realisation_key
-from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum, uniform_covariance
+from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import Observation, ObservedBand, harmonic_sources
 from jaxsky.settings import BandTable, Experiment, SettingsError, at_key, find_file
@@ -47,8 +48,9 @@ class Leakage(NamedTuple):
 class Band(NamedTuple):
     """Observed Q and U [uK_RJ] of a band at the resolution of the map.
 
-    `beam` is the FWHM of a Gaussian [arcmin] or a table b_l. `noise` is the covariance of Q and U
-    in each pixel, `correlated` the spectrum of noise beyond that, if there is any [uK_RJ^2].
+    `beam` is the FWHM of a Gaussian [arcmin] or a table b_l. `noise` is a level [uK_RJ arcmin] or
+    the covariance of Q and U in each pixel, `correlated` the spectrum of noise beyond that, if
+    there is any [uK_RJ^2].
     `leakage` is in the maps, and subtracted where they are brought to a common resolution.
     """
 
@@ -56,7 +58,7 @@ class Band(NamedTuple):
     used: Bool[np.ndarray, " pix"]
     bandpass: Bandpass
     beam: float | Float[Array, " ell"]
-    noise: Float[Array, "stokes stokes pix"]
+    noise: Numeric
     correlated: Float[Array, " ell"] | None = None
     leakage: Leakage | None = None
 
@@ -150,7 +152,7 @@ def _simulated(
     bands = {}
     for name, maps in observe_bands(key, sky, observation, setup.cmb):
         observed, total = setup.observed(name), maps["total"]
-        noise, correlated = _noise_of(observed, used.size, f"bands.{name}.noise")
+        noise, correlated = _noise_of(observed, observation.nside, f"bands.{name}.noise")
         if (leakage := _leakage_of(observed, used)) is not None:
             total = total + leakage.maps
         band, beam = observed.bandpass, observed.beam
@@ -163,20 +165,17 @@ def _simulated(
 
 
 def _noise_of(
-    observed: Observed, npix: int, where: str
-) -> tuple[Float[Array, "stokes stokes pix"], Float[Array, " ell"] | None]:
-    """Covariance of each pixel and spectrum beyond it of the noise of a simulation."""
-    nside = healpy.npix2nside(npix)
-    if observed.covariance is not None:
-        return jnp.asarray(observed.covariance), None
-    if observed.level is not None:
-        return uniform_covariance(observed.level, nside), None
+    observed: Observed, nside: int, where: str
+) -> tuple[Numeric, Float[Array, " ell"] | None]:
+    """White noise of a simulation, and the spectrum of what was smoothed."""
+    if observed.noise is not None:
+        return observed.noise, None
     if observed.spectrum is None:
         raise SettingsError(
             f"{where}: is missing, or is of pixels that were smoothed with the map."
         )
     beyond = max(0, 4 * nside + 1 - observed.spectrum.size)
-    return uniform_covariance(0.0, nside), jnp.asarray(np.pad(observed.spectrum, (0, beyond)))
+    return 0.0, jnp.asarray(np.pad(observed.spectrum, (0, beyond)))
 
 
 def _leakage_of(observed: Observed | None, used: Bool[np.ndarray, " pix"]) -> Leakage | None:
@@ -247,7 +246,7 @@ def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -
     if spec.noise is None:
         if observed is None:
             raise SettingsError(f"{where}: is missing.")
-        noise, correlated = _noise_of(observed, used.size, where)
+        noise, correlated = _noise_of(observed, nside, where)
     elif spec.noise.estimate_above is not None:
         with at_key(f"{where}.estimate_above"):
             noise, correlated = _estimated_noise(spec.noise, maps, used)
@@ -269,7 +268,7 @@ def _read_leakage(folder: Path, spec: BandTable, bandpass: Bandpass) -> Leakage:
 
 
 def _estimated_noise(noise, maps, used):
-    """Covariance of Q and U in each pixel and spectrum of the rest, from the maps themselves."""
+    """White noise and the spectrum of the rest, from the maps themselves."""
     nside, npix = healpy.npix2nside(maps.shape[-1]), maps.shape[-1]
     latitude = healpy.pix2ang(nside, np.arange(npix), lonlat=True)[1]
     quiet = used & (np.abs(latitude) >= noise.estimate_above)
@@ -277,6 +276,5 @@ def _estimated_noise(noise, maps, used):
         variance = estimate_variance(maps, quiet)
         return jnp.eye(2)[..., None] * variance[:, None, None] * jnp.ones(npix), None
     white, knee, slope = fit_knee(maps, quiet, 2 * nside)
-    covariance = jnp.eye(2)[..., None] * jnp.full(npix, white / healpy.nside2pixarea(nside))
     excess = knee_spectrum(white, knee, slope, 4 * nside) - white
-    return covariance, excess.at[:2].set(0.0)
+    return float(np.degrees(np.sqrt(white)) * 60), excess.at[:2].set(0.0)

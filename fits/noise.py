@@ -11,8 +11,9 @@ from jaxsky.checks import Numeric
 
 #: Pixels per pass.
 CHUNK = 1 << 15
-#: Ratios of sigma between bands that are constant to this accuracy make noise separable.
-ROUNDING = 1e-12
+#: Ratios of sigma between bands that are constant to this accuracy make noise separable: smoothed
+#: maps of the variance of uniform noise ring by 1e-7.
+ROUNDING = 1e-6
 #: A band that has less than this share of the weight of any component has none.
 LEAST_SHARE = 1e-6
 

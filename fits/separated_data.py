@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import healpy
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fits.common import prepared_maps
-from fits.fluctuations import Fluctuations, uniform_level
+from fits.fluctuations import Fluctuations, noise_alm
 from fits.inputs import Inputs, inputs_of
 from fits.mixing import NOMINAL
 from fits.multipoles import harmonic_coefficients, harmonic_likelihood
@@ -30,16 +29,11 @@ from fits.separated_maps import (
     harmonic_component_maps,
 )
 from jaxsky import Bandpass, Component, Sky, set_parameters
+from jaxsky.checks import Numeric
 from jaxsky.components import component_class
-from jaxsky.harmonics import analysis, expand, gaussian_beam, lmax_of, synthesis
+from jaxsky.harmonics import expand, gaussian_beam, lmax_of, synthesis
 from jaxsky.inputs import read_parameters
-from jaxsky.keys import stream
-from jaxsky.noise import draw, uniform_alm
 from jaxsky.settings import Experiment, MapFile, SettingsError, at_key
-
-#: Noise that varies by less than this fraction from pixel to pixel is uniform: smoothed maps of
-#: variances ring by 1e-7.
-UNIFORM = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,15 +104,14 @@ class MultipoleData(_Data):
     """Coefficients that are separated multipole by multipole, each band with its own beam.
 
     `fwhms` are those of the bands [arcmin], and `noise` is N_l of the maps as observed [unit^2 sr].
-    To draw it there are the `covariance` of Q and U in each pixel of the bands [unit^2], each at
-    its own nside, the `levels` where it is uniform [unit arcmin], else None, and the part of N_l
-    that is `correlated` between pixels. Maps of components have `nside` and `fwhm` [arcmin].
+    To draw it there is the `white` noise of each band, a level [unit arcmin] or the covariance of Q
+    and U in each of its own pixels [unit^2], and the part of N_l that is `correlated` between
+    pixels. Maps of components have `nside` and `fwhm` [arcmin].
     """
 
     fwhms: Float[np.ndarray, " band"]
     noise: Float[np.ndarray, "band stokes ell"]
-    covariance: tuple[Float[Array, "stokes stokes pix"], ...]
-    levels: tuple[float | None, ...]
+    white: tuple[Numeric, ...]
     correlated: Float[np.ndarray, "band ell"]
     nside: int
     fwhm: float
@@ -131,18 +124,9 @@ class MultipoleData(_Data):
 
     def noise_realisation(self, key: Array) -> Float[np.ndarray, "band stokes alm"]:
         """Noise like that of the data."""
-        bands, lmax = [], self.noise.shape[-1] - 1
-        for name, covariance, level, spectrum in zip(
-            self.bands, self.covariance, self.levels, self.correlated, strict=True
-        ):
-            own = stream(key, "noise", name)
-            if level is not None:
-                alm = uniform_alm(own, level, lmax)
-            else:
-                alm = analysis(draw(own, covariance), lmax, 0)
-            white = jax.random.normal(stream(key, "correlated", name), alm.shape)
-            bands.append(np.asarray(alm + white * expand(jnp.sqrt(jnp.asarray(spectrum)))))
-        return np.stack(bands)
+        window = jnp.ones(self.noise.shape[-1])
+        noises = zip(self.bands, self.white, jnp.asarray(self.correlated), strict=True)
+        return np.stack([noise_alm(key, *band, window) for band in noises])
 
     def components(self, like: SpectralLikelihood, params: Mapping, data, **options):
         """Amplitudes of the components with all that is known of them."""
@@ -226,6 +210,8 @@ def _pixel_data(
     used = prepared.used & inside
     _check_some(used)
 
+    sigma = np.asarray(prepared.sigma) * factors[:, None, None]
+
     def scaled(maps):
         return np.where(used, np.asarray(maps) * factors[:, None, None], 0.0)
 
@@ -240,20 +226,10 @@ def _pixel_data(
         observed=scaled(prepared.data),
         foregrounds=alone,
         labels=parameter_labels(settings, used),
-        noise=_pixel_noise(np.asarray(prepared.sigma) * factors[:, None, None], used),
+        noise=as_noise(np.where(used, sigma, np.inf), sigma.shape),
         fluctuations=fluctuations,
         factors=factors,
     )
-
-
-def _pixel_noise(sigma: Float[np.ndarray, "band stokes pix"], used: np.ndarray) -> Noise:
-    """Noise of the pixels that are used; separable if it is uniform but for rounding."""
-    values = sigma[..., used]
-    middle = values.mean(axis=-1)
-    if np.all(np.abs(values / middle[..., None] - 1) < UNIFORM):
-        mask = np.where(used, 1.0, np.inf)
-        return as_noise(middle, sigma.shape, mask)
-    return as_noise(np.where(used, sigma, np.inf), sigma.shape)
 
 
 def _multipole_data(
@@ -282,14 +258,19 @@ def _multipole_data(
             )
     nsides = [healpy.npix2nside(band.used.size) for band in bands.values()]
     lmax = 2 * min(common.nside, *nsides)
-    covariance, white = [], np.zeros(len(nsides))
+    white: list[Numeric] = []
     correlated = np.zeros((len(nsides), lmax + 1))
+    noise = np.zeros((len(nsides), 1, lmax + 1))
     for i, (band, factor) in enumerate(zip(bands.values(), factors, strict=True)):
-        covariance.append(jnp.asarray(band.noise) * factor**2)
-        white[i] = jnp.diagonal(covariance[i]).mean() * healpy.nside2pixarea(nsides[i])
+        if np.ndim(band.noise):
+            white.append(jnp.asarray(band.noise) * factor**2)
+            level = jnp.diagonal(white[i]).mean() * healpy.nside2pixarea(nsides[i])
+        else:
+            white.append(band.noise * factor)
+            level = (white[i] * np.radians(1 / 60)) ** 2
         if band.correlated is not None:
             correlated[i] = band.correlated[: lmax + 1] * factor**2
-    noise = (white[:, None] + correlated)[:, None]
+        noise[i] = level + correlated[i]
 
     def coefficients(maps):
         scaled = [np.asarray(m) * f for m, f in zip(maps, factors, strict=True)]
@@ -304,8 +285,7 @@ def _multipole_data(
         foregrounds=None if alone is None else coefficients(alone.values()),
         fwhms=np.array([float(band.beam) for band in bands.values()]),
         noise=np.broadcast_to(noise, (len(nsides), 2, lmax + 1)),
-        covariance=tuple(covariance),
-        levels=tuple(map(uniform_level, covariance)),
+        white=tuple(white),
         correlated=correlated,
         nside=common.nside,
         fwhm=common.fwhm,

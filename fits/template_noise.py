@@ -22,6 +22,7 @@ from fits.template_likelihood import TemplateLikelihood
 from jaxsky import Sky
 from jaxsky.harmonics import Preparation, gaussian_beam, pixel_window
 from jaxsky.inputs import Template
+from jaxsky.noise import pixel_covariance
 from jaxsky.noise_inputs import read_noise
 from jaxsky.settings import ComponentTable, SettingsError
 from jaxsky.units import conversion
@@ -68,10 +69,10 @@ def read_template_noise(
         return TemplateNoise(noise.level * float(conversion(unit, "uK_RJ", nu_ref)))
     maps = template.component.amplitude
     nside, used = healpy.npix2nside(template.used.size), template.used
-    covariance, _ = read_noise(
+    found, _ = read_noise(
         folder, noise, nu_ref, nside, where, template.unit, own=spec, maps=maps, used=used
     )
-    return TemplateNoise(covariance=covariance)
+    return TemplateNoise(covariance=pixel_covariance(found, nside))
 
 
 def prepared_variance(

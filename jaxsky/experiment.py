@@ -54,23 +54,19 @@ class SimulationInputs(NamedTuple):
         """How a band is observed, as its maps are."""
         channel = self.observation.channels[name]
         beam = channel.map_beam
-        level = spectrum = covariance = None
-        smoothed, noise = channel.target is not None, channel.noise
-        if noise is not None and jnp.ndim(noise):
-            covariance = None if smoothed else np.asarray(noise)
-        elif noise is not None and not smoothed:
-            level = float(noise)
-        elif noise is not None:
-            lmax = self.observation.lmax
-            window = np.asarray(beam_ratio(beam, channel.beam, lmax, f"band {name!r}"))
-            spectrum = (float(noise) * np.radians(1 / 60) * window) ** 2
-            spectrum[:2] = 0.0
+        noise, spectrum = channel.noise, None
+        if noise is not None and channel.target is not None:
+            if not jnp.ndim(noise):
+                lmax = self.observation.lmax
+                window = np.asarray(beam_ratio(beam, channel.beam, lmax, f"band {name!r}"))
+                spectrum = (float(noise) * np.radians(1 / 60) * window) ** 2
+                spectrum[:2] = 0.0
+            noise = None
         return Observed(
             channel.band,
             jnp.asarray(beam) if jnp.ndim(beam) else float(beam),
-            level,
+            noise if noise is None or jnp.ndim(noise) else float(noise),
             spectrum,
-            covariance,
             None if name not in self.leakage else np.asarray(self.leakage[name]),
             self.truth,
         )
@@ -245,19 +241,15 @@ def read_channel(
     noise: Array | float | None = None
     if spec.noise is not None and noisy:
         unit = _noise_unit(spec, f"{where}.noise")
-        if spec.noise.level is not None:
-            with at_key(f"{where}.noise"):
-                noise = spec.noise.level * band.conversion(unit, "uK_RJ")
-        else:
-            own = None if spec.file is None else spec
-            noise, known = read_noise(
-                folder, spec.noise, band, nside, f"{where}.noise", unit, stokes, own=own
+        own = None if spec.file is None else spec
+        noise, known = read_noise(
+            folder, spec.noise, band, nside, f"{where}.noise", unit, stokes, own=own
+        )
+        if missing := int(np.sum(~known)):
+            raise SettingsError(
+                f"{where}.noise: {missing} pixels have no noise; a simulation takes maps of the "
+                "full sky."
             )
-            if missing := int(np.sum(~known)):
-                raise SettingsError(
-                    f"{where}.noise: {missing} pixels have no noise; a simulation takes maps of "
-                    "the full sky."
-                )
     target = None if settings.simulate.fwhm == "own" else settings.simulate.fwhm
     return ObservedBand(band, jnp.asarray(beam), target, noise, settings.simulate.diagonal_noise)
 

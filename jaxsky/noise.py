@@ -1,175 +1,73 @@
-"""White noise of maps: draws from the covariance of each pixel, and estimates from the maps."""
+"""White noise of maps: draws, of a level or of a covariance of each pixel, and estimates.
+
+Noise stays what it was written as until pixels are needed: a uniform level [u arcmin], u being the
+unit of the maps, or the covariance of the Stokes parameters in each pixel [u^2].
+"""
 
 import math
-from collections.abc import Sequence
-from functools import partial, reduce
+from functools import partial
 
 import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
-from jaxsky.checks import Numeric, as_array, check_finite, check_shape, is_concrete
+from jaxsky.checks import Numeric, as_array, check_finite
 from jaxsky.harmonics import analysis, children, expand, power_spectrum
 from jaxsky.keys import stokes_noise
-
-#: Pixels that are checked at once.
-_PIECE = 1 << 20
-#: Columns of a covariance by their number, in the order of Planck's maps.
-_COLUMNS = {3: ("QQ", "QU", "UU"), 6: ("II", "IQ", "IU", "QQ", "QU", "UU")}
 
 
 @partial(jax.jit, static_argnames=("nside", "stokes"))
 def uniform_covariance(
     noise: Numeric, nside: int, stokes: int = 2
 ) -> Float[Array, "stokes stokes pix"]:
-    """Covariance of each pixel for a uniform noise level.
-
-    Parameters
-    ----------
-    noise : noise [u arcmin], u being the unit of the maps
-    nside : resolution
-    stokes : number of Stokes parameters, all with this noise
-    """
+    """Covariance of each pixel for a level, the same for all Stokes parameters."""
     npix, pixel = healpy.nside2npix(nside), healpy.nside2resol(nside, arcmin=True)
     return jnp.eye(stokes)[..., None] * jnp.full(npix, (noise / pixel) ** 2)
+
+
+def pixel_covariance(
+    noise: Numeric, nside: int, stokes: int = 2
+) -> Float[Array, "stokes stokes pix"]:
+    """Covariance of each pixel for noise of either kind."""
+    return jnp.asarray(noise) if jnp.ndim(noise) else uniform_covariance(noise, nside, stokes)
 
 
 def uniform_map(
     key: Array, noise: ArrayLike, nside: int, stokes: int = 2
 ) -> Float[Array, "stokes pix"]:
-    """White noise of a uniform level: a draw from `uniform_covariance`, without that in memory.
-
-    Parameters
-    ----------
-    key : of jax.random
-    noise : noise [u arcmin], u being the unit of the maps
-    nside : resolution
-    stokes : number of Stokes parameters, all with this noise
-    """
+    """White noise of a level: a draw from `uniform_covariance`, without that in memory."""
     sigma = as_array("noise", noise) / float(healpy.nside2resol(nside, arcmin=True))
     return sigma * stokes_noise(key, stokes, healpy.nside2npix(nside), sigma.dtype)
 
 
+@partial(jax.jit, static_argnames=("lmax", "stokes"))
 def uniform_alm(
     key: Array, noise: ArrayLike, lmax: int, stokes: int = 2
 ) -> Float[Array, "stokes alm"]:
-    """Packed coefficients of white noise, N_l = noise^2 (in u rad) at all multipoles.
+    """Packed coefficients of white noise of a level, N_l = noise^2 (in u rad) at all multipoles.
 
-    Parameters
-    ----------
-    key : of jax.random
-    noise : noise [u arcmin], u being the unit of the maps
-    lmax : largest multipole
-    stokes : rows: 1 for I, 2 for E, B, 3 for I, E, B; E and B have no modes at l < 2
+    Rows are I (1), E, B (2) or I, E, B (3); E and B have no modes at l < 2.
     """
     if stokes not in (1, 2, 3):
         raise ValueError(f"Argument `stokes` must be 1, 2 or 3, not {stokes!r}.")
-    return _uniform_alm(key, as_array("noise", noise), lmax, stokes)
-
-
-@partial(jax.jit, static_argnames=("lmax", "stokes"))
-def _uniform_alm(key, noise, lmax, stokes):
+    noise = as_array("noise", noise)
     spins = jnp.array({1: [0], 2: [2, 2], 3: [0, 2, 2]}[stokes])
     there = jnp.arange(lmax + 1) >= spins[:, None]
     levels = jnp.where(there, noise * (math.pi / 180 / 60), 0)
     return stokes_noise(key, stokes, (lmax + 1) ** 2, noise.dtype) * expand(levels)
 
 
-def rms_covariance(rms: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:
-    """Covariance of each pixel from maps of the rms, without correlations.
+def white_alm(key: Array, noise: Numeric, lmax: int) -> Float[Array, "2 alm"]:
+    """Coefficients E and B of noise of either kind; those of pixels in a tenth of the usual time.
 
-    Parameters
-    ----------
-    rms : standard deviation of each Stokes parameter in each pixel, shape (stokes, pix)
+    A level has independent multipoles, and takes no pixels. Pixels are drawn, and analysed without
+    refinement and multipoles beyond lmax: the mean spectrum is right to 1e-4.
     """
-    rms = as_array("rms", rms)
-    check_shape("rms", rms, rms.ndim == 2, "have shape (stokes, pix)")
-    check_finite("rms", rms)
-    if is_concrete(rms) and (bad := int(jnp.sum(rms < 0))):
-        raise ValueError(f"Argument `rms` has {bad} of {rms.size} values that are negative.")
-    return _diagonal(rms**2)
-
-
-def hits_covariance(
-    sigma0: ArrayLike, hits: Float[Array, " pix"], stokes: int = 2
-) -> Float[Array, "stokes stokes pix"]:
-    """Covariance of each pixel from the number of observations, sigma_0^2 / hits.
-
-    Parameters
-    ----------
-    sigma0 : noise of one observation, a number or one for each Stokes parameter; those of WMAP's
-        polarization differ a little from those of its intensity
-    hits : number of observations of each pixel
-    stokes : number of Stokes parameters
-    """
-    sigma0, hits = _each(sigma0, stokes), as_array("hits", hits)
-    check_shape("hits", hits, hits.ndim == 1, "have shape (pix,)")
-    check_finite("hits", hits)
-    if is_concrete(hits) and (bad := int(jnp.sum(hits <= 0))):
-        raise ValueError(f"Argument `hits` is not positive in {bad} of {hits.size} pixels.")
-    return _diagonal(sigma0[:, None] ** 2 / hits)
-
-
-def weights_covariance(
-    sigma0: ArrayLike, weights: Float[Array, "3 pix"]
-) -> Float[Array, "2 2 pix"]:
-    """Covariance of Q and U in each pixel from weights QQ, QU, UU: sigma_0^2 times their inverse.
-
-    WMAP's maps have such weights, which like numbers of observations grow with time (Jarosik et
-    al. 2011).
-
-    Parameters
-    ----------
-    sigma0 : noise of one observation of Q or U, a number or one for each
-    weights : elements QQ, QU, UU; a pixel whose weights have no inverse gets no finite covariance
-    """
-    sigma0, weights = _each(sigma0, 2), as_array("weights", weights)
-    check_shape("weights", weights, weights.shape[:-1] == (3,), "have shape (3, pix)")
-    QQ, QU, UU = weights
-    inverse = jnp.stack([jnp.stack([UU, -QU]), jnp.stack([-QU, QQ])]) / (QQ * UU - QU**2)
-    return jnp.outer(sigma0, sigma0)[..., None] * inverse
-
-
-def _each(sigma0: ArrayLike, stokes: int) -> Float[Array, " stokes"]:
-    """The noise of one observation in each Stokes parameter."""
-    sigma0 = as_array("sigma0", sigma0)
-    good = sigma0.shape in ((), (stokes,))
-    check_shape("sigma0", sigma0, good, f"be a number or have shape ({stokes},)")
-    check_finite("sigma0", sigma0)
-    return jnp.broadcast_to(sigma0, (stokes,))
-
-
-def _diagonal(variance: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:
-    return jnp.eye(len(variance), dtype=variance.dtype)[..., None] * variance
-
-
-def covariance_from_columns(
-    columns: Float[Array, "column pix"], names: Sequence[str] | None = None
-) -> Float[Array, "stokes stokes pix"]:
-    """Covariance of each pixel from its elements, as Planck's maps have them.
-
-    Parameters
-    ----------
-    columns : three maps for Q, U or six for I, Q, U
-    names : what they are, "QQ_COV" or "QQ" and so on, I or T; by default in Planck's order, QQ,
-        QU, UU or II, IQ, IU, QQ, QU, UU
-    """
-    columns = as_array("columns", columns)
-    good = columns.ndim == 2 and len(columns) in _COLUMNS
-    check_shape("columns", columns, good, "have shape (3, pix) or (6, pix)")
-    expected = _COLUMNS[len(columns)]
-    given = list(expected if names is None else names)
-    pairs = ["".join(sorted(name[:2].upper().replace("T", "I"))) for name in given]
-    if sorted(pairs) != sorted(expected):
-        raise ValueError(
-            f"Argument `names` must be {', '.join(expected)} in any order, "
-            f"but is {', '.join(given)}."
-        )
-    rows = dict(zip(pairs, columns, strict=True))
-    stokes = "QU" if len(columns) == 3 else "IQU"
-    return jnp.stack([jnp.stack([rows[min(a + b, b + a)] for b in stokes]) for a in stokes])
+    if not jnp.ndim(noise):
+        return uniform_alm(key, noise, lmax)
+    return analysis(draw(key, jnp.asarray(noise, float)), lmax, 0)
 
 
 @jax.jit
@@ -186,34 +84,6 @@ def cholesky(covariance: Float[Array, "stokes stokes pix"]) -> Float[Array, "sto
             else:
                 lower[i][j] = rest / jnp.where(lower[j][j] > 0, lower[j][j], 1.0)
     return jnp.stack([jnp.stack(row) for row in lower])
-
-
-@jax.jit
-def _number_indefinite(covariance: Float[Array, "stokes stokes pix"]) -> Int[Array, ""]:
-    """The number of pixels whose covariance is not positive definite."""
-    # A root of a negative number is NaN, and NaN is not positive; each pixel is read once.
-    pivots = [row[s] for s, row in enumerate(cholesky(covariance.astype(float)))]
-    return jnp.sum(~reduce(jnp.logical_and, [(p > 0) & jnp.isfinite(p) for p in pivots]))
-
-
-def check_covariance(name: str, covariance: Float[Array, "stokes stokes pix"]) -> None:
-    """Raise ValueError if the covariance of a pixel is not positive definite; says of how many.
-
-    Only the lower triangle is looked at, as in `draw`. Traced arrays pass.
-
-    Parameters
-    ----------
-    name : of the argument, for the message
-    covariance : of the Stokes parameters in each pixel
-    """
-    good = covariance.ndim == 3 and covariance.shape[0] == covariance.shape[1]
-    check_shape(name, covariance, good, "have shape (stokes, stokes, pix)")
-    if not is_concrete(covariance):
-        return
-    npix = covariance.shape[-1]
-    pieces = (covariance[..., start : start + _PIECE] for start in range(0, npix, _PIECE))
-    if bad := sum(int(_number_indefinite(piece)) for piece in pieces):
-        raise ValueError(f"Argument `{name}` is not positive definite in {bad} of {npix} pixels.")
 
 
 @partial(jax.jit, static_argnames="diagonal")
@@ -233,13 +103,7 @@ def draw(
     takes the diagonal of L alone, as standard deviations. Those are what remains of each Stokes
     parameter when the ones before it are known: the draws have no correlations, and where the
     covariance has some, U is too quiet by the factor 1 - R^2 in variance, R being its multiple
-    correlation with I and Q; Q by that with I, and I not at all.
-
-    Parameters
-    ----------
-    key : of jax.random
-    covariance : of the Stokes parameters in each pixel, positive semi-definite
-    diagonal : independent draws with the diagonal of L as standard deviations, as in the paper
+    correlation with I and Q; Q by that with I, and I not at all. `diagonal` draws as the paper.
     """
     # Apart from the products: in one program XLA evaluates the normals anew in each of its rows.
     _, stokes, npix = covariance.shape
@@ -253,11 +117,7 @@ def estimate_variance(
     """Noise variance per pixel from the scatter inside groups of four neighbouring pixels.
 
     What varies little over such a group cancels, which leaves the noise where the sky is smooth.
-
-    Parameters
-    ----------
-    maps : maps with white noise, RING
-    used : pixels to use; groups of which all four are used count
+    Groups count of which all four pixels (RING) are used.
     """
     nside = healpy.npix2nside(maps.shape[-1])
     whole = children(used, nside // 2).all(axis=-1)
@@ -295,13 +155,7 @@ def fit_knee(
 
     The most probable values given the spectrum (EE + BB)/2 of the masked maps divided by the
     fraction of the sky, whose values are taken as independent between multipoles. Whatever the
-    sky itself shows in these pixels counts as noise.
-
-    Parameters
-    ----------
-    maps : Q and U, RING
-    used : pixels to use; the fewer, the coarser the estimate
-    lmax : largest multipole to use
+    sky itself shows in these pixels (RING) counts as noise.
     """
     fraction = float(np.mean(used))
     if not fraction:

@@ -48,19 +48,17 @@ def _noise(
     if channel.noise is None:
         return None
     noise = jnp.asarray(channel.noise, observation.dtype)
-    stokes, nside = len(observation.stokes), observation.nside
-    if not noise.ndim and channel.target is not None:
-        # Uniform noise stays isotropic when it is smoothed.
-        alm = uniform_alm(key, noise, observation.lmax, stokes)
-        window = beam_ratio(channel.target, channel.beam, observation.lmax, "the channel")
-        return _Part((alm,), (1.0,), window)
-    if not noise.ndim:
-        return uniform_map(key, noise, nside, stokes)
-    white = draw(key, noise, diagonal=channel.diagonal)
+    stokes, nside, lmax = len(observation.stokes), observation.nside, observation.lmax
     if channel.target is None:
-        return white
-    window = beam_ratio(channel.target, channel.beam, observation.lmax, "the channel")
-    return resample(white, window.astype(observation.dtype), nside)
+        if noise.ndim:
+            return draw(key, noise, diagonal=channel.diagonal)
+        return uniform_map(key, noise, nside, stokes)
+    window = beam_ratio(channel.target, channel.beam, lmax, "the channel")
+    if noise.ndim:
+        white = draw(key, noise, diagonal=channel.diagonal)
+        return resample(white, window.astype(observation.dtype), nside)
+    # Uniform noise stays isotropic when it is smoothed.
+    return _Part((uniform_alm(key, noise, lmax, stokes),), (1.0,), window)
 
 
 def observe_bands(

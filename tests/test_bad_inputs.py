@@ -587,7 +587,7 @@ LEVELS = 1.5 + 0.1 * RNG.random(NPIX)
 RMS = {"bands/0/noise": {"rms": {"file": "rms.fits"}}}
 PIXEL = healpy.nside2resol(NSIDE, arcmin=True)
 BAND_44 = Bandpass.top_hat(44.1, 10.72)
-rms_of = lambda found: np.sqrt(found.bands["44"].noise[0, 0])  # noqa: E731
+rms_of = lambda found: found.bands["44"].noise / PIXEL  # noqa: E731
 TOGETHER = [
     sky("files that are right", {}),
     sky("a map of beta_dust", BETA, beta=of_pixels(LEVELS)),

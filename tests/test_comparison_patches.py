@@ -16,6 +16,7 @@ from fits.inputs import inputs_of
 from fits.patches import fit_patches
 from fits.pseudo_cl import band_powers
 from jaxsky.harmonics import gaussian_beam
+from jaxsky.noise import pixel_covariance
 from jaxsky.settings import Experiment
 
 NSIDE = 64
@@ -47,7 +48,7 @@ def test_noise_is_that_of_each_patch(inputs):
     """Twice as much on one half of the sky."""
     band = inputs.bands["353"]
     north = healpy.pix2ang(NSIDE, np.arange(band.used.size), lonlat=True)[1] > 0
-    uneven = band._replace(noise=band.noise * jnp.where(north, 4.0, 1.0))
+    uneven = band._replace(noise=pixel_covariance(band.noise, NSIDE) * jnp.where(north, 4.0, 1.0))
     prepared = common_maps(inputs._replace(bands={"353": uneven}), NSIDE, 60.0)
     patches = prepare_patches(
         itertools.islice(paper_patches(NSIDE), 0, 48, 16), np.asarray(gaussian_beam(60.0, 128))

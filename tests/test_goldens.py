@@ -69,7 +69,6 @@ def fluctuations():
         jnp.stack([gaussian_beam(900.0, lmax)] * 2),
         jnp.array([0.9, 0.7]),
         ("44", "70"),
-        (None, None),
     )
 
 

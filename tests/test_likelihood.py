@@ -69,7 +69,6 @@ def fluctuations(cmb: bool = True) -> Fluctuations:
         windows,
         jnp.array([0.95, 0.9]),
         ("44", "70"),
-        (None, None),
     )
 
 

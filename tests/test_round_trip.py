@@ -247,7 +247,7 @@ def test_smoothed_noise_of_pixels_is_not_guessed(files, tmp_path):
     settings = load(files, values)
     out = tmp_path / "sims"
     assert list(run(settings, simulation_inputs(settings), out, range(1)))
-    with pytest.raises(SettingsError, match=r"bands.44.noise: .*smoothed"):
+    with pytest.raises(SettingsError, match=r"bands.own.noise: .*smoothed"):
         inputs_of(load(files, [*values, f'common.maps = "{out / "sim_00000"}"']))
 
 
@@ -371,7 +371,7 @@ def test_a_cmb_above_the_noise_is_no_misfit(folder):
 
 
 def test_tables_of_another_size_than_the_map_are_refused(tmp_path):
-    observed = Observed(Bandpass.delta(100.0), 30.0, covariance=np.ones((2, 2, 48)))
+    observed = Observed(Bandpass.delta(100.0), 30.0, np.ones((2, 2, 48)))
     options = {"names": ["Q", "U"], "unit": "uK_RJ", "tables": observed_tables(observed)}
     write_maps(tmp_path / "a.fits", np.zeros((2, 192)), **options)
     with pytest.raises(InputError, match="its table NOISE has 48 pixels, its map 192"):

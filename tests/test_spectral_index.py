@@ -8,7 +8,7 @@ import pytest
 
 from fits.commands.run import DEFAULTS
 from fits.common import common_maps, prepare_component
-from fits.fluctuations import Fluctuations, uniform_level
+from fits.fluctuations import Fluctuations
 from fits.inputs import Band, Inputs, inputs_of
 from fits.optimize import best_fit
 from fits.regions import region_masks
@@ -80,7 +80,7 @@ def test_variance_of_prepared_noise():
     ):
         draws = jax.lax.map(lambda k, p=preparation: p(draw(k, covariance)), keys, batch_size=50)
         model = Fluctuations(
-            (preparation,), (covariance,), (None,), None, None, jnp.ones(1), ("44",), (None,)
+            (preparation,), (covariance,), (None,), None, None, jnp.ones(1), ("44",)
         )
         ratio = np.asarray(draws.var(axis=0) / model.sigma()[0] ** 2)
         inside = np.abs(healpy.pix2ang(nside, np.arange(ratio.shape[1]), lonlat=True)[1])
@@ -94,11 +94,12 @@ def test_variance_of_prepared_noise():
 def test_uniform_noise_is_drawn_by_multipoles():
     """As smoothed white noise in pixels: the same variance and the same spectrum."""
     nside_in, nside, lmax = 32, 16, 47
-    covariance = uniform_covariance(1000.0, nside_in)
-    assert uniform_level(covariance) == pytest.approx(1000.0, rel=1e-12)
     preparation = Preparation.smoothing(nside_in, 60.0, nside, 400.0, lmax)
-    parts = (preparation,), (covariance,), (None,), None, None, jnp.ones(1), ("44",)
-    model, pixels = Fluctuations(*parts, (1000.0,)), Fluctuations(*parts, (None,))
+    model, pixels = (
+        Fluctuations((preparation,), (noise,), (None,), None, None, jnp.ones(1), ("44",))
+        for noise in (1000.0, uniform_covariance(1000.0, nside_in))
+    )
+    np.testing.assert_allclose(model.sigma(), pixels.sigma(), rtol=1e-6)
     keys = jax.random.split(jax.random.key(0), 200)
     maps = [np.stack([m.noise_realisation(k)[0] for k in keys]) for m in (model, pixels)]
     # Some 1600 modes x 200 draws: 0.3 % of sampling error.
@@ -112,28 +113,17 @@ def test_uniform_noise_is_drawn_by_multipoles():
     np.testing.assert_allclose(powers[0][0].mean(), powers[0][1].mean(), rtol=0.03)
 
 
-def test_noise_that_is_not_uniform_has_no_level():
-    covariance = np.array(uniform_covariance(3.0, 4))
-    for at, value in [((0, 0, 5), 2.0), ((0, 1, 5), 1e-3), ((1, 1), 2.0), ((0, 0, 0), np.nan)]:
-        changed = covariance.copy()
-        changed[at] = value
-        assert uniform_level(changed) is None
-    assert uniform_level(covariance.astype(np.float32)) == pytest.approx(3.0, rel=1e-6)
-    assert uniform_level(0 * covariance) == 0.0
-
-
 def test_noise_of_a_band_is_that_of_its_name():
-    covariance = uniform_covariance(1000.0, 16)
     how = Preparation.smoothing(16, 60.0, 8, 900.0, 16)
 
-    def drawn(names, level):
+    def drawn(names, noise):
         count = len(names)
-        parts = (how,) * count, (covariance,) * count, (None,) * count, None, None
-        model = Fluctuations(*parts, jnp.ones(count), names, (level,) * count)
+        parts = (how,) * count, (noise,) * count, (None,) * count, None, None
+        model = Fluctuations(*parts, jnp.ones(count), names)
         return dict(zip(names, np.asarray(model.noise_realisation(jax.random.key(5))), strict=True))
 
-    for level in (1000.0, None):
-        both, other = drawn(("44", "70"), level), drawn(("30", "70"), level)
+    for noise in (1000.0, uniform_covariance(1000.0, 16)):
+        both, other = drawn(("44", "70"), noise), drawn(("30", "70"), noise)
         np.testing.assert_array_equal(both["70"], other["70"])
         assert abs(np.corrcoef(both["44"].ravel(), both["70"].ravel())[0, 1]) < 0.5
 
@@ -320,7 +310,6 @@ def pulls():
         windows,
         factors,
         ("44", "70"),
-        (None, None),
     )
     latitude = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)[1]
     sigma = jnp.where(np.abs(latitude) <= 20, model.sigma(), jnp.inf)

@@ -14,6 +14,7 @@ from jaxsky.harmonics.packing import (
     degrees,
     expand,
     lmax_of,
+    map_variance,
     power_spectrum,
     resize,
 )

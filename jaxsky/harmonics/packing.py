@@ -68,6 +68,11 @@ def power_spectrum(
     return sums.reshape(*alm.shape[:-1], -1) / (2 * jnp.arange(lmax + 1) + 1)
 
 
+def map_variance(spectrum: Float[Array, " ell"]) -> float:
+    """Variance of a pixel of maps that have a spectrum."""
+    return float(np.sum((2 * np.arange(spectrum.size) + 1) * np.asarray(spectrum)) / (4 * np.pi))
+
+
 def alm_from_healpy(alm: np.ndarray, lmax: int) -> Float[np.ndarray, "... alm"]:
     """healpy's complex coefficients as packed real ones, along the last axis."""
     alm = np.asarray(alm, dtype=complex)

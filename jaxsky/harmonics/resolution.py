@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.checks import check_finite
-from jaxsky.harmonics.packing import expand, resize
+from jaxsky.harmonics.packing import expand, map_variance, resize
 from jaxsky.harmonics.transforms import analysis, synthesis
 from jaxsky.harmonics.windows import beam_ratio, shortened
 
@@ -158,17 +158,6 @@ class Preparation(eqx.Module):
         return resample(maps, self.window, self.nside, fine=FINE)
 
     @eqx.filter_jit
-    def of_noise(self, maps: Float[Array, "stokes pix"]) -> Float[Array, "stokes pix"]:
-        """White noise at the common resolution, in a tenth of the time that other maps take.
-
-        Without refinement and multipoles beyond those that are kept: its mean spectrum is the
-        same to 1e-4, and it is not the same realisation.
-        """
-        if self.window is None:
-            return average_pixels(maps, self.nside)
-        return resample(maps, self.window, self.nside, fine=np.inf)
-
-    @eqx.filter_jit
     def transpose(self, maps: Float[Array, "stokes pix"]) -> Float[Array, "stokes pix"]:
         """The transposed operator, from the common resolution to that of the maps."""
         shape = (len(maps), healpy.nside2npix(self.nside_in))
@@ -191,6 +180,12 @@ class Preparation(eqx.Module):
             smoothed = resample(values, squared, self.nside, fine=FINE_VARIANCE)
             rows.append(smoothed[0].block_until_ready())
         return area * jnp.stack(rows)
+
+    def uniform_variance(self, level: float) -> float:
+        """Variance of prepared white noise of a level [u arcmin]."""
+        if self.window is None:
+            return (level / healpy.nside2resol(self.nside, arcmin=True)) ** 2
+        return map_variance((level * np.radians(1 / 60) * np.asarray(self.window)) ** 2)
 
 
 def _check_nside(nside_in: int, nside: int, what: str) -> None:

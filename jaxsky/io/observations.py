@@ -29,17 +29,17 @@ TABLES = {
 class Observed(NamedTuple):
     """How a map was observed.
 
-    `beam` is the FWHM of a Gaussian [arcmin], or a table b_l. Noise is uniform, of a `level`
-    [uK_RJ arcmin], or was smoothed with the map, to a `spectrum` N_l [uK_RJ^2], or has a
-    `covariance` of Q and U in each pixel [uK_RJ^2]. `leakage` is Q and U that leaked from the
-    intensity [uK_RJ], with the beam of the map; `truth` has spectral parameters by dotted name.
+    `beam` is the FWHM of a Gaussian [arcmin], or a table b_l. `noise` is a level [uK_RJ
+    arcmin] or the covariance of Q and U in each pixel [uK_RJ^2]; where it was smoothed with the map
+    it is None, and has a `spectrum` N_l [uK_RJ^2] if that is known. `leakage` is Q and U that
+    leaked from the intensity [uK_RJ], with the beam of the map; `truth` has spectral parameters by
+    dotted name.
     """
 
     bandpass: Bandpass
     beam: float | Float[Array, " ell"]
-    level: float | None = None
+    noise: float | Float[Array | np.ndarray, "2 2 pix"] | None = None
     spectrum: Float[np.ndarray, " ell"] | None = None
-    covariance: Float[np.ndarray, "2 2 pix"] | None = None
     leakage: Float[np.ndarray, "2 pix"] | None = None
     truth: Mapping[str, float] = {}
 
@@ -52,8 +52,8 @@ def observed_tables(observed: Observed) -> list[pyfits.BinTableHDU]:
         rows["BEAM"] = [observed.beam]
     if observed.spectrum is not None:
         rows["NOISE_SPECTRUM"] = [observed.spectrum]
-    if observed.covariance is not None:
-        (QQ, QU), (_, UU) = np.asarray(observed.covariance)[-2:, -2:]
+    if not (observed.noise is None or isinstance(observed.noise, float)):
+        (QQ, QU), (_, UU) = np.asarray(observed.noise)[-2:, -2:]
         rows["NOISE"] = [QQ, QU, UU]
     if observed.leakage is not None:
         rows["LEAKAGE"] = list(observed.leakage)
@@ -72,8 +72,8 @@ def observed_tables(observed: Observed) -> list[pyfits.BinTableHDU]:
     header["CONVENT"] = (band.convention, "convention of the weights")
     if not np.ndim(observed.beam):
         header["FWHM"] = (float(observed.beam), "[arcmin] beam of the map")
-    if observed.level is not None:
-        header["NOISE"] = (observed.level, "[uK_RJ arcmin] uniform noise")
+    if isinstance(observed.noise, float):
+        header["NOISE"] = (observed.noise, "[uK_RJ arcmin] uniform noise")
     return tables
 
 
@@ -110,9 +110,8 @@ def read_observed(path: Path) -> Observed | None:
         return Observed(
             Bandpass(nu, weights, header["CONVENT"]),
             stated["FWHM"] if "FWHM" in stated else jnp.asarray(found["BEAM"][0]),
-            stated.get("NOISE"),
+            stated.get("NOISE") if noise is None else np.array([noise[:2], noise[1:]]),
             None if spectrum is None else spectrum[0],
-            None if noise is None else np.array([noise[:2], noise[1:]]),
             found.get("LEAKAGE"),
             truth,
         )

@@ -198,15 +198,12 @@ def _check_templates(
         pixel = healpy.nside2resol(nside, arcmin=True)
         own = max(template.fwhm, PIXELS * pixel) if written else template.fwhm
         if settings.sky.components[name].small_scales is None and beams[band] < own:
-            why = (
-                f"{template.fwhm:g} arcmin"
-                if template.fwhm == own
-                else (f"{own:.3g} arcmin, {PIXELS:g} pixels of nside {nside}")
-            )
+            pixels = f", {PIXELS:g} pixels of nside {nside}" if template.fwhm < own else ""
             raise SettingsError(
-                f"sky.{name}: its resolution, {why}, is coarser than the {beams[band]:g} arcmin of "
-                f"band {band!r}; add small scales, [sky.{name}.small_scales], or bring the maps to "
-                f"a common simulate.fwhm of at least {own:.3g} arcmin."
+                f"sky.{name}: its resolution, {own:.3g} arcmin{pixels}, is coarser than "
+                f"the {beams[band]:g} arcmin of band {band!r}; add small scales, "
+                f"[sky.{name}.small_scales], or bring the maps to a common simulate.fwhm of at "
+                f"least {own:.3g} arcmin."
             )
 
 

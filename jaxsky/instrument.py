@@ -18,15 +18,9 @@ from jaxsky.units import parse_unit
 
 
 class Channel(eqx.Module):
-    """One channel: a top-hat band, a Gaussian beam and white noise.
+    """A channel: a top-hat band [GHz], a Gaussian beam [arcmin], white noise of Q and U.
 
-    Parameters
-    ----------
-    name : name of the channel
-    center, width : middle and full width of the band [GHz]
-    fwhm : full width at half maximum of the beam [arcmin]
-    noise : noise of Q and of U [noise_unit arcmin]
-    noise_unit : unit of temperature of the noise, "uK_CMB" or another name of `jaxsky.units`
+    The unit of the noise [noise_unit arcmin] is one of temperature in `jaxsky.units`.
     """
 
     name: str = eqx.field(static=True)
@@ -107,18 +101,13 @@ class Instrument(eqx.Module):
     ) -> dict[str, ObservedBand]:
         """All channels by name as `Observation` takes them, with noise in uK_RJ arcmin.
 
-        Parameters
-        ----------
-        target : common beam of the maps [arcmin]; None leaves each its own
-        samples : of each top-hat band
+        Target is the common beam of the maps [arcmin]; None leaves each its own.
         """
-        bands = self.bands(samples)
-        return {
-            c.name: ObservedBand(
-                band, c.fwhm, target, c.noise * band.conversion(c.noise_unit, "uK_RJ")
-            )
-            for c, band in zip(self.channels, bands.values(), strict=True)
-        }
+        found = {}
+        for c, band in zip(self, self.bands(samples).values(), strict=True):
+            noise = c.noise * band.conversion(c.noise_unit, "uK_RJ")
+            found[c.name] = ObservedBand(band, c.fwhm, target, noise)
+        return found
 
 
 @cache

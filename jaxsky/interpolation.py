@@ -79,13 +79,9 @@ def _evaluate(coefs: Float[Array, "..."], *points: Float[Array, " pix"]) -> Floa
     return t * high - higher + terms[0]
 
 
-def _is_map(leaf: Any) -> bool:
-    return eqx.is_array(leaf) and leaf.ndim == 1
-
-
 def _split(component: Component) -> tuple[list[Array], Callable[..., Component]]:
     """The parameters that are maps, and a function from numbers in their place to a component."""
-    maps, rest = eqx.partition(component, _is_map)
+    maps, rest = eqx.partition(component, lambda leaf: eqx.is_array(leaf) and leaf.ndim == 1)
     leaves, structure = jax.tree.flatten(maps)
     return leaves, lambda values: eqx.combine(jax.tree.unflatten(structure, values), rest)
 
@@ -99,15 +95,6 @@ def _range(values: Array) -> tuple[Array, Array]:
     return middle, jnp.maximum((high - low) / 2, least * (1 + jnp.abs(middle)))
 
 
-def _tail(
-    rebuild: Callable[..., Component], values: list[Array], band: Samples
-) -> Float[Array, " node"]:
-    """See `_tails`: along one parameter, in one band."""
-    line = jax.vmap(lambda *v: average(rebuild(v).sed, band))(*values)
-    coefs = jnp.abs(_coefficients(line))
-    return jnp.cumsum(coefs[::-1])[::-1] / jnp.abs(line).min()
-
-
 @jax.jit
 def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
     """Bound of the relative error of a series cut at each length, for each map, over all bands.
@@ -115,6 +102,12 @@ def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
     The series along one parameter is taken at the ends and the middle of the others.
     """
     maps, rebuild = _split(component)
+
+    def tail(values, band):
+        line = jax.vmap(lambda *v: average(rebuild(v).sed, band))(*values)
+        coefs = jnp.abs(_coefficients(line))
+        return jnp.cumsum(coefs[::-1])[::-1] / jnp.abs(line).min()
+
     ranges = [_range(m) for m in maps]
     grid = jnp.asarray(chebpts1(MAX_NODES))
     worst = []
@@ -124,7 +117,7 @@ def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
             unit: list[Any] = [*corner[:axis], grid, *corner[axis:]]
             values = [mid + half * u for (mid, half), u in zip(ranges, unit, strict=True)]
             values = [jnp.broadcast_to(v, (MAX_NODES,)) for v in values]
-            lines.append(jax.vmap(partial(_tail, rebuild, values))(samples))
+            lines.append(jax.vmap(partial(tail, values))(samples))
         worst.append(jnp.concatenate(lines).max(axis=0))
     return jnp.stack(worst)
 

@@ -304,7 +304,7 @@ def test_the_other_sign_of_beta_syn_is_named_with_its_key(table_):
         with pytest.raises(ValueError, match=words):
             Experiment.model_validate(raw | change | table_)
     twice = {"fixed": {"synchrotron.nu_ref": 23.0}}
-    with pytest.raises(ValueError, match=r"fixed.synchrotron.nu_ref: is given twice"):
+    with pytest.raises(ValueError, match=r"fixed.synchrotron.nu_ref: belongs next to law"):
         Experiment.model_validate(raw | twice)
     offset = {"free": {"synchrotron.beta_syn.offset": {"start": -0.1, "uniform": [-1.0, 0.5]}}}
     Experiment.model_validate(raw | offset)

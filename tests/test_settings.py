@@ -190,7 +190,10 @@ def test_set_replaces_a_key_and_nothing_else(tmp_path):
 @pytest.mark.parametrize(
     ("assignment", "words"),
     [
-        ("fixed = { 'dust.nu_ref' = 545.0 }", "fixed.dust.nu_ref: is that of the embedded map"),
+        (
+            "fixed = { 'dust.nu_ref' = 545.0 }",
+            "fixed.dust.nu_ref: belongs next to law",
+        ),
         ("sky.dust.parameters = { nu_ref = 545.0 }", "sky.dust: nu_ref belongs next to law"),
         ("sky.dust.noise = { level = 3.0 }", "sky.dust: fwhm, angles and noise are of a map"),
         (

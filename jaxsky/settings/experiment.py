@@ -249,12 +249,9 @@ class Experiment(SettingsTable):
         check_signs(self.fixed, "fixed")
         check_signs(self.truth, "truth")
         check_signs({name: one.numbers() for name, one in self.free.items()}, "free")
-        for name, one in self.sky.components.items():
-            own = one.file is None and name in self.sky.templates
-            if (own or one.nu_ref is not None) and f"{name}.nu_ref" in self.fixed:
-                twice = f"is given twice, here and in sky.{name}"
-                where = "is that of the embedded map" if own else twice
-                raise MistakeAt(f"fixed.{name}.nu_ref", where)
+        for name in self.sky.components:
+            if f"{name}.nu_ref" in self.fixed:
+                raise MistakeAt(f"fixed.{name}.nu_ref", f"belongs next to law in sky.{name}")
         if not self.forecast.free and not self.free_in("forecast"):
             raise MistakeAt("forecast.free", "is empty, and so is the table free")
         if "cmb" in (self.simulate.include or ()) and not self.cmb.include:

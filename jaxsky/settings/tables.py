@@ -12,6 +12,7 @@ from jaxsky.galaxy import GalaxyModel
 from jaxsky.instrument import band_tables
 from jaxsky.settings.files import BandpassSpec, BeamedKeys, BeamedMap, MapFile, MapKeys, NoiseTable
 from jaxsky.settings.types import (
+    RESERVED,
     BandName,
     FileName,
     Law,
@@ -22,9 +23,9 @@ from jaxsky.settings.types import (
     Seed,
     SettingsTable,
     Several,
-    TensorRatio,
     Word,
-    check_component_names,
+    check_name,
+    check_names,
     check_reference,
     check_signs,
     mistakes,
@@ -58,32 +59,14 @@ def _without_leakage(name: str) -> str | None:
 
 def leakage_warning(name: str, files: Sequence[str]) -> str | None:
     """A warning if the map of a band is known by its files to hold leakage."""
-    found = [Path(file).name for file in files]
-    advice = {file: words for file in found if (words := _without_leakage(file)) is not None}
-    if not advice:
-        return None
-    file, words = next(iter(advice.items()))
-    return (
-        f"bands.{name}: {file} holds intensity that has leaked into Q and U through the "
-        "bandpasses, and nothing is subtracted; indices fitted to it may be wrong by many sigma. "
-        f"{words}."
-    )
-
-
-def _check_release(
-    files: Sequence[str], leakage: Sequence[str], map_label: str, label: str
-) -> None:
-    """Raise ValueError if leakage is of another release than the map, or subtracted already."""
-    for file in files:
-        if "BPassCorrected" in file:
-            raise ValueError(f"leakage is subtracted from {file} already")
-    releases = [_RELEASE.search(file) for file in (*files, *leakage)]
-    found = [release[1] for release in releases if release]
-    if len(set(found)) > 1:
-        raise ValueError(
-            f"leakage {label} is of release {found[-1]}, but the map {map_label} of release "
-            f"{found[0]}"
-        )
+    for file in (Path(file).name for file in files):
+        if (advice := _without_leakage(file)) is not None:
+            return (
+                f"bands.{name}: {file} holds intensity that has leaked into Q and U through the "
+                "bandpasses, and nothing is subtracted; indices fitted to it may be wrong by many "
+                f"sigma. {advice}."
+            )
+    return None
 
 
 #: Components of the embedded model, named as their laws.
@@ -169,14 +152,6 @@ class ComponentTable(BeamedKeys):
         """Whether its law, which is known, has any polarization."""
         return component_class(str(self.law)).polarized
 
-    def check(self, law: str) -> None:
-        """Raise ValueError for keys that do not go with a law."""
-        if law == "cmb":
-            raise MistakeAt("law", "the CMB is described in the table cmb")
-        if self.angles and component_class(law) is not AME:
-            raise ValueError("angles are for the law 'ame' only")
-        check_reference(law, self.nu_ref)
-
 
 class SkyTable(SettingsTable):
     """Components of the sky by name, and the embedded model, whose maps those replace."""
@@ -209,12 +184,17 @@ class SkyTable(SettingsTable):
 
     @model_validator(mode="after")
     def _consistent(self) -> "SkyTable":
-        check_component_names(self.given)
+        check_names("components", self.given)
         for name, one in self.components.items():
             try:
+                check_name(name, "", RESERVED)
                 if one.law is None:
                     raise ValueError("law is missing")
-                one.check(one.law)
+                if one.law == "cmb":
+                    raise MistakeAt("law", "the CMB is described in the table cmb")
+                if one.angles and component_class(one.law) is not AME:
+                    raise ValueError("angles are for the law 'ame' only")
+                check_reference(one.law, one.nu_ref)
                 own = one.file is None and name in self.templates
                 if own and (one.law != name or one.nu_ref is not None):
                     raise ValueError("law and nu_ref are those of the embedded map; give a file")
@@ -237,7 +217,7 @@ class CMBTable(SettingsTable):
     """
 
     include: bool = True
-    r: TensorRatio = 0.0
+    r: float = Field(0.0, ge=0, le=1000)  # the largest leaves the tensors far above all else
     A_lens: float = Field(1.0, ge=0)
     cosmology: dict[str, float] = Field(default={})
     spectra: FileName | None = None
@@ -287,8 +267,21 @@ class BandTable(BeamedKeys):
             if self.noise is not None and self.noise.estimate_above is not None:
                 raise MistakeAt("noise.estimate_above", "is of a map, but file is missing")
         if self.leakage is not None:
-            _check_release(self.files, self.leakage.files, self.label, self.leakage.label)
+            self._check_release(self.leakage)
         return self
+
+    def _check_release(self, leakage: BeamedMap) -> None:
+        """Refuse leakage of another release than the map, or that is subtracted already."""
+        for file in self.files:
+            if "BPassCorrected" in file:
+                raise ValueError(f"leakage is subtracted from {file} already")
+        releases = [_RELEASE.search(file) for file in (*self.files, *leakage.files)]
+        first, *others = [release[1] for release in releases if release] or [""]
+        if set(others) - {first}:
+            raise ValueError(
+                f"leakage {leakage.label} is of release {others[-1]}, but the map {self.label} of "
+                f"release {first}"
+            )
 
     def bands(self, folder: Path) -> list["BandTable"]:
         """The bands that this stands for: channels of an instrument, with what is given here.

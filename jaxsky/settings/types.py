@@ -105,7 +105,8 @@ def valid(check: Callable[[Any], object]) -> AfterValidator:
     return AfterValidator(kept)
 
 
-def _check_name(value: str, characters: str = "", reserved: Collection[str] = ()) -> None:
+def check_name(value: str, characters: str = "", reserved: Collection[str] = ()) -> None:
+    """Raise ValueError unless a name can be part of names of files and columns."""
     if value.lower() in reserved:
         raise ValueError(f"the name {value!r} has a meaning of its own in results; choose another")
     if len(value) > LONGEST:
@@ -120,8 +121,6 @@ def _check_name(value: str, characters: str = "", reserved: Collection[str] = ()
 
 Positive = Annotated[float, Field(gt=0)]
 Multipole = Annotated[int, Field(ge=2)]
-#: The largest leaves the tensors far above all else.
-TensorRatio = Annotated[float, Field(ge=0, le=1000)]
 Nside = Annotated[int, Field(gt=0, le=8192), valid(_power_of_two)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Word = Annotated[str, Field(min_length=1)]
@@ -137,8 +136,8 @@ Several = Annotated[list[T], Field(min_length=1), valid(_distinct)]
 Pair = Annotated[tuple[T, T], Strict(False)]
 #: The law of a component: a name, or "module:Class" (`jaxsky.components.component_class`).
 Law = Annotated[str, valid(component_class)]
-BandName = Annotated[str, valid(lambda value: _check_name(value, "."))]
-RegionName = Annotated[str, valid(_check_name)]
+BandName = Annotated[str, valid(lambda value: check_name(value, "."))]
+RegionName = Annotated[str, valid(check_name)]
 
 
 def _key(raw: Any, place: Sequence[str | int], missing: bool) -> str:
@@ -204,16 +203,6 @@ def check_names(kind: str, names: Iterable[str]) -> None:
             raise ValueError(
                 f"the names of the {kind} must differ{more}, but are {', '.join(names)}"
             )
-
-
-def check_component_names(names: Collection[str]) -> None:
-    """Raise MistakeAt its name if a component cannot be called so."""
-    check_names("components", names)
-    for name in names:
-        try:
-            _check_name(name, "", RESERVED)
-        except ValueError as error:
-            raise MistakeAt(name, error) from None
 
 
 def check_reference(law: str, nu_ref: float | None) -> None:

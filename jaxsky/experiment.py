@@ -114,7 +114,9 @@ def simulation_inputs(
             )
     _check_templates(settings, templates, seen, written)
     sources = {name: _source(settings, name, template) for name, template in templates.items()}
-    lmax = _lmax(channels, target, nside)
+    # The last multipole that any of the maps shows.
+    beams = [c.beam for c in channels.values()] if target is None else [target]
+    lmax = int(min(2 * nside, max(2.0, *map(_reach, beams))))
     observation = Observation(channels, nside, stokes, min(seen.values()), lmax, precision)
     cmb = cmb_spectra(settings, lmax) if "cmb" in included else None
     leakage = _leakage(settings, foregrounds, observation, galaxy)
@@ -150,12 +152,6 @@ def _width(beam: Array | float) -> float:
     below = np.flatnonzero(table < 0.5)
     ell = int(below[0]) if below.size else len(table)
     return float(np.degrees(4 * np.log(2) / np.sqrt(ell * (ell + 1))) * 60)
-
-
-def _lmax(channels: Mapping[str, ObservedBand], target: float | None, nside: int) -> int:
-    """The last multipole that any of the maps shows, at most 2 nside."""
-    beams = [c.beam for c in channels.values()] if target is None else [target]
-    return int(min(2 * nside, max(2.0, *map(_reach, beams))))
 
 
 def _reach(beam: Array | float) -> float:

@@ -313,9 +313,9 @@ class Experiment(SettingsTable):
         """Start values of the free parameters of a command."""
         values = {}
         for name, one in self.free_in(command).items():
-            if (value := one.first()) is None:
+            if one.start is None:
                 raise SettingsError(f"free.{name}: start is missing.")
-            values[name] = value
+            values[name] = one.start
         return values
 
 

@@ -349,13 +349,9 @@ class FreeParameter(SettingsTable):
             raise ValueError(f"start {start:g} is not inside the uniform prior {self.uniform}")
         if self.gaussian and not self.gaussian[1] > 0:
             raise ValueError(f"gaussian needs a positive sigma, not {self.gaussian[1]:g}")
+        if start is None and (self.gaussian or self.uniform):
+            self.start = self.gaussian[0] if self.gaussian else sum(self.uniform or ()) / 2
         return self
-
-    def first(self) -> float | None:
-        """Where to start; None if that is not said."""
-        if self.start is None and self.gaussian:
-            return self.gaussian[0]
-        return sum(self.uniform) / 2 if self.start is None and self.uniform else self.start
 
     def numbers(self) -> list[float]:
         """All values that it names, for a check of their sign."""

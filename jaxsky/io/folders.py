@@ -91,11 +91,11 @@ def _acquire(lock: filelock.BaseFileLock, timeout: float = 0) -> bool:
     """Lock a file; False if the file system has no locks."""
     try:
         lock.acquire(timeout)
+        return True
     except OSError as error:
         if error.errno in NO_LOCKS:
             return False
         raise
-    return True
 
 
 @contextmanager
@@ -152,15 +152,15 @@ class Folder:
         self.path, self.locked = path, False
         me, now, host = os.getpid(), time.time_ns(), socket.gethostname()
         self._owner = Owner(me, now, part.start, part.stop, host)
-        self._lock = _lock(self._place)
 
     @property
     def _place(self) -> Path:
         return self.path / self._owner.name
 
-    def enter(self) -> None:
+    @contextmanager
+    def owned(self) -> Iterator[None]:
         """Work in the folder, unless another process works on the same part."""
-        me = self._owner
+        me, lock = self._owner, _lock(self._place)
         with alone(self.path) as locked:
             for other in _owners(self.path) if locked else ():
                 if other.first < me.stop and me.first < other.stop:
@@ -168,16 +168,21 @@ class Folder:
                         f"{self.path}: is being written to by another command ({other}); wait "
                         "for its end, or choose another --out."
                     )
-            self.locked = locked and _acquire(self._lock)
+            self.locked = locked and _acquire(lock)
             self._place.touch()
-
-    def leave(self) -> None:
-        """Let others work in the folder."""
-        with suppress(OSError):
-            self.check()
-            with alone(self.path):
-                self._place.unlink()
-        self._lock.release()
+        guards.append(self.check)
+        try:
+            yield
+        except (OSError, ValueError):
+            self.check()  # the reason of all errors, if there is none any more
+            raise
+        finally:
+            guards.remove(self.check)
+            with suppress(OSError):
+                self.check()
+                with alone(self.path):
+                    self._place.unlink()
+            lock.release()
 
     def check(self) -> None:
         """Raise FileNotFoundError if the folder was removed, or is another one now."""
@@ -207,10 +212,9 @@ class Folder:
             if not locked:
                 return
             living = {str(other.pid) for other in _owners(self.path) if other != self._owner}
-            for pattern in (f"{PARTIAL}*", f"*/{PARTIAL}*"):
-                for path in self.path.glob(pattern):
-                    if path.name.split("-")[1] not in living:
-                        path.unlink(missing_ok=True)
+            for path in (*self.path.glob(f"{PARTIAL}*"), *self.path.glob(f"*/{PARTIAL}*")):
+                if path.name.split("-")[1] not in living:
+                    path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -226,16 +230,8 @@ def occupied(out: Path, part: range = ALL) -> Iterator[Folder]:
         raise OSError(f"{out}: cannot be made ({error.strerror}); choose another --out.") from error
     folder = Folder(out, part)
     try:
-        folder.enter()
-        guards.append(folder.check)
-        try:
+        with folder.owned():
             yield folder
-        except (OSError, ValueError):
-            folder.check()  # the reason of all errors, if there is none any more
-            raise
-        finally:
-            guards.remove(folder.check)
-            folder.leave()
     finally:
         for made in missing:
             with suppress(OSError):

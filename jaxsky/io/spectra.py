@@ -31,10 +31,10 @@ _D_ELL = re.compile(r"(?<![a-z0-9])D_?(L|ELL)(?![a-z])|\bL\s*\*?\s*\(L\s*\+\s*1\
 _ROUNDING = 1 + 1e-5
 
 
-def _multipole_range(
-    path: Path, ell: Float[np.ndarray, " row"], lmax: int, start: int
-) -> tuple[int, int]:
-    """First multipole of a table, at most `start`, and number of its rows up to lmax."""
+def _up_to(
+    path: Path, ell: Float[np.ndarray, " row"], values: np.ndarray, lmax: int, start: int
+) -> Float[np.ndarray, "... ell"]:
+    """Values of a table at l = 0 ... lmax; 0 below its first row, which is at most l = `start`."""
     if lmax < 0:
         raise ValueError(f"Argument `lmax` must not be negative, but is {lmax}.")
     if odd := int(np.sum(~(ell == np.round(ell)) | (ell < 0))):
@@ -46,7 +46,8 @@ def _multipole_range(
         raise InputError(f"{path}: l = {ell[at]:.0f} is followed by l = {ell[at + 1]:.0f}.")
     if ell[-1] < lmax:
         raise InputError(f"{path}: ends at l = {ell[-1]:.0f}, but lmax is {lmax}.")
-    return int(ell[0]), max(0, lmax + 1 - int(ell[0]))
+    below = np.zeros((*values.shape[:-1], int(ell[0])))
+    return np.concatenate([below, values], axis=-1)[..., : lmax + 1]
 
 
 def _name(word: str) -> str:
@@ -58,9 +59,8 @@ def _located(path: Path, names: Sequence[str], wanted: Sequence[str]) -> list[in
     """Numbers of the columns that are wanted."""
     known = [_name(name) for name in names]
     if missing := [name for name in wanted if name not in known]:
-        hint = ""
-        if missing == ["BB"]:
-            hint = "; CAMB writes it with lensed and total spectra (_lensedCls.dat, _totCls.dat)"
+        camb = "; CAMB writes it with lensed and total spectra (_lensedCls.dat, _totCls.dat)"
+        hint = camb if missing == ["BB"] else ""
         raise InputError(
             f"{path}: no column {', '.join(missing)}; it has {', '.join(names)}{hint}."
         )
@@ -114,20 +114,19 @@ def _spectra_of_text(path: Path, format: str | None) -> Spectra:
 def _fits_factor(path: Path, name: str, found: str | None, given: str | None) -> float:
     """Factor to uK_CMB^2 from the unit of a column or the argument that stands in for it."""
     stated = None if (found or "").lower() in ("", "unknown") else found
-    text = stated if given is None else given
-    if text is None:
+    if (units := [unit for unit in (given, stated) if unit is not None]) == []:
         raise InputError(f'{path}: column {name} has no unit; give `unit`, such as "uK_CMB^2".')
     factors = []
-    for value in (text, stated or text):
+    for unit in units:
         try:
             # A spectrum of the CMB in bare kelvins is one of thermodynamic temperature.
-            definite = re.sub(r"K\^2$", "K_CMB^2", unit_name(value))
+            definite = re.sub(r"K\^2$", "K_CMB^2", unit_name(unit))
             factors.append(unit_factor(definite, "uK_CMB^2"))
         except ValueError:
             raise InputError(
-                f"{path}: column {name} has the unit {value!r}, which is no square of K_CMB."
+                f"{path}: column {name} has the unit {unit!r}, which is no square of K_CMB."
             ) from None
-    if factors[0] != factors[1]:
+    if factors[0] != factors[-1]:
         raise InputError(f"{path}: argument `unit` is {given}, but column {name} is in {stated}.")
     return factors[0]
 
@@ -211,9 +210,7 @@ def read_spectra(
         if unit is not None:
             raise InputError(f"{path}: argument `unit` is for FITS files, text is in uK^2.")
         ell, values = _spectra_of_text(path, format)
-    start, rows = _multipole_range(path, ell, lmax, 2)
-    spectra = np.zeros((4, lmax + 1))
-    spectra[:, start:] = values[:, :rows]
+    spectra = _up_to(path, ell, values, lmax, 2)
     _check(path, spectra)
     return spectra
 
@@ -222,32 +219,20 @@ def read_spectra(
 _WINDOWS = ("TEMPERATURE", "INTENSITY", "T", "NOMINAL", "BL")
 
 
-def _windows(hdu: object) -> list[str]:
-    """Names of a table's columns that hold windows; none for other HDUs."""
-    names = hdu.columns.names if isinstance(hdu, TABLES) else []
-    return [name for name in names if name.upper() in _WINDOWS]
+def _window_of_fits(path: Path, hdu: int | str) -> Float[np.ndarray, " row"]:
+    def windows(table: object) -> list[str]:
+        names = table.columns.names if isinstance(table, TABLES) else []
+        return [name for name in names if name.upper() in _WINDOWS]
 
-
-def _beam_of_fits(path: Path, hdu: int | str) -> tuple[np.ndarray, np.ndarray]:
     with open_fits(path) as hdus:
         table = select_hdu(path, hdus, hdu, TABLES)
-        names = _windows(table)
-        if not names:
-            others = [h.name for h in hdus if _windows(h)]
-            hint = f"; give `hdu`, one of {', '.join(others)}" if others else ""
+        if not (names := windows(table)):
+            others = ", ".join(h.name for h in hdus if windows(h))
             raise InputError(
-                f"{path}, HDU {hdu!r}: no column is named {', '.join(_WINDOWS)}; "
-                f"it has {', '.join(table.columns.names)}{hint}."
+                f"{path}, HDU {hdu!r}: no column is named {', '.join(_WINDOWS)}; it has "
+                f"{', '.join(table.columns.names)}{others and f'; give `hdu`, one of {others}'}."
             )
-        window = np.array(table.data.field(names[0]), np.float64).ravel()
-    return np.arange(window.size, dtype=float), window
-
-
-def _beam_of_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    table = read_text(path).numbers()
-    if table.shape[1] < 2:
-        raise InputError(f"{path}: one column, but l and b_l are needed.")
-    return table[:, 0], table[:, 1]
+        return np.array(table.data.field(names[0]), np.float64).ravel()
 
 
 def read_beam(path: str | Path, lmax: int, *, hdu: int | str = 1) -> Float[np.ndarray, " ell"]:
@@ -279,11 +264,16 @@ def read_beam(path: str | Path, lmax: int, *, hdu: int | str = 1) -> Float[np.nd
         If lmax is negative.
     """
     path = Path(path)
-    ell, window = _beam_of_fits(path, hdu) if is_fits(path) else _beam_of_text(path)
-    _, rows = _multipole_range(path, ell, lmax, 0)
-    window = window[:rows]
+    if is_fits(path):
+        window = _window_of_fits(path, hdu)
+        ell = np.arange(window.size, dtype=float)
+    elif (text := read_text(path)).width < 2:
+        raise InputError(f"{path}: one column, but l and b_l are needed.")
+    else:
+        ell, window = text.numbers().T[:2]
+    window = _up_to(path, ell, window, lmax, 0)
     if bad := int(np.sum(~np.isfinite(window))):
-        raise InputError(f"{path}: {bad} of {rows} values of the window are not finite.")
+        raise InputError(f"{path}: {bad} of {window.size} values of the window are not finite.")
     if not window[0] > 0:
         raise InputError(f"{path}: the window must be positive at l = 0, but is {window[0]:g}.")
     return window / window[0]

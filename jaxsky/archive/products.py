@@ -15,9 +15,10 @@ from astropy.io import fits as pyfits
 from rich.filesize import decimal
 
 from jaxsky.io import InputError, read_spectra
+from jaxsky.io.files import UnfitError
 from jaxsky.io.folders import locked
 from jaxsky.io.quantities import unit_name
-from jaxsky.io.tables import HealpixTable, open_fits
+from jaxsky.io.tables import HealpixTable, open_fits, open_table
 
 
 class Product(NamedTuple):
@@ -191,9 +192,11 @@ def _check_structure(product: Product, path: Path) -> list[str]:
             raise InputError(f"{path}: is no FITS file, it begins with {shown!r}.")
         with open_fits(path) as hdus:
             _check_whole(hdus)
-            if product.nside is not None:
-                _check_maps(HealpixTable(path, hdus, 1), product)
-        return ["complete"] if product.nside is None else ["columns", "complete"]
+        if product.nside is None:
+            return ["complete"]
+        with open_table(path, 1) as table:
+            _check_maps(table, product)
+        return ["columns", "complete"]
     if start.lstrip().startswith(b"<"):
         raise InputError(f"{path}: is no table, it begins with {shown!r}.")
     if product.lmax is not None:
@@ -217,7 +220,7 @@ def _check_whole(hdus: pyfits.HDUList) -> None:
 
 def _check_maps(table: HealpixTable, product: Product) -> None:
     if table.nside != product.nside:
-        raise InputError(f"{table.where}: nside is {table.nside}, but {product.nside} is expected.")
+        raise UnfitError(f"nside is {table.nside}, but {product.nside} is expected.")
     for name in product.columns:
         text = table.unit(table.index(name))
         # Hits and covariances have units of their own.
@@ -229,6 +232,4 @@ def _check_maps(table: HealpixTable, product: Product) -> None:
         except ValueError:
             unit = text
         if unit not in (product.unit, product.unit.replace("_CMB", "").replace("_RJ", "")):
-            raise InputError(
-                f"{table.where}: column {name} is in {text}, but {product.unit} is expected."
-            )
+            raise UnfitError(f"column {name} is in {text}, but {product.unit} is expected.")

@@ -11,7 +11,7 @@ from astropy.io import fits as pyfits
 from jaxtyping import Float
 
 from jaxsky.bandpass import CONVENTIONS, Bandpass
-from jaxsky.io.files import InputError, is_fits
+from jaxsky.io.files import UnfitError, in_file, is_fits
 from jaxsky.io.tables import open_fits, select_hdu
 from jaxsky.io.text import TextTable, read_text
 
@@ -50,7 +50,7 @@ def _units(line: str) -> list[str]:
     return list(found)
 
 
-def _frequency_unit(path: Path, table: TextTable, column: int, given: str | None) -> str | None:
+def _frequency_unit(table: TextTable, column: int, given: str | None) -> str | None:
     """The unit of the frequencies in a column, by the header or the argument `unit`.
 
     Of a text table the line above the rows counts first; what is said above that is overruled by
@@ -63,31 +63,25 @@ def _frequency_unit(path: Path, table: TextTable, column: int, given: str | None
         last = [_known(cell)] if cell else []
     if given is not None:
         if len(last) == 1 and _known(given) != last[0]:
-            raise InputError(
-                f"{path}: argument `unit` is {given!r}, but the file says {last[0]!r}."
-            )
+            raise UnfitError(f"argument `unit` is {given!r}, but the file says {last[0]!r}.")
         return given
     words = " ".join([*table.bars[:1], *table.header])
     stated = last if len(last) == 1 or table.bars else _units(words)
     if len(stated) > 1:
-        raise InputError(f"{path}: the header names the units {', '.join(stated)}; give `unit`.")
+        raise UnfitError(f"the header names the units {', '.join(stated)}; give `unit`.")
     waves = _WAVES.search(words)
     if stated and stated[0] in ("um", "mm") and not (waves or table.bars):
-        raise InputError(f"{path}: what is in {stated[0]} is not said; give `unit`.")
+        raise UnfitError(f"what is in {stated[0]} is not said; give `unit`.")
     if not stated and (waves or table.bars):
-        raise InputError(f"{path}: the unit of the frequencies is missing; give `unit`.")
+        raise UnfitError("the unit of the frequencies is missing; give `unit`.")
     return stated[0] if stated else None
 
 
-def _to_GHz(
-    path: Path, samples: Float[np.ndarray, "2 sample"], unit: str
-) -> Float[np.ndarray, "2 sample"]:
+def _to_GHz(samples: Float[np.ndarray, "2 sample"], unit: str) -> Float[np.ndarray, "2 sample"]:
     """Frequencies, wavenumbers or wavelengths with their weights, as frequencies in GHz."""
     known = _known(unit)
     if known not in _UNITS:
-        raise InputError(
-            f"{path}: the frequencies' unit is {unit!r}, not one of {', '.join(_UNITS)}."
-        )
+        raise UnfitError(f"the frequencies' unit is {unit!r}, not one of {', '.join(_UNITS)}.")
     with np.errstate(divide="ignore"):
         nu = u.Quantity(samples[0], known).to_value(u.GHz, equivalencies=u.spectral())
     falls = u.Unit(known).physical_type == "length"
@@ -111,28 +105,27 @@ _NO_WEIGHT = 1e-6
 _WIDEST = 8
 
 
-def _checked(path: Path, nu: np.ndarray, weights: np.ndarray) -> Samples:
+def _checked(nu: np.ndarray, weights: np.ndarray) -> Samples:
     """The samples at positive frequencies [GHz]; raises InputError if they are no bandpass."""
     if bad := int(np.sum(~np.isfinite(nu) | ~np.isfinite(weights))):
-        raise InputError(f"{path}: {bad} of {nu.size} samples of the bandpass are not finite.")
+        raise UnfitError(f"{bad} of {nu.size} samples of the bandpass are not finite.")
     low = nu <= 0
     if low.all():
-        raise InputError(f"{path}: the bandpass has no sample at a positive frequency.")
+        raise UnfitError("the bandpass has no sample at a positive frequency.")
     if np.any(np.abs(weights[low]) > _NO_WEIGHT * np.abs(weights).max()):
-        raise InputError(
-            f"{path}: {low.sum()} samples of the bandpass at nu <= 0 have weights up to "
+        raise UnfitError(
+            f"{low.sum()} samples of the bandpass at nu <= 0 have weights up to "
             f"{np.abs(weights[low]).max():g}."
         )
     nu, weights = nu[~low], weights[~low]
     if np.any(steps := np.diff(nu) <= 0):
         at = int(np.argmax(steps))
-        raise InputError(
-            f"{path}: frequencies of a bandpass must increase, "
-            f"but {nu[at + 1]:g} follows {nu[at]:g} GHz."
+        raise UnfitError(
+            f"frequencies of a bandpass must increase, but {nu[at + 1]:g} follows {nu[at]:g} GHz."
         )
     integral = np.trapezoid(weights, nu) if nu.size > 1 else weights[0]
     if not integral > 0:
-        raise InputError(f"{path}: the integral of the bandpass is not positive.")
+        raise UnfitError("the integral of the bandpass is not positive.")
     return nu, weights
 
 
@@ -144,29 +137,29 @@ def _merged(nu: np.ndarray, weights: np.ndarray) -> Samples:
     return nu[starts], np.add.reduceat(weights, starts) / counts
 
 
-def _rimo_samples(path: Path, hdus: pyfits.HDUList, name: str) -> tuple[Samples, str]:
-    tables = [select_hdu(path, hdus, i) for i, h in enumerate(hdus) if h.name == name]
+def _rimo_samples(hdus: pyfits.HDUList, name: str) -> tuple[Samples, str]:
+    tables = [select_hdu(hdus, i) for i, h in enumerate(hdus) if h.name == name]
     for column in ("WAVENUMBER", "TRANSMISSION"):
         if column not in tables[0].columns.names:
             known = ", ".join(tables[0].columns.names)
-            raise InputError(f"{path}, HDU {name!r}: no column {column!r}; it has {known}.")
+            raise UnfitError(f"HDU {name!r}: no column {column!r}; it has {known}.")
     data = [
         [np.array(t.data.field(c), np.float64) for c in ("WAVENUMBER", "TRANSMISSION")]
         for t in tables
     ]
     if not all(np.array_equal(data[0], other) for other in data[1:]):
-        raise InputError(f"{path}: {len(tables)} HDUs are named {name!r} and differ.")
+        raise UnfitError(f"{len(tables)} HDUs are named {name!r} and differ.")
     unit = str(tables[0].columns["WAVENUMBER"].unit)
     if unit not in _RIMO:
-        raise InputError(
-            f"{path}, HDU {name!r}: WAVENUMBER has the unit {unit!r}, not {' or '.join(_RIMO)}."
+        raise UnfitError(
+            f"HDU {name!r}: WAVENUMBER has the unit {unit!r}, not {' or '.join(_RIMO)}."
         )
-    samples = _merged(*_to_GHz(path, np.array(data[0]), unit))
-    return _checked(path, *samples), _RIMO[unit]
+    samples = _merged(*_to_GHz(np.array(data[0]), unit))
+    return _checked(*samples), _RIMO[unit]
 
 
 def _rimo_names(
-    path: Path, names: Sequence[str], band: str | None, detectors: Sequence[str] | None
+    names: Sequence[str], band: str | None, detectors: Sequence[str] | None
 ) -> list[str]:
     """Names of the HDUs of a band average, or of its detectors."""
     wanted = None if band is None else str(band).upper().lstrip("F0")
@@ -181,16 +174,16 @@ def _rimo_names(
     if detectors is not None:
         asked = [str(d).upper().removeprefix("LFI") for d in detectors]
         if not asked:
-            raise InputError(f"{path}: argument `detectors` is empty.")
+            raise UnfitError("argument `detectors` is empty.")
         for detector in asked:
             if detector not in single:
                 where = "" if band is None else f" in band {band}"
                 known = ", ".join(single) or "none"
-                raise InputError(f"{path}: no detector {detector!r}{where}; it has {known}.")
+                raise UnfitError(f"no detector {detector!r}{where}; it has {known}.")
         return [single[detector] for detector in asked]
     if wanted is None or wanted not in averages:
         problem = "give `band`" if wanted is None else f"no band {str(band)!r}"
-        raise InputError(f"{path}: {problem}; it has {', '.join(averages)}.")
+        raise UnfitError(f"{problem}; it has {', '.join(averages)}.")
     return [averages[wanted]]
 
 
@@ -209,62 +202,59 @@ def _read_rimo(
     with open_fits(path) as hdus:
         known = list(dict.fromkeys(h.name for h in hdus if h.name.startswith("BANDPASS_")))
         if not known:
-            raise InputError(f"{path}: no HDU is named BANDPASS_...; not an instrument model.")
-        found = [
-            _rimo_samples(path, hdus, name) for name in _rimo_names(path, known, band, detectors)
-        ]
+            raise UnfitError("no HDU is named BANDPASS_...; not an instrument model.")
+        found = [_rimo_samples(hdus, name) for name in _rimo_names(known, band, detectors)]
     return _mean([samples for samples, _ in found]), found[0][1]
 
 
-def _columns(path: Path, table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
+def _columns(table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
     """Numbers of the columns of frequency and weight."""
     width, names = table.width, table.names()
     if fields is None:
         shown = f" ({' '.join(names)})" if names else ""
         if width > _WIDEST:
-            raise InputError(
-                f"{path}: {width} columns{shown}; give `fields`, those of frequency and weight."
+            raise UnfitError(
+                f"{width} columns{shown}; give `fields`, those of frequency and weight."
             )
         first = [row.cells[0] for row in table.rows]
         counted = first in ([str(i + start) for i in range(len(first))] for start in (0, 1))
         if (counted and width > 2) or (names and _NO_FREQUENCY.fullmatch(names[0])):
-            raise InputError(
-                f"{path}: the first of {width} columns{shown} may not be the frequency; give "
+            raise UnfitError(
+                f"the first of {width} columns{shown} may not be the frequency; give "
                 "`fields`, the columns of frequency and weight, such as [1, 2]."
             )
         return [0, 1]
     if isinstance(fields, str) or len(fields) != 2:
-        raise InputError(f"{path}: argument `fields` must name two columns, not {fields!r}.")
+        raise UnfitError(f"argument `fields` must name two columns, not {fields!r}.")
     columns = []
     for field in fields:
         column = names.index(field) if isinstance(field, str) and field in names else field
         if not isinstance(column, int) or isinstance(column, bool) or not 0 <= column < width:
             known = ", ".join(names) or f"0 to {width - 1}"
-            raise InputError(f"{path}: no column {field!r}; it has {known}.")
+            raise UnfitError(f"no column {field!r}; it has {known}.")
         columns.append(column)
     if columns[0] == columns[1]:
-        raise InputError(f"{path}: argument `fields` names column {fields[0]!r} twice.")
+        raise UnfitError(f"argument `fields` names column {fields[0]!r} twice.")
     return columns
 
 
 def _read_text(
-    path: Path, fields: Sequence[int | str] | None, given: str | None
-) -> tuple[Samples, str | None]:
-    """Frequencies and weights of a table, and the convention, which IPAC tables have."""
-    table = read_text(path)
-    columns = _columns(path, table, fields)
+    table: TextTable, fields: Sequence[int | str] | None, given: str | None
+) -> tuple[Samples, str]:
+    """Frequencies and weights of a table, and the convention, which IPAC tables have, or ""."""
+    columns = _columns(table, fields)
     samples = table.numbers(columns).T
-    unit = _frequency_unit(path, table, columns[0], given)
-    nu, weights = _checked(path, *_to_GHz(path, samples, unit or "GHz"))
+    unit = _frequency_unit(table, columns[0], given)
+    nu, weights = _checked(*_to_GHz(samples, unit or "GHz"))
     center = float(np.average(nu, weights=np.abs(weights)))
     low, high = _BARE if unit is None else _STATED
     if not low <= center <= high:
         asked = "" if unit else "; give `unit`, such as MHz or THz, or GHz if it is right"
-        raise InputError(
-            f"{path}: in {unit or 'GHz'}, the middle of the band is at {center:g} GHz, outside of "
+        raise UnfitError(
+            f"in {unit or 'GHz'}, the middle of the band is at {center:g} GHz, outside of "
             f"{low:g} to {high:g} GHz{asked}."
         )
-    return (nu, weights), "power" if table.bars else None
+    return (nu, weights), "power" if table.bars else ""
 
 
 def read_bandpass(
@@ -323,19 +313,19 @@ def read_bandpass(
         raise TypeError(f"Argument `unit` must be the name of a unit, not {unit!r}.")
     if not 0 <= trim < 1:
         raise ValueError(f"Argument `trim` must be within [0, 1), but is {trim}.")
-    found: str | None
-    if is_fits(path):
-        for name, argument in {"unit": unit, "fields": fields}.items():
-            if argument is not None:
-                raise InputError(f"{path}: argument `{name}` is for text files, this is FITS.")
-        (nu, weights), found = _read_rimo(path, None if band is None else str(band), detectors)
-    elif band is not None or detectors is not None:
-        raise InputError(f"{path}: a text table has one band; leave out `band` and `detectors`.")
-    else:
-        (nu, weights), found = _read_text(path, fields, unit)
-    if (convention := convention or found) is None:
-        known = ", ".join(CONVENTIONS)
-        raise InputError(f"{path}: the file does not say it; give `convention`, one of {known}.")
+    with in_file(path):
+        if is_fits(path):
+            for name, argument in {"unit": unit, "fields": fields}.items():
+                if argument is not None:
+                    raise UnfitError(f"argument `{name}` is for text files, this is FITS.")
+            (nu, weights), found = _read_rimo(path, None if band is None else str(band), detectors)
+        elif band is not None or detectors is not None:
+            raise UnfitError("a text table has one band; leave out `band` and `detectors`.")
+        else:
+            (nu, weights), found = _read_text(read_text(path), fields, unit)
+        if not (convention := convention or found):
+            known = ", ".join(CONVENTIONS)
+            raise UnfitError(f"the file does not say it; give `convention`, one of {known}.")
     if trim:
         inside = np.flatnonzero(weights > trim * weights.max())
         nu, weights = (x[inside[0] : inside[-1] + 1] for x in (nu, weights))

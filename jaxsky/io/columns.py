@@ -17,9 +17,9 @@ import healpy
 import numpy as np
 from jaxtyping import Float
 
-from jaxsky.io.files import InputError
+from jaxsky.io.files import InputError, UnfitError
 from jaxsky.io.quantities import is_ambiguous, unit_name
-from jaxsky.io.tables import PIXELS, HealpixTable, equals, open_fits
+from jaxsky.io.tables import PIXELS, HealpixTable, equals, open_table
 from jaxsky.units import UNITS
 
 _LETTERS = {"I": "I", "T": "I", "Q": "Q", "U": "U"}
@@ -202,9 +202,8 @@ def default_fields(table: HealpixTable, argument: str = "fields") -> list[int]:
     columns = [i for i, name in enumerate(table.names) if name.upper() not in PIXELS]
     if len(columns) == 1:
         return columns
-    raise InputError(
-        f"{table.where}: no column is named as I, Q or U; give `{argument}` out of "
-        f"{', '.join(table.names)}."
+    raise UnfitError(
+        f"no column is named as I, Q or U; give `{argument}` out of {', '.join(table.names)}."
     )
 
 
@@ -216,14 +215,14 @@ def _unit(table: HealpixTable, column: int, given: str | None) -> str:
             found = unit_name(text)
     if given is None and (found is None or is_ambiguous(found)):
         says = f"has the unit {text!r}, which leaves open what is meant" if text else "has no unit"
-        raise InputError(
-            f'{table.where}: column {name} {says}; give `unit`, such as "uK_CMB", "K_RJ", '
+        raise UnfitError(
+            f'column {name} {says}; give `unit`, such as "uK_CMB", "K_RJ", '
             '"MJy/sr", "K" for a temperature of matter or "" for a pure number.'
         )
     # An argument may make the header's bare kelvins definite.
     if given is not None and found not in (None, given, re.sub("_(CMB|RJ)", "", given)):
-        raise InputError(
-            f"{table.where}: argument `unit` is {given or 'that of a pure number'}, but column "
+        raise UnfitError(
+            f"argument `unit` is {given or 'that of a pure number'}, but column "
             f"{name} is {f'in {found}' if found else 'a pure number'}."
         )
     return str(found if given is None else given)
@@ -265,11 +264,10 @@ def _read_table(
     unit: str | None,
     stated: Mapping[str, str | None],
 ) -> list[Column]:
-    with open_fits(path) as hdus:
-        table = HealpixTable(path, hdus, hdu)
+    with open_table(path, hdu) as table:
         wanted = default_fields(table) if fields is None else [table.index(f) for f in fields]
         if len(set(wanted)) < len(wanted):
-            raise InputError(f"{table.where}: `fields` names a column twice: {fields}.")
+            raise UnfitError(f"`fields` names a column twice: {fields}.")
         units = {i: _unit(table, i, unit) for i in wanted}
         order = table.state("ordering", stated["ordering"])
         frame = table.state("coordinates", stated["coordinates"])

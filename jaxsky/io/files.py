@@ -15,6 +15,19 @@ class MissingFileError(InputError):
     """A file that is not there."""
 
 
+class UnfitError(Exception):
+    """What is wrong with a file that is being read; see `in_file`."""
+
+
+@contextmanager
+def in_file(where: Path | str) -> Iterator[None]:
+    """Say what is wrong with a file as an InputError that names it, or its part."""
+    try:
+        yield
+    except UnfitError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
 def check_file(path: Path) -> None:
     """Raise InputError unless a path is a file that can be read; says what else it is."""
     try:

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxsky.io.columns import default_fields
-from jaxsky.io.files import InputError, check_file
-from jaxsky.io.tables import HealpixTable, equals, from_nested, open_fits, spelled
+from jaxsky.io.files import UnfitError, check_file, in_file
+from jaxsky.io.tables import equals, from_nested, open_table, spelled
 
 
 def _read_npz(path: Path, field: str | int | None, ordering: str | None) -> np.ndarray:
@@ -21,26 +21,18 @@ def _read_npz(path: Path, field: str | int | None, ordering: str | None) -> np.n
             known = list(archive)
             name = known[0] if field is None and len(known) == 1 else field
             if name not in known:
-                what = (
-                    "give `field`, as it has several masks"
-                    if field is None
-                    else f"no mask {field!r}"
-                )
-                raise InputError(f"{path}: {what}; it has {', '.join(known)}.")
+                what = f"no mask {field!r}" if field is not None else "give `field`, of several masks"
+                raise UnfitError(f"{what}; it has {', '.join(known)}.")
             found = np.squeeze(archive[name])
-    except InputError:
-        raise
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: not a readable .npz archive ({error}).") from error
+        raise UnfitError(f"not a readable .npz archive ({error}).") from error
     if found.dtype.kind not in "biuf" or found.ndim != 1:
-        raise InputError(
-            f"{path}: {name} is no mask, but has type {found.dtype} and shape {found.shape}."
-        )
+        raise UnfitError(f"{name} is no mask, but has type {found.dtype} and shape {found.shape}.")
     if not healpy.isnpixok(found.size):
-        raise InputError(f"{path}: not a HEALPix mask, {found.size} is not 12 nside^2 pixels.")
+        raise UnfitError(f"not a HEALPix mask, {found.size} is not 12 nside^2 pixels.")
     values = found.astype(np.float64)
     values[~np.isfinite(values) | equals(values, healpy.UNSEEN, 1e-5)] = np.nan
-    return values if order == "RING" else from_nested(str(path), values)
+    return values if order == "RING" else from_nested(values)
 
 
 def _in_galactic(mask: np.ndarray, coordinates: str) -> np.ndarray:
@@ -86,30 +78,30 @@ def read_mask(
     """
     path = Path(path)
     frame, others = "G", []
-    if path.suffix == ".npz":
-        values = _read_npz(path, field, ordering)
-    else:
-        with open_fits(path) as hdus:
-            table = HealpixTable(path, hdus, hdu)
-            column = default_fields(table, "field")[0] if field is None else table.index(field)
-            order = table.state("ordering", ordering)
-            frame = table.state("coordinates", None, "G")
-            values = table.values(column, order, logical=True)
-            others = [name for name in table.names if name != table.names[column]]
-    found = healpy.npix2nside(values.size)
-    if nside is not None and nside != found:
-        raise InputError(f"{path}: nside is {found}, but {nside} is expected.")
-    odd = values[np.isfinite(values) & (values != 0) & (values != 1)]
-    if odd.size:
-        listed = ", ".join(f"{value:.6g}" for value in np.unique(odd)[:3])
-        raise InputError(
-            f"{path}: a mask has values 0 and 1, but {odd.size} of {values.size} pixels have "
-            f"others, such as {listed}."
-        )
-    mask = values == 1
-    if not mask.any():
-        hint = f"; give `field` out of {', '.join(others)}" if field is None and others else ""
-        raise InputError(f"{path}: the mask leaves no pixel{hint}.")
+    with in_file(path):
+        if path.suffix == ".npz":
+            values = _read_npz(path, field, ordering)
+        else:
+            with open_table(path, hdu) as table:
+                column = default_fields(table, "field")[0] if field is None else table.index(field)
+                order = table.state("ordering", ordering)
+                frame = table.state("coordinates", None, "G")
+                values = table.values(column, order, logical=True)
+                others = [name for name in table.names if name != table.names[column]]
+        found = healpy.npix2nside(values.size)
+        if nside not in (None, found):
+            raise UnfitError(f"nside is {found}, but {nside} is expected.")
+        odd = values[np.isfinite(values) & (values != 0) & (values != 1)]
+        if odd.size:
+            listed = ", ".join(f"{value:.6g}" for value in np.unique(odd)[:3])
+            raise UnfitError(
+                f"a mask has values 0 and 1, but {odd.size} of {values.size} pixels have others, "
+                f"such as {listed}."
+            )
+        mask = values == 1
+        if not mask.any():
+            hint = f"; give `field` out of {', '.join(others)}" if field is None and others else ""
+            raise UnfitError(f"the mask leaves no pixel{hint}.")
     return mask if frame == "G" else _in_galactic(mask, frame)
 
 

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from jaxsky.io.files import InputError, is_fits
+from jaxsky.io.files import UnfitError, in_file, is_fits
 from jaxsky.io.quantities import unit_factor, unit_name
 from jaxsky.io.tables import TABLES, open_fits, select_hdu
 from jaxsky.io.text import read_text
@@ -32,20 +32,20 @@ _ROUNDING = 1 + 1e-5
 
 
 def _up_to(
-    path: Path, ell: Float[np.ndarray, " row"], values: np.ndarray, lmax: int, start: int
+    ell: Float[np.ndarray, " row"], values: np.ndarray, lmax: int, start: int
 ) -> Float[np.ndarray, "... ell"]:
     """Values of a table at l = 0 ... lmax; 0 below its first row, which is at most l = `start`."""
     if lmax < 0:
         raise ValueError(f"Argument `lmax` must not be negative, but is {lmax}.")
     if odd := int(np.sum(~(ell == np.round(ell)) | (ell < 0))):
-        raise InputError(f"{path}: {odd} of {ell.size} rows do not begin with a multipole.")
+        raise UnfitError(f"{odd} of {ell.size} rows do not begin with a multipole.")
     if ell[0] > start:
-        raise InputError(f"{path}: begins at l = {ell[0]:.0f}, but l = {start} is needed.")
+        raise UnfitError(f"begins at l = {ell[0]:.0f}, but l = {start} is needed.")
     if np.any(jumps := np.diff(ell) != 1):
         at = int(np.argmax(jumps))
-        raise InputError(f"{path}: l = {ell[at]:.0f} is followed by l = {ell[at + 1]:.0f}.")
+        raise UnfitError(f"l = {ell[at]:.0f} is followed by l = {ell[at + 1]:.0f}.")
     if ell[-1] < lmax:
-        raise InputError(f"{path}: ends at l = {ell[-1]:.0f}, but lmax is {lmax}.")
+        raise UnfitError(f"ends at l = {ell[-1]:.0f}, but lmax is {lmax}.")
     below = np.zeros((*values.shape[:-1], int(ell[0])))
     return np.concatenate([below, values], axis=-1)[..., : lmax + 1]
 
@@ -55,48 +55,46 @@ def _name(word: str) -> str:
     return _NAMES.get(word.upper(), word.upper())
 
 
-def _located(path: Path, names: Sequence[str], wanted: Sequence[str]) -> list[int]:
+def _located(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
     """Numbers of the columns that are wanted."""
     known = [_name(name) for name in names]
     if missing := [name for name in wanted if name not in known]:
         camb = "; CAMB writes it with lensed and total spectra (_lensedCls.dat, _totCls.dat)"
         hint = camb if missing == ["BB"] else ""
-        raise InputError(
-            f"{path}: no column {', '.join(missing)}; it has {', '.join(names)}{hint}."
-        )
+        raise UnfitError(f"no column {', '.join(missing)}; it has {', '.join(names)}{hint}.")
     return [known.index(name) for name in wanted]
 
 
 def _text_order(
-    path: Path, header: list[list[str]], columns: int, format: str | None
+    file: str, header: list[list[str]], columns: int, format: str | None
 ) -> Sequence[str]:
     """Names of the columns of a text file, from its header, `format` or its own name."""
     named = [names for words in header if "TT" in (names := [_name(word) for word in words])]
     if named:
         words = named[-1]
         if len(words) != columns:
-            raise InputError(
-                f"{path}: the header names {len(words)} columns ({' '.join(words)}), "
+            raise UnfitError(
+                f"the header names {len(words)} columns ({' '.join(words)}), "
                 f"but there are {columns}."
             )
         if format is not None and tuple(words[:5]) != _ORDERS[format]:
-            raise InputError(
-                f"{path}: argument `format` is {format!r}, but the columns are {' '.join(words)}."
+            raise UnfitError(
+                f"argument `format` is {format!r}, but the columns are {' '.join(words)}."
             )
         return words
-    if path.name.endswith("scalCls.dat"):
-        raise InputError(
-            f"{path}: CAMB's scalar spectra have no BB; read the lensed or total ones "
+    if file.endswith("scalCls.dat"):
+        raise UnfitError(
+            "CAMB's scalar spectra have no BB; read the lensed or total ones "
             "(_lensedCls.dat, _totCls.dat)."
         )
-    if format is None and path.name.endswith(("lensedCls.dat", "totCls.dat")):
+    if format is None and file.endswith(("lensedCls.dat", "totCls.dat")):
         format = "camb"
     if format is None:
         choices = " or ".join(f"{k!r} for {' '.join(v)}" for k, v in _ORDERS.items())
-        raise InputError(f"{path}: no header names the columns; give `format`, {choices}.")
+        raise UnfitError(f"no header names the columns; give `format`, {choices}.")
     if columns < 5:
-        raise InputError(
-            f"{path}: {columns} columns, but format {format!r} has {' '.join(_ORDERS[format])}."
+        raise UnfitError(
+            f"{columns} columns, but format {format!r} has {' '.join(_ORDERS[format])}."
         )
     return _ORDERS[format]
 
@@ -104,18 +102,18 @@ def _text_order(
 def _spectra_of_text(path: Path, format: str | None) -> Spectra:
     text = read_text(path)
     table = text.numbers()
-    names = _text_order(path, text.words(), text.width, format)
-    at, *columns = _located(path, names, ("L", *SPECTRA))
+    names = _text_order(path.name, text.words(), text.width, format)
+    at, *columns = _located(names, ("L", *SPECTRA))
     ell = table[:, at]
     factor = np.where(ell > 0, 2 * np.pi / np.maximum(ell * (ell + 1), 1), 0)
     return ell, table[:, columns].T * factor
 
 
-def _fits_factor(path: Path, name: str, found: str | None, given: str | None) -> float:
+def _fits_factor(name: str, found: str | None, given: str | None) -> float:
     """Factor to uK_CMB^2 from the unit of a column or the argument that stands in for it."""
     stated = None if (found or "").lower() in ("", "unknown") else found
     if (units := [unit for unit in (given, stated) if unit is not None]) == []:
-        raise InputError(f'{path}: column {name} has no unit; give `unit`, such as "uK_CMB^2".')
+        raise UnfitError(f'column {name} has no unit; give `unit`, such as "uK_CMB^2".')
     factors = []
     for unit in units:
         try:
@@ -123,47 +121,42 @@ def _fits_factor(path: Path, name: str, found: str | None, given: str | None) ->
             definite = re.sub(r"K\^2$", "K_CMB^2", unit_name(unit))
             factors.append(unit_factor(definite, "uK_CMB^2"))
         except ValueError:
-            raise InputError(
-                f"{path}: column {name} has the unit {unit!r}, which is no square of K_CMB."
+            raise UnfitError(
+                f"column {name} has the unit {unit!r}, which is no square of K_CMB."
             ) from None
     if factors[0] != factors[-1]:
-        raise InputError(f"{path}: argument `unit` is {given}, but column {name} is in {stated}.")
+        raise UnfitError(f"argument `unit` is {given}, but column {name} is in {stated}.")
     return factors[0]
 
 
 def _spectra_of_fits(path: Path, unit: str | None) -> Spectra:
     with open_fits(path) as hdus:
-        table = select_hdu(path, hdus, 1, TABLES)
+        table = select_hdu(hdus, 1, TABLES)
         if stated := _D_ELL.search(repr(table.header)):
-            raise InputError(
-                f"{path}: the header says {stated[0]!r}; spectra in FITS files must be C_l."
-            )
+            raise UnfitError(f"the header says {stated[0]!r}; spectra in FITS files must be C_l.")
         names = table.columns.names
-        columns = _located(path, names, SPECTRA)
+        columns = _located(names, SPECTRA)
         multipoles = [table.data.field(n) for n in names if _name(n) == "L"]
-        factors = [
-            _fits_factor(path, names[c], table.header.get(f"TUNIT{c + 1}"), unit) for c in columns
-        ]
+        factors = [_fits_factor(names[c], table.header.get(f"TUNIT{c + 1}"), unit) for c in columns]
         values = np.array([np.ravel(table.data.field(c)) for c in columns], np.float64)
         ell = np.array(multipoles[0] if multipoles else np.arange(values.shape[1]), float).ravel()
     return ell, values * np.array(factors)[:, None]
 
 
-def _check(path: Path, spectra: Float[np.ndarray, "4 ell"]) -> None:
+def _check(spectra: Float[np.ndarray, "4 ell"]) -> None:
     """Raise InputError if the spectra are not those of a Gaussian field."""
     for name, values in zip(SPECTRA, spectra, strict=True):
         bad = ~np.isfinite(values) | ((values < 0) & (name != "TE"))
         if bad.any():
             kind = "finite" if name == "TE" else "finite and not negative"
-            raise InputError(
-                f"{path}: {name} must be {kind}, but is not at {bad.sum()} multipoles, "
+            raise UnfitError(
+                f"{name} must be {kind}, but is not at {bad.sum()} multipoles, "
                 f"the first l = {np.argmax(bad)}."
             )
     TT, EE, _, TE = spectra
     if np.any(bad := np.abs(TE) > np.sqrt(TT * EE) * _ROUNDING):
-        raise InputError(
-            f"{path}: |TE| exceeds sqrt(TT EE) at {bad.sum()} multipoles, "
-            f"the first l = {np.argmax(bad)}."
+        raise UnfitError(
+            f"|TE| exceeds sqrt(TT EE) at {bad.sum()} multipoles, the first l = {np.argmax(bad)}."
         )
 
 
@@ -202,16 +195,17 @@ def read_spectra(
     path = Path(path)
     if format is not None and format not in _ORDERS:
         raise ValueError(f"Argument `format` must be one of {', '.join(_ORDERS)}, not {format!r}.")
-    if is_fits(path):
-        if format is not None:
-            raise InputError(f"{path}: argument `format` is for text files, this is FITS.")
-        ell, values = _spectra_of_fits(path, unit)
-    else:
-        if unit is not None:
-            raise InputError(f"{path}: argument `unit` is for FITS files, text is in uK^2.")
-        ell, values = _spectra_of_text(path, format)
-    spectra = _up_to(path, ell, values, lmax, 2)
-    _check(path, spectra)
+    with in_file(path):
+        if is_fits(path):
+            if format is not None:
+                raise UnfitError("argument `format` is for text files, this is FITS.")
+            ell, values = _spectra_of_fits(path, unit)
+        else:
+            if unit is not None:
+                raise UnfitError("argument `unit` is for FITS files, text is in uK^2.")
+            ell, values = _spectra_of_text(path, format)
+        spectra = _up_to(ell, values, lmax, 2)
+        _check(spectra)
     return spectra
 
 
@@ -225,11 +219,11 @@ def _window_of_fits(path: Path, hdu: int | str) -> Float[np.ndarray, " row"]:
         return [name for name in names if name.upper() in _WINDOWS]
 
     with open_fits(path) as hdus:
-        table = select_hdu(path, hdus, hdu, TABLES)
+        table = select_hdu(hdus, hdu, TABLES)
         if not (names := windows(table)):
             others = ", ".join(h.name for h in hdus if windows(h))
-            raise InputError(
-                f"{path}, HDU {hdu!r}: no column is named {', '.join(_WINDOWS)}; it has "
+            raise UnfitError(
+                f"HDU {hdu!r}: no column is named {', '.join(_WINDOWS)}; it has "
                 f"{', '.join(table.columns.names)}{others and f'; give `hdu`, one of {others}'}."
             )
         return np.array(table.data.field(names[0]), np.float64).ravel()
@@ -264,16 +258,17 @@ def read_beam(path: str | Path, lmax: int, *, hdu: int | str = 1) -> Float[np.nd
         If lmax is negative.
     """
     path = Path(path)
-    if is_fits(path):
-        window = _window_of_fits(path, hdu)
-        ell = np.arange(window.size, dtype=float)
-    elif (text := read_text(path)).width < 2:
-        raise InputError(f"{path}: one column, but l and b_l are needed.")
-    else:
-        ell, window = text.numbers().T[:2]
-    window = _up_to(path, ell, window, lmax, 0)
-    if bad := int(np.sum(~np.isfinite(window))):
-        raise InputError(f"{path}: {bad} of {window.size} values of the window are not finite.")
-    if not window[0] > 0:
-        raise InputError(f"{path}: the window must be positive at l = 0, but is {window[0]:g}.")
+    with in_file(path):
+        if is_fits(path):
+            window = _window_of_fits(path, hdu)
+            ell = np.arange(window.size, dtype=float)
+        elif (text := read_text(path)).width < 2:
+            raise UnfitError("one column, but l and b_l are needed.")
+        else:
+            ell, window = text.numbers().T[:2]
+        window = _up_to(ell, window, lmax, 0)
+        if bad := int(np.sum(~np.isfinite(window))):
+            raise UnfitError(f"{bad} of {window.size} values of the window are not finite.")
+        if not window[0] > 0:
+            raise UnfitError(f"the window must be positive at l = 0, but is {window[0]:g}.")
     return window / window[0]

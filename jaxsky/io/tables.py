@@ -15,7 +15,7 @@ from astropy.io import fits as pyfits
 from astropy.utils.exceptions import AstropyUserWarning
 from jaxtyping import Bool, Float, Int
 
-from jaxsky.io.files import InputError, check_file
+from jaxsky.io.files import InputError, UnfitError, check_file, in_file
 
 #: What a header says of maps, by the argument that stands in for it: keywords, and spellings in
 #: upper case -> the package's.
@@ -54,10 +54,10 @@ _PUZZLED = (OSError, ValueError, TypeError, LookupError, AttributeError, pyfits.
 
 @contextmanager
 def open_fits(path: Path) -> Iterator[pyfits.HDUList]:
-    """An open FITS file; what astropy finds wrong with it while it is open is an InputError."""
+    """An open FITS file; what is found wrong with it while it is open is an InputError."""
     check_file(path)
     damaged = f"{path}: not a FITS file, or a truncated one"
-    with warnings.catch_warnings():
+    with in_file(path), warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropyUserWarning)
         for message in (".*truncated", ".*[Ee]rror validating header"):
             warnings.filterwarnings("error", message, AstropyUserWarning)
@@ -75,6 +75,15 @@ def open_fits(path: Path) -> Iterator[pyfits.HDUList]:
         except _PUZZLED as error:
             what = damaged if _is_cut(path, hdus) else f"{path}: cannot be read"
             raise InputError(f"{what} ({_reason(error)}).") from error
+
+
+@contextmanager
+def open_table(path: Path, hdu: int | str) -> Iterator["HealpixTable"]:
+    """A HEALPix table in a FITS file; see `open_fits`."""
+    with open_fits(path) as hdus:
+        table, where = select_hdu(hdus, hdu), f"{path}, HDU {hdu!r}"
+        with in_file(where):
+            yield HealpixTable(where, table, hdus[0].header)
 
 
 def _reason(error: BaseException) -> str:
@@ -110,7 +119,7 @@ def equals(
 
 
 def select_hdu(
-    path: Path, hdus: pyfits.HDUList, hdu: int | str, kinds: Any = pyfits.BinTableHDU
+    hdus: pyfits.HDUList, hdu: int | str, kinds: Any = pyfits.BinTableHDU
 ) -> pyfits.BinTableHDU:
     """The table `hdu` (number or name) of an open file, binary unless `kinds` are `TABLES`."""
     try:
@@ -119,12 +128,12 @@ def select_hdu(
         found = hdus[hdu]
     except (IndexError, KeyError):
         names = ", ".join(f"{i} ({h.name})" for i, h in enumerate(hdus))
-        raise InputError(
-            f"{path}: no HDU {hdu!r}; it has {names}, and is truncated if there should be more."
+        raise UnfitError(
+            f"no HDU {hdu!r}; it has {names}, and is truncated if there should be more."
         ) from None
     if not isinstance(found, kinds):
         kind = "table" if kinds is TABLES else "binary table"
-        raise InputError(f"{path}: HDU {hdu!r} holds no {kind}.")
+        raise UnfitError(f"HDU {hdu!r} holds no {kind}.")
     return found
 
 
@@ -143,36 +152,34 @@ def _nested(nside: int) -> Int[np.ndarray, " pix"]:
     return healpy.ring2nest(nside, np.arange(healpy.nside2npix(nside))).astype(np.int32)
 
 
-def from_nested(where: str, values: Float[np.ndarray, " pix"]) -> Float[np.ndarray, " pix"]:
+def from_nested(values: Float[np.ndarray, " pix"]) -> Float[np.ndarray, " pix"]:
     """Values in NESTED order, in RING order."""
     nside = healpy.npix2nside(values.size)
-    check_nested(where, nside)
+    check_nested(nside)
     return values[_nested(nside)]
 
 
-def check_nested(where: str, nside: int) -> None:
-    """Raise InputError if pixels of this nside have no NESTED order."""
+def check_nested(nside: int) -> None:
+    """Raise UnfitError if pixels of this nside have no NESTED order."""
     if not healpy.isnsideok(nside, nest=True):
-        raise InputError(f"{where}: ordering is NESTED, but nside is {nside}, no power of 2.")
+        raise UnfitError(f"ordering is NESTED, but nside is {nside}, no power of 2.")
 
 
 class HealpixTable:
-    """The columns and the header of the HEALPix table `hdu` in an open FITS file."""
+    """The columns and the header of a HEALPix table in an open FITS file."""
 
-    def __init__(self, path: Path, hdus: pyfits.HDUList, hdu: int | str) -> None:
-        self.where = f"{path}, HDU {hdu!r}"
-        self._table = select_hdu(path, hdus, hdu)
-        self._primary = hdus[0].header
+    def __init__(self, where: str, table: pyfits.BinTableHDU, primary: pyfits.Header) -> None:
+        self.where, self._table, self._primary = where, table, primary
         # Before the data are read: astropy copies the columns of a closed file that its HDU holds.
         names = self._table.columns.names
         #: The letter of each column's format.
         self._kinds = [f.lstrip("0123456789")[:1] for f in map(str, self._table.columns.formats)]
         if None in names:
             number = names.index(None) + 1
-            raise InputError(f"{self.where}: column {number} has no name, TTYPE{number}.")
+            raise UnfitError(f"column {number} has no name, TTYPE{number}.")
         self.names: tuple[str, ...] = tuple(names)
         if (pixtype := self.keyword("PIXTYPE")) not in (None, "HEALPIX"):
-            raise InputError(f"{self.where}: not a HEALPix map, PIXTYPE is {pixtype}.")
+            raise UnfitError(f"not a HEALPix map, PIXTYPE is {pixtype}.")
         listed = self._listed()
         self.nside = self._nside(explicit=listed is not None)
         self._pixels = None if listed is None else self._check_pixels(listed)
@@ -191,19 +198,18 @@ class HealpixTable:
         scheme = self.keyword("INDXSCHM")
         explicit = scheme == "EXPLICIT" or (named and scheme != "IMPLICIT")
         if explicit and self.keyword("NSIDE") is None:
-            raise InputError(f"{self.where}: explicit indexing without NSIDE in the header.")
+            raise UnfitError("explicit indexing without NSIDE in the header.")
         if scheme == "EXPLICIT" and not named:
-            raise InputError(
-                f"{self.where}: explicit indexing, but no column 'PIXEL'; it has "
-                f"{', '.join(self.names)}."
+            raise UnfitError(
+                f"explicit indexing, but no column 'PIXEL'; it has {', '.join(self.names)}."
             )
         if not named:
             return None
         if not explicit:
             numbers, order = self._stored(named[0]), np.arange(len(self._table.data))
             if not np.array_equal(numbers, order) and np.array_equal(np.sort(numbers), order):
-                raise InputError(
-                    f"{self.where}: INDXSCHM is IMPLICIT, but column {self.names[named[0]]} has "
+                raise UnfitError(
+                    f"INDXSCHM is IMPLICIT, but column {self.names[named[0]]} has "
                     "the pixels in another order."
                 )
             return None
@@ -213,44 +219,40 @@ class HealpixTable:
         text = self.keyword("NSIDE")
         stated = None if text is None else _number(text)
         if stated is not None and not (1 <= stated <= LARGEST_NSIDE and stated.is_integer()):
-            raise InputError(
-                f"{self.where}: NSIDE is {text}, but must be a whole number, 1 to {LARGEST_NSIDE}."
-            )
+            raise UnfitError(f"NSIDE is {text}, but must be a whole number, 1 to {LARGEST_NSIDE}.")
         if explicit and stated is not None:
             return int(stated)
         first = next((i for i, kind in enumerate(self._kinds) if kind in NUMBERS), 0)
         npix = 0 if not self.names else self._table.data.field(first).size
         if not npix or not healpy.isnpixok(npix):
-            raise InputError(
-                f"{self.where}: not a HEALPix map, its columns have {npix} values, "
-                "which is not 12 nside^2."
+            raise UnfitError(
+                f"not a HEALPix map, its columns have {npix} values, which is not 12 nside^2."
             )
         nside = healpy.npix2nside(npix)
         if stated is not None and stated != nside:
-            raise InputError(
-                f"{self.where}: NSIDE is {stated:.0f}, but its columns have {npix} pixels "
-                f"(nside {nside})."
+            raise UnfitError(
+                f"NSIDE is {stated:.0f}, but its columns have {npix} pixels (nside {nside})."
             )
         return nside
 
     def _check_pixels(self, column: int) -> Int[np.ndarray, " row"]:
         """The numbers of the pixels, each of them one of the sky and there once."""
         stored, npix = self._stored(column), healpy.nside2npix(self.nside)
-        where = f"{self.where}: column {self.names[column]}"
+        where = f"column {self.names[column]}"
         with np.errstate(invalid="ignore"):
             pixels = stored.astype(np.int64)
         if bad := np.flatnonzero(~((pixels == stored) & (pixels >= 0) & (pixels < npix))).tolist():
-            raise InputError(
+            raise UnfitError(
                 f"{where} has {len(bad)} of {pixels.size} values that are no pixels of nside "
                 f"{self.nside} (0 to {npix - 1}), such as {stored[bad[0]]:g}."
             )
         if stored.dtype == np.float32 and npix > 2**24:
-            raise InputError(
+            raise UnfitError(
                 f"{where} is in single precision, which cannot hold the pixels of nside "
                 f"{self.nside}."
             )
         if twice := pixels.size - np.unique(pixels).size:
-            raise InputError(f"{where} has {twice} pixels more than once.")
+            raise UnfitError(f"{where} has {twice} pixels more than once.")
         return pixels
 
     def index(self, field: int | str) -> int:
@@ -259,12 +261,12 @@ class HealpixTable:
             same = [i for i, name in enumerate(self.names) if name == field]
             same = same or [i for i, n in enumerate(self.names) if n.upper() == field.upper()]
             if len(same) > 1:
-                raise InputError(f"{self.where}: {len(same)} columns are called {field!r}.")
+                raise UnfitError(f"{len(same)} columns are called {field!r}.")
             if same:
                 return same[0]
         elif not isinstance(field, bool) and 0 <= field < len(self.names):
             return int(field)
-        raise InputError(f"{self.where}: no column {field!r}; it has {', '.join(self.names)}.")
+        raise UnfitError(f"no column {field!r}; it has {', '.join(self.names)}.")
 
     def unit(self, index: int) -> str | None:
         """TUNIT of a column; None if it is missing or blank."""
@@ -274,13 +276,11 @@ class HealpixTable:
         """A copy of a column of numbers, one after the other, as it is or of a type."""
         kind, name = self._kinds[index], self.names[index]
         if kind not in NUMBERS:
-            raise InputError(
-                f"{self.where}: column {name} holds {KINDS.get(kind, kind)}, not real numbers."
-            )
+            raise UnfitError(f"column {name} holds {KINDS.get(kind, kind)}, not real numbers.")
         found = self._table.data.field(index)
         if found.ndim > 2:
             shape = " x ".join(map(str, found.shape[1:]))
-            raise InputError(f"{self.where}: column {name} has a table of {shape} in each row.")
+            raise UnfitError(f"column {name} has a table of {shape} in each row.")
         return np.array(found, dtype=dtype).ravel()
 
     def _null(self, index: int) -> int | None:
@@ -288,7 +288,7 @@ class HealpixTable:
         key = f"TNULL{index + 1}"
         text = str(self._table.header.get(key, "")).strip()
         if text and not (found := _number(text)).is_integer():
-            raise InputError(f"{self.where}: {key} is {text}, which is not a whole number.")
+            raise UnfitError(f"{key} is {text}, which is not a whole number.")
         return int(found) if text else None
 
     def lowest(self, index: int) -> float | None:
@@ -316,15 +316,15 @@ class HealpixTable:
         pixels = self._pixels
         expected = npix if pixels is None else pixels.size
         if column.size != expected:
-            raise InputError(
-                f"{self.where}: column {self.names[index]} has {column.size} values, but there "
+            raise UnfitError(
+                f"column {self.names[index]} has {column.size} values, but there "
                 f"are {expected} pixels."
             )
         if pixels is None:
-            return from_nested(self.where, column) if ordering == "NESTED" else column
+            return from_nested(column) if ordering == "NESTED" else column
         full = np.full(npix, np.nan)
         if ordering == "NESTED":
-            check_nested(self.where, self.nside)
+            check_nested(self.nside)
             pixels = healpy.nest2ring(self.nside, pixels)
         full[pixels] = column
         return full
@@ -335,7 +335,7 @@ class HealpixTable:
         bad = ~np.isfinite(column) | equals(column, healpy.UNSEEN, 1e-5)
         if (text := self.keyword("BAD_DATA")) not in (None, "UNSEEN", "NAN"):
             if np.isnan(stated := _number(str(text))):
-                raise InputError(f"{self.where}: BAD_DATA is {text}, which is not a number.")
+                raise UnfitError(f"BAD_DATA is {text}, which is not a number.")
             bad |= equals(column, stated, 1e-5)
         if (null := self._null(index)) is not None:
             # What is not an integer has no TNULL by the standard, but says what it means.
@@ -356,18 +356,14 @@ class HealpixTable:
         text = self.keyword(*keywords)
         found = None if text is None else spellings.get(text)
         if text is not None and found is None and given is None:
-            raise InputError(
-                f"{self.where}: {keywords[0]} is {text}, which is none of {choices}; "
-                f"give `{argument}`."
+            raise UnfitError(
+                f"{keywords[0]} is {text}, which is none of {choices}; give `{argument}`."
             )
         if given is not None and found is not None and given != found:
-            raise InputError(
-                f"{self.where}: argument `{argument}` is {given}, but the header says {found}."
-            )
+            raise UnfitError(f"argument `{argument}` is {given}, but the header says {found}.")
         stated = given or found or default
         if stated is None:
-            raise InputError(
-                f"{self.where}: the header has no {keywords[0]}; give `{argument}`, "
-                f"one of {choices}."
+            raise UnfitError(
+                f"the header has no {keywords[0]}; give `{argument}`, one of {choices}."
             )
         return stated

@@ -378,7 +378,7 @@ def test_full_maps_with_pixel_numbers(tmp_path):
     np.testing.assert_array_equal(read_maps(path).maps[0, order], I)
     columns = {"PIXEL": order, "I": I}
     path = save(path, columns, formats={"PIXEL": "J"}, INDXSCHM="IMPLICIT")
-    with refused("IMPLICIT, but column PIXEL has the pixels in another"):
+    with refused("IMPLICIT, but column PIXEL has another order"):
         read_maps(path)
     columns["PIXEL"] = np.arange(NPIX)
     path = save(path, columns, formats={"PIXEL": "J"}, INDXSCHM="IMPLICIT")

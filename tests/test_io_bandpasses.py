@@ -213,7 +213,7 @@ def test_wavenumbers_and_wavelengths(tmp_path, content, arguments):
         (b"# wavelength\n28 1\n30 1\n", {}, "unit of the frequencies is missing; give `unit`"),
         (b"|nu|w|\n|d|d|\n28 1\n30 1\n", {}, "unit of the frequencies is missing; give `unit`"),
         (b"28 1\n30 1\n", {"unit": "K"}, "unit is 'K', not one of Hz, kHz, MHz"),
-        (b"-1 .5\n0 1\n30 1\n31 1\n", {}, "2 samples of the bandpass at nu <= 0 have weights"),
+        (b"-1 .5\n0 1\n30 1\n31 1\n", {}, "2 samples at nu <= 0 have weights"),
     ],
 )
 def test_text_that_is_refused(tmp_path, content, arguments, words):
@@ -243,7 +243,7 @@ def test_bad_rimos(tmp_path):
         ("columns", {"band": "30"}, "no column 'WAVENUMBER'; it has FREQ, TRANSMISSION"),
         ("unit", {"band": "30"}, "has the unit 'Angstrom', not GHz or 1/cm"),
         ("twice", {"band": "30"}, "2 HDUs are named 'BANDPASS_030' and differ"),
-        ("falling", {"band": "30"}, r"falling.fits: frequencies .* must increase"),
+        ("falling", {"band": "30"}, r"falling.fits: frequencies must increase"),
     ]:
         with refused(words):
             read_bandpass(files[name], **arguments)

@@ -114,9 +114,9 @@ def test_text_that_leaves_something_open(tmp_path):
     for path, arguments, words in [
         (text(tmp_path / "a.txt", "L TT EE BB TE"), {},
          "a.txt: no header names the columns; give `format`, 'planck' for L TT TE EE BB or"),
-        (text(tmp_path / "s_scalCls.dat", scalar), {}, "no BB; read the lensed or total ones"),
+        (text(tmp_path / "s_scalCls.dat", scalar), {}, "no BB; read ..._lensedCls.dat and"),
         (text(tmp_path / "t_scalCls.dat", scalar, scalar), {},
-         "no column BB; it has L, TT, EE, TE, PP, TP; CAMB writes it with lensed and total"),
+         "no column BB; it has L, TT, EE, TE, PP, TP; CAMB writes it to ..._lensed"),
         (text(tmp_path / "u.txt", "L TT EE", "L TT EE"), {}, "no column BB, TE; it has L, TT, EE"),
         (text(tmp_path / "v.txt", "L TT EE BB TE", "x TT EE BB TE"), {}, "no column L; it has X"),
         (text(tmp_path / "w_totCls.dat", "L TT EE TE"), {}, "4 columns, but format 'camb' has L"),

@@ -113,16 +113,12 @@ def _checked(nu: np.ndarray, weights: np.ndarray) -> Samples:
     if low.all():
         raise UnfitError("the bandpass has no sample at a positive frequency.")
     if np.any(np.abs(weights[low]) > _NO_WEIGHT * np.abs(weights).max()):
-        raise UnfitError(
-            f"{low.sum()} samples of the bandpass at nu <= 0 have weights up to "
-            f"{np.abs(weights[low]).max():g}."
-        )
+        largest = np.abs(weights[low]).max()
+        raise UnfitError(f"{low.sum()} samples at nu <= 0 have weights up to {largest:g}.")
     nu, weights = nu[~low], weights[~low]
     if np.any(steps := np.diff(nu) <= 0):
         at = int(np.argmax(steps))
-        raise UnfitError(
-            f"frequencies of a bandpass must increase, but {nu[at + 1]:g} follows {nu[at]:g} GHz."
-        )
+        raise UnfitError(f"frequencies must increase, but {nu[at + 1]:g} follows {nu[at]:g} GHz.")
     integral = np.trapezoid(weights, nu) if nu.size > 1 else weights[0]
     if not integral > 0:
         raise UnfitError("the integral of the bandpass is not positive.")
@@ -219,10 +215,8 @@ def _columns(table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
         first = [row.cells[0] for row in table.rows]
         counted = first in ([str(i + start) for i in range(len(first))] for start in (0, 1))
         if (counted and width > 2) or (names and _NO_FREQUENCY.fullmatch(names[0])):
-            raise UnfitError(
-                f"the first of {width} columns{shown} may not be the frequency; give "
-                "`fields`, the columns of frequency and weight, such as [1, 2]."
-            )
+            said = f"the first of {width} columns{shown} may not be the frequency"
+            raise UnfitError(f"{said}; give `fields`, the columns of frequency and weight.")
         return [0, 1]
     if isinstance(fields, str) or len(fields) != 2:
         raise UnfitError(f"argument `fields` must name two columns, not {fields!r}.")
@@ -250,10 +244,8 @@ def _read_text(
     low, high = _BARE if unit is None else _STATED
     if not low <= center <= high:
         asked = "" if unit else "; give `unit`, such as MHz or THz, or GHz if it is right"
-        raise UnfitError(
-            f"in {unit or 'GHz'}, the middle of the band is at {center:g} GHz, outside of "
-            f"{low:g} to {high:g} GHz{asked}."
-        )
+        middle = f"in {unit or 'GHz'}, the middle of the band is at {center:g} GHz"
+        raise UnfitError(f"{middle}, outside of {low:g} to {high:g} GHz{asked}.")
     return (nu, weights), "power" if table.bars else ""
 
 

@@ -215,16 +215,14 @@ def _unit(table: HealpixTable, column: int, given: str | None) -> str:
             found = unit_name(text)
     if given is None and (found is None or is_ambiguous(found)):
         says = f"has the unit {text!r}, which leaves open what is meant" if text else "has no unit"
-        raise UnfitError(
-            f'column {name} {says}; give `unit`, such as "uK_CMB", "K_RJ", '
-            '"MJy/sr", "K" for a temperature of matter or "" for a pure number.'
+        units = (
+            '"uK_CMB", "K_RJ", "MJy/sr", "K" for a temperature of matter or "" for a pure number'
         )
+        raise UnfitError(f"column {name} {says}; give `unit`, such as {units}.")
     # An argument may make the header's bare kelvins definite.
     if given is not None and found not in (None, given, re.sub("_(CMB|RJ)", "", given)):
-        raise UnfitError(
-            f"argument `unit` is {given or 'that of a pure number'}, but column "
-            f"{name} is {f'in {found}' if found else 'a pure number'}."
-        )
+        is_in = f"in {found}" if found else "a pure number"
+        raise UnfitError(f"argument `unit` is {given or 'no unit'}, but column {name} is {is_in}.")
     return str(found if given is None else given)
 
 
@@ -238,10 +236,8 @@ def _split(path: Any, hdu: Any, fields: Any) -> list[tuple[Path, Any, list[Any] 
     number = max(len(paths), len(hdus))
     for name, given in {"path": paths, "hdu": hdus}.items():
         if len(given) not in (1, number) or not given:
-            raise InputError(
-                f"Argument `{name}` must be one, or as many as the other names, {number}, "
-                f"but is {len(given)}."
-            )
+            said = f"must be one, or as many as the other names, {number}, but is {len(given)}"
+            raise InputError(f"Argument `{name}` {said}.")
     wanted = None if fields is None else _several(fields)
     if wanted is not None and not wanted:
         raise InputError(f"{paths[0]}: argument `fields` is empty.")

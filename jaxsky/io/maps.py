@@ -28,10 +28,8 @@ def _blocks(where: str, names: Sequence[str], kinds: Sequence[str | None]) -> li
         elif kinds[row] in ("", "I"):
             found.append([row])
         else:
-            raise InputError(
-                f"{where}: column {names[row]} cannot be turned to Galactic "
-                "coordinates; read Q followed by U, and no covariances."
-            )
+            turned = f"{where}: column {names[row]} cannot be turned to Galactic coordinates"
+            raise InputError(f"{turned}; read Q followed by U, and no covariances.")
         row += len(found[-1])
     return found
 
@@ -256,23 +254,18 @@ def _check_written(
     maps: np.ndarray, names: Sequence[str], units: Sequence[str], mask: np.ndarray | None
 ) -> None:
     if maps.ndim != 2 or not healpy.isnpixok(maps.shape[-1]):
-        raise ValueError(
-            "Argument `maps` must have shape (field, pix) with 12 nside^2 pixels, "
-            f"but has shape {maps.shape}."
-        )
+        wanted = "(field, pix) with 12 nside^2 pixels"
+        raise ValueError(f"Argument `maps` must have shape {wanted}, but has shape {maps.shape}.")
     for name, values in {"names": names, "unit": units}.items():
         if len(values) != len(maps):
             raise ValueError(f"Argument `{name}` has {len(values)} entries for {len(maps)} maps.")
     if mask is not None and mask.shape != maps.shape[-1:]:
-        raise ValueError(
-            f"Argument `mask` must have shape {maps.shape[-1:]}, but has shape {mask.shape}."
-        )
+        pix = maps.shape[-1:]
+        raise ValueError(f"Argument `mask` must have shape {pix}, but has shape {mask.shape}.")
     used = maps if mask is None else maps[:, mask]
     if bad := int(np.sum(~np.isfinite(used))):
-        raise ValueError(
-            f"Argument `maps` has {bad} of {used.size} values that are not finite; "
-            "leave pixels out with `mask`."
-        )
+        counted = f"{bad} of {used.size} values that are not finite"
+        raise ValueError(f"Argument `maps` has {counted}; leave pixels out with `mask`.")
 
 
 def write_maps(
@@ -345,9 +338,7 @@ def write_maps(
     }
     for key, value in (extra_header or {}).items():
         if key.upper() in table.header or key.upper() in required:
-            raise ValueError(
-                f"Argument `extra_header` must not set {key}, which is written anyway."
-            )
+            raise ValueError(f"Argument `extra_header` must not set {key}: it is written anyway.")
         table.header[key] = value
     table.header.update(required)
     with whole(path) as beside:

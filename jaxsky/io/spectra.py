@@ -26,6 +26,7 @@ _NAMES = {
     **dict.fromkeys(("CURL", "B-MODE C_L"), "BB"),
     **dict.fromkeys(("G-T", "T-E CROSS C_L"), "TE"),
 }
+_CAMB = "..._lensedCls.dat and ..._totCls.dat"
 _D_ELL = re.compile(r"(?<![a-z0-9])D_?(L|ELL)(?![a-z])|\bL\s*\*?\s*\(L\s*\+\s*1\)", re.I)
 #: |TE| may exceed sqrt(TT EE) by this factor, the rounding of text with six digits.
 _ROUNDING = 1 + 1e-5
@@ -59,8 +60,7 @@ def _located(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
     """Numbers of the columns that are wanted."""
     known = [_name(name) for name in names]
     if missing := [name for name in wanted if name not in known]:
-        camb = "; CAMB writes it with lensed and total spectra (_lensedCls.dat, _totCls.dat)"
-        hint = camb if missing == ["BB"] else ""
+        hint = f"; CAMB writes it to {_CAMB}" if missing == ["BB"] else ""
         raise UnfitError(f"no column {', '.join(missing)}; it has {', '.join(names)}{hint}.")
     return [known.index(name) for name in wanted]
 
@@ -83,10 +83,7 @@ def _text_order(
             )
         return words
     if file.endswith("scalCls.dat"):
-        raise UnfitError(
-            "CAMB's scalar spectra have no BB; read the lensed or total ones "
-            "(_lensedCls.dat, _totCls.dat)."
-        )
+        raise UnfitError(f"CAMB's scalar spectra have no BB; read {_CAMB}.")
     if format is None and file.endswith(("lensedCls.dat", "totCls.dat")):
         format = "camb"
     if format is None:
@@ -143,21 +140,20 @@ def _spectra_of_fits(path: Path, unit: str | None) -> Spectra:
     return ell, values * np.array(factors)[:, None]
 
 
+def _first(bad: np.ndarray) -> str:
+    return f"{bad.sum()} multipoles, the first l = {np.argmax(bad)}"
+
+
 def _check(spectra: Float[np.ndarray, "4 ell"]) -> None:
     """Raise InputError if the spectra are not those of a Gaussian field."""
     for name, values in zip(SPECTRA, spectra, strict=True):
         bad = ~np.isfinite(values) | ((values < 0) & (name != "TE"))
         if bad.any():
             kind = "finite" if name == "TE" else "finite and not negative"
-            raise UnfitError(
-                f"{name} must be {kind}, but is not at {bad.sum()} multipoles, "
-                f"the first l = {np.argmax(bad)}."
-            )
+            raise UnfitError(f"{name} must be {kind}, but is not at {_first(bad)}.")
     TT, EE, _, TE = spectra
     if np.any(bad := np.abs(TE) > np.sqrt(TT * EE) * _ROUNDING):
-        raise UnfitError(
-            f"|TE| exceeds sqrt(TT EE) at {bad.sum()} multipoles, the first l = {np.argmax(bad)}."
-        )
+        raise UnfitError(f"|TE| exceeds sqrt(TT EE) at {_first(bad)}.")
 
 
 def read_spectra(

@@ -200,18 +200,15 @@ class HealpixTable:
         if explicit and self.keyword("NSIDE") is None:
             raise UnfitError("explicit indexing without NSIDE in the header.")
         if scheme == "EXPLICIT" and not named:
-            raise UnfitError(
-                f"explicit indexing, but no column 'PIXEL'; it has {', '.join(self.names)}."
-            )
+            listed = ", ".join(self.names)
+            raise UnfitError(f"explicit indexing, but no column 'PIXEL'; it has {listed}.")
         if not named:
             return None
         if not explicit:
             numbers, order = self._stored(named[0]), np.arange(len(self._table.data))
             if not np.array_equal(numbers, order) and np.array_equal(np.sort(numbers), order):
-                raise UnfitError(
-                    f"INDXSCHM is IMPLICIT, but column {self.names[named[0]]} has "
-                    "the pixels in another order."
-                )
+                name = self.names[named[0]]
+                raise UnfitError(f"INDXSCHM is IMPLICIT, but column {name} has another order.")
             return None
         return named[0]
 
@@ -225,14 +222,10 @@ class HealpixTable:
         first = next((i for i, kind in enumerate(self._kinds) if kind in NUMBERS), 0)
         npix = 0 if not self.names else self._table.data.field(first).size
         if not npix or not healpy.isnpixok(npix):
-            raise UnfitError(
-                f"not a HEALPix map, its columns have {npix} values, which is not 12 nside^2."
-            )
+            raise UnfitError(f"its columns have {npix} values, which is not 12 nside^2.")
         nside = healpy.npix2nside(npix)
         if stated is not None and stated != nside:
-            raise UnfitError(
-                f"NSIDE is {stated:.0f}, but its columns have {npix} pixels (nside {nside})."
-            )
+            raise UnfitError(f"NSIDE is {text}, but its columns have {npix} pixels.")
         return nside
 
     def _check_pixels(self, column: int) -> Int[np.ndarray, " row"]:
@@ -242,15 +235,10 @@ class HealpixTable:
         with np.errstate(invalid="ignore"):
             pixels = stored.astype(np.int64)
         if bad := np.flatnonzero(~((pixels == stored) & (pixels >= 0) & (pixels < npix))).tolist():
-            raise UnfitError(
-                f"{where} has {len(bad)} of {pixels.size} values that are no pixels of nside "
-                f"{self.nside} (0 to {npix - 1}), such as {stored[bad[0]]:g}."
-            )
+            odd = f"{len(bad)} of {pixels.size} values that are no pixels, 0 to {npix - 1}"
+            raise UnfitError(f"{where} has {odd}, such as {stored[bad[0]]:g}.")
         if stored.dtype == np.float32 and npix > 2**24:
-            raise UnfitError(
-                f"{where} is in single precision, which cannot hold the pixels of nside "
-                f"{self.nside}."
-            )
+            raise UnfitError(f"{where} is in single precision, which cannot hold all pixels.")
         if twice := pixels.size - np.unique(pixels).size:
             raise UnfitError(f"{where} has {twice} pixels more than once.")
         return pixels
@@ -316,10 +304,8 @@ class HealpixTable:
         pixels = self._pixels
         expected = npix if pixels is None else pixels.size
         if column.size != expected:
-            raise UnfitError(
-                f"column {self.names[index]} has {column.size} values, but there "
-                f"are {expected} pixels."
-            )
+            name = self.names[index]
+            raise UnfitError(f"column {name} has {column.size} values for {expected} pixels.")
         if pixels is None:
             return from_nested(column) if ordering == "NESTED" else column
         full = np.full(npix, np.nan)

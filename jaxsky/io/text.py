@@ -9,13 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsky.io.files import InputError
+from jaxsky.io.files import UnfitError, in_file
 
 COMMENTS = ("#", ";", "%", "!", "\\", "|", "//", "*")
 _TRAILING = re.compile(r"\s(?:[#!%\\]|//).*")
 _NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:[ed][+-]?\d+)?|nan|inf|infinity)", re.I | re.ASCII
 )
+#: What to do about decimal commas.
+_WRITE = "write decimal points, or semicolons between the columns"
 #: A field that begins as a number does, if not as a word.
 _DAMAGED = re.compile(r"[\"'(\[+-]*\.?\d")
 
@@ -61,13 +63,11 @@ class TextTable(NamedTuple):
         for line, text, cells in self.rows:
             wanted = range(len(cells)) if columns is None else columns
             values = [_number(cells[c]) if c < len(cells) else None for c in wanted]
-            if None in values:
-                raise InputError(f"{self.path}, line {line}: not a row of numbers: {text!r}.")
-            if columns is None and len(values) != self.width:
-                raise InputError(
-                    f"{self.path}, line {line}: {len(values)} numbers, but {self.width} in the "
-                    "lines above."
-                )
+            with in_file(f"{self.path}, line {line}"):
+                if None in values:
+                    raise UnfitError(f"not a row of numbers: {text!r}.")
+                if columns is None and len(values) != self.width:
+                    raise UnfitError(f"{len(values)} numbers, but {self.width} in the lines above.")
             table.append(values)
         return np.array(table, np.float64)
 
@@ -86,23 +86,20 @@ def _lines(path: Path) -> list[str]:
     try:
         text = content.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError:
-        raise InputError(f"{path}: neither a FITS file nor a text table.") from None
+        raise UnfitError("neither a FITS file nor a text table.") from None
     if "\0" in text:
-        raise InputError(f"{path}: neither a FITS file nor a text table, for it has NUL bytes.")
+        raise UnfitError("neither a FITS file nor a text table, for it has NUL bytes.")
     return text.splitlines()
 
 
-def _cells(path: Path, line: int, text: str) -> list[str]:
+def _cells(text: str) -> list[str]:
     """Fields between semicolons, commas or blanks; a comma may be decimal in the first."""
     if ";" in text:
         return [cell.strip().replace(",", ".") for cell in text.strip(" ;").split(";")]
     words = [word.strip(",") for word in text.split()]
     for word in words if len(words) > 1 else ():
         if "," in word and all(_number(part) is not None for part in word.split(",")):
-            raise InputError(
-                f"{path}, line {line}: {word!r} is two numbers or one with a decimal comma; write "
-                "decimal points, or semicolons between the columns."
-            )
+            raise UnfitError(f"{word!r} is two numbers or one with a decimal comma; {_WRITE}.")
     return [cell for cell in re.split(r"[\s,]+", text) if cell]
 
 
@@ -114,38 +111,42 @@ def read_text(path: Path) -> TextTable:
     begin with a digit.
     """
     table = TextTable(path, [], [], [])
-    for line, whole in enumerate(_lines(path), start=1):
-        text = whole.strip()
-        if not text:
-            continue
-        if text.startswith("|") and table.rows:
-            raise InputError(f"{path}, line {line}: a header among the rows: {text!r}.")
-        if text.startswith(COMMENTS):
-            if text.startswith("|"):
-                table.bars.append(text)
-            elif not table.rows:
-                table.header.append(text.lstrip("".join(COMMENTS)).strip())
-            continue
-        cells = _cells(path, line, _TRAILING.sub("", text))
-        if not table.rows and all(_number(cell) is None for cell in cells):
-            if all(_DAMAGED.match(cell) for cell in cells):
-                raise InputError(f"{path}, line {line}: not a row of numbers: {text!r}.")
-            table.header.append(text)
-        else:
-            table.rows.append(Row(line, text, cells))
-    if not table.rows:
-        raise InputError(f"{path}: no line has numbers.")
-    _check_commas(path, table.rows)
+    with in_file(path):
+        for line, text in enumerate(map(str.strip, _lines(path)), start=1):
+            if text:
+                with in_file(f"{path}, line {line}"):
+                    _add_line(table, line, text)
+        if not table.rows:
+            raise UnfitError("no line has numbers.")
+        _check_commas(table.rows)
     return table
 
 
-def _check_commas(path: Path, rows: list[Row]) -> None:
+def _add_line(table: TextTable, line: int, text: str) -> None:
+    """Put a line of the file where it belongs."""
+    if text.startswith("|") and table.rows:
+        raise UnfitError(f"a header among the rows: {text!r}.")
+    if text.startswith("|"):
+        table.bars.append(text)
+    elif text.startswith(COMMENTS):
+        if not table.rows:
+            table.header.append(text.lstrip("".join(COMMENTS)).strip())
+    else:
+        cells = _cells(_TRAILING.sub("", text))
+        if table.rows or any(_number(cell) is not None for cell in cells):
+            table.rows.append(Row(line, text, cells))
+        elif all(_DAMAGED.match(cell) for cell in cells):
+            raise UnfitError(f"not a row of numbers: {text!r}.")
+        else:
+            table.header.append(text)
+
+
+def _check_commas(rows: list[Row]) -> None:
     """Refuse rows such as 30,5,2,0: two numbers with decimal commas, or four."""
     cells = [cell for row in rows for cell in row.cells]
     halves = all(len(row.cells) % 2 == 0 and len(row.cells) > 2 for row in rows)
     commas = all(len(row.text.split()) == 1 and "," in row.text for row in rows)
     if halves and commas and all(cell.lstrip("+-").isdigit() for cell in cells):
-        raise InputError(
-            f"{path}, line {rows[0].line}: {rows[0].text!r} may have decimal commas; write decimal "
-            "points, or semicolons between the columns."
+        raise UnfitError(
+            f"line {rows[0].line}: {rows[0].text!r} may have decimal commas; {_WRITE}."
         )

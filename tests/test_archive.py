@@ -111,7 +111,7 @@ def test_products_are_found_by_group_name_and_part():
 def test_a_file_is_fetched_once_and_checked(server, tmp_path, log, known):
     wanted = product(f"{server}/good/{NAME}", hash=known, size=len(CONTENT))
     seen = []
-    path = fetch(wanted, tmp_path, report=lambda *numbers: seen.append(numbers))
+    path = fetch(wanted, tmp_path, report=lambda **numbers: seen.append(tuple(numbers.values())))
     assert path.read_bytes() == CONTENT
     assert seen[0] == (0, len(CONTENT))
     assert seen[-1] == (len(CONTENT), len(CONTENT))

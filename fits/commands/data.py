@@ -1,5 +1,6 @@
 """`jaxsky data`: official data products."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -43,16 +44,14 @@ def _list(products: Words = None, folder: Folder = None) -> None:
         here = path.is_file()
         known = product._replace(size=path.stat().st_size) if here else product
         size = total_size([known]) if known.size or known.about else ""
-        nside = str(product.nside or "")
-        kept = "yes" if here else ""
+        nside, kept = str(product.nside or ""), "yes" if here else ""
         rows.append((product.name, product.what, nside, product.unit or "", size, kept))
     if not products:
         rows += [(), ("sets", "files of an analysis")]
-        for name, group_of in product_sets().items():
+        for name, found in product_sets().items():
             members = find([name])
-            count = sum((folder / p.name).is_file() for p in members)
-            held = f"{count} of {len(members)}"
-            rows.append((name, group_of.title, "", "", total_size(members), held))
+            held = f"{sum((folder / p.name).is_file() for p in members)} of {len(members)}"
+            rows.append((name, found.title, "", "", total_size(members), held))
     header = ("file", "what", "nside", "unit", "size", "here")
     table = ResultTable(header, tuple(rows), title=f"Kept in {folder}", words=6)
     print_tables([table], width=None if console.is_terminal else 200)
@@ -92,18 +91,15 @@ def _fetch(
     with interruptible("; fetch it again to resume"), bar as progress:
         for product in wanted:
             task = progress.add_task(product.name, total=product.size)
-
-            def report(have: int, total: int | None, task=task) -> None:
-                progress.update(task, completed=have, total=total)
-
-            def waiting(name: str = product.name) -> None:
-                console.print(f"{name}: another process fetches it; waiting.")
-
+            report = partial(progress.update, task)
+            waiting = partial(
+                console.print, f"{product.name}: another process fetches it; waiting."
+            )
             path = archive.fetch(
                 product, folder, mirror=mirror, accept=accept, report=report, waiting=waiting
             )
             size = path.stat().st_size
-            progress.update(task, completed=size, total=size)
+            report(completed=size, total=size)
     console.print(f"In {folder}: {len(wanted)} files.", soft_wrap=True)
 
 
@@ -120,10 +116,7 @@ def _verify(products: Words = None, folder: Folder = None) -> None:
     wrong = 0
     for product in wanted:
         try:
-            console.print(
-                f"{product.name}: {archive.verify(product, folder)}",
-                soft_wrap=True,
-            )
+            console.print(f"{product.name}: {archive.verify(product, folder)}", soft_wrap=True)
         except InputError as error:
             wrong += 1
             console.print(str(error), style="red", soft_wrap=True)

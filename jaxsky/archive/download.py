@@ -1,12 +1,12 @@
 """Download of products into a cache: resumed, checked, whole or not at all."""
 
-import contextlib
 import errno
 import json
 import os
 import re
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urljoin, urlsplit
@@ -37,7 +37,8 @@ ANEW = "; if the archive has issued the file anew, --accept takes it"
 #: What is wrong with a disk.
 _FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used up"}
 
-Report = Callable[[int, int | None], None]
+
+Report = Callable[..., None]
 
 
 class CutError(Exception):
@@ -167,24 +168,23 @@ def _check(
 def _receive(
     answer: requests.Response, part: Path, have: int, total: int | None, report: Report
 ) -> None:
-    report(have, total)
+    report(completed=have, total=total)
     # What has come counts, also before a break.
     answer.raw.enforce_content_length = False
     with part.open("ab" if have else "wb") as file:
-        while chunk := _read(answer, have):
+        while True:
+            try:
+                chunk = answer.raw.read1(CHUNK, decode_content=False)
+            except (urllib3.exceptions.HTTPError, OSError):
+                raise CutError(have) from None
+            if not chunk:
+                break
             file.write(chunk)
             file.flush()
             have += len(chunk)
-            report(have, total)
+            report(completed=have, total=total)
     if total is not None and have != total:
         raise CutError(have)
-
-
-def _read(answer: requests.Response, have: int) -> bytes:
-    try:
-        return answer.raw.read1(CHUNK, decode_content=False)
-    except (urllib3.exceptions.HTTPError, OSError):
-        raise CutError(have) from None
 
 
 def _reason(error: requests.RequestException) -> str:
@@ -213,7 +213,7 @@ def fetch(
     *,
     mirror: str | None = None,
     accept: bool = False,
-    report: Report = lambda have, total: None,
+    report: Report = lambda completed, total: None,
     waiting: Callable[[], None] = lambda: None,
 ) -> Path:
     """A product's file, downloaded unless it is there; of either, size and structure are checked.
@@ -230,7 +230,7 @@ def fetch(
     folder : where files are kept, by default `cache_folder`
     mirror : address of a folder with the files, instead of the archives
     accept : take a file of another size or hash than the catalogue says; its structure counts
-    report : called with the bytes that are there, and all bytes or None
+    report : called with the bytes that are there as `completed`, and all or None as `total`
     waiting : called if another process fetches the file
 
     Raises
@@ -285,7 +285,7 @@ def _kept(product: Product, path: Path, part: Path) -> Path:
         check_product(recorded(product, path.parent)._replace(hash=None), path)
     except InputError as error:
         raise InputError(f"{error} It is left as it is; move it away and fetch it again.") from None
-    with contextlib.suppress(OSError):  # the cache may be of someone else
+    with suppress(OSError):  # the cache may be of someone else
         _tidy(part)
     return path
 
@@ -297,7 +297,11 @@ def _tidy(part: Path) -> None:
 
 
 def _download(
-    product: Product, addresses: Sequence[str], part: Path, accept: bool, report: Report
+    product: Product,
+    addresses: Sequence[str],
+    part: Path,
+    accept: bool,
+    report: Report,
 ) -> None:
     """Bring the file from the first address that has it."""
     wanted = product._replace(size=None, hash=None) if accept else product

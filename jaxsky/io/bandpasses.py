@@ -135,30 +135,25 @@ def _merged(nu: np.ndarray, weights: np.ndarray) -> Samples:
 
 def _rimo_samples(hdus: pyfits.HDUList, name: str) -> tuple[Samples, str]:
     tables = [select_hdu(hdus, i) for i, h in enumerate(hdus) if h.name == name]
+    names = tables[0].columns.names
     for column in ("WAVENUMBER", "TRANSMISSION"):
-        if column not in tables[0].columns.names:
-            known = ", ".join(tables[0].columns.names)
-            raise UnfitError(f"HDU {name!r}: no column {column!r}; it has {known}.")
-    data = [
-        [np.array(t.data.field(c), np.float64) for c in ("WAVENUMBER", "TRANSMISSION")]
-        for t in tables
-    ]
+        if column not in names:
+            raise UnfitError(f"HDU {name!r}: no column {column!r}; it has {', '.join(names)}.")
+    data = [np.array([t.data["WAVENUMBER"], t.data["TRANSMISSION"]], np.float64) for t in tables]
     if not all(np.array_equal(data[0], other) for other in data[1:]):
         raise UnfitError(f"{len(tables)} HDUs are named {name!r} and differ.")
     unit = str(tables[0].columns["WAVENUMBER"].unit)
     if unit not in _RIMO:
-        raise UnfitError(
-            f"HDU {name!r}: WAVENUMBER has the unit {unit!r}, not {' or '.join(_RIMO)}."
-        )
-    samples = _merged(*_to_GHz(np.array(data[0]), unit))
-    return _checked(*samples), _RIMO[unit]
+        known = " or ".join(_RIMO)
+        raise UnfitError(f"HDU {name!r}: WAVENUMBER has the unit {unit!r}, not {known}.")
+    return _checked(*_merged(*_to_GHz(data[0], unit))), _RIMO[unit]
 
 
 def _rimo_names(
     names: Sequence[str], band: str | None, detectors: Sequence[str] | None
 ) -> list[str]:
     """Names of the HDUs of a band average, or of its detectors."""
-    wanted = None if band is None else str(band).upper().lstrip("F0")
+    wanted = None if band is None else band.upper().lstrip("F0")
     averages, single = {}, {}
     for name in names:
         key, _, detector = name.upper().removeprefix("BANDPASS_").partition("-")
@@ -167,20 +162,19 @@ def _rimo_names(
             single[detector] = name
         elif not detector:
             averages[key] = name
-    if detectors is not None:
-        asked = [str(d).upper().removeprefix("LFI") for d in detectors]
-        if not asked:
-            raise UnfitError("argument `detectors` is empty.")
-        for detector in asked:
-            if detector not in single:
-                where = "" if band is None else f" in band {band}"
-                known = ", ".join(single) or "none"
-                raise UnfitError(f"no detector {detector!r}{where}; it has {known}.")
-        return [single[detector] for detector in asked]
-    if wanted is None or wanted not in averages:
-        problem = "give `band`" if wanted is None else f"no band {str(band)!r}"
-        raise UnfitError(f"{problem}; it has {', '.join(averages)}.")
-    return [averages[wanted]]
+    if detectors is None:
+        if wanted is None or wanted not in averages:
+            asked = "give `band`" if wanted is None else f"no band {band!r}"
+            raise UnfitError(f"{asked}; it has {', '.join(averages)}.")
+        return [averages[wanted]]
+    asked_for = [str(d).upper().removeprefix("LFI") for d in detectors]
+    if not asked_for:
+        raise UnfitError("argument `detectors` is empty.")
+    if missing := [detector for detector in asked_for if detector not in single]:
+        where = "" if band is None else f" in band {band}"
+        known = ", ".join(single) or "none"
+        raise UnfitError(f"no detector {missing[0]!r}{where}; it has {known}.")
+    return [single[detector] for detector in asked_for]
 
 
 def _mean(tables: Sequence[Samples]) -> Samples:
@@ -209,9 +203,7 @@ def _columns(table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
     if fields is None:
         shown = f" ({' '.join(names)})" if names else ""
         if width > _WIDEST:
-            raise UnfitError(
-                f"{width} columns{shown}; give `fields`, those of frequency and weight."
-            )
+            raise UnfitError(f"{width} columns{shown}; give `fields`, of frequency and weight.")
         first = [row.cells[0] for row in table.rows]
         counted = first in ([str(i + start) for i in range(len(first))] for start in (0, 1))
         if (counted and width > 2) or (names and _NO_FREQUENCY.fullmatch(names[0])):

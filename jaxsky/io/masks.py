@@ -9,7 +9,7 @@ from jaxtyping import Bool
 
 from jaxsky.io.columns import default_fields
 from jaxsky.io.files import UnfitError, check_file, in_file
-from jaxsky.io.tables import equals, from_nested, open_table, spelled
+from jaxsky.io.tables import equals, in_ring, open_table, spelled
 
 
 def _read_npz(path: Path, field: str | int | None, ordering: str | None) -> np.ndarray:
@@ -32,7 +32,7 @@ def _read_npz(path: Path, field: str | int | None, ordering: str | None) -> np.n
         raise UnfitError(f"not a HEALPix mask, {found.size} is not 12 nside^2 pixels.")
     values = found.astype(np.float64)
     values[~np.isfinite(values) | equals(values, healpy.UNSEEN, 1e-5)] = np.nan
-    return values if order == "RING" else from_nested(values)
+    return in_ring(values, order)
 
 
 def _in_galactic(mask: np.ndarray, coordinates: str) -> np.ndarray:

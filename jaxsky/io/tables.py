@@ -152,17 +152,14 @@ def _nested(nside: int) -> Int[np.ndarray, " pix"]:
     return healpy.ring2nest(nside, np.arange(healpy.nside2npix(nside))).astype(np.int32)
 
 
-def from_nested(values: Float[np.ndarray, " pix"]) -> Float[np.ndarray, " pix"]:
-    """Values in NESTED order, in RING order."""
+def in_ring(values: Float[np.ndarray, " pix"], ordering: str) -> Float[np.ndarray, " pix"]:
+    """Values of an ordering, in RING order."""
+    if ordering == "RING":
+        return values
     nside = healpy.npix2nside(values.size)
-    check_nested(nside)
-    return values[_nested(nside)]
-
-
-def check_nested(nside: int) -> None:
-    """Raise UnfitError if pixels of this nside have no NESTED order."""
     if not healpy.isnsideok(nside, nest=True):
         raise UnfitError(f"ordering is NESTED, but nside is {nside}, no power of 2.")
+    return values[_nested(nside)]
 
 
 class HealpixTable:
@@ -271,14 +268,6 @@ class HealpixTable:
             raise UnfitError(f"column {name} has a table of {shape} in each row.")
         return np.array(found, dtype=dtype).ravel()
 
-    def _null(self, index: int) -> int | None:
-        """TNULL of a column: a stored integer, before it is scaled."""
-        key = f"TNULL{index + 1}"
-        text = str(self._table.header.get(key, "")).strip()
-        if text and not (found := _number(text)).is_integer():
-            raise UnfitError(f"{key} is {text}, which is not a whole number.")
-        return int(found) if text else None
-
     def lowest(self, index: int) -> float | None:
         """What the lowest integer stands for that a column can store; None for other types."""
         if self._kinds[index] not in "IJK":
@@ -296,24 +285,18 @@ class HealpixTable:
         NaN where it has no value: pixels that are not listed, UNSEEN, BAD_DATA and TNULL of the
         header, NaN and infinity. If `logical`, columns of true and false are 1 and 0.
         """
-        npix = healpy.nside2npix(self.nside)
         if logical and self._kinds[index] == "L":
             column = np.array(self._table.data.field(index), dtype=np.float64).ravel()
         else:
             column = self._real(index)
-        pixels = self._pixels
-        expected = npix if pixels is None else pixels.size
-        if column.size != expected:
+        npix, pixels = healpy.nside2npix(self.nside), self._pixels
+        if column.size != (expected := npix if pixels is None else pixels.size):
             name = self.names[index]
             raise UnfitError(f"column {name} has {column.size} values for {expected} pixels.")
-        if pixels is None:
-            return from_nested(column) if ordering == "NESTED" else column
-        full = np.full(npix, np.nan)
-        if ordering == "NESTED":
-            check_nested(self.nside)
-            pixels = healpy.nest2ring(self.nside, pixels)
-        full[pixels] = column
-        return full
+        if pixels is not None:
+            listed, column = column, np.full(npix, np.nan)
+            column[pixels] = listed
+        return in_ring(column, ordering)
 
     def _real(self, index: int) -> Float[np.ndarray, " row"]:
         """A column of real numbers, NaN where it has none."""
@@ -323,11 +306,16 @@ class HealpixTable:
             if np.isnan(stated := _number(str(text))):
                 raise UnfitError(f"BAD_DATA is {text}, which is not a number.")
             bad |= equals(column, stated, 1e-5)
-        if (null := self._null(index)) is not None:
-            # What is not an integer has no TNULL by the standard, but says what it means.
+        key = f"TNULL{index + 1}"
+        if text := str(self._table.header.get(key, "")).strip():
+            # It is a stored integer, before it is scaled. What is not an integer has none by the
+            # standard, but says what it means.
+            if not (null := _number(text)).is_integer():
+                raise UnfitError(f"{key} is {text}, which is not a whole number.")
             raw = self._table.data.view(np.ndarray)
             stored = raw[raw.dtype.names[index]].ravel()
-            bad |= stored == null if stored.dtype.kind in "iu" else equals(column, null, 1e-5)
+            exact = stored.dtype.kind in "iu"
+            bad |= stored == int(null) if exact else equals(column, null, 1e-5)
         column[bad] = np.nan
         return column
 

@@ -5,7 +5,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -59,14 +59,10 @@ class _State(NamedTuple):
     total: int | None
 
 
-def _beside(part: Path) -> Path:
-    return part.with_name(f"{part.name}.json")
-
-
 def _state(part: Path) -> _State | None:
     """What is known of a partial file; None if it has to be begun anew."""
     try:
-        state = _State(**json.loads(_beside(part).read_text()))
+        state = _State(**json.loads(part.with_name(f"{part.name}.json").read_text()))
         have = part.stat().st_size
     except (OSError, ValueError, TypeError):
         return None
@@ -75,7 +71,7 @@ def _state(part: Path) -> _State | None:
 
 def discard(part: Path) -> None:
     """Remove a partial file and what is known of it, in an order that allows to be interrupted."""
-    _beside(part).unlink(missing_ok=True)
+    part.with_name(f"{part.name}.json").unlink(missing_ok=True)
     part.unlink(missing_ok=True)
 
 
@@ -102,7 +98,7 @@ def _transfer(address: str, part: Path, size: int | None, report: Report) -> Non
         discard(part)
         if version := _version(answer):
             state = _State(address, version, total)
-            _beside(part).write_text(json.dumps(state._asdict()))
+            part.with_name(f"{part.name}.json").write_text(json.dumps(state._asdict()))
         _receive(answer, part, 0, total, report)
 
 
@@ -159,10 +155,8 @@ def _check(
         raise RefusedError(f"has {total} bytes, but should have {size}{ANEW}")
     free = shutil.disk_usage(part.parent).free
     if total is not None and total - have > free:
-        raise DownloadError(
-            f"{part.parent}: {in_words(free)} are free, but {part.stem} takes "
-            f"{in_words(total - have)} more; make room, or give another --dir."
-        )
+        more = f"{in_words(free)} are free, but {part.stem} takes {in_words(total - have)} more"
+        raise DownloadError(f"{part.parent}: {more}; make room, or give another --dir.")
 
 
 def _receive(
@@ -236,17 +230,19 @@ def fetch(
     Raises
     ------
     DownloadError
-        If no address answers, a transfer is cut, what came is not the file, or it cannot be
-        written.
+        If no address has the file, a transfer is cut, or it cannot be written.
     jaxsky.io.InputError
-        If the file that is there is not the product, or the record of hashes is damaged; both are
-        left as they are.
+        If what is there, file or record of hashes, is damaged; it is left as it is.
     ValueError
         If the mirror is no http or https address.
     """
     folder = cache_folder() if folder is None else folder
     path, part = folder / product.name, folder / f"{product.name}.part"
-    addresses = product.addresses if mirror is None else (_join(mirror, product.name),)
+    wanted = product._replace(size=None, hash=None) if accept else product
+    if mirror is not None:
+        if not mirror.lower().startswith(("http://", "https://")):
+            raise ValueError(f"--mirror must begin with https:// or http://, but is {mirror!r}.")
+        wanted = wanted._replace(addresses=(f"{mirror.rstrip('/')}/{product.name}",))
     checksums(folder)  # a damaged record is said before anything is transferred
     if os.path.lexists(path):
         return _kept(product, path, part)
@@ -255,8 +251,8 @@ def fetch(
         with locked(folder / f".{product.name}.lock", waiting=waiting):
             if path.exists():  # another process has brought it
                 return _kept(product, path, part)
-            _download(product, addresses, part, accept, report)
-            if accept or product.hash is None:
+            _download(wanted, part, report)
+            if wanted.hash is None:
                 remember(product, folder, part)
             # A cached file is never anything but whole.
             os.replace(part, path)
@@ -269,12 +265,6 @@ def fetch(
             said = f"{where}: cannot be written ({why}); give another --dir."
         raise DownloadError(said) from None
     return path
-
-
-def _join(mirror: str, name: str) -> str:
-    if not mirror.lower().startswith(("http://", "https://")):
-        raise ValueError(f"--mirror must begin with https:// or http://, but is {mirror!r}.")
-    return f"{mirror.rstrip('/')}/{name}"
 
 
 def _kept(product: Product, path: Path, part: Path) -> Path:
@@ -296,21 +286,18 @@ def _tidy(part: Path) -> None:
     part.with_name(f".{part.stem}.lock").unlink(missing_ok=True)
 
 
-def _download(
-    product: Product,
-    addresses: Sequence[str],
-    part: Path,
-    accept: bool,
-    report: Report,
-) -> None:
+def _download(product: Product, part: Path, report: Report) -> None:
     """Bring the file from the first address that has it."""
-    wanted = product._replace(size=None, hash=None) if accept else product
     failures, begun = [], _state(part)
-    for address in sorted(addresses, key=lambda a: begun is None or a != begun.address):
+    for address in sorted(product.addresses, key=lambda a: begun is None or a != begun.address):
         try:
-            _transfer(address, part, wanted.size, report)
-            _check_came(wanted, part)
+            _transfer(address, part, product.size, report)
+            check_product(product, part, ANEW)
             return
+        except InputError as error:
+            discard(part)
+            said = str(error).replace(str(part), product.name).rstrip(".")
+            failures.append(f"{address} sent another file ({said})")
         except CutError as cut:
             raise DownloadError(
                 f"{product.name}: the transfer from {address} ended early, after {cut} bytes; "
@@ -324,13 +311,3 @@ def _download(
         f"{product.name}: {'; '.join(failures)}. Try again later, give another --mirror, or put "
         f"the file into {part.parent} by hand."
     )
-
-
-def _check_came(product: Product, part: Path) -> None:
-    """Remove and refuse a file that came, if it is not what it should be."""
-    try:
-        check_product(product, part, ANEW)
-    except InputError as error:
-        discard(part)
-        said = str(error).replace(str(part), product.name).rstrip(".")
-        raise RefusedError(f"sent another file ({said})") from None

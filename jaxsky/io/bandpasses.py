@@ -283,9 +283,7 @@ def read_bandpass(
     Raises
     ------
     InputError
-        If the file is missing or damaged; band or detector is not found; frequencies do not
-        increase, values are not finite, or the integral is not positive; a row is not two
-        numbers; there is weight at nu <= 0; convention, unit or columns are not certain.
+        If the file has no such bandpass, or convention, unit or columns are not certain.
     ValueError
         If `convention` or `trim` is no valid value.
     """

@@ -221,10 +221,8 @@ def read_maps(
     Raises
     ------
     InputError
-        If a file is missing, truncated or not HEALPix; a column or HDU is missing, or holds no
-        real numbers; something the maps cannot be used without is said neither by header nor
-        argument, or differently by both or by several files; the nside is not that expected;
-        no pixel has values.
+        If a file is no such map, or something that maps cannot be used without is said neither by
+        header nor argument, or differently by both or by several files.
     ValueError
         If `unit` is unknown.
     """
@@ -300,11 +298,8 @@ def write_maps(
     ------
     FileExistsError
         If the file exists and `overwrite` is not set.
-    InputError
-        If its folder does not exist.
     ValueError
-        For wrong shapes, an unknown unit, values that are not finite, or an `extra_header` that
-        contradicts what is written here.
+        If an argument is wrong, or the folder does not exist.
     """
     path = Path(path)
     maps = np.atleast_2d(np.asarray(maps, dtype=np.float32 if single else np.float64))

@@ -72,9 +72,8 @@ def read_mask(
     Raises
     ------
     InputError
-        If the file is missing, damaged or not HEALPix; the mask in it is not found; it has
-        values other than 0 and 1 (read an apodized mask with `read_maps`), the wrong nside, or
-        leaves no pixel.
+        If the file has no such mask, or it has values other than 0 and 1 (read an apodized mask
+        with `read_maps`), the wrong nside, or leaves no pixel.
     """
     path = Path(path)
     frame, others = "G", []

@@ -181,10 +181,8 @@ def read_spectra(
     Raises
     ------
     InputError
-        If the file is missing or damaged, lacks a spectrum, has gaps in l or ends below lmax;
-        says neither by itself nor by an argument what its columns and units are, or different
-        things by both; holds D_l in FITS; or has values that are not finite, negative TT, EE or
-        BB, or |TE| > sqrt(TT EE).
+        If the file lacks a spectrum or multipoles, says neither by itself nor by an argument what
+        its columns and units are, or has values that are not those of a Gaussian field.
     ValueError
         If `format` is unknown or lmax is negative.
     """
@@ -247,9 +245,7 @@ def read_beam(path: str | Path, lmax: int, *, hdu: int | str = 1) -> Float[np.nd
     Raises
     ------
     InputError
-        If the file is missing or damaged; has no such column or table; has gaps in l, does not
-        begin at l = 0 or ends below lmax; or has values that are not finite, or is not positive
-        at l = 0.
+        If the file has no such window, or not for all multipoles.
     ValueError
         If lmax is negative.
     """

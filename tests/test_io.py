@@ -313,7 +313,7 @@ def test_bad_masks(tmp_path):
         (two, {"field": "A"}, "no ORDERING; give `ordering`"),
         (two, {"field": "B", "ordering": "RING"}, r"two.fits: the mask leaves no pixel"),
         (two, {"field": "A", "ordering": "RING", "nside": 4}, "nside is 8, but 4 is expected"),
-        (tmp_path / "m.npz", {}, "give `field`, as it has several masks; it has A, B"),
+        (tmp_path / "m.npz", {}, "give `field`, of several; it has A, B"),
         (tmp_path / "m.npz", {"field": "C"}, "no mask 'C'; it has A, B"),
         (tmp_path / "m.npz", {"field": "B"}, r"100 is not 12 nside\^2 pixels"),
         (tmp_path / "m.npz", {"field": "A", "ordering": "up"}, "one of RING, NESTED, not 'up'"),

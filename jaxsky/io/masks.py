@@ -21,7 +21,7 @@ def _read_npz(path: Path, field: str | int | None, ordering: str | None) -> np.n
             known = list(archive)
             name = known[0] if field is None and len(known) == 1 else field
             if name not in known:
-                what = f"no mask {field!r}" if field is not None else "give `field`, of several masks"
+                what = "give `field`, of several" if field is None else f"no mask {field!r}"
                 raise UnfitError(f"{what}; it has {', '.join(known)}.")
             found = np.squeeze(archive[name])
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:

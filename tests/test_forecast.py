@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from fits import fisher
-from fits.b_modes import noise_level, noise_weights
 from fits.fisher import (
     ForecastModel,
     fiducial,
     fisher_errors,
     foreground_names,
 )
+from fits.tensor_ratio import noise_level, noise_weights
 from jaxsky import AME, Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.instrument import Channel, Instrument, load_instrument
 from jaxsky.noise import uniform_covariance

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from fits import b_modes
-from fits.b_modes import BandLaw
+from fits import tensor_ratio
 from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
 from fits.common import prepare_component
@@ -74,7 +73,7 @@ class Forecast(NamedTuple):
     inputs: ForecastInputs
     spectra: MaskedSpectra
     powers: dict[str, Float[np.ndarray, "2 bin"]]
-    laws: dict[str, BandLaw]
+    laws: dict[str, tensor_ratio.BandLaw]
     equal_r: dict[str, dict[str, float]]
     tensors: Float[np.ndarray, "4 ell"]
     lensed: Float[np.ndarray, "4 ell"]
@@ -159,10 +158,10 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
     window = np.asarray(gaussian_beam(inputs.fwhm, 2 * edges[-1]))
     spectra = masked_spectra(inputs.mask, edges, window=window)
     bands = {name: inputs.bands[name].band for name in inputs.shown}
-    powers = b_modes.foreground_powers(inputs.sky, bands, spectra)
+    powers = tensor_ratio.foreground_powers(inputs.sky, bands, spectra)
     with at_key("forecast.fit"):
         laws = {
-            name: b_modes.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
+            name: tensor_ratio.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
             for name, D in powers.items()
         }
     highest = max(spectra.lmax, spec.fisher_lmax, PIVOT)
@@ -170,7 +169,8 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
         tensors = tensor_spectra(highest, **settings.cmb.cosmology)
         lensed = camb_spectra(highest, **settings.cmb.cosmology)
     equal = {
-        name: b_modes.equal_r(spectra, powers[name], law, tensors) for name, law in laws.items()
+        name: tensor_ratio.equal_r(spectra, powers[name], law, tensors)
+        for name, law in laws.items()
     }
     progress.step("Fisher matrix")
     model, parameters = _model(settings, inputs, spectra, tensors, lensed)
@@ -196,16 +196,16 @@ def _model(
     foregrounds: dict[str, float] = {}
     for field, row in rows.items():
         for name, D in auto.items():
-            law = b_modes.fit_law(spectra, D[row], spec.fit, f"{field} of {name!r}")
+            law = tensor_ratio.fit_law(spectra, D[row], spec.fit, f"{field} of {name!r}")
             foregrounds |= {f"{field}.{name}.{kind}": v for kind, v in law._asdict().items()}
     for first, second in itertools.combinations(maps, 2):
         cross = band_powers(spectra, maps[first], maps[second])
         for field, row in rows.items():
-            foregrounds[f"{field}.{first}.{second}.correlation"] = b_modes.band_correlation(
+            foregrounds[f"{field}.{first}.{second}.correlation"] = tensor_ratio.band_correlation(
                 spectra, cross[row], auto[first][row], auto[second][row], spec.fit
             )
     ell, lmax = np.arange(spec.lmin, spec.fisher_lmax + 1), spec.fisher_lmax
-    weights = [b_modes.noise_weights(band, lmax)[ell] for band in inputs.bands.values()]
+    weights = [tensor_ratio.noise_weights(band, lmax)[ell] for band in inputs.bands.values()]
     cmb_rows = 1 + np.array(list(rows.values()))[:, None]
     model = ForecastModel.of(
         unit_sky(sky, inputs.mask),

@@ -6,7 +6,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 
-from fits.b_modes import noise_weights
 from fits.commands.forecast import Forecast
 from fits.fisher import Errors
 from fits.plots import (
@@ -20,6 +19,7 @@ from fits.plots import (
     round_numbers,
     with_powers,
 )
+from fits.tensor_ratio import noise_weights
 from fits.writing import with_error
 from jaxsky.settings import Experiment
 

@@ -17,7 +17,7 @@ import jaxsky
 from fits.commands.console import print_written, replace_unprintable
 from fits.commands.data import data_commands
 from fits.commands.endings import print_error, prompt
-from fits.commands.run import DEFAULTS, Options, run_command
+from fits.commands.run import DEFAULTS, run_command
 from jaxsky.io.folders import cache_folder
 from jaxsky.programs import keep_programs
 
@@ -106,8 +106,10 @@ def _simulate(
     if only is not None and only not in ONLY:
         raise ValueError(f"--only must be one of {', '.join(ONLY)}, not {only!r}.")
     indices = range(first, first + nsims)
-    options = Options(settings_file, out, values, resume, overwrite)
-    run_command(simulate_command(indices, only), options, indices)
+    command = simulate_command(indices, only)
+    run_command(
+        command, settings_file, out, values, resume=resume, overwrite=overwrite, part=indices
+    )
 
 
 def _analysis(name: str) -> Callable[..., None]:
@@ -126,8 +128,10 @@ def _analysis(name: str) -> Callable[..., None]:
         resume: Resume = False,
         overwrite: Overwrite = False,
     ) -> None:
-        options = Options(settings_file, out, values, resume, overwrite, maps)
-        run_command(import_module(f"fits.commands.{name}").COMMAND, options)
+        named = import_module(f"fits.commands.{name}").COMMAND
+        run_command(
+            named, settings_file, out, values, resume=resume, overwrite=overwrite, maps=maps
+        )
 
     return command
 
@@ -146,7 +150,7 @@ def _forecast(
     """Forecast B modes: foregrounds against primordial ones, and errors on r and the laws."""
     from fits.commands.forecast import COMMAND
 
-    run_command(COMMAND, Options(settings_file, out, values, overwrite=overwrite))
+    run_command(COMMAND, settings_file, out, values, overwrite=overwrite)
 
 
 @app.command("paper")
@@ -164,7 +168,8 @@ def _paper(
     """Make the figures and tables of the paper again, and a page that shows them."""
     from fits.commands.paper import paper_command
 
-    run_command(paper_command(only or ()), Options(settings_file, out, values, resume, overwrite))
+    command = paper_command(only or ())
+    run_command(command, settings_file, out, values, resume=resume, overwrite=overwrite)
 
 
 app.add_typer(data_commands, name="data")

@@ -264,6 +264,14 @@ def round_numbers(axis: Axis, digits: Sequence[float] = (1, 2, 5)) -> None:
     axis.set_minor_formatter(mpl.ticker.NullFormatter())
 
 
+def label_b_modes(axes: Axes, first: float, last: float, columns: int) -> None:
+    """Axes of BB as D_l in uK_CMB^2 between two multipoles, and a legend below."""
+    axes.set(yscale="log", xlim=(first, last), xlabel=r"multipole $\ell$")
+    axes.set_ylabel(rf"$\ell(\ell+1)C_\ell^{{BB}}/2\pi$ [{UNITS['uK_CMB']}$^2$]")
+    axes.yaxis.set_major_locator(mpl.ticker.LogLocator(numticks=20))
+    legend_below(axes, columns, fontsize=7)
+
+
 def draw_spectra(
     axes: Axes, spectra: Mapping[str, Float[np.ndarray, " ell"]], unit: str, **options: Any
 ) -> None:

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 
 from fits.commands.forecast import Forecast
@@ -11,10 +10,9 @@ from fits.fisher import Errors
 from fits.plots import (
     COLORS,
     COLUMN,
-    UNITS,
     draw_panels,
     label,
-    legend_below,
+    label_b_modes,
     plain,
     round_numbers,
     with_powers,
@@ -46,15 +44,9 @@ def plot_b_modes(path: Path, found: Forecast, settings: Experiment) -> None:
             bottom = min(bottom, primordial[: min(100, len(ell))].min())
         axes.plot([], [], color=LENSING, lw=1.2, label="lensing")
         axes.plot([], [], color="k", lw=0.7, label="noise (thin)")
-        axes.set(
-            xlim=(2, lmax),
-            ylim=(bottom / 2, None),
-            xlabel=r"multipole $\ell$",
-            ylabel=rf"$\ell(\ell+1)C_\ell^{{BB}}/2\pi$ [{UNITS['uK_CMB']}$^2$]",
-        )
+        label_b_modes(axes, 2, lmax, 3)
+        axes.set_ylim(bottom=bottom / 2)
         round_numbers(axes.xaxis)
-        axes.yaxis.set_major_locator(mpl.ticker.LogLocator(numticks=20))
-        legend_below(axes, 3, fontsize=7)
 
 
 def _band(name: str) -> str:

@@ -187,7 +187,7 @@ def paper_command(only: Sequence[str]) -> Command:
             settings,
             command.out,
             only,
-            overwrite=command.options.overwrite,
+            overwrite=command.overwrite,
             # What is replaced is seen to figure by figure.
             begin=lambda: command.steps.keep(command.log),
             progress=command.steps,

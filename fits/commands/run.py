@@ -25,17 +25,6 @@ CIRCUMSTANCES = "log.json"
 DEFAULTS = Path(__file__).parents[1] / "defaults"
 
 
-class Options(NamedTuple):
-    """What the command line says, to any command."""
-
-    settings_file: Path | None
-    out: Path
-    values: Sequence[str] | None = None
-    resume: bool = False
-    overwrite: bool = False
-    maps: Path | None = None
-
-
 class Report(NamedTuple):
     """What a command has found: said on the terminal, and shown on a page unless `page` is False.
 
@@ -57,16 +46,13 @@ class Report(NamedTuple):
 class Run(NamedTuple):
     """A command at work: what it may write, and to whom it says what it does."""
 
-    options: Options
+    out: Path
+    resume: bool
+    overwrite: bool
     results: Sequence[str]
     folder: Folder
     steps: Steps
-    part: range = ALL
-
-    @property
-    def out(self) -> Path:
-        """Folder of the results."""
-        return self.options.out
+    part: range
 
     @property
     def log(self) -> Path:
@@ -76,7 +62,7 @@ class Run(NamedTuple):
 
     def begin(self) -> None:
         """Nothing is wrong with the input: what is to be replaced goes, and the log begins."""
-        if self.options.overwrite:
+        if self.overwrite:
             self.folder.remove(self.results)
             self.folder.narrow(self.part)  # others may make the rest
         self.steps.keep(self.log)
@@ -94,33 +80,41 @@ class Command(NamedTuple):
     resumable: bool = True
 
 
-def run_command(command: Command, options: Options, part: range = ALL) -> None:
+def run_command(
+    command: Command,
+    settings_file: Path | None,
+    out: Path,
+    values: Sequence[str] | None = None,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    maps: Path | None = None,
+    part: range = ALL,
+) -> None:
     """Run a command with what the command line says.
 
     `part` of the results is made, see `jaxsky.io.folders.occupied`. All of them are replaced, so
     nobody else may be making any then.
     """
-    path, out = options.settings_file or DEFAULTS / f"{command.name}.toml", options.out
-    values = list(options.values or ())
-    if options.maps is not None:
-        values.append(f"common.maps={json.dumps(str(options.maps.resolve()))}")
+    path, values = settings_file or DEFAULTS / f"{command.name}.toml", list(values or ())
+    if maps is not None:
+        values.append(f"common.maps={json.dumps(str(maps.resolve()))}")
     settings = load(path, values)
-    resume = options.resume if command.resumable else None
     with (
         of_file(path),
         results_folder(
             out,
             command.results,
-            resume=resume,
-            overwrite=options.overwrite,
-            part=ALL if options.overwrite else part,
+            resume=resume if command.resumable else None,
+            overwrite=overwrite,
+            part=ALL if overwrite else part,
         ) as folder,
         Steps() as steps,
     ):
         import matplotlib as mpl
 
         mpl.use("Agg")  # pictures go to files
-        running = Run(options, command.results, folder, steps, part)
+        running = Run(out, resume, overwrite, command.results, folder, steps, part)
         report = command.work(settings, running)
         report = report._replace(warnings=[*report.warnings, *_other_sky(settings)])
         written = [*_write(settings, report, running), *report.written]

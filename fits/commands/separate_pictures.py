@@ -3,18 +3,17 @@
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 
 from fits.cleaning import Separation
 from fits.plots import (
     COLORS,
     COLUMN,
-    UNITS,
     MapPanel,
     color_limit,
     draw_panels,
     label,
+    label_b_modes,
     legend_below,
     plot_maps,
     spread,
@@ -103,16 +102,9 @@ def plot_spectra(path: Path, found: Separation, settings: Experiment) -> None:
         for name, powers, color, dashes, width in curves:
             positive = np.where(powers > 0, powers, np.nan)
             axes.plot(ell, positive, dashes, color=color, lw=width, label=name)
-        axes.set(
-            yscale="log",
-            xlim=(edges[0], edges[-1] - 1),
-            xlabel=r"multipole $\ell$",
-            ylabel=rf"$\ell(\ell+1)C_\ell^{{BB}}/2\pi$ [{UNITS['uK_CMB']}$^2$]",
-        )
+        label_b_modes(axes, edges[0], edges[-1] - 1, 2)
         lowest = min(x[x > 0].min(initial=np.inf) for x in (residual, found.left) if x is not None)
         axes.set_ylim(bottom=max(lowest / 3, np.nanmax(model.lensing) * 1e-8))
-        axes.yaxis.set_major_locator(mpl.ticker.LogLocator(numticks=20))
-        legend_below(axes, 2, fontsize=7)
 
 
 def plot_ratio(path: Path, found: Separation, settings: Experiment) -> None:

@@ -45,16 +45,14 @@ def _restricted(settings: Experiment, only: str) -> Experiment:
 def _work(settings: Experiment, command: Run, *, indices: range, only: str | None) -> Report:
     if only is not None:
         settings = _restricted(settings, only)
-    out, steps, options = command.out, command.steps, command.options
+    out, steps, overwrite = command.out, command.steps, command.overwrite
     steps.step("reading templates")
-    montecarlo.check_folder(out, settings, options.resume, options.overwrite, indices)
+    montecarlo.check_folder(out, settings, command.resume, overwrite, indices)
     setup = experiment.simulation_inputs(settings)
     names, notes = setup.observation.names, list[str]()
     seconds, count = [], len(indices) * len(names)
     steps.step("simulating")
-    files = montecarlo.run(
-        settings, setup, out, indices, options.overwrite, notes.append, command.begin
-    )
+    files = montecarlo.run(settings, setup, out, indices, overwrite, notes.append, command.begin)
     for done, file in enumerate(files, 1):
         steps.advance(done, count)
         if file.seconds is not None:

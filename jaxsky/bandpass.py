@@ -122,16 +122,8 @@ class Bandpass(eqx.Module):
     ) -> Float[Array, ""]:
         """Factor between brightness units in this band; see `jaxsky.units.band_conversion`.
 
-        Parameters
-        ----------
-        source, target : names of units
-        nu_ref : frequency at which MJy/sr is quoted [GHz], needed for that unit: the published
-            factors are for nominal frequencies, and the center differs by percents
-
-        Raises
-        ------
-        ValueError
-            If a unit is unknown, or nu_ref is missing.
+        MJy/sr needs `nu_ref`, the frequency at which it is quoted [GHz], and is refused without:
+        the published factors are for nominal frequencies, and the center differs by percents.
         """
         if nu_ref is None and "MJy/sr" in (parse_unit(source)[1], parse_unit(target)[1]):
             raise ValueError("Over a band MJy/sr needs `nu_ref`, the frequency it is quoted at.")

@@ -7,9 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 
-def exported(
-    package: str,
-) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
+def exported(package: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
     """`__all__`, `__getattr__` and `__dir__` of a package, as its block for type checkers says.
 
     The imports under `if TYPE_CHECKING:`, which Python passes over, are made one name at a time.

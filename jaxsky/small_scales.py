@@ -193,12 +193,6 @@ def modulation(maps: Float[Array, "2 pix"], fwhm: ArrayLike, nside: int) -> Floa
     return resample(intensity[None], window, nside)[0] / intensity.mean()
 
 
-def _rise(joins: Sequence[int], lmax: int) -> Float[Array, "field ell"]:
-    """0 below half the join, 1 from the join on: below, the template stays as it is."""
-    at = jnp.arange(lmax + 1) / jnp.asarray(joins)[:, None]
-    return jnp.sin(jnp.pi / 2 * jnp.clip(2 * at - 1, 0, 1)) ** 2
-
-
 def _correlations(
     alms: Float[Array, "field alm"], ranges: Sequence[tuple[int, int]]
 ) -> Float[Array, "field field"]:
@@ -311,6 +305,8 @@ def continue_templates(
     result = []
     for i, (template, how) in enumerate(zip(stay, small, strict=True)):
         added = analysis(gain * synthesis(drawn[2 * i : 2 * i + 2], nside), lmax)
-        added = expand(_rise((how.EE[1], how.BB[1]), lmax)) * added
+        # 0 below half the join, 1 from the join on: below, the template stays as it is.
+        at = jnp.arange(lmax + 1) / jnp.asarray((how.EE[1], how.BB[1]))[:, None]
+        added = expand(jnp.sin(jnp.pi / 2 * jnp.clip(2 * at - 1, 0, 1)) ** 2) * added
         result.append(template + how.amplitude * (added + borrowed[2 * i : 2 * i + 2]))
     return Continued(result, parts, repaired)

@@ -47,8 +47,8 @@ def _here(
     return f"Here, {listed(found)}." if found else ""
 
 
-def _pixels_here(paper: PaperSky, bands: Sequence[str]) -> str:
-    nside = paper.settings.common.nside
+def _pixels_here(paper: PaperSky) -> str:
+    nside, bands = paper.settings.common.nside, list(paper.comparison.prepared.bands)
     return _here(paper, f"nside is {nside} rather than 64" * (nside != 64), bands, SHOWN)
 
 
@@ -71,7 +71,7 @@ def figure_scatter(paper: PaperSky, picture: Path) -> Item:
         region=region_words(settings, region),
         beam=_beam(paper),
         maps=paper.maps_differ,
-        here=_pixels_here(paper, bands),
+        here=_pixels_here(paper),
     )
 
 
@@ -80,8 +80,8 @@ def figure_maps(paper: PaperSky, picture: Path) -> Item:
     settings, found = paper.settings, paper.comparison
     nside = min(settings.compare.panel_nside, settings.common.nside)
     pictures.plot_model_maps(picture, found, "QU", _chosen(found), nside, settings.title)
-    here = _pixels_here(paper, list(found.prepared.bands))
-    return described("Figure 6", nside=nside, maps=paper.maps_differ, here=here)
+    maps, here = paper.maps_differ, _pixels_here(paper)
+    return described("Figure 6", nside=nside, maps=maps, here=here)
 
 
 def figure_full_sky(experiment: str, paper: PaperSky, picture: Path) -> Item:
@@ -187,18 +187,17 @@ def figure_probability(paper: PaperSky, picture: Path) -> Item:
     except SettingsError as error:
         raise Impossible(str(error)) from None
     plot_grids(picture, fits, known_truth(inputs, fits), settings.title)
-    numbers, truth = [], inputs.truth or {}
-    for fit in fits:
-        result = fit.results["grid"]
-        numbers += [
-            Number(
-                f"{name}, {fit.region}, Q and U",
-                with_errors(result.best_fit[name], *result.interval_68[name]),
-                f"truth {truth[name]:g}" if name in truth else "",
-            )
-            for name in result.free
-            if fit.stokes == "QU"
-        ]
+    truth = inputs.truth or {}
+    grids = {f.region: f.results["grid"] for f in fits if f.stokes == "QU"}
+    numbers = [
+        Number(
+            f"{name}, {region}, Q and U",
+            with_errors(grid.best_fit[name], *grid.interval_68[name]),
+            f"truth {truth[name]:g}" if name in truth else "",
+        )
+        for region, grid in grids.items()
+        for name in grid.free
+    ]
     simulated = TEXTS["Figure 11"]["simulated"]
     return described(
         "Figure 11",

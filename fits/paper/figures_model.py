@@ -221,9 +221,8 @@ def figure_randomised(paper: PaperSky, picture: Path) -> Item:
     def Q_of(maps: Float[Array, "2 pix"]) -> Float[np.ndarray, " pix"]:
         return np.asarray(maps[0], np.float32)
 
-    wide = polarization_template(layer.maps, layer.fwhm, layer.fwhm, nside)
-    panels = {f"template, {layer.fwhm / 60:.2g}°": Q_of(wide)}
-    del wide
+    original = f"template, {layer.fwhm / 60:.2g}°"
+    panels = {original: Q_of(polarization_template(layer.maps, layer.fwhm, layer.fwhm, nside))}
     for title, make in makers.items():
         (alm,) = make("synchrotron").alms
         beam = gaussian_beam(fwhm, lmax_of(alm))
@@ -350,13 +349,10 @@ def _brightest(band: str, inside: Mapping[str, Float[np.ndarray, " inside"]]) ->
     rms = {which: float(np.sqrt(np.mean(values**2))) for which, values in inside.items()}
     parts = [which for which in rms if which not in ("total", "noise")]
     order = sorted(parts, key=rms.__getitem__, reverse=True)
-    words = {name: "CMB" if name == "cmb" else name for name in order}
-    listed_rms = ", ".join(f"{words[name]} {rms[name]:.2g}" for name in order)
-    return Number(
-        f"brightest in the patch at {band} GHz",
-        words[order[0]],
-        f"rms of Q [µK_RJ]: {listed_rms}, noise {rms['noise']:.2g} a pixel",
-    )
+    names = ["CMB" if which == "cmb" else which for which in order]
+    each = ", ".join(f"{n} {rms[which]:.2g}" for n, which in zip(names, order, strict=True))
+    note = f"rms of Q [µK_RJ]: {each}, noise {rms['noise']:.2g} a pixel"
+    return Number(f"brightest in the patch at {band} GHz", names[0], note)
 
 
 def table_core(paper: PaperSky, picture: Path) -> Item:

@@ -59,7 +59,7 @@ class Separation(NamedTuple):
     @property
     def components(self) -> tuple[str, ...]:
         """Their names, in order."""
-        return tuple(self.like.sky)
+        return tuple(self.like.mixing.sky)
 
     @property
     def degradation(self) -> float:

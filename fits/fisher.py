@@ -28,10 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.mixing import Mixing, SpectralBands
+from fits.mixing import Mixing
 from fits.pseudo_cl import PIVOT
-from jaxsky import Bandpass, Sky, get_parameters, parameter_names, set_parameters
-from jaxsky.bandpass import stack_bands
+from jaxsky import Bandpass, Sky, get_parameters, parameter_names
 from jaxsky.checks import check_double
 from jaxsky.sky import unknown_parameter
 
@@ -63,8 +62,7 @@ class ForecastModel(eqx.Module):
     @classmethod
     def of(cls, sky: Sky, bands: Mapping[str, Bandpass], *rest: Any) -> "ForecastModel":
         """The model for bandpasses by name; the rest are the fields from `weights` on."""
-        seen, samples = tuple(bands.values()), stack_bands(list(bands.values()))
-        return cls(Mixing(sky, SpectralBands(seen, tuple(bands), "QU"), samples, "uK_CMB"), *rest)
+        return cls(Mixing.of(sky, bands, "uK_CMB"), *rest)
 
     @property
     def sky(self) -> Sky:
@@ -94,17 +92,6 @@ class Errors(NamedTuple):
         """Correlation coefficient of two parameters."""
         i, j = self.free.index(first), self.free.index(second)
         return float(self.covariance[i, j] / (self.sigma(first) * self.sigma(second)))
-
-
-def unit_sky(sky: Sky, mask: Float[np.ndarray, " pix"]) -> Sky:
-    """The laws of a sky: amplitude 1 in one pixel, parameters that are maps at their mean."""
-
-    def reduced(leaf):
-        if leaf.ndim == 2:
-            return jnp.ones((2, 1), leaf.dtype)
-        return jnp.average(leaf, weights=mask) if leaf.ndim else leaf
-
-    return jax.tree.map(reduced, sky)
 
 
 def foreground_names(
@@ -161,11 +148,9 @@ def fiducial(
 
 def _laws(params: Mapping[str, Array], model: ForecastModel) -> Float[Array, "band component"]:
     """What each component shows in each band [uK_CMB], the CMB last."""
-    known = parameter_names(model.sky)
-    own = {name: params[name] for name in params if name in known}
-    sky = set_parameters(model.sky, own)
+    sky = model.mixing.laws(params)
     polarized = jnp.stack([one.template[-1, 0] for one in sky.components.values()])
-    return jnp.pad(model.mixing.one(own) * polarized, ((0, 0), (0, 1)), constant_values=1.0)
+    return jnp.pad(model.mixing.one(params) * polarized, ((0, 0), (0, 1)), constant_values=1.0)
 
 
 def _spectra(

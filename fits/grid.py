@@ -1,14 +1,15 @@
 """The posterior of one or two parameters on a grid."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
+from scipy.integrate import cumulative_trapezoid
 
 from fits.posterior import Likelihood, chi2
-from fits.priors import Prior, bounds, check_priors, log_prior
+from fits.priors import Prior, Uniform, check_priors
 from fits.results import FitResult
 from fits.template_likelihood import PixelLikelihood
 from jaxsky.checks import Numeric
@@ -22,24 +23,21 @@ ONE_SIGMA = 0.6826894921370859
 
 
 @jax.jit
-def _log_posterior(like, axes, priors):
-    """-(chi^2)/2 + log prior on the product of the axes, and chi^2.
+def chi2_on_grid(like, axes):
+    """chi^2 on the product of the axes, which are arrays by name of parameter.
 
     One vmap an axis, so that what depends on one parameter is computed along its axis only.
     """
     names = list(axes)
 
     def point(*values):
-        params = dict(zip(names, values, strict=True))
-        value = chi2(like, params)
-        return -value / 2 + log_prior(params, priors), value
+        return chi2(like, dict(zip(names, values, strict=True)))
 
     if isinstance(like, PixelLikelihood):
         # One point after the other: all at once would hold the maps once for each of them.
-        mesh = [axis.ravel() for axis in jnp.meshgrid(*axes.values(), indexing="ij")]
-        shape = tuple(axis.size for axis in axes.values())
-        flat = jax.lax.map(lambda values: point(*values), tuple(mesh))
-        return jax.tree.map(lambda x: x.reshape(shape), flat)
+        mesh = jnp.meshgrid(*axes.values(), indexing="ij")
+        flat = jax.lax.map(lambda values: point(*values), tuple(axis.ravel() for axis in mesh))
+        return flat.reshape(mesh[0].shape)
     mapped = point
     for i in reversed(range(len(names))):
         mapped = jax.vmap(mapped, in_axes=tuple(0 if j == i else None for j in range(len(names))))
@@ -53,29 +51,15 @@ def _weights(axis: np.ndarray) -> np.ndarray:
     return weights
 
 
-def _marginal(density: np.ndarray, axes: list[np.ndarray], i: int) -> np.ndarray:
-    for j in reversed(range(len(axes))):
-        if j != i:
-            density = np.tensordot(density, _weights(axes[j]), axes=(j, 0))
-    return density / np.sum(density * _weights(axes[i]))
-
-
-def _quantiles(axis: np.ndarray, density: np.ndarray, levels: list[float]) -> list[float]:
-    steps = np.diff(axis) * (density[1:] + density[:-1]) / 2
-    cumulative = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum()
-    return [float(q) for q in np.interp(levels, cumulative, axis)]
-
-
-def _narrow(axis: np.ndarray, profile: np.ndarray) -> tuple[float, float]:
-    """Range of an axis in which the profile matters, one step wider on either side."""
-    inside = np.flatnonzero(profile > -NARROW / 2)
-    return float(axis[max(inside[0] - 1, 0)]), float(axis[min(inside[-1] + 1, len(axis) - 1)])
+def _along(values: np.ndarray, i: int) -> Float[np.ndarray, "point _"]:
+    """Values on the grid, a row for each point of axis i."""
+    return np.moveaxis(values, i, 0).reshape(values.shape[i], -1)
 
 
 def grid_is_possible(free: Iterable[str], priors: Mapping[str, Prior]) -> bool:
     """True for one or two parameters that each have a uniform prior."""
     names = list(free)
-    return len(names) <= 2 and all(np.isfinite(bounds(name, priors)).all() for name in names)
+    return len(names) <= 2 and all(isinstance(priors.get(name), Uniform) for name in names)
 
 
 def grid_fit(
@@ -123,61 +107,61 @@ def grid_fit(
             f"A grid takes one or two free parameters, not {len(free)} ({', '.join(free)}); "
             "use the gradient fit or MCMC."
         )
-    ranges = {name: bounds(name, priors) for name in free}
-    for name, (low, high) in ranges.items():
-        if not np.isfinite([low, high]).all():
+    ranges = {}
+    for name in free:
+        if not isinstance(prior := priors.get(name), Uniform):
             raise ValueError(f"A grid needs a uniform prior for {name!r}, to know its range.")
-    limits = dict(ranges)
+        ranges[name] = (prior.low, prior.high)
+    limits = ranges
     for _ in range(6):
         axes = {name: np.linspace(low, high, points) for name, (low, high) in ranges.items()}
-        log_posterior, chi2s = (np.asarray(a) for a in _log_posterior(like, axes, priors))
-        log_posterior = log_posterior - log_posterior.max()
-        values = list(axes.values())
-        narrowed = {}
-        for i, name in enumerate(free):
-            others = tuple(j for j in range(len(free)) if j != i)
-            narrowed[name] = _narrow(values[i], log_posterior.max(axis=others))
-        shrunk = [(narrowed[n][1] - narrowed[n][0]) / (ranges[n][1] - ranges[n][0]) for n in free]
+        chi2s = np.asarray(chi2_on_grid(like, axes))
+        narrowed, shrunk = {}, []
+        for i, (name, axis) in enumerate(axes.items()):
+            # To where the posterior matters, and one step wider on either side.
+            inside = np.flatnonzero(_along(chi2s, i).min(axis=1) - chi2s.min() < NARROW)
+            low, high = axis[max(inside[0] - 1, 0)], axis[min(inside[-1] + 1, points - 1)]
+            narrowed[name] = (float(low), float(high))
+            shrunk.append((high - low) / (axis[-1] - axis[0]))
         if min(shrunk) > 0.8:
             break
         ranges = narrowed
-    result = _summary(free, axes, log_posterior, chi2s, limits, like.dof(len(free)))
+    result = _summary(axes, chi2s, limits, like.dof(len(free)))
     return result.judged(result.chi2, result.dof, like.start)
 
 
 def _summary(
-    free: tuple[str, ...],
     axes: dict[str, np.ndarray],
-    log_posterior: np.ndarray,
     chi2s: np.ndarray,
     limits: dict[str, tuple[float, float]],
     dof: int,
 ) -> FitResult:
-    values = list(axes.values())
-    density = np.exp(log_posterior)
-    marginals = {name: _marginal(density, values, i) for i, name in enumerate(free)}
-    tail = (1 - ONE_SIGMA) / 2
-    intervals = {}
-    for name, axis in axes.items():
-        low, high = _quantiles(axis, marginals[name], [tail, 1 - tail])
+    """What chi^2 on a grid says of the parameters, whose priors have these limits."""
+    free, log_posterior = tuple(axes), (chi2s.min() - chi2s) / 2
+    weights = np.exp(log_posterior)
+    for axis_weights in np.meshgrid(*map(_weights, axes.values()), indexing="ij"):
+        weights = weights * axis_weights
+    weights = weights / weights.sum()
+    marginals, intervals = {}, {}
+    for i, (name, axis) in enumerate(axes.items()):
+        marginals[name] = _along(weights, i).sum(axis=1) / _weights(axis)
+        cumulative = cumulative_trapezoid(marginals[name], axis, initial=0.0)
+        levels = np.array([1 - ONE_SIGMA, 1 + ONE_SIGMA]) / 2
+        low, high = np.interp(levels, cumulative / cumulative[-1], axis).tolist()
         intervals[name] = (low, high)
-    mesh = np.stack([m.ravel() for m in np.meshgrid(*values, indexing="ij")])
-    best = int(np.argmax(log_posterior))
-    weights = density.ravel()
-    for axis_weights in np.meshgrid(*[_weights(a) for a in values], indexing="ij"):
-        weights = weights * axis_weights.ravel()
-    details: dict[str, Any] = {
-        "axes": axes,
-        "log_posterior": log_posterior,
-        "marginals": marginals,
-    }
-    values_at_best = {name: float(mesh[i, best]) for i, name in enumerate(free)}
-    flat = log_posterior.min() > -FLAT
-    edges = [name for name, value in values_at_best.items() if value in limits[name]]
-    covariance = np.atleast_2d(np.cov(mesh, aweights=weights / weights.sum(), ddof=0))
+    mesh = np.stack([m.ravel() for m in np.meshgrid(*axes.values(), indexing="ij")])
+    best = int(np.argmin(chi2s))
+    best_fit = dict(zip(free, mesh[:, best].tolist(), strict=True))
+    covariance = np.atleast_2d(np.cov(mesh, aweights=weights.ravel(), ddof=0))
+    edges = [name for name, value in best_fit.items() if value in limits[name]]
+    message = "integrated"
+    if edges:
+        message = f"The highest point lies at the edge of the uniform prior of {', '.join(edges)}."
+    if flat := log_posterior.min() > -FLAT:
+        message = f"The posterior is flat: the data do not constrain {', '.join(free)}."
     return FitResult(
         method="grid",
-        best_fit=values_at_best,
+        best_fit=best_fit,
         sigma=dict(zip(free, np.sqrt(np.diagonal(covariance)).tolist(), strict=True)),
         interval_68=intervals,
         labels=free,
@@ -185,12 +169,6 @@ def _summary(
         chi2=float(chi2s.ravel()[best]),
         dof=dof,
         converged=not edges and not flat,
-        message=(
-            f"The posterior is flat: the data do not constrain {', '.join(free)}."
-            if flat
-            else f"The highest point lies at the edge of the uniform prior of {', '.join(edges)}."
-            if edges
-            else "integrated"
-        ),
-        details=details,
+        message=message,
+        details={"axes": axes, "log_posterior": log_posterior, "marginals": marginals},
     )

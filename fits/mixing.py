@@ -8,16 +8,17 @@ Names of parameters are those of the sky ("dust.beta_dust"), and of bands:
 * "angle.<band>": rotation of its polarization, Q + iU times exp(2i angle) [deg]; 0
 """
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from fits.template_likelihood import NamedBands
-from jaxsky import Sky, parameter_names, set_parameters
-from jaxsky.bandpass import Samples, average
+from jaxsky import Bandpass, Sky, parameter_names, set_parameters
+from jaxsky.bandpass import Samples, average, stack_bands
 from jaxsky.checks import Numeric
 from jaxsky.interpolation import band_seds, choose_nodes
 from jaxsky.sed import cmb_derivative
@@ -38,19 +39,69 @@ def spectral_names(sky: Sky) -> tuple[str, ...]:
     return tuple(n for n in parameter_names(sky) if n.split(".")[1] not in NOT_SPECTRAL)
 
 
-class SpectralBands(NamedBands):
-    """Named bands with the parameters that act on their mixing matrix."""
+def named_bands(bands: Mapping[str, Bandpass] | Sequence[Bandpass]) -> dict[str, Bandpass]:
+    """Bands with names; those of a list are called "0", "1", ..."""
+    if isinstance(bands, Mapping):
+        return dict(bands)
+    return {str(i): band for i, band in enumerate(bands)}
 
-    def parameter_names(self) -> tuple[str, ...]:
+
+def unit_sky(sky: Sky, stokes: int = 2, mask: Float[np.ndarray, " pix"] | None = None) -> Sky:
+    """The laws of a sky: amplitude 1 in one pixel, parameters that are maps at their mean.
+
+    The mean is weighted with the mask.
+    """
+
+    def reduced(leaf):
+        if leaf.ndim == 2:
+            return jnp.asarray(np.ones((stokes, 1)))
+        return jnp.asarray(np.average(leaf, weights=mask)) if leaf.ndim else leaf.astype(float)
+
+    return jax.tree.map(reduced, sky)
+
+
+class Mixing(eqx.Module):
+    """Mixing matrices as a function of spectral parameters.
+
+    Parameters
+    ----------
+    sky : the laws, on a single pixel
+    bandpasses, names : the bands
+    samples : their frequencies and weights while they are where they should be
+    unit : of the data. A band with data in K_CMB is calibrated on the CMB: shifted or stretched,
+        it shows the CMB as before. In K_RJ it is calibrated on a source of constant antenna
+        temperature.
+    """
+
+    sky: Sky
+    bandpasses: tuple[Bandpass, ...]
+    samples: Samples
+    names: tuple[str, ...] = eqx.field(static=True)
+    unit: str = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, sky: Sky, bands: Mapping[str, Bandpass], unit: str) -> "Mixing":
+        """With bands by name."""
+        seen = tuple(bands.values())
+        return cls(sky, seen, stack_bands(seen), tuple(bands), unit)
+
+    def band_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters of the bands."""
         return tuple(f"{kind}.{band}" for kind in NOMINAL for band in self.names)
 
-    def values(self, kind: str, params: Mapping[str, Numeric]) -> Float[Array, "band ..."]:
+    def laws(self, params: Mapping[str, Numeric]) -> Sky:
+        """The sky with those of the parameters that are of its components."""
+        own = {name: v for name, v in params.items() if name.split(".")[0] in self.sky}
+        return set_parameters(self.sky, own)
+
+    def of_bands(self, kind: str, params: Mapping[str, Numeric]) -> Float[Array, "band ..."]:
         """Parameters of one kind in all bands."""
         given = [params.get(f"{kind}.{band}", NOMINAL[kind]) for band in self.names]
         return jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, given)))
 
-    def moved(self, samples: Samples, params: Mapping[str, Numeric]) -> Samples:
+    def _moved(self, params: Mapping[str, Numeric]) -> Samples:
         """Frequencies and weights of the bands, those with parameters shifted and stretched."""
+        samples = self.samples
         for i, (name, band) in enumerate(zip(self.names, self.bandpasses, strict=True)):
             if not {f"width.{name}", f"shift.{name}"} & set(params):
                 continue
@@ -63,84 +114,57 @@ class SpectralBands(NamedBands):
             )
         return samples
 
-
-class Mixing(eqx.Module):
-    """Mixing matrices as a function of spectral parameters.
-
-    Parameters
-    ----------
-    sky : the laws, on a single pixel
-    bands : the bands
-    samples : their frequencies and weights while they are where they should be
-    unit : of the data. A band with data in K_CMB is calibrated on the CMB: shifted or stretched,
-        it shows the CMB as before. In K_RJ it is calibrated on a source of constant antenna
-        temperature.
-    """
-
-    sky: Sky
-    bands: SpectralBands
-    samples: Samples
-    unit: str = eqx.field(static=True)
-
-    @property
-    def components(self) -> tuple[str, ...]:
-        """Names of the components, in order."""
-        return tuple(self.sky)
-
-    def _calibrated(self, laws, bands):
-        """Rows of the matrix in units of the data: amplitudes are uK."""
+    def _calibrated(self, laws, samples, params):
+        """Rows of the matrix (band, component) in units of the data: amplitudes are uK."""
         size, kind = parse_unit(self.unit)
         factor = jnp.asarray(1e-6 / size)
         if kind == "K_CMB":
-            factor = factor / jax.vmap(lambda b: average(cmb_derivative, b))(bands)[:, None]
-        return laws * factor
+            factor = factor / jax.vmap(lambda b: average(cmb_derivative, b))(samples)[:, None]
+        return laws * factor * self.of_bands("gain", params)[:, None]
 
-    def one(self, params: Mapping[str, Array]) -> Float[Array, "band component"]:
+    def one(self, params: Mapping[str, Numeric]) -> Float[Array, "band component"]:
         """The matrix for parameters that are numbers."""
-        sky = set_parameters(self.sky, self.bands.sky_parameters(params))
-        bands = self.bands.moved(self.samples, params)
-        laws = [jax.vmap(lambda b, c=c: average(c.sed, b))(bands) for c in sky.components.values()]
-        matrix = self._calibrated(jnp.stack(laws, axis=-1), bands)
-        return matrix * self.bands.values("gain", params)[:, None]
+        samples = self._moved(params)
+        laws = [
+            jax.vmap(lambda band, c=c: average(c.sed, band))(samples)
+            for c in self.laws(params).components.values()
+        ]
+        return self._calibrated(jnp.stack(laws, axis=-1), samples, params)
 
     def _interpolated(self, params, cells) -> Float[Array, "cell band component"]:
         """The matrix in many cells; bands must not move."""
-        amplitude = jnp.ones((2, cells))
-        names = list(self.sky)
-        wide = eqx.tree_at(
-            lambda s: [s[n].amplitude for n in names], self.sky, [amplitude] * len(names)
-        )
-        wide = set_parameters(wide, self.bands.sky_parameters(params))
+        wide = jax.tree.map(lambda x: jnp.ones((2, cells)) if x.ndim == 2 else x, self.sky)
         columns = []
-        for component in wide.components.values():
-            nodes = choose_nodes(component, self.bands.bandpasses, TOLERANCE)
+        for component in dataclasses.replace(self, sky=wide).laws(params).components.values():
+            nodes = choose_nodes(component, self.bandpasses, TOLERANCE)
             laws = band_seds(component, self.samples, nodes)
-            columns.append(jnp.broadcast_to(laws, (cells, len(self.bands.names))))
-        stacked = jnp.stack(columns, axis=-1)
-        matrix = jax.vmap(lambda m: self._calibrated(m, self.samples))(stacked)
-        gain = self.bands.values("gain", params)
-        return matrix * jnp.broadcast_to(gain.T, (cells, len(gain)))[..., None]
+            columns.append(jnp.broadcast_to(laws, (cells, len(self.names))))
+        return jax.vmap(lambda laws, own: self._calibrated(laws, self.samples, own))(
+            jnp.stack(columns, axis=-1), params
+        )
 
     def __call__(
         self, params: Mapping[str, Float[Array, " cell"]], cells: int
     ) -> Float[Array, "cell band component"]:
         """The matrices of cells with their own parameters; those not given keep their values."""
+        params = dict(params)
         moving = any(name.split(".")[0] in ("shift", "width") for name in params)
         if cells > CELLS and not moving:
             return self._interpolated(params, cells)
         if not params:
-            return jnp.broadcast_to(self.one({}), (cells, *jax.eval_shape(self.one, {}).shape))
+            one = self.one({})
+            return jnp.broadcast_to(one, (cells, *one.shape))
         if cells == 1:
             return self.one({name: value[0] for name, value in params.items()})[None]
         if cells <= CELLS:
-            return jax.vmap(lambda p: self.one(p))(dict(params))
-        return jax.lax.map(jax.checkpoint(lambda p: self.one(p)), dict(params), batch_size=CELLS)
+            return jax.vmap(lambda p: self.one(p))(params)
+        return jax.lax.map(jax.checkpoint(lambda p: self.one(p)), params, batch_size=CELLS)
 
     def rotated(
         self, matrix: Float[Array, "cell band component"], params: Mapping[str, Array]
     ) -> Float[Array, "cell row unknown"]:
         """The matrix for Q and U together: rows Q of all bands, then U; unknowns likewise."""
-        angle = 2 * jnp.deg2rad(self.bands.values("angle", params))
-        angle = angle.reshape(len(self.bands.names), -1).T[..., None]
+        angle = 2 * jnp.deg2rad(self.of_bands("angle", params))
+        angle = angle.reshape(len(self.names), -1).T[..., None]
         cosine, sine = jnp.cos(angle) * matrix, jnp.sin(angle) * matrix
         return jnp.block([[cosine, -sine], [sine, cosine]])

@@ -22,10 +22,9 @@ from jaxtyping import Array, Float
 
 from fits.amplitudes import Pixels
 from fits.compress import Layout
-from fits.mixing import spectral_names
+from fits.mixing import named_bands, spectral_names
 from fits.noise import bare
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
-from fits.template_likelihood import named_bands
 from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.checks import UNSEEN, Numeric, check_double, check_finite
 from jaxsky.harmonics import (

@@ -43,8 +43,8 @@ class Response:
         self._posterior = posterior = Posterior(like, priors or {})
         self.theta = np.array(like.flat(like.check(params)))
         self._keep = np.flatnonzero(posterior.present & ~posterior.edges(self.theta))
-        curvature = posterior.curvature(self.theta, posterior.exact(self.theta), self._keep)
-        self._factor = Factor(curvature)
+        hessian = posterior.derivatives(self.theta).hessian
+        self._factor = Factor(posterior.curvature(self.theta, hessian, self._keep))
         if not self._factor.positive:
             raise ValueError("The best fit is no maximum of the posterior.")
 

@@ -17,18 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import scipy.sparse
-from jaxtyping import Float
+from jaxtyping import Array, Float, Int
 
 from fits.posterior import Likelihood, Matrix, Posterior, prior_terms
-from fits.priors import (
-    Prior,
-    at_edge,
-    bounds,
-    check_priors,
-    from_unbounded,
-    prior_residuals,
-    to_unbounded,
-)
+from fits.priors import Gaussian, Prior, check_priors
 from fits.results import FitResult, help_by_prior
 from fits.systems import Factor, degenerate, variances
 from jaxsky.checks import Numeric
@@ -72,13 +64,11 @@ class Newton(NamedTuple):
             moving = np.flatnonzero(posterior.present & ~blocked)
             if not moving.size:
                 return theta, step
-            local = posterior.exact(theta)
-            matrix = posterior.curvature(theta, local, moving)
+            matrix = posterior.curvature(theta, posterior.derivatives(theta).hessian, moving)
             factor = Factor(matrix)
             exact = factor.positive
             if not exact:
-                local = posterior.convex(theta, local)
-                matrix = posterior.curvature(theta, local, moving)
+                matrix = posterior.curvature(theta, posterior.convex(theta), moving)
                 factor = Factor(matrix)
             slope = gradient[moving]
             newton = factor.solve(-slope) if factor.positive else None
@@ -114,73 +104,84 @@ class Newton(NamedTuple):
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | Newton
 
 
+class _Search(NamedTuple):
+    """A posterior in the scaled numbers without bounds that solvers of optimistix move in.
+
+    Regions without a pixel are left out: some solvers do not bear what has no effect.
+    """
+
+    like: Likelihood
+    priors: list[tuple[Prior, Array]]
+    theta: Float[Array, " all"]
+    present: Int[np.ndarray, " par"]
+    scale: Float[np.ndarray, " par"]
+    low: Float[np.ndarray, " par"]
+    width: Float[np.ndarray, " par"]
+
+
 @jax.jit
-def _params(unbounded, args):
-    """Parameters by name and as a vector, from scaled numbers without bounds."""
-    like, priors, theta, present, scale = args
-    within = from_unbounded({name: v * scale[name] for name, v in unbounded.items()}, priors)
-    flat = jnp.concatenate([jnp.atleast_1d(within[name]) for name in like.free])
-    return within, theta.at[present].set(flat)
+def _theta(numbers, search):
+    """The vector of all parameters, those with a uniform prior at low + (high-low)(1+sin u)/2.
+
+    As in MINUIT: smooth, and flat at the edge, so that an optimum at the edge is a minimum in u.
+    """
+    u = numbers * search.scale
+    inside = search.low + search.width * (1 + jnp.sin(u)) / 2
+    return search.theta.at[search.present].set(jnp.where(search.width > 0, inside, u))
 
 
-def _residuals(unbounded, args):
-    like, priors, *_ = args[0]
-    within, theta = _params(unbounded, args[0])
-    return jnp.concatenate([like.residuals(like.named(theta)), prior_residuals(within, priors)])
+def _residuals(numbers, search):
+    theta = _theta(numbers, search)
+    of_priors = [jnp.where(own, (theta - p.mean) / p.sigma, 0.0) for p, own in search.priors]
+    return jnp.concatenate([search.like.residuals(search.like.named(theta)), *of_priors])
 
 
-def _objective(unbounded, args):
-    inputs, rows = args
-    like = inputs[0]
-    theta = _params(unbounded, inputs)[1]
-    return like.total(theta[like.cells()]) / 2 + prior_terms(theta, rows)[0]
+def _objective(numbers, search):
+    theta = _theta(numbers, search)
+    of_data = search.like.total(theta[search.like.cells()]) / 2
+    return of_data + prior_terms(theta, search.priors)[0]
 
 
 def _sizes(posterior: Posterior) -> np.ndarray:
     """Standard deviations at the start, in the numbers in which uniform priors have no bounds."""
     theta = posterior.start
-    local = posterior.convex(theta, posterior.exact(theta))
-    diagonal = posterior.curvature(theta, local).diagonal()
+    diagonal = posterior.curvature(theta, posterior.convex(theta)).diagonal()
     with np.errstate(divide="ignore", invalid="ignore"):
         size = np.where(diagonal > 0, 1 / np.sqrt(diagonal), np.maximum(np.abs(theta), 1.0))
         slope = np.sqrt((theta - posterior.low) * (posterior.high - theta))
         return np.where(np.isfinite(slope), np.minimum(size / slope, 1.0), size)
 
 
-def _searched(
-    posterior: Posterior, priors: Mapping[str, Prior], solver: Solver, max_steps: int
-) -> tuple[np.ndarray, int]:
+def _searched(posterior: Posterior, solver: Solver, max_steps: int) -> tuple[np.ndarray, int]:
     """What a solver of optimistix finds, and the number of its steps."""
-    like, theta = posterior.like, posterior.start
-    # Regions without a pixel are left out: some solvers do not bear what has no effect.
-    present = np.flatnonzero(posterior.present)
-    where = {n: present[posterior.owner[present] == i] for i, n in enumerate(like.free)}
-    unbounded = to_unbounded({name: theta[own] for name, own in where.items()}, priors)
     least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
-    if least_squares:
-        scale = {name: np.maximum(np.abs(value), 1e-3) for name, value in unbounded.items()}
-    else:
-        size = _sizes(posterior)
-        scale = {name: size[own] for name, own in where.items()}
-    scaled = {name: value / scale[name] for name, value in unbounded.items()}
-    inputs = (like, dict(priors), jnp.asarray(theta), present, scale)
-    rows = [] if least_squares else posterior.priors
+    for prior, own in posterior.priors:
+        if least_squares and not isinstance(prior, Gaussian):
+            raise TypeError(
+                f"Least squares takes uniform and Gaussian priors, not the {type(prior).__name__} "
+                f"of {posterior.names[int(np.argmax(own))]!r}."
+            )
+    present = np.flatnonzero(posterior.present)
+    start, low, high = (x[present] for x in (posterior.start, posterior.low, posterior.high))
+    bounded = np.isfinite(low)
+    low, width = np.where(bounded, low, 0.0), np.where(bounded, high - low, 0.0)
+    unit = (start - low) / np.where(bounded, width, 1.0)
+    u = np.where(bounded, np.arcsin(np.where(bounded, 2 * unit - 1, 0.0)), start)
+    scale = np.maximum(np.abs(u), 1e-3) if least_squares else _sizes(posterior)[present]
+    theta = jnp.asarray(posterior.start)
+    search = _Search(posterior.like, posterior.priors, theta, present, scale, low, width)
 
-    def solve(scaled):
+    def solve(numbers):
         run: Callable[..., optx.Solution] = optx.least_squares if least_squares else optx.minimise
         function = _residuals if least_squares else _objective
-        solution = run(
-            function, solver, scaled, args=(inputs, rows), max_steps=max_steps, throw=False
-        )
-        return solution, np.asarray(_params(solution.value, inputs)[1])
+        solution = run(function, solver, numbers, args=search, max_steps=max_steps, throw=False)
+        return solution, np.asarray(_theta(solution.value, search))
 
-    solution, found = solve(scaled)
-    edges = {n: at_edge(found[own], *bounds(n, priors)) for n, own in where.items()}
-    if any(edge.any() for edge in edges.values()):
+    solution, found = solve(jnp.asarray(u / scale))
+    edges = posterior.edges(found)[present]
+    if edges.any():
         # The range is flat at its edge, so a step that reached it too early has stuck there.
-        solution, found = solve(
-            {name: jnp.where(edges[name], 0.0, value) for name, value in solution.value.items()}
-        )
+        solution, found = solve(jnp.where(edges, 0.0, solution.value))
     return found, int(solution.stats["num_steps"])
 
 
@@ -235,8 +236,7 @@ def best_fit(
             f"fits.Newton(), not {type(solver).__name__}."
         )
     like = like.at(start)
-    priors = check_priors(priors, like.free)
-    posterior = Posterior(like, priors)
+    posterior = Posterior(like, check_priors(priors, like.free))
     if solver is None and like.profiled:
         solver = Newton()
     elif solver is None:
@@ -244,15 +244,14 @@ def best_fit(
     if isinstance(solver, Newton):
         theta, steps = solver.minimise(posterior, max_steps)
     else:
-        theta, steps = _searched(
-            posterior, priors, solver, MAX_STEPS if max_steps is None else max_steps
-        )
+        theta, steps = _searched(posterior, solver, MAX_STEPS if max_steps is None else max_steps)
 
     # From here on, nothing depends on how the optimum was found.
     edges = posterior.edges(theta)
     keep = np.flatnonzero(posterior.present & ~edges)
-    matrix = posterior.curvature(theta, posterior.exact(theta), keep)
-    scatter = posterior.curvature(theta, np.asarray(posterior.derivatives(theta).fisher), keep)
+    found = posterior.derivatives(theta)
+    matrix = posterior.curvature(theta, found.hessian, keep)
+    scatter = posterior.curvature(theta, found.fisher, keep)
     unknown = degenerate(matrix, [posterior.labels[i] for i in keep]) if keep.size else []
     factor = Factor(matrix)
     spread = scatter if like.profiled else matrix
@@ -269,7 +268,7 @@ def best_fit(
         interval_68={n: (values[n] - errors[n], values[n] + errors[n]) for n in values},
         labels=posterior.labels,
         covariance=covariance,
-        chi2=2 * float(posterior.derivatives(theta).value.sum()),
+        chi2=2 * float(found.value.sum()),
         dof=like.dof(int(posterior.present.sum())),
         converged=message == "converged",
         message=message,

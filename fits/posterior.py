@@ -17,12 +17,14 @@ import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
 from fits.amplitudes import Derivatives
-from fits.priors import Gaussian, Prior, Uniform, at_edge, bounds, to_unbounded
+from fits.priors import Gaussian, Prior, Uniform
 from fits.systems import assembled
 from jaxsky.checks import Numeric, as_array
 
 #: Dense, or sparse for many parameters.
 Matrix: TypeAlias = np.ndarray | scipy.sparse.csc_matrix
+#: A value this close to the edge of a uniform prior, in units of its width, is at the edge.
+EDGE = 1e-4
 
 
 class Likelihood(eqx.Module):
@@ -158,57 +160,50 @@ def prior_terms(theta, priors):
 class Posterior:
     """-log posterior of the parameters that any cell has, within bounds.
 
-    Parameters
-    ----------
-    like : the likelihood
-    priors : priors by name, the same in each region; uniform ones are bounds
-
-    Attributes
-    ----------
-    start : the vector to start from
-    names, labels : of each parameter: its name, and name and region ("dust.beta_dust[3]")
-    present : True for parameters of regions with pixels
-    low, high : bounds of each parameter
-    priors : the others, with the parameters that they are for
+    `names` and `labels` of each parameter are its name, and name and region ("dust.beta_dust[3]");
+    `present` is true for regions with pixels; `low` and `high` are bounds, those of uniform priors,
+    and `priors` the others, with the parameters that they are for.
     """
 
     def __init__(self, like: Likelihood, priors: Mapping[str, Prior]) -> None:
-        to_unbounded(like.start, priors)  # the start is inside
         self.like = like
         self.start = np.array(like.flat({}))
         #: The last vector that derivatives were asked for, and what they are.
         self._last: tuple[bytes, Derivatives] | None = None
-        sizes = {name: like.start[name].size for name in like.free}
-        self.owner = np.repeat(np.arange(len(sizes)), list(sizes.values()))
+        self.owner = np.repeat(np.arange(len(like.free)), [like.start[n].size for n in like.free])
         self.names = tuple(like.free[i] for i in self.owner)
         self.index = np.asarray(like.cells())
         self.present = np.zeros(len(self.owner), bool)
         self.present[self.index] = True
-        limits = np.array([bounds(name, priors) for name in like.free]).reshape(-1, 2)
-        self.low, self.high = limits[self.owner].T
-        self.priors = [
-            (prior, jnp.asarray(self.present & (self.owner == like.free.index(name))))
-            for name, prior in priors.items()
-            if not isinstance(prior, Uniform)
-        ]
+        self.low, self.high = np.full((2, len(self.owner)), [[-np.inf], [np.inf]])
+        self.priors: list[tuple[Prior, Array]] = []
+        for name, prior in priors.items():
+            own = self.owner == like.free.index(name)
+            if not isinstance(prior, Uniform):
+                self.priors.append((prior, jnp.asarray(self.present & own)))
+                continue
+            self.low[own], self.high[own] = prior.low, prior.high
+            outside = own & ~((prior.low < self.start) & (self.start < prior.high))
+            if outside.any():
+                raise ValueError(
+                    f"Start value {self.start[outside][0]:g} of {name!r} is not inside its uniform "
+                    f"prior {prior.low:g} ... {prior.high:g}."
+                )
 
     def named(self, theta: Float[np.ndarray, " par"]) -> dict[str, Any]:
         """Values by name, numbers or arrays; NaN for regions without pixels."""
-        theta = np.where(self.present, theta, np.nan)
-        shaped = {
-            name: np.asarray(value) for name, value in self.like.named(jnp.asarray(theta)).items()
-        }
-        return {name: float(v) if v.ndim == 0 else v for name, v in shaped.items()}
+        shaped = self.like.named(jnp.asarray(np.where(self.present, theta, np.nan)))
+        return {name: np.asarray(v) if v.ndim else float(v) for name, v in shaped.items()}
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Name, and region if it has several, of each parameter."""
-        labels = []
-        for i, name in enumerate(self.like.free):
-            regions = np.flatnonzero(self.owner == i) - np.argmax(self.owner == i)
-            single = self.like.start[name].ndim == 0
-            labels += [name if single else f"{name}[{k}]" for k in regions]
-        return tuple(labels)
+        start = self.like.start
+        return tuple(
+            f"{name}[{k}]" if start[name].ndim else name
+            for name in self.like.free
+            for k in range(start[name].size)
+        )
 
     def where(self, bad: Bool[np.ndarray, " par"]) -> str:
         """Names of parameters, with the regions and pixels that they are of."""
@@ -248,25 +243,22 @@ class Posterior:
         return value, gradient
 
     def curvature(
-        self, theta: np.ndarray, local: np.ndarray, keep: np.ndarray | None = None
+        self, theta: np.ndarray, local: Array | np.ndarray, keep: np.ndarray | None = None
     ) -> Matrix:
         """The matrix of all parameters, or those to keep, from those of the cells and priors."""
         diagonal = np.zeros(len(theta))
         if self.priors:
             diagonal = np.asarray(prior_terms(theta, self.priors)[2])
-        matrix = assembled(local, self.index, len(theta), diagonal)
+        matrix = assembled(np.asarray(local), self.index, len(theta), diagonal)
         if keep is None:
             return matrix
         return (
             matrix[np.ix_(keep, keep)] if isinstance(matrix, np.ndarray) else matrix[keep][:, keep]
         )
 
-    def exact(self, theta: np.ndarray) -> np.ndarray:
-        """Second derivatives of -ln L in each cell."""
-        return np.asarray(self.derivatives(theta).hessian)
-
-    def convex(self, theta: np.ndarray, exact: np.ndarray) -> np.ndarray:
-        """Matrices of cells, those that are not positive replaced by Fisher matrices."""
+    def convex(self, theta: np.ndarray) -> np.ndarray:
+        """Second derivatives of each cell; Fisher matrices where these are not positive."""
+        exact = np.asarray(self.derivatives(theta).hessian)
         usable = np.isfinite(exact).all(axis=(1, 2))
         safe = np.where(usable[:, None, None], exact, 0)
         diagonal = np.einsum("cii->ci", safe)
@@ -285,4 +277,6 @@ class Posterior:
 
     def edges(self, theta: np.ndarray) -> Bool[np.ndarray, " par"]:
         """Parameters that lie at an edge of their uniform prior."""
-        return self.present & at_edge(theta, self.low, self.high)
+        near = np.minimum(np.abs(theta - self.low), np.abs(theta - self.high))
+        width = np.where(np.isfinite(self.high), self.high - self.low, 0.0)
+        return self.present & (near < EDGE * width)

@@ -1,21 +1,18 @@
-"""Priors on parameters, and the map from unbounded numbers to their range."""
+"""Priors on parameters."""
 
 from collections.abc import Iterable, Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
 from jaxsky.checks import Numeric
 from jaxsky.settings import Experiment
 
-#: A value this close to the edge of a uniform prior, in units of its width, is at the edge.
-EDGE = 1e-4
-
 
 class Prior(eqx.Module):
-    """Base class: a log-density up to a constant, and its share of a sum of squares."""
+    """Base class of priors on a parameter."""
 
     def log_density(self, value: Numeric) -> Array:
         """Log-density up to a constant; -inf outside the range."""
@@ -76,11 +73,6 @@ class Gaussian(Prior):
         return -0.5 * ((value - self.mean) / self.sigma) ** 2
 
 
-def log_prior(params: Mapping[str, Numeric], priors: Mapping[str, Prior]) -> Float[Array, ""]:
-    """Sum of the log-densities of the parameters that have a prior."""
-    return sum((p.log_density(params[name]) for name, p in priors.items()), jnp.zeros(()))
-
-
 def priors_of(settings: Experiment, command: str) -> dict[str, Prior]:
     """Priors of the free parameters of a command that have one."""
     priors: dict[str, Prior] = {}
@@ -101,63 +93,3 @@ def check_priors(priors: Mapping[str, Prior] | None, free: Iterable[str]) -> dic
                 f"There is a prior for {name!r}, which is not free; free are {', '.join(free)}."
             )
     return dict(priors or {})
-
-
-def prior_residuals(
-    params: Mapping[str, Numeric], priors: Mapping[str, Prior]
-) -> Float[Array, " gaussian"]:
-    """(value - mean)/sigma of the Gaussian priors: their sum of squares is -2 log_prior."""
-    rows = []
-    for name, p in priors.items():
-        if isinstance(p, Gaussian):
-            rows.append(jnp.ravel((params[name] - p.mean) / p.sigma))
-        elif not isinstance(p, Uniform):
-            raise TypeError(
-                f"Least squares takes uniform and Gaussian priors, not the {type(p).__name__} of "
-                f"{name!r}."
-            )
-    return jnp.concatenate(rows) if rows else jnp.zeros(0)
-
-
-def bounds(name: str, priors: Mapping[str, Prior]) -> tuple[float, float]:
-    """Range of a parameter; infinite without a uniform prior."""
-    prior = priors.get(name)
-    return (prior.low, prior.high) if isinstance(prior, Uniform) else (-np.inf, np.inf)
-
-
-def at_edge(value: Numeric, low: Numeric, high: Numeric) -> Bool[np.ndarray, "*shape"]:
-    """Whether values lie at an edge of their range; never if that is infinite."""
-    low, high = np.asarray(low), np.asarray(high)
-    width = np.where(np.isfinite(low) & np.isfinite(high), high - low, 0.0)
-    value = np.asarray(value)
-    return np.minimum(np.abs(value - low), np.abs(value - high)) < EDGE * width
-
-
-def from_unbounded(
-    params: Mapping[str, Numeric], priors: Mapping[str, Prior]
-) -> dict[str, Numeric]:
-    """Parameters within their uniform priors from unbounded ones, low + (high-low)(1+sin u)/2.
-
-    As in MINUIT: smooth, and flat at the edge, so that an optimum at the edge is a minimum in u.
-    """
-    result = dict(params)
-    for name, p in priors.items():
-        if isinstance(p, Uniform) and name in result:
-            result[name] = p.low + (p.high - p.low) * (1 + jnp.sin(result[name])) / 2
-    return result
-
-
-def to_unbounded(params: Mapping[str, Numeric], priors: Mapping[str, Prior]) -> dict[str, Numeric]:
-    """The inverse of `from_unbounded`."""
-    result = dict(params)
-    for name, p in priors.items():
-        if isinstance(p, Uniform) and name in result:
-            value = np.asarray(result[name])
-            outside = ~((p.low < value) & (value < p.high))
-            if outside.any():
-                raise ValueError(
-                    f"Start value {value[outside].flat[0]:g} of {name!r} is not inside its uniform "
-                    f"prior {p.low:g} ... {p.high:g}."
-                )
-            result[name] = np.arcsin(2 * (value - p.low) / (p.high - p.low) - 1)
-    return result

@@ -22,13 +22,11 @@ from jaxtyping import Array, Float, Int
 from fits import amplitudes
 from fits.amplitudes import Pixels
 from fits.compress import Layout, compressed, gathered, layouts, used_pixels
-from fits.mixing import Mixing, SpectralBands, spectral_names
+from fits.mixing import Mixing, named_bands, spectral_names, unit_sky
 from fits.noise import Noise, as_noise, bare
 from fits.posterior import Likelihood
 from fits.regions import Cells, check_labels, intersections
-from fits.template_likelihood import named_bands
-from jaxsky import Bandpass, Component, Sky, get_parameters, set_parameters
-from jaxsky.bandpass import Samples, stack_bands
+from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.checks import Numeric, as_array, check_double, check_finite
 from jaxsky.sky import check_parameter, unknown_parameter
 from jaxsky.units import parse_unit
@@ -43,41 +41,33 @@ class SpectralLikelihood(Likelihood):
     Parameters
     ----------
     start : values of the free parameters
-    sky : the laws, on a single pixel
-    bands, samples : the bands, and their frequencies and weights
+    mixing : the mixing matrix as a function of parameters
     fixed : parameters that are maps and not free, in each cell
     index : position of each free parameter of each cell in the vector of all
     pixels : data and weights, for each of `layout`
     block_cell : cell of each block of pixels; None if they are in order
     of_pixel : cell of each pixel, -1 where masked; None if there is only one
     layout : Stokes parameters of `pixels`
-    unit : of the data
+    stokes : those of the data
     values : number of data less that of amplitudes
     weightless : bands that add nothing to what the others tell, and are not counted
     """
 
-    sky: Sky
-    bands: SpectralBands
-    samples: Samples
+    mixing: Mixing
     fixed: dict[str, Float[Array, " cell"]]
     index: Int[Array, "cell free"]
     pixels: tuple[Pixels, ...]
     block_cell: Int[Array, " block"] | None
     of_pixel: Int[Array, " pix"] | None
     layout: tuple[Layout, ...] = eqx.field(static=True)
-    unit: str = eqx.field(static=True)
+    stokes: str = eqx.field(static=True)
     values: int = eqx.field(static=True)
     weightless: tuple[str, ...] = eqx.field(static=True)
 
     profiled = True
 
-    @property
-    def mixing(self) -> Mixing:
-        """The mixing matrix as a function of parameters."""
-        return Mixing(self.sky, self.bands, self.samples, self.unit)
-
     def check(self, params):
-        known = (*spectral_names(self.sky), *self.bands.parameter_names())
+        known = (*spectral_names(self.mixing.sky), *self.mixing.band_parameters())
         for name, value in params.items():
             if name not in known:
                 raise unknown_parameter(name, known)
@@ -173,32 +163,20 @@ class SpectralLikelihood(Likelihood):
         return jnp.concatenate([part.ravel() for part in parts])
 
 
-def _unit_sky(sky: Sky) -> tuple[Sky, dict[str, np.ndarray]]:
-    """The laws on a single pixel, with numbers in the place of maps; and those maps."""
-    names = spectral_names(sky)
-    maps = {n: np.asarray(v) for n, v in get_parameters(sky, names).items() if v.ndim}
-    numbers = set_parameters(sky, {name: float(np.mean(v)) for name, v in maps.items()})
-
-    def reduced(leaf):
-        return jnp.ones((2, 1)) if leaf.ndim == 2 else leaf.astype(float).ravel()[:1].reshape(())
-
-    return jax.tree.map(reduced, numbers), maps
-
-
 def _check_start(
-    sky: Sky, bands: SpectralBands, start: Mapping[str, Numeric], labels: Mapping[str, Numeric]
+    mixing: Mixing, start: Mapping[str, Numeric], labels: Mapping[str, Numeric]
 ) -> None:
-    spectral = spectral_names(sky)
-    known = (*spectral, *bands.parameter_names())
+    spectral, of_bands = spectral_names(mixing.sky), mixing.band_parameters()
+    known = (*spectral, *of_bands)
     for name in (*start, *labels):
         if name not in known:
             raise unknown_parameter(name, known)
         if name in start and name in spectral:
-            check_parameter(sky, name, name, as_array(name, start[name]))
+            check_parameter(mixing.sky, name, name, as_array(name, start[name]))
     for name in labels:
         if name not in start:
             raise ValueError(f"There are labels for {name!r}, which is not in `start`.")
-        if name in bands.parameter_names():
+        if name in of_bands:
             raise ValueError(f"Parameter {name!r} of a band cannot vary between regions.")
 
 
@@ -288,15 +266,15 @@ def spectral_likelihood(
             f"{len(bands)} bands are too few: amplitudes of {components} components take as many, "
             "and their laws one more."
         )
-    own = SpectralBands(tuple(bands.values()), tuple(bands), "QU" if data.shape[1] == 2 else "IQU")
-    _check_start(sky, own, start, labels or {})
+    mixing = Mixing.of(unit_sky(sky), bands, unit)
+    _check_start(mixing, start, labels or {})
     noise = as_noise(noise, data.shape)
     used = used_pixels(noise, data.shape[-1], components)
     maps = {n: check_labels(n, v, used.size, used) for n, v in (labels or {}).items()}
     values = _start_values(start, maps)
 
-    unit_sky, fixed = _unit_sky(sky)
-    fixed = {name: value for name, value in fixed.items() if name not in start}
+    held = get_parameters(sky, [name for name in spectral_names(sky) if name not in start])
+    fixed = {name: np.asarray(value) for name, value in held.items() if value.ndim}
     varying = dict(maps)
     for name, value in fixed.items():
         if value.shape != used.shape:
@@ -310,16 +288,14 @@ def spectral_likelihood(
     angles = any(name.startswith("angle.") for name in start)
     like = SpectralLikelihood(
         values,
-        unit_sky,
-        own,
-        stack_bands(own.bandpasses),
+        mixing,
         {name: jnp.asarray(value[first]) for name, value in fixed.items()},
         _index(values, cells),
         (),
         None,
         None if cells.of_pixel is None else jnp.asarray(cells.of_pixel),
         layouts(data.shape[1], angles or noise.covariance is not None),
-        unit,
+        "QU" if data.shape[1] == 2 else "IQU",
         0,
         (),
     )
@@ -377,7 +353,7 @@ def _check_matrices(like: SpectralLikelihood) -> np.ndarray:
         raise ValueError("The laws are not finite at the start values.")
     if np.linalg.svd(matrix, compute_uv=False)[:, -1].min() < 1e-7:
         raise ValueError(
-            f"The components {', '.join(like.sky)} cannot be told apart at the start values: "
-            "their laws are the same in these bands."
+            f"The components {', '.join(like.mixing.sky)} cannot be told apart at the start "
+            "values: their laws are the same in these bands."
         )
     return given

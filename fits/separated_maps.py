@@ -113,7 +113,7 @@ def _passes(like: SpectralLikelihood, params: Mapping[str, Numeric], npix: int) 
 
 def _check_data(like: SpectralLikelihood, data: Numeric) -> np.ndarray:
     data = bare("data", data)
-    wanted = (len(like.bands.names), len(like.bands.stokes))
+    wanted = (len(like.mixing.names), len(like.stokes))
     good = data.ndim == 3 and data.shape[:2] == wanted
     check_shape("data", data, good, f"have shape (band, stokes, pix) = {(*wanted, 'pix')}")
     return data
@@ -142,7 +142,7 @@ def component_maps(
         For unknown parameters, and what `spectral_likelihood` refuses.
     """
     data = _check_data(like, data)
-    names, (_, stokes, npix) = tuple(like.sky), data.shape
+    names, (_, stokes, npix) = tuple(like.mixing.sky), data.shape
     noise = as_noise(noise, data.shape)
     used = used_pixels(noise, npix, len(names))
     amplitude = np.empty((len(names), stokes, npix))
@@ -181,7 +181,7 @@ def emission_maps(
     amplitude: Float[np.ndarray, "component stokes pix"],
 ) -> Float[np.ndarray, "band stokes pix"]:
     """What components show in the bands, in the unit of the data, from maps or coefficients."""
-    result = np.empty((len(like.bands.names), *amplitude.shape[1:]))
+    result = np.empty((len(like.mixing.names), *amplitude.shape[1:]))
     for layout, part, matrix in _passes(like, params, amplitude.shape[-1]):
         rows = layout.rows(amplitude[..., part])
         if len(matrix) == 1:
@@ -268,10 +268,10 @@ def harmonic_component_maps(
             f"Argument `like` has regions, {len(like.index)} in all, but in the harmonic domain "
             "parameters are the same on all of the sky."
         )
-    names, alm = tuple(like.sky), check_alm(alm, len(like.bands.names))
-    if alm.shape[1] != len(like.bands.stokes):
+    names, alm = tuple(like.mixing.sky), check_alm(alm, len(like.mixing.names))
+    if alm.shape[1] != len(like.stokes):
         raise ValueError(
-            f"Argument `alm` must have {len(like.bands.stokes)} rows a band like the data of "
+            f"Argument `alm` must have {len(like.stokes)} rows a band like the data of "
             f"`like`, but has {alm.shape[1]}."
         )
     multipoles = multipoles_of(alm, noise, beams, len(names), lmin, lmax)

@@ -16,8 +16,8 @@ Names of parameters are those of the sky ("dust.beta_dust"), "calibration.<band>
 the model in a band, and "offset.<band>.<stokes>", a constant added to it [uK_RJ].
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -28,8 +28,9 @@ import scipy.linalg
 from jaxtyping import Array, Float, Int
 
 from fits.compress import gram, square_root
+from fits.mixing import Mixing, named_bands, unit_sky
 from fits.posterior import Likelihood
-from jaxsky import Bandpass, Sky, observe_components, parameter_names, set_parameters
+from jaxsky import Bandpass, Sky, observe_components, parameter_names
 from jaxsky.checks import UNSEEN, Numeric, as_array, check_double
 from jaxsky.interpolation import NodeCounts, Nodes
 from jaxsky.sky import OFFSET, interpolation_nodes, unknown_parameter
@@ -39,49 +40,33 @@ from jaxsky.sky import OFFSET, interpolation_nodes, unknown_parameter
 CovarianceOf = Callable[[Float[Array, "band row stokes pix"]], Float[np.ndarray, "row row"]]
 
 
-class NamedBands(eqx.Module):
-    """Named bands with their instrumental parameters."""
-
-    bandpasses: tuple[Bandpass, ...]
-    names: tuple[str, ...] = eqx.field(static=True)
-    stokes: str = eqx.field(static=True)
-
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the calibration factors and offsets."""
-        calibrations = [f"calibration.{band}" for band in self.names]
-        return (*calibrations, *(f"offset.{b}.{s}" for b in self.names for s in self.stokes))
-
-    def calibration(self, params: Mapping[str, Array]) -> Float[Array, " band"]:
-        """Calibration factors, 1 unless given."""
-        return jnp.stack([jnp.asarray(params.get(f"calibration.{b}", 1.0)) for b in self.names])
-
-    def offset(self, params: Mapping[str, Array]) -> Float[Array, "band stokes"]:
-        """Offsets [uK_RJ], 0 unless given."""
-        rows = [params.get(f"offset.{b}.{s}", 0.0) for b in self.names for s in self.stokes]
-        return jnp.stack([jnp.asarray(r) for r in rows]).reshape(len(self.names), -1)
-
-    def sky_parameters(self, params: Mapping[str, Array]) -> dict[str, Array]:
-        """The parameters that are not those of the bands."""
-        own = self.parameter_names()
-        return {name: value for name, value in params.items() if name not in own}
-
-
 class SkyLikelihood(Likelihood):
     """Base class of those whose amplitudes are the templates'."""
 
-    sky: Sky
-    bands: NamedBands
+    mixing: Mixing
+    #: Stokes parameters of the maps
+    stokes: str = eqx.field(static=True)
+
+    def calibration(self, params: Mapping[str, Array]) -> Float[Array, " band"]:
+        """Calibration factors, 1 unless given."""
+        return jnp.array([params.get(f"calibration.{band}", 1.0) for band in self.mixing.names])
+
+    def offset(self, params: Mapping[str, Array]) -> Float[Array, "band stokes"]:
+        """Offsets [uK_RJ], 0 unless given."""
+        return jnp.array(
+            [[params.get(f"offset.{b}.{s}", 0.0) for s in self.stokes] for b in self.mixing.names]
+        )
 
     def check(self, params):
-        known = (*parameter_names(self.sky), *self.bands.parameter_names())
         if not params:
             raise ValueError("Argument `start` must name at least one free parameter.")
-        own = self.bands.parameter_names()
+        names = self.mixing.names
+        bands = [f"calibration.{b}" for b in names]
+        bands += [f"offset.{b}.{s}" for b in names for s in self.stokes]
+        of_sky = [n for n in parameter_names(self.mixing.sky) if not n.endswith(".amplitude")]
         for name, value in params.items():
-            target = name.removesuffix(OFFSET)
-            shifted_band = target != name and target in own
-            if target not in known or shifted_band or name.endswith(".amplitude"):
-                raise unknown_parameter(name, [k for k in known if not k.endswith(".amplitude")])
+            if name.removesuffix(OFFSET) not in of_sky and name not in bands:
+                raise unknown_parameter(name, (*of_sky, *bands))
             if jnp.shape(value) != ():
                 raise ValueError(f"Free parameter {name!r} must be a number, not a map.")
         return {name: as_array(name, value).astype(float) for name, value in params.items()}
@@ -90,9 +75,9 @@ class SkyLikelihood(Likelihood):
 class TemplateLikelihood(SkyLikelihood):
     """Likelihood on inner products; for spectral parameters that are constant over the region.
 
-    `sky` has unit amplitudes on a single pixel: what a component shows in a band is then the
-    coefficient of its template. `matrix` turns (1, -coefficients, -offset) of all bands and
-    Stokes parameters into residuals.
+    The sky of `mixing` has unit amplitudes on a single pixel: what a component shows in a band is
+    then the coefficient of its template. `matrix` turns (1, -coefficients, -offset) of all bands
+    and Stokes parameters into residuals.
     """
 
     matrix: Float[Array, "row vector"]
@@ -101,14 +86,13 @@ class TemplateLikelihood(SkyLikelihood):
 
     def coefficients(self, params: Mapping[str, Array]) -> Float[Array, "band stokes template"]:
         """What each template is multiplied with in each band."""
-        sky = set_parameters(self.sky, self.bands.sky_parameters(params))
-        seen = observe_components(sky, self.bands.bandpasses)
-        factors = jnp.stack([maps[..., 0] for maps in seen.values()], axis=-1)
-        return factors * self.bands.calibration(params)[:, None, None]
+        laws = self.mixing.one(params) * self.calibration(params)[:, None]
+        components = self.mixing.laws(params).components.values()
+        return laws[:, None] * jnp.concatenate([c.template for c in components], axis=1)
 
     def residuals(self, params):
         coefficients = self.coefficients(params)
-        offset = self.bands.offset(params)[..., None]
+        offset = self.offset(params)[..., None]
         vector = jnp.concatenate([jnp.ones_like(offset), -coefficients, -offset], axis=-1)
         return self.matrix @ vector.ravel()
 
@@ -125,33 +109,14 @@ class PixelLikelihood(SkyLikelihood):
     values: Int[Array, ""]
 
     def residuals(self, params):
-        sky = set_parameters(self.sky, self.bands.sky_parameters(params))
-        seen = observe_components(sky, self.bands.bandpasses, nodes=self.nodes)
-        model = sum(seen.values()) * self.bands.calibration(params)[:, None, None]
-        model = model + self.bands.offset(params)[..., None]
+        bands = self.mixing.bandpasses
+        seen = observe_components(self.mixing.laws(params), bands, nodes=self.nodes)
+        model = sum(seen.values()) * self.calibration(params)[:, None, None]
+        model = model + self.offset(params)[..., None]
         if self.rows is None:
             return ((self.data - model) * self.root_weights).ravel()
         products = jnp.einsum("brsp,bsp->br", self.rows, self.data - model)
         return jnp.asarray(self.whitening) @ products.ravel()
-
-
-def _unit_sky(sky: Sky) -> Sky:
-    """The sky with amplitudes of one on a single pixel, for its coefficients."""
-    ones = jnp.ones((sky.shape[0], 1), next(iter(sky.components.values())).amplitude.dtype)
-    names = list(sky)
-    return eqx.tree_at(lambda s: [s[n].amplitude for n in names], sky, [ones] * len(names))
-
-
-def _is_uniform(sky: Sky) -> bool:
-    """True if no spectral parameter is a map."""
-    return all(leaf.ndim != 1 for leaf in jax.tree.leaves(sky))
-
-
-def named_bands(bands: Mapping[str, Bandpass] | Sequence[Bandpass]) -> dict[str, Bandpass]:
-    """Bands with names; those of a list are called "0", "1", ..."""
-    if isinstance(bands, Mapping):
-        return dict(bands)
-    return {str(i): band for i, band in enumerate(bands)}
 
 
 def _check_maps(sky: Sky, bands: Mapping[str, Any], data: Array, sigma: Array) -> None:
@@ -234,36 +199,31 @@ def likelihood(
     if not stokes or set(stokes) - set(labels):
         raise ValueError(f"Argument `stokes` must be among {labels!r}, not {stokes!r}.")
     keep = np.array([labels.index(s) for s in stokes])
-    own = NamedBands(tuple(bands.values()), tuple(bands), labels)
-    params = SkyLikelihood({}, sky, own).check(start)
+    mixing = Mixing.of(sky, bands, "uK_RJ")
+    params = SkyLikelihood({}, mixing, labels).check(start)
     offsets = [name for name in params if name.startswith("offset.")]
     for name in offsets:
         if name[-1] not in stokes:
             raise ValueError(f"Parameter {name!r} has no effect on Stokes {stokes}.")
-    sky_params = own.sky_parameters(params)
-    shifts = {name: value for name, value in sky_params.items() if name.endswith(OFFSET)}
-    sky = set_parameters(sky, {n: v for n, v in sky_params.items() if n not in shifts})
+    sky = mixing.laws({n: value for n, value in params.items() if not n.endswith(OFFSET)})
     weights = _weights(data, sigma)
-    if not _is_uniform(sky) or pixelwise:
-        at_start = set_parameters(sky, shifts)
-        return _pixel_likelihood(
-            params, at_start, sky, own, data, weights, keep, covariance_of, bool(offsets)
-        )
+    if pixelwise or any(leaf.ndim == 1 for leaf in jax.tree.leaves(sky)):
+        mixing = dataclasses.replace(mixing, sky=sky)
+        return _on_pixels(params, mixing, data, weights, labels, keep, covariance_of)
 
+    mixing = dataclasses.replace(mixing, sky=unit_sky(sky, len(labels)))
     templates = jnp.stack([c.amplitude for c in sky.components.values()])
     products = np.asarray(gram(data, templates, weights))[:, keep]
-    values = jnp.asarray(np.sum(np.asarray(weights)[:, keep] > 0))
     if covariance_of is None:
-        root = square_root(products)
-        matrix = _matrix(None, root, keep, len(labels))
-        return TemplateLikelihood(params, _unit_sky(sky), own, matrix, values)
-    used = slice(1, None if offsets else -1)  # a constant row tells offsets from templates
-    if offsets:
-        templates = jnp.concatenate([templates, jnp.ones_like(templates[:1])])
-    rows = _weighted_templates(templates, weights)
-    whitening = _whitening(_covariance(covariance_of, rows, keep))
-    matrix = _matrix(whitening, products[:, :, used], keep, len(labels))
-    return TemplateLikelihood(params, _unit_sky(sky), own, matrix, jnp.array(len(whitening)))
+        matrix = _matrix(np.asarray(square_root(products)), keep, len(labels))
+        values = int(np.sum(np.asarray(weights)[:, keep] > 0))
+    else:
+        # A constant row tells offsets from templates.
+        rows = [*templates, *([jnp.ones_like(templates[0])] if offsets else [])]
+        whitening = _whitening(covariance_of, _weighted(jnp.stack(rows), weights), keep)
+        matrix = _matrix(products[:, :, 1 : len(rows) + 1], keep, len(labels), whitening)
+        values = len(whitening)
+    return TemplateLikelihood(params, mixing, labels, matrix, jnp.asarray(values))
 
 
 @jax.jit
@@ -273,21 +233,20 @@ def _weights(data, sigma):
 
 
 @jax.jit
-def _weighted_templates(templates, weights):
-    """Rows W T of each band and template, zero where masked."""
-    return weights[:, None] * jnp.where(weights[:, None] > 0, templates, 0)
+def _weighted(maps, weights):
+    """Rows W T of each band and map, zero where masked."""
+    return weights[:, None] * jnp.where(weights[:, None] > 0, maps, 0)
 
 
-@partial(jax.jit, static_argnames="stokes")
-def _matrix(whitening, blocks, keep, stokes):
+def _matrix(blocks, keep, stokes, whitening=None):
     """Blocks (band, kept stokes, row, vector) on the diagonal of a matrix for all Stokes rows."""
     bands, kept, rows, size = blocks.shape
-    matrix = jax.scipy.linalg.block_diag(*blocks.reshape(-1, rows, size))
+    matrix = scipy.linalg.block_diag(*blocks.reshape(-1, rows, size))
     if whitening is not None:
         matrix = whitening @ matrix
-    full = jnp.zeros((len(matrix), bands, stokes, size))
-    full = full.at[:, :, keep].set(matrix.reshape(-1, bands, kept, size))
-    return full.reshape(len(matrix), -1)
+    full = np.zeros((len(matrix), bands, stokes, size))
+    full[:, :, keep] = matrix.reshape(-1, bands, kept, size)
+    return jnp.asarray(full.reshape(len(matrix), -1))
 
 
 @jax.jit
@@ -298,52 +257,49 @@ def _one_stokes_each(rows: Array) -> Float[Array, "band row stokes pix"]:
     return split.reshape(bands, stokes * templates, stokes, npix)
 
 
-def _covariance(
+def _whitening(
     covariance_of: CovarianceOf, rows: Float[Array, "band template stokes pix"], keep: np.ndarray
 ) -> Float[np.ndarray, "row row"]:
-    """Covariance of the products of rows with the data, one for each of the Stokes parameters kept.
+    """W with W^T W the inverse covariance of the products of rows with the data.
 
-    Cut out of that of all Stokes parameters, which is the same whatever is kept.
+    One product for each of the Stokes parameters kept, cut out of the covariance of all Stokes
+    parameters, which is the same whatever is kept.
     """
     bands, templates, stokes, _ = rows.shape
     total = np.asarray(covariance_of(_one_stokes_each(rows)))
     total = total.reshape(2 * (bands, stokes, templates))
     size = bands * len(keep) * templates
-    return total[:, keep][:, :, :, :, keep].reshape(size, size)
-
-
-def _whitening(covariance: Float[np.ndarray, "row row"]) -> Float[Array, "row row"]:
-    """W with W^T W the inverse of a covariance."""
+    covariance = total[:, keep][:, :, :, :, keep].reshape(size, size)
     scale = np.sqrt(np.diagonal(covariance))
-    usable = np.all(scale > 0)
-    if usable:
-        correlation = covariance / scale[:, None] / scale[None, :]
-        usable = np.linalg.eigvalsh(correlation)[0] > 1e-12
-    if not usable:
+    safe = np.where(scale > 0, scale, 1.0)
+    correlation = covariance / safe[:, None] / safe
+    if not (np.all(scale > 0) and np.linalg.eigvalsh(correlation)[0] > 1e-12):
         raise ValueError(
             "The templates cannot be told apart in this region: the covariance of their "
             "amplitudes is not positive definite."
         )
     root = np.linalg.cholesky(correlation)
-    return jnp.asarray(scipy.linalg.solve_triangular(root, np.diag(1 / scale), lower=True))
+    return scipy.linalg.solve_triangular(root, np.diag(1 / scale), lower=True)
 
 
-def _pixel_likelihood(start, at_start, sky, bands, data, weights, keep, covariance_of, constant):
-    every = weights
-    weights = jnp.zeros_like(weights).at[:, keep].set(weights[:, keep])
-    data = jnp.where(weights > 0, data, 0)
+def _on_pixels(params, mixing, data, weights, labels, keep, covariance_of):
+    """The likelihood of each pixel; its rows are the components' maps at the start values."""
+    at_start = mixing.laws({n: value for n, value in params.items() if n.endswith(OFFSET)})
+    used = jnp.zeros_like(weights).at[:, keep].set(weights[:, keep])
+    data = jnp.where(used > 0, data, 0)
     # Two spare nodes: a shift of a map moves its range, hardly its width.
-    plan = interpolation_nodes(at_start, bands.bandpasses, 1e-10)
+    plan = interpolation_nodes(at_start, mixing.bandpasses, 1e-10)
     nodes = tuple(n and NodeCounts(tuple(k + 2 for k in n.counts)) for n in plan)
     rows = whitening = None
-    values = jnp.sum(weights > 0)
+    values = jnp.sum(used > 0)
     if covariance_of is not None:
-        seen = observe_components(at_start, bands.bandpasses, nodes=nodes)
-        maps = [*seen.values(), *([jnp.ones_like(data)] if constant else [])]
-        whole = every[:, None] * jnp.stack(maps, axis=1)
-        whitening = _whitening(_covariance(covariance_of, whole, keep))
+        maps = list(observe_components(at_start, mixing.bandpasses, nodes=nodes).values())
+        if any(name.startswith("offset.") for name in params):
+            maps.append(jnp.ones_like(data))
+        whole = _weighted(jnp.stack(maps, axis=1), weights)
+        whitening = jnp.asarray(_whitening(covariance_of, whole, keep))
         kept = (keep[:, None] * len(maps) + np.arange(len(maps))).ravel()
         rows = _one_stokes_each(whole)[:, kept]
         values = jnp.array(len(whitening))
-    root = jnp.sqrt(weights)
-    return PixelLikelihood(start, sky, bands, data, root, nodes, rows, whitening, values)
+    root = jnp.sqrt(used)
+    return PixelLikelihood(params, mixing, labels, data, root, nodes, rows, whitening, values)

@@ -137,8 +137,8 @@ def unbounded_posterior(posterior: Posterior, theta: np.ndarray) -> tuple[Unboun
     width = high - low
 
     def derivatives(theta):
-        local = posterior.convex(theta, posterior.exact(theta))
-        return posterior.curvature(theta, local, present), posterior.value(theta)[1][present]
+        matrix = posterior.curvature(theta, posterior.convex(theta), present)
+        return matrix, posterior.value(theta)[1][present]
 
     # Away from the edges by what the density falls over there.
     matrix, slope = derivatives(theta)

@@ -15,6 +15,7 @@ from fits.fisher import (
     fisher_errors,
     foreground_names,
 )
+from fits.mixing import unit_sky
 from fits.tensor_ratio import noise_level, noise_weights
 from jaxsky import AME, Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.instrument import Channel, Instrument, load_instrument
@@ -328,7 +329,7 @@ def test_laws_that_vary_enter_with_their_mean():
     mask = np.where(np.arange(48) < 24, 1.0, 0.0)
     beta = spread(1.5, 0.2)
     sky = Sky({"dust": Dust(maps, beta), "synchrotron": Synchrotron(maps)})
-    unit = fisher.unit_sky(sky, mask)
+    unit = unit_sky(sky, mask=mask)
     assert unit.shape == (2, 1)
     np.testing.assert_allclose(unit["dust"].beta_dust, beta[:24].mean())
     assert set_parameters(unit, {"dust.beta_dust": 1.0})["dust"].beta_dust == 1.0

@@ -9,7 +9,7 @@ import pytest
 from fits.grid import grid_fit
 from fits.kept import ChainFile
 from fits.optimize import Newton, best_fit
-from fits.priors import Gaussian, Uniform, from_unbounded, log_prior, to_unbounded
+from fits.priors import Gaussian, Uniform
 from fits.results import FitError, misfit
 from fits.sampling import sample
 from fits.template_likelihood import likelihood
@@ -107,14 +107,10 @@ def test_more_free_parameters_by_name():
         assert abs(found.best_fit[name] - value) < 4 * found.sigma[name]
 
 
-def test_unbounded_numbers_and_ranges_are_inverse():
-    params = {"a": 0.7, "b": -3.0}
-    priors = {"a": Uniform(0.5, 2.5)}
-    back = from_unbounded(to_unbounded(params, priors), priors)
-    assert {k: float(v) for k, v in back.items()} == pytest.approx(params)
-    assert float(log_prior({"a": 3.0}, priors)) == -np.inf
-    with pytest.raises(ValueError, match=r"Start value 9 of 'a' is not inside its uniform prior"):
-        to_unbounded({"a": 9.0}, priors)
+def test_a_start_outside_its_prior_is_refused(like):
+    assert float(PRIORS["dust.beta_dust"].log_density(3.0)) == -np.inf
+    with pytest.raises(ValueError, match=r"Start value 9 of 'dust.beta_dust' is not inside its un"):
+        best_fit(like, START | {"dust.beta_dust": 9.0}, priors=PRIORS)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,8 @@ import optimistix as optx
 import pytest
 
 from fits.optimize import Newton, best_fit
-from fits.priors import Gaussian, Prior, Uniform, at_edge, prior_residuals, to_unbounded
+from fits.posterior import Posterior
+from fits.priors import Gaussian, Prior, Uniform
 from fits.profile_likelihood import spectral_likelihood
 from fits.results import FitError
 from test_separation import BANDS, NPIX, START, problem, random_sky
@@ -149,12 +150,15 @@ def test_a_minimiser_takes_any_prior():
     assert deviation(fit, best_fit(constant(), priors=priors)) < 1e-6
 
 
-def test_pieces_of_priors_take_arrays():
-    priors = {"a": Uniform(0.0, 2.0), "b": Gaussian(1.0, 0.5)}
-    values = {"a": np.array([0.5, 1.5]), "b": np.array([1.0, 2.0])}
-    np.testing.assert_allclose(prior_residuals(values, priors), [0.0, 2.0])
-    np.testing.assert_allclose(to_unbounded(values, priors)["a"], np.arcsin([-0.5, 0.5]))
-    with pytest.raises(ValueError, match="Start value 2 of 'a' is not inside"):
-        to_unbounded({"a": np.array([1.0, 2.0])}, priors)
-    edges = at_edge([0.0, 1.0, 2.0, 0.0], 0.0, [2.0, 2.0, 2.0, np.inf])
-    assert edges.tolist() == [True, False, True, False]
+def test_priors_hold_in_each_region_with_pixels():
+    like = regions()
+    posterior = Posterior(like, BOTH)
+    theta = np.array(like.flat({"dust.T_dust": 40.0, "synchrotron.beta_syn": 3.05}))
+    labels = np.array(posterior.labels)
+    assert labels[posterior.edges(theta)].tolist() == ["dust.T_dust[2]"]
+    count = sum(label.startswith("synchrotron") for label in labels[posterior.present])
+    of_priors = posterior.value(theta)[0] - Posterior(like, {}).value(theta)[0]
+    assert of_priors == pytest.approx(count * 2.5**2 / 2, rel=1e-6)
+    start = {"dust.T_dust": np.array([20.0, 20.0, 45.0])}
+    with pytest.raises(ValueError, match=r"Start value 45 of 'dust.T_dust' is not inside"):
+        best_fit(like, start, priors=BOTH)

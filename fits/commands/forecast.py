@@ -13,7 +13,8 @@ from fits import tensor_ratio
 from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
 from fits.common import prepare_component
-from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors, foreground_names, unit_sky
+from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors, foreground_names
+from fits.mixing import unit_sky
 from fits.plots import spread
 from fits.pseudo_cl import (
     LEAST_WINDOW,
@@ -208,7 +209,7 @@ def _model(
     weights = [tensor_ratio.noise_weights(band, lmax)[ell] for band in inputs.bands.values()]
     cmb_rows = 1 + np.array(list(rows.values()))[:, None]
     model = ForecastModel.of(
-        unit_sky(sky, inputs.mask),
+        unit_sky(sky, mask=inputs.mask),
         {name: band.band for name, band in inputs.bands.items()},
         jnp.asarray(np.stack(weights, axis=1)),
         jnp.asarray(tensors[cmb_rows, ell]),

@@ -29,7 +29,7 @@ CLEANED, NOISE, RESIDUAL, LEFT, LENSING, TRUTH = (*COLORS[:4], "0.5", COLORS[3])
 
 
 def _title(found: Separation, name: str) -> str:
-    component: Any = found.like.sky[name]
+    component: Any = found.like.mixing.sky[name]
     if component.unit == "uK_CMB":
         return name.upper() if name == "cmb" else name
     return f"{name}, {float(component.nu_ref):g} GHz"
@@ -37,8 +37,9 @@ def _title(found: Separation, name: str) -> str:
 
 def plot_components(path: Path, found: Separation, settings: Experiment) -> None:
     """Q and U of the components, a row for each."""
+    sky = found.like.mixing.sky
     rows = [
-        stokes_panels(_title(found, name), maps, color_limit(maps), found.like.sky[name].unit)
+        stokes_panels(_title(found, name), maps, color_limit(maps), sky[name].unit)
         for name, maps in zip(found.components, found.maps[:, -2:], strict=True)
     ]
     plot_maps(path, rows, settings.title)

@@ -20,12 +20,8 @@ from jaxtyping import Array, Float
 class Pixels(NamedTuple):
     """Data in pixels that are treated in the same way.
 
-    Parameters
-    ----------
-    data : a row for each band, or for Q of each band and then U of each band
-    weights : inverse noise variance, or the diagonal of the inverse covariance; one value a row
-        if it is the same in all pixels
-    cross : element QU of the inverse covariance in each band; None where there is none
+    Rows are bands, or Q of each band and then U of each band. Weights are the inverse variance of
+    the noise, or the diagonal of its inverse covariance, and `cross` is the element QU of that.
     """
 
     data: Float[Array, "*batch group row pix"]
@@ -70,16 +66,16 @@ def _cholesky(matrix: list[list[Array]]) -> list[list[Array]]:
     return lower
 
 
-def _back_substitute(lower: list[list[Array]], right: list[Array]) -> list[Array]:
-    """The solution of L L^T x = right."""
+def _back_substituted(lower: list[list[Array]], right: Array) -> Array:
+    """The solution x of L L^T x = right (group, unknown, pix)."""
     size = len(lower)
     y: list[Array] = []
     for i in range(size):
-        y.append((right[i] - sum(lower[i][k] * y[k] for k in range(i))) * lower[i][i])
+        y.append((right[:, i] - sum(lower[i][k] * y[k] for k in range(i))) * lower[i][i])
     x: list[Any] = [None] * size
     for i in reversed(range(size)):
         x[i] = (y[i] - sum(lower[k][i] * x[k] for k in range(i + 1, size))) * lower[i][i]
-    return x
+    return jnp.stack(x, axis=1)
 
 
 def _projected(mixing: Array, maps: Array) -> Array:
@@ -94,11 +90,20 @@ def _model(mixing: Array, amplitudes: Array) -> Array:
 def _solved(mixing: Array, pixels: Pixels, right: Array) -> tuple[Array, list[list[Array]]]:
     """The solution of M^T W M x = right (group, unknown, pix), and the factors of the matrix."""
     lower = _cholesky(_gram(mixing, pixels))
-    return _stacked(lower, right), lower
+    return _back_substituted(lower, right), lower
 
 
-def _stacked(lower: list[list[Array]], right: Array) -> Array:
-    return jnp.stack(_back_substitute(lower, list(jnp.moveaxis(right, 1, 0))), axis=1)
+def _along(function, primals, tangents):
+    """The derivative of a function along tangents, of which those that are zero cost nothing."""
+    leaves, structure = jax.tree.flatten(primals)
+    slopes = jax.tree.leaves(tangents, is_leaf=lambda x: isinstance(x, SymbolicZero))
+    moving = [i for i, slope in enumerate(slopes) if not isinstance(slope, SymbolicZero)]
+
+    def moved(*values):
+        given = dict(enumerate(leaves)) | dict(zip(moving, values, strict=True))
+        return function(*jax.tree.unflatten(structure, list(given.values())))
+
+    return jax.jvp(moved, [leaves[i] for i in moving], [slopes[i] for i in moving])[1]
 
 
 @jax.custom_jvp
@@ -110,22 +115,13 @@ def solve(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, "
 def _solve_jvp(primals, tangents):
     """From M^T W (d - M s) = 0: one more solution, and no derivative of the factors."""
     mixing, pixels = primals
-    d_mixing, d_pixels = tangents
     right = _projected(mixing, _weighted(pixels, pixels.data))
     amplitudes, lower = _solved(mixing, pixels, right)
-    rest = pixels.data - _model(mixing, amplitudes)
-    right = jnp.zeros_like(amplitudes)
-    if not isinstance(d_mixing, SymbolicZero):
-        right += _projected(d_mixing, _weighted(pixels, rest))
-        right -= _projected(mixing, _weighted(pixels, _model(d_mixing, amplitudes)))
-    if not isinstance(d_pixels.data, SymbolicZero):
-        right += _projected(mixing, _weighted(pixels, d_pixels.data))
-    if not isinstance(d_pixels.weights, SymbolicZero):
-        right += _projected(mixing, d_pixels.weights * rest)
-    if pixels.cross is not None and not isinstance(d_pixels.cross, SymbolicZero):
-        moved = Pixels(rest, jnp.zeros_like(pixels.weights), d_pixels.cross)
-        right += _projected(mixing, _weighted(moved, rest))
-    return amplitudes, _stacked(lower, right)
+
+    def zero(mixing, pixels):
+        return _projected(mixing, _weighted(pixels, pixels.data - _model(mixing, amplitudes)))
+
+    return amplitudes, _back_substituted(lower, _along(zero, primals, tangents))
 
 
 solve.defjvp(_solve_jvp, symbolic_zeros=True)
@@ -136,12 +132,10 @@ def inverse_gram(
 ) -> Float[Array, "group unknown unknown pix"]:
     """Covariance (M^T W M)^-1 of the amplitudes; one pixel if the weights are uniform."""
     lower = _cholesky(_gram(mixing, pixels))
-    one, zero = jnp.ones_like(lower[0][0]), jnp.zeros_like(lower[0][0])
-    size = len(lower)
-    columns = [
-        _back_substitute(lower, [one if i == j else zero for i in range(size)]) for j in range(size)
-    ]
-    return jnp.stack([jnp.stack(column, axis=1) for column in columns], axis=2)
+    size, one = len(lower), jnp.ones_like(lower[0][0])[:, None]
+    units = jnp.eye(size)[:, :, None]
+    columns = [_back_substituted(lower, one * unit) for unit in units]
+    return jnp.stack(columns, axis=2)
 
 
 def residuals(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, "group row pix"]:
@@ -168,11 +162,8 @@ def explained(
 class Derivatives(NamedTuple):
     """-ln L and its derivatives in the parameters that a mixing matrix depends on.
 
-    Parameters
-    ----------
-    value, gradient, hessian : the function, first and second derivatives
-    fisher : second derivatives for data that are what the parameters predict: the Fisher matrix of
-        the fitted amplitudes, positive semi-definite
+    `fisher` has second derivatives for data that are what the parameters predict: the Fisher
+    matrix of the fitted amplitudes, positive semi-definite.
     """
 
     value: Float[Array, "*batch"]
@@ -209,7 +200,7 @@ def derivatives(
     products = jnp.einsum("krn,kun->ru", weighted, amplitudes)
 
     def inner(x):
-        return jnp.einsum("ikun,jkun->ij", x, jax.vmap(lambda y: _stacked(lower, y))(x))
+        return jnp.einsum("ikun,jkun->ij", x, jax.vmap(lambda y: _back_substituted(lower, y))(x))
 
     return Derivatives(
         jnp.sum(rest * weighted) / 2,
@@ -237,23 +228,14 @@ def least_chi2(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Arr
 
 
 def _chi2_jvp(primals, tangents):
-    mixing, pixels = primals
-    d_mixing, d_pixels = tangents
-    amplitudes, rest, weighted = _parts(mixing, pixels)
-    value = jnp.sum(rest * weighted)
+    amplitudes, rest, weighted = _parts(*primals)
 
-    def along(gradient, tangent):
-        if isinstance(tangent, SymbolicZero):
-            return 0.0
-        return jnp.sum(gradient() * tangent)
+    def linear(mixing, pixels):
+        """With the derivative of chi^2, in which amplitudes count as constant."""
+        moved = pixels.data - _model(mixing, amplitudes)
+        return 2 * jnp.sum(weighted * moved) + jnp.sum(rest * _weighted(pixels, rest))
 
-    slope = along(lambda: -2 * jnp.einsum("krn,kun->ru", weighted, amplitudes), d_mixing)
-    slope += along(lambda: 2 * weighted, d_pixels.data)
-    slope += along(lambda: rest**2, d_pixels.weights)
-    if pixels.cross is not None:
-        half = rest.shape[1] // 2
-        slope += along(lambda: 2 * rest[:, :half] * rest[:, half:], d_pixels.cross)
-    return value, jnp.asarray(slope, value.dtype)
+    return jnp.sum(rest * weighted), _along(linear, primals, tangents)
 
 
 least_chi2.defjvp(_chi2_jvp, symbolic_zeros=True)

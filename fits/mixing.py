@@ -63,18 +63,14 @@ def unit_sky(sky: Sky, stokes: int = 2, mask: Float[np.ndarray, " pix"] | None =
 class Mixing(eqx.Module):
     """Mixing matrices as a function of spectral parameters.
 
-    Parameters
-    ----------
-    sky : the laws, on a single pixel
-    bandpasses, names : the bands
-    samples : their frequencies and weights while they are where they should be
-    unit : of the data. A band with data in K_CMB is calibrated on the CMB: shifted or stretched,
-        it shows the CMB as before. In K_RJ it is calibrated on a source of constant antenna
-        temperature.
+    A band with data in K_CMB is calibrated on the CMB: shifted or stretched, it shows the CMB as
+    before. In K_RJ it is calibrated on a source of constant antenna temperature.
     """
 
+    #: the laws, on a single pixel
     sky: Sky
     bandpasses: tuple[Bandpass, ...]
+    #: frequencies and weights of the bands while they are where they should be
     samples: Samples
     names: tuple[str, ...] = eqx.field(static=True)
     unit: str = eqx.field(static=True)

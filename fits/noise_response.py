@@ -40,7 +40,7 @@ class Response:
         params: Mapping[str, Numeric],
         priors: Mapping[str, Prior] | None = None,
     ) -> None:
-        self._posterior = posterior = Posterior(like, priors or {})
+        self._posterior = posterior = Posterior(like, priors)
         self.theta = np.array(like.flat(like.check(params)))
         self._keep = np.flatnonzero(posterior.present & ~posterior.edges(self.theta))
         hessian = posterior.derivatives(self.theta).hessian

@@ -20,7 +20,7 @@ import scipy.sparse
 from jaxtyping import Array, Float, Int
 
 from fits.posterior import Likelihood, Matrix, Posterior, prior_terms
-from fits.priors import Gaussian, Prior, check_priors
+from fits.priors import Gaussian, Prior
 from fits.results import FitResult, help_by_prior
 from fits.systems import Factor, degenerate, variances
 from jaxsky.checks import Numeric
@@ -236,7 +236,7 @@ def best_fit(
             f"fits.Newton(), not {type(solver).__name__}."
         )
     like = like.at(start)
-    posterior = Posterior(like, check_priors(priors, like.free))
+    posterior = Posterior(like, priors)
     if solver is None and like.profiled:
         solver = Newton()
     elif solver is None:

@@ -17,7 +17,7 @@ import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
 from fits.amplitudes import Derivatives
-from fits.priors import Gaussian, Prior, Uniform
+from fits.priors import Gaussian, Prior, Uniform, check_priors
 from fits.systems import assembled
 from jaxsky.checks import Numeric, as_array
 
@@ -30,15 +30,13 @@ EDGE = 1e-4
 class Likelihood(eqx.Module):
     """Base class: -2 log L is the sum of squares of `residuals(params)`, up to a constant.
 
-    A subclass defines `residuals`, `check` and a field `values`, the number of data; `total` and
-    `derivatives` if it has them in closed form.
-
-    Parameters
-    ----------
-    start : values of the free parameters by name
+    A subclass defines `residuals` and `check`, and `total` and `derivatives` if it has them in
+    closed form.
     """
 
+    #: Values of the free parameters by name, and the number of data less that of amplitudes.
     start: dict[str, Array]
+    values: Int[Array, ""] | int
     #: Whether amplitudes are fitted in each pixel: then the inverse curvature alone is too small
     #: for errors where signals are near the noise of a pixel.
     profiled: ClassVar[bool] = False
@@ -53,7 +51,7 @@ class Likelihood(eqx.Module):
 
     def dof(self, free: int) -> int:
         """Degrees of freedom of chi^2: data with weight, less amplitudes and free parameters."""
-        return int(self.values) - free  # type: ignore[attr-defined]  # a field of each
+        return int(self.values) - free
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -165,7 +163,7 @@ class Posterior:
     and `priors` the others, with the parameters that they are for.
     """
 
-    def __init__(self, like: Likelihood, priors: Mapping[str, Prior]) -> None:
+    def __init__(self, like: Likelihood, priors: Mapping[str, Prior] | None) -> None:
         self.like = like
         self.start = np.array(like.flat({}))
         #: The last vector that derivatives were asked for, and what they are.
@@ -177,7 +175,7 @@ class Posterior:
         self.present[self.index] = True
         self.low, self.high = np.full((2, len(self.owner)), [[-np.inf], [np.inf]])
         self.priors: list[tuple[Prior, Array]] = []
-        for name, prior in priors.items():
+        for name, prior in check_priors(priors, like.free).items():
             own = self.owner == like.free.index(name)
             if not isinstance(prior, Uniform):
                 self.priors.append((prior, jnp.asarray(self.present & own)))

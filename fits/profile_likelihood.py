@@ -12,6 +12,7 @@ place of the pixels (`fits.compress`) and nothing depends on nside.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -27,7 +28,7 @@ from fits.noise import Noise, as_noise, bare
 from fits.posterior import Likelihood
 from fits.regions import Cells, check_labels, intersections
 from jaxsky import Bandpass, Component, Sky, get_parameters
-from jaxsky.checks import Numeric, as_array, check_double, check_finite
+from jaxsky.checks import Numeric, as_array, check_double, check_finite, check_shape
 from jaxsky.sky import check_parameter, unknown_parameter
 from jaxsky.units import parse_unit
 
@@ -36,32 +37,22 @@ PASS = 4096
 
 
 class SpectralLikelihood(Likelihood):
-    """See `spectral_likelihood`; for grids and chains like any `Likelihood`.
-
-    Parameters
-    ----------
-    start : values of the free parameters
-    mixing : the mixing matrix as a function of parameters
-    fixed : parameters that are maps and not free, in each cell
-    index : position of each free parameter of each cell in the vector of all
-    pixels : data and weights, for each of `layout`
-    block_cell : cell of each block of pixels; None if they are in order
-    of_pixel : cell of each pixel, -1 where masked; None if there is only one
-    layout : Stokes parameters of `pixels`
-    stokes : those of the data
-    values : number of data less that of amplitudes
-    weightless : bands that add nothing to what the others tell, and are not counted
-    """
+    """See `spectral_likelihood`; for grids and chains like any `Likelihood`."""
 
     mixing: Mixing
+    #: parameters that are maps and not free, in each cell
     fixed: dict[str, Float[Array, " cell"]]
+    #: position of each free parameter of each cell in the vector of all
     index: Int[Array, "cell free"]
+    #: data and weights, for each of `layout`
     pixels: tuple[Pixels, ...]
+    #: cell of each block of pixels, None if they are in order; of each pixel, -1 where masked
     block_cell: Int[Array, " block"] | None
     of_pixel: Int[Array, " pix"] | None
     layout: tuple[Layout, ...] = eqx.field(static=True)
+    #: Stokes parameters of the data
     stokes: str = eqx.field(static=True)
-    values: int = eqx.field(static=True)
+    #: bands that add nothing to what the others tell, and are not counted
     weightless: tuple[str, ...] = eqx.field(static=True)
 
     profiled = True
@@ -116,14 +107,12 @@ class SpectralLikelihood(Likelihood):
                 cell, own = inputs
                 return function(jax.tree.map(lambda x: x[cell], of_cell), own)
 
-            at_once = max(1, PASS // size)
             if blocks * size <= PASS:
                 results.append(jax.vmap(one)((cells, pixels)))
-            elif at_once == 1:
-                # With a batch size of 1 XLA copies all data and weights first.
-                results.append(jax.lax.map(one, (cells, pixels)))
-            else:
-                results.append(jax.lax.map(one, (cells, pixels), batch_size=at_once))
+                continue
+            # With a batch size of 1 XLA copies all data and weights first.
+            at_once = PASS // size if 2 * size <= PASS else None
+            results.append(jax.lax.map(one, (cells, pixels), batch_size=at_once))
         return tuple(results)
 
     def _cell_of_block(self, blocks: int) -> Int[Array, " block"]:
@@ -138,17 +127,16 @@ class SpectralLikelihood(Likelihood):
         """-ln L of each cell, and its derivatives in the parameters of the cell."""
         units = jnp.eye(local.shape[1])
 
-        def slope(function, unit):
-            return jax.jvp(function, (local,), (jnp.broadcast_to(unit, local.shape),))
+        def slope(function, x, unit):
+            return jax.jvp(function, (x,), (jnp.broadcast_to(unit, x.shape),))
 
         def first(x):
-            return jax.vmap(
-                lambda unit: jax.jvp(self.matrices, (x,), (jnp.broadcast_to(unit, x.shape),))[1],
-                out_axes=1,
-            )(units)
+            along = partial(slope, self.matrices, x)
+            return jax.vmap(along, out_axes=(None, 1))(units)
 
-        one, two = jax.vmap(lambda unit: slope(first, unit), out_axes=(None, 1))(units)
-        every = tuple(zip(self.matrices(local), one, two, strict=True))
+        along = partial(slope, first, local)
+        (matrices, one), (_, two) = jax.vmap(along, out_axes=(None, 1))(units)
+        every = tuple(zip(matrices, one, two, strict=True))
         parts = self._mapped(lambda m, own: amplitudes.derivatives(m[0], m[1], m[2], own), every)
         summed = []
         for part in parts:
@@ -163,30 +151,24 @@ class SpectralLikelihood(Likelihood):
         return jnp.concatenate([part.ravel() for part in parts])
 
 
-def _check_start(
-    mixing: Mixing, start: Mapping[str, Numeric], labels: Mapping[str, Numeric]
-) -> None:
-    spectral, of_bands = spectral_names(mixing.sky), mixing.band_parameters()
-    known = (*spectral, *of_bands)
+def _start_values(
+    mixing: Mixing, start: Mapping[str, Numeric], labels: Mapping[str, np.ndarray]
+) -> dict[str, Array]:
+    """Start values as arrays, one value for each region where there are labels."""
+    spectral = spectral_names(mixing.sky)
     for name in (*start, *labels):
-        if name not in known:
+        if name not in (known := (*spectral, *mixing.band_parameters())):
             raise unknown_parameter(name, known)
-        if name in start and name in spectral:
-            check_parameter(mixing.sky, name, name, as_array(name, start[name]))
-    for name in labels:
         if name not in start:
             raise ValueError(f"There are labels for {name!r}, which is not in `start`.")
-        if name in of_bands:
+        if name in labels and name not in spectral:
             raise ValueError(f"Parameter {name!r} of a band cannot vary between regions.")
-
-
-def _start_values(
-    start: Mapping[str, Numeric], labels: Mapping[str, np.ndarray]
-) -> dict[str, Array]:
     values = {}
     for name in sorted(start):
         value = as_array(name, start[name])
         check_finite(name, value)
+        if name in spectral:
+            check_parameter(mixing.sky, name, name, value)
         wanted: tuple[int, ...] = ()
         if name in labels:
             wanted = value.shape if value.ndim == 1 else (int(labels[name].max()) + 1,)
@@ -256,22 +238,19 @@ def spectral_likelihood(
     components = len(sky.components)
     if parse_unit(unit)[1] not in ("K_RJ", "K_CMB"):
         raise ValueError(f"Argument `unit` must be one of K_RJ or K_CMB, not {unit!r}.")
-    if data.ndim != 3 or len(data) != len(bands) or data.shape[1] not in (2, 3):
-        raise ValueError(
-            f"Argument `data` must have shape (band, stokes, pix) with {len(bands)} bands and "
-            f"Stokes Q, U or I, Q, U, but has shape {data.shape}."
-        )
+    good = data.ndim == 3 and len(data) == len(bands) and data.shape[1] in (2, 3)
+    form = f"(band, stokes, pix) with {len(bands)} bands and Stokes Q, U or I, Q, U"
+    check_shape("data", data, good, f"have shape {form}")
     if len(bands) < components + bool(start):
         raise ValueError(
             f"{len(bands)} bands are too few: amplitudes of {components} components take as many, "
             "and their laws one more."
         )
     mixing = Mixing.of(unit_sky(sky), bands, unit)
-    _check_start(mixing, start, labels or {})
     noise = as_noise(noise, data.shape)
     used = used_pixels(noise, data.shape[-1], components)
     maps = {n: check_labels(n, v, used.size, used) for n, v in (labels or {}).items()}
-    values = _start_values(start, maps)
+    values = _start_values(mixing, start, maps)
 
     held = get_parameters(sky, [name for name in spectral_names(sky) if name not in start])
     fixed = {name: np.asarray(value) for name, value in held.items() if value.ndim}
@@ -288,6 +267,7 @@ def spectral_likelihood(
     angles = any(name.startswith("angle.") for name in start)
     like = SpectralLikelihood(
         values,
+        0,
         mixing,
         {name: jnp.asarray(value[first]) for name, value in fixed.items()},
         _index(values, cells),
@@ -296,7 +276,6 @@ def spectral_likelihood(
         None if cells.of_pixel is None else jnp.asarray(cells.of_pixel),
         layouts(data.shape[1], angles or noise.covariance is not None),
         "QU" if data.shape[1] == 2 else "IQU",
-        0,
         (),
     )
     matrix = _check_matrices(like)[:, : len(data), :components]

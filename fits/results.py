@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from fits.writing import with_error
 from jaxsky.checks import Numeric
@@ -23,10 +23,7 @@ LOST = 50.0
 def misfit(chi2: float, dof: int, expected: float = 1.0) -> str | None:
     """What to say of a chi^2 that no statistics, but only wrong inputs explain; None if it is not.
 
-    Parameters
-    ----------
-    chi2, dof : of a fit
-    expected : chi2 per degree of freedom of the right model, if chi2 leaves out what is known
+    `expected` is that of the right model per degree of freedom, if chi2 leaves out what is known.
     """
     if chi2 <= ASTRONOMICAL * expected * max(dof, FEW):
         return None
@@ -35,15 +32,6 @@ def misfit(chi2: float, dof: int, expected: float = 1.0) -> str | None:
         "data: look for missing values that are read as data, a wrong unit, or noise that is "
         "far too small."
     )
-
-
-def _astray(name: str, value: Numeric, sigma: Numeric, start: Numeric) -> Bool[np.ndarray, "..."]:
-    """Whether the data do not hold a parameter: it ran away, or its error is absurd.
-
-    Offsets, which have units of maps, are never astray.
-    """
-    limit = np.inf if name.startswith("offset.") else LOST * np.maximum(np.abs(start), 1.0)
-    return np.asarray((np.abs(value) > limit) | (np.asarray(sigma) > limit))
 
 
 def help_by_prior(names: tuple[str, ...]) -> str:
@@ -180,15 +168,15 @@ class FitResult(NamedTuple):
     ) -> "FitResult":
         """Itself, not converged if parameters ran away, or chi^2 is that of no fit.
 
-        Parameters
-        ----------
-        chi2, dof : of the data, or of what the likelihood compares
-        start : start values by name
-        expected : see `misfit`
+        A parameter ran away if it or its error is far from its start; offsets, which have units of
+        maps, never do. chi^2 and dof are of the data, or of what the likelihood compares, for
+        `misfit`.
         """
         failures = [] if self.converged else [self.message]
         for name, value in self.best_fit.items():
-            lost = _astray(name, value, self.sigma[name], start[name])
+            limit = LOST * np.maximum(np.abs(start[name]), 1.0)
+            lost = np.asarray((np.abs(value) > limit) | (np.asarray(self.sigma[name]) > limit))
+            lost &= not name.startswith("offset.")
             if not (self.converged and lost.any()):
                 continue
             where = f" in {lost.sum()} of {np.isfinite(value).sum()} regions"

@@ -5,6 +5,7 @@ few evaluations for a sample that does not depend on the last one, however many 
 are. It moves in the numbers of `fits.unbounded`, in which walkers start, too.
 """
 
+import inspect
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -17,22 +18,16 @@ import numpy as np
 from blackjax.adaptation.step_size import dual_averaging_adaptation
 from blackjax.diagnostics import ess_bulk, rhat
 from jaxtyping import Array, Float
-from tqdm import tqdm
+from rich.progress import Progress as Bar
 
 from fits.kept import ChainFile
 from fits.optimize import best_fit
 from fits.posterior import Likelihood, Posterior
-from fits.priors import Prior, check_priors
+from fits.priors import Prior
 from fits.results import FitResult
 from fits.unbounded import Unbounded, unbounded_posterior
 from jaxsky.checks import Numeric, check_seed
 
-#: What each sampler takes, with the values if they are not given, and what its results are called.
-OPTIONS: dict[str, dict[str, Any]] = {
-    "emcee": {"nsteps": 5000, "nwalkers": 32, "backend": None},
-    "nuts": {"nsteps": 1000, "nwarmup": 300, "nchains": 4},
-}
-METHODS = {"emcee": "mcmc", "nuts": "nuts"}
 #: A chain of emcee shorter than this many autocorrelation times is reported as too short.
 ENOUGH = 50
 #: Mean acceptance that the step size of the no-U-turn sampler is tuned to.
@@ -68,15 +63,15 @@ def _values(unbounded, z):
 
 def _ensemble(
     unbounded: Unbounded,
-    *,
+    labels: tuple[str, ...],
     seed: int,
-    nsteps: int,
-    nwalkers: int,
-    backend: ChainFile | None,
-    progress: bool | Callable[[int, int], None],
+    report: Callable[[int, int], None],
+    nsteps: int = 5000,
+    nwalkers: int = 32,
+    backend: ChainFile | None = None,
 ) -> dict[str, Any]:
     """Steps of emcee's ensemble; those that a file already holds are not made again."""
-    size = unbounded.center.size
+    size = len(labels)
     if nwalkers < 2 * size or nsteps < 1:
         raise ValueError(
             f"MCMC needs at least {2 * size} walkers and a step for {size} parameters, "
@@ -102,15 +97,8 @@ def _ensemble(
         random_state = np.random.RandomState(rng.integers(2**32)).get_state()
         state = emcee.State(positions, random_state=random_state)
     try:
-        steps = sampler.sample(
-            state,
-            iterations=max(0, nsteps - done),
-            progress=progress is True,
-            progress_kwargs={"leave": False},
-        )
-        for i, _ in enumerate(steps, done + 1):
-            if callable(progress):
-                progress(i, nsteps)
+        for i, _ in enumerate(sampler.sample(state, iterations=max(0, nsteps - done)), done + 1):
+            report(i, nsteps)
     finally:
         if backend is not None:
             backend.flush()
@@ -182,7 +170,7 @@ def _advanced(unbounded, begun, key, first, nwarmup, steps):
     return jax.lax.scan(step, begun, first + jnp.arange(steps))
 
 
-def _course(unbounded, z, key, first, last, nwarmup, advance) -> dict[str, np.ndarray]:
+def _course(unbounded, z, key, first, last, nwarmup, report) -> dict[str, np.ndarray]:
     """The steps first ... last - 1 of chains that begin at z, in which the step size is tuned."""
     for _ in range(30):
         chains = _begun(unbounded, z)
@@ -198,38 +186,37 @@ def _course(unbounded, z, key, first, last, nwarmup, advance) -> dict[str, np.nd
     for number in range(first, last, BLOCK):
         state, course = _advanced(unbounded, state, key, number, nwarmup, BLOCK)
         courses.append(jax.tree.map(np.asarray, course))
-        advance(min(number + BLOCK, last))
+        report(min(number + BLOCK, last))
     return {k: np.concatenate([c[k] for c in courses])[: last - first] for k in courses[0]}
 
 
 def _no_u_turn(
     unbounded: Unbounded,
     labels: tuple[str, ...],
-    *,
     seed: int,
-    nsteps: int,
-    nwarmup: int,
-    nchains: int,
-    progress: bool | Callable[[int, int], None],
+    report: Callable[[int, int], None],
+    nsteps: int = 1000,
+    nwarmup: int = 300,
+    nchains: int = 4,
 ) -> dict[str, Any]:
     """Chains of the no-U-turn sampler."""
+    if nsteps < 4 or nwarmup < 0 or nchains < 1:
+        raise ValueError(
+            "The sampler 'nuts' needs at least 4 steps and a chain, not "
+            f"nsteps={nsteps}, nwarmup={nwarmup}, nchains={nchains}."
+        )
     z = SPREAD * np.random.default_rng(seed).normal(size=(nchains, len(labels)))
     key, total = jax.random.key(seed), nwarmup + nsteps
     pilot = nwarmup // 2 // BLOCK * BLOCK
-    with tqdm(total=total, disable=progress is not True, delay=2, leave=False) as bar:
-
-        def advance(done: int) -> None:
-            bar.update(done - bar.n)
-            if callable(progress):
-                progress(done, total)
-
-        if pilot and unbounded.root.ndim == 2:
-            chain = _course(unbounded, z, key, 0, pilot, pilot, advance)["chain"]
-            unbounded = unbounded.adapted(chain[pilot // 3 :].reshape(-1, len(labels)))
-            z = unbounded.coordinates(chain[-1])
-        else:
-            pilot = 0
-        course = _course(unbounded, z, key, pilot, total, nwarmup, advance)
+    parts = partial(_course, key=key, nwarmup=nwarmup, report=lambda done: report(done, total))
+    if pilot and unbounded.root.ndim == 2:
+        # Half of the warm-up says how parameters vary together.
+        chain = parts(unbounded, z, first=0, last=pilot, nwarmup=pilot)["chain"]
+        unbounded = unbounded.adapted(chain[pilot // 3 :].reshape(-1, len(labels)))
+        z = unbounded.coordinates(chain[-1])
+    else:
+        pilot = 0
+    course = parts(unbounded, z, first=pilot, last=total)
     course = {name: values[nwarmup - pilot :] for name, values in course.items()}
     ratio, effective = map(np.asarray, agreement(course["chain"]))
     worst, least = int(np.argmax(ratio)), float(np.min(effective))
@@ -264,23 +251,11 @@ def _no_u_turn(
     }
 
 
-def _options(sampler: str, given: dict[str, Any]) -> dict[str, Any]:
-    """What the sampler is called with."""
-    if sampler not in OPTIONS:
-        names = " or ".join(map(repr, OPTIONS))
-        raise ValueError(f"Argument `sampler` must be {names}, not {sampler!r}.")
-    known = OPTIONS[sampler]
-    given = {name: value for name, value in given.items() if value is not None}
-    for name in given:
-        if name not in known:
-            raise ValueError(f"Argument `{name}` is not one of the sampler {sampler!r}.")
-    options = known | given
-    if sampler == "nuts" and (
-        options["nsteps"] < 4 or options["nwarmup"] < 0 or options["nchains"] < 1
-    ):
-        shown = ", ".join(f"{name}={value}" for name, value in options.items())
-        raise ValueError(f"The sampler 'nuts' needs at least 4 steps and a chain, not {shown}.")
-    return options
+#: The samplers, and what their results are called.
+SAMPLERS: dict[str, tuple[Callable[..., dict[str, Any]], str]] = {
+    "emcee": (_ensemble, "mcmc"),
+    "nuts": (_no_u_turn, "nuts"),
+}
 
 
 def sample(
@@ -347,10 +322,17 @@ def sample(
         result is in its `.result`.
     """
     check_seed("seed", seed)
-    given = {"nsteps": nsteps, "nwarmup": nwarmup, "nchains": nchains}
-    options = _options(sampler, given | {"nwalkers": nwalkers, "backend": backend})
+    if sampler not in SAMPLERS:
+        names = " or ".join(map(repr, SAMPLERS))
+        raise ValueError(f"Argument `sampler` must be {names}, not {sampler!r}.")
+    run, method = SAMPLERS[sampler]
+    options = {"nsteps": nsteps, "nwarmup": nwarmup, "nchains": nchains, "nwalkers": nwalkers}
+    options = {n: v for n, v in (options | {"backend": backend}).items() if v is not None}
+    for name in options:
+        if name not in inspect.signature(run).parameters:
+            raise ValueError(f"Argument `{name}` is not one of the sampler {sampler!r}.")
     like = like.at(start)
-    posterior = Posterior(like, check_priors(priors, like.free))
+    posterior = Posterior(like, priors)
     fit = best_fit(like, priors=priors, throw=False)
     center = np.array(like.flat(like.check(fit.best_fit)))
     unbounded, unknown = unbounded_posterior(posterior, center)
@@ -359,7 +341,7 @@ def sample(
         shown = ", ".join(unknown[:6]) + (f" and {len(unknown) - 6} more" if unknown[6:] else "")
         nothing = posterior.named(np.full(posterior.start.size, np.nan))
         return fit._replace(
-            method=METHODS[sampler],
+            method=method,
             best_fit=nothing,
             sigma=nothing,
             interval_68={name: (value, value) for name, value in nothing.items()},
@@ -369,16 +351,22 @@ def sample(
             message=f"Data and priors do not determine {shown}: there is nothing to draw from.",
             details={},
         ).checked(throw)
-    if sampler == "emcee":
-        details = _ensemble(unbounded, seed=seed, progress=progress, **options)
-    else:
-        details = _no_u_turn(unbounded, labels, seed=seed, progress=progress, **options)
+    with Bar(transient=True, disable=progress is not True) as bar:
+        task = bar.add_task("samples", total=None)
+
+        def report(done: int, total: int) -> None:
+            if callable(progress):
+                progress(done, total)
+            elif progress:
+                bar.update(task, completed=done, total=total)
+
+        details = run(unbounded, labels, seed, report, **options)
     details["tau"] = dict(zip(labels, details["tau"].tolist(), strict=True))
     best = np.unravel_index(np.argmax(details["log_prob"]), details["log_prob"].shape)
     theta = np.array(unbounded.theta)
     theta[posterior.present] = details["chain"][best]
     result = fit._replace(
-        method=METHODS[sampler],
+        method=method,
         best_fit=posterior.named(theta),
         labels=labels,
         chi2=2 * float(posterior.derivatives(theta).value.sum()),

@@ -78,11 +78,10 @@ def _fit_pixels(
 ) -> RegionFit:
     """The fits of one region and choice of Stokes parameters; see `fit_regions`."""
     # An offset of a Stokes parameter that is not looked at has no effect.
-    other = tuple(s for s in "QU" if s not in stokes)
     start = {
         name: value
         for name, value in settings.start("fit").items()
-        if not (name.startswith("offset.") and name.endswith(other))
+        if not name.startswith("offset.") or name[-1] in stokes
     }
     priors = {name: prior for name, prior in priors_of(settings, "fit").items() if name in start}
     progress.step(f"{region}, {stokes}: inner products")
@@ -97,10 +96,9 @@ def _fit_pixels(
     results: dict[str, FitResult] = {}
     for method in settings.fit.methods:
         progress.step(f"{region}, {stokes}: {method}")
-        if method == "grid" and not grid_is_possible(start, priors):
-            continue
         if method == "grid":
-            results[method] = grid_fit(like, start, priors=priors, points=settings.fit.points)
+            if grid_is_possible(start, priors):
+                results[method] = grid_fit(like, start, priors=priors, points=settings.fit.points)
         elif method == "gradient":
             results[method] = best_fit(like, start, priors=priors, throw=False)
         else:
@@ -185,15 +183,9 @@ def fit_regions(
     chains: Path | None = None,
     progress: Progress = QUIET,
 ) -> list[RegionFit]:
-    """All fits that the settings ask for.
+    """All fits that the settings ask for, in each region.
 
-    Parameters
-    ----------
-    settings : what to fit, and how
-    prepared : templates and maps at the common resolution
-    regions : pixels of each region by name
-    chains : file of the chains; steps that it already holds are not made again
-    progress : told of each step of the work
+    `chains` is the file of the chains; steps that it already holds are not made again.
     """
     if not settings.free_in("fit"):
         raise SettingsError("free: name at least one parameter to fit.")

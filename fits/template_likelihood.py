@@ -25,13 +25,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from fits.compress import gram, square_root
 from fits.mixing import Mixing, named_bands, unit_sky
 from fits.posterior import Likelihood
 from jaxsky import Bandpass, Sky, observe_components, parameter_names
-from jaxsky.checks import UNSEEN, Numeric, as_array, check_double
+from jaxsky.checks import UNSEEN, Numeric, as_array, check_double, check_shape
 from jaxsky.interpolation import NodeCounts, Nodes
 from jaxsky.sky import OFFSET, interpolation_nodes, unknown_parameter
 
@@ -41,7 +41,10 @@ CovarianceOf = Callable[[Float[Array, "band row stokes pix"]], Float[np.ndarray,
 
 
 class SkyLikelihood(Likelihood):
-    """Base class of those whose amplitudes are the templates'."""
+    """Base class of those whose amplitudes are the templates'.
+
+    `values` are pixels with weight, or amplitudes for the exact form.
+    """
 
     mixing: Mixing
     #: Stokes parameters of the maps
@@ -81,8 +84,6 @@ class TemplateLikelihood(SkyLikelihood):
     """
 
     matrix: Float[Array, "row vector"]
-    #: number of data, those of no weight left out: pixels, or amplitudes for the exact form
-    values: Int[Array, ""]
 
     def coefficients(self, params: Mapping[str, Array]) -> Float[Array, "band stokes template"]:
         """What each template is multiplied with in each band."""
@@ -106,7 +107,6 @@ class PixelLikelihood(SkyLikelihood):
     #: rows of inner products and their whitening, for the exact form; None for the diagonal one
     rows: Float[Array, "band row stokes pix"] | None
     whitening: Float[Array, "row row"] | None
-    values: Int[Array, ""]
 
     def residuals(self, params):
         bands = self.mixing.bandpasses
@@ -121,20 +121,13 @@ class PixelLikelihood(SkyLikelihood):
 
 def _check_maps(sky: Sky, bands: Mapping[str, Any], data: Array, sigma: Array) -> None:
     shape = (len(bands), *sky.shape)
-    if data.shape != shape:
-        raise ValueError(
-            f"Argument `data` must have shape (band, stokes, pix) = {shape}, "
-            f"but has shape {data.shape}."
-        )
+    form = f"(band, stokes, pix) = {shape}"
+    check_shape("data", data, data.shape == shape, f"have shape {form}")
     try:
         broadcasts = jnp.broadcast_shapes(sigma.shape, shape) == shape
     except ValueError:
         broadcasts = False
-    if not broadcasts:
-        raise ValueError(
-            f"Argument `sigma` must broadcast to (band, stokes, pix) = {shape}, "
-            f"but has shape {sigma.shape}."
-        )
+    check_shape("sigma", sigma, broadcasts, f"broadcast to {form}")
     values, errors = np.asarray(data), np.asarray(sigma)
     if bad := int(np.sum(~(errors > 0))):
         raise ValueError(f"Argument `sigma` has {bad} of {errors.size} values that are not > 0.")
@@ -200,7 +193,7 @@ def likelihood(
         raise ValueError(f"Argument `stokes` must be among {labels!r}, not {stokes!r}.")
     keep = np.array([labels.index(s) for s in stokes])
     mixing = Mixing.of(sky, bands, "uK_RJ")
-    params = SkyLikelihood({}, mixing, labels).check(start)
+    params = SkyLikelihood({}, 0, mixing, labels).check(start)
     offsets = [name for name in params if name.startswith("offset.")]
     for name in offsets:
         if name[-1] not in stokes:
@@ -223,7 +216,7 @@ def likelihood(
         whitening = _whitening(covariance_of, _weighted(jnp.stack(rows), weights), keep)
         matrix = _matrix(products[:, :, 1 : len(rows) + 1], keep, len(labels), whitening)
         values = len(whitening)
-    return TemplateLikelihood(params, mixing, labels, matrix, jnp.asarray(values))
+    return TemplateLikelihood(params, jnp.asarray(values), mixing, labels, matrix)
 
 
 @jax.jit
@@ -302,4 +295,4 @@ def _on_pixels(params, mixing, data, weights, labels, keep, covariance_of):
         rows = _one_stokes_each(whole)[:, kept]
         values = jnp.array(len(whitening))
     root = jnp.sqrt(used)
-    return PixelLikelihood(params, mixing, labels, data, root, nodes, rows, whitening, values)
+    return PixelLikelihood(params, values, mixing, labels, data, root, nodes, rows, whitening)

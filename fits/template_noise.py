@@ -103,18 +103,8 @@ def attenuation(
 ) -> Attenuation:
     """What the noise of templates does to the fit of one region and choice of Stokes parameters.
 
-    Parameters
-    ----------
-    like, result : what was fitted, and its result
-    sky : templates at the common resolution
-    variances : of their noise in each pixel, by name; those that are missing are exact
-    sigma : noise of the bands, in each pixel
-    used : pixels of the region
-    stokes : "Q", "U" or "QU"
-
-    Returns
-    -------
-    Shares and shifts; no shifts for parameters that are maps, for which they are not known.
+    `sky` has the templates at the common resolution, and `variances` are those of their noise;
+    templates that it does not name are exact. No shifts are known for parameters that are maps.
     """
     weights = jnp.where(used & jnp.isfinite(sigma), 1 / sigma**2, 0.0)
     templates = jnp.stack([c.amplitude for c in sky.components.values()])

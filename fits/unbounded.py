@@ -21,7 +21,6 @@ from fits.systems import degenerate
 
 #: Samples for each parameter, from which on they tell more than the curvature at the best fit.
 ENOUGH = 30
-
 #: A prior cuts a parameter that spreads this much in its unbounded number: whose edge is within
 #: about four standard deviations.
 NEAR = 0.25
@@ -123,12 +122,9 @@ class Unbounded(NamedTuple):
 
 
 def unbounded_posterior(posterior: Posterior, theta: np.ndarray) -> tuple[Unbounded, list[str]]:
-    """The posterior, scaled by its curvature near the best fit; parameters it does not determine.
+    """The posterior, scaled by its curvature near the best fit theta.
 
-    Parameters
-    ----------
-    posterior : the function
-    theta : the best fit
+    Also the labels of parameters that it does not determine.
     """
     present = np.flatnonzero(posterior.present)
     bounded = np.isfinite(posterior.low[present])
@@ -173,12 +169,8 @@ def unbounded_posterior(posterior: Posterior, theta: np.ndarray) -> tuple[Unboun
 def _straightened(matrix, bounded, scale, jacobian):
     """Root, cut parameters, and lean of others on these; see `Unbounded`.
 
-    Parameters
-    ----------
-    matrix : curvature in unbounded numbers, scaled to a unit diagonal
-    bounded : parameters with a uniform prior
-    scale : by which it was scaled
-    jacobian : derivative of parameters in unbounded numbers
+    The matrix is the curvature in unbounded numbers times `scale` on both sides, with a unit
+    diagonal; `jacobian` is the derivative of parameters in unbounded numbers.
     """
     spread = scale * np.sqrt(np.diagonal(np.linalg.inv(matrix)))
     cut = bounded & (spread > NEAR)

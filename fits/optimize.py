@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import scipy.sparse
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float
 
-from fits.posterior import Likelihood, Matrix, Posterior, prior_terms
+from fits.posterior import Likelihood, Matrix, Posterior
 from fits.priors import Gaussian, Prior
 from fits.results import FitResult, help_by_prior
 from fits.systems import Factor, degenerate, variances
@@ -104,42 +104,26 @@ class Newton(NamedTuple):
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | Newton
 
 
-class _Search(NamedTuple):
-    """A posterior in the scaled numbers without bounds that solvers of optimistix move in.
-
-    Regions without a pixel are left out: some solvers do not bear what has no effect.
-    """
-
-    like: Likelihood
-    priors: list[tuple[Prior, Array]]
-    theta: Float[Array, " all"]
-    present: Int[np.ndarray, " par"]
-    scale: Float[np.ndarray, " par"]
-    low: Float[np.ndarray, " par"]
-    width: Float[np.ndarray, " par"]
-
-
 @jax.jit
-def _theta(numbers, search):
-    """The vector of all parameters, those with a uniform prior at low + (high-low)(1+sin u)/2.
+def _values(numbers, density, scale):
+    """Parameters from scaled numbers, with a uniform prior low + (high-low)(1+sin u)/2.
 
     As in MINUIT: smooth, and flat at the edge, so that an optimum at the edge is a minimum in u.
     """
-    u = numbers * search.scale
-    inside = search.low + search.width * (1 + jnp.sin(u)) / 2
-    return search.theta.at[search.present].set(jnp.where(search.width > 0, inside, u))
+    u = numbers * scale
+    inside = density.low + (density.high - density.low) * (1 + jnp.sin(u)) / 2
+    return jnp.where(density.bounded, inside, u)
 
 
-def _residuals(numbers, search):
-    theta = _theta(numbers, search)
-    of_priors = [jnp.where(own, (theta - p.mean) / p.sigma, 0.0) for p, own in search.priors]
-    return jnp.concatenate([search.like.residuals(search.like.named(theta)), *of_priors])
+def _residuals(numbers, args):
+    like, priors, *_ = density = args[0]
+    theta = density.full(_values(numbers, *args))
+    of_priors = [jnp.where(own, (theta - p.mean) / p.sigma, 0.0) for p, own in priors]
+    return jnp.concatenate([like.residuals(like.named(theta)), *of_priors])
 
 
-def _objective(numbers, search):
-    theta = _theta(numbers, search)
-    of_data = search.like.total(theta[search.like.cells()]) / 2
-    return of_data + prior_terms(theta, search.priors)[0]
+def _objective(numbers, args):
+    return -args[0].log_prob(_values(numbers, *args))
 
 
 def _sizes(posterior: Posterior) -> np.ndarray:
@@ -161,21 +145,22 @@ def _searched(posterior: Posterior, solver: Solver, max_steps: int) -> tuple[np.
                 f"Least squares takes uniform and Gaussian priors, not the {type(prior).__name__} "
                 f"of {posterior.names[int(np.argmax(own))]!r}."
             )
-    present = np.flatnonzero(posterior.present)
-    start, low, high = (x[present] for x in (posterior.start, posterior.low, posterior.high))
-    bounded = np.isfinite(low)
-    low, width = np.where(bounded, low, 0.0), np.where(bounded, high - low, 0.0)
-    unit = (start - low) / np.where(bounded, width, 1.0)
-    u = np.where(bounded, np.arcsin(np.where(bounded, 2 * unit - 1, 0.0)), start)
+    # Regions without a pixel are left out: some solvers do not bear what has no effect.
+    density = posterior.density(posterior.start)
+    present, bounded, low, high = map(np.asarray, density[3:])
+    start = posterior.start[present]
+    unit = np.where(bounded, (start - low) / (high - low), 0.5)
+    u = np.where(bounded, np.arcsin(2 * unit - 1), start)
     scale = np.maximum(np.abs(u), 1e-3) if least_squares else _sizes(posterior)[present]
-    theta = jnp.asarray(posterior.start)
-    search = _Search(posterior.like, posterior.priors, theta, present, scale, low, width)
+    args = (density, jnp.asarray(scale))
 
     def solve(numbers):
         run: Callable[..., optx.Solution] = optx.least_squares if least_squares else optx.minimise
         function = _residuals if least_squares else _objective
-        solution = run(function, solver, numbers, args=search, max_steps=max_steps, throw=False)
-        return solution, np.asarray(_theta(solution.value, search))
+        solution = run(function, solver, numbers, args=args, max_steps=max_steps, throw=False)
+        theta = posterior.start.copy()
+        theta[present] = _values(solution.value, *args)
+        return solution, theta
 
     solution, found = solve(jnp.asarray(u / scale))
     edges = posterior.edges(found)[present]

@@ -7,7 +7,7 @@ parameters are put together from them. A likelihood without regions is a single 
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -155,6 +155,32 @@ def prior_terms(theta, priors):
     return value, first, second
 
 
+class Density(NamedTuple):
+    """The posterior of the parameters of regions with pixels, for compiled programs.
+
+    `theta` is a vector of all parameters, and `present` the positions of these in it; `bounded` are
+    those with a uniform prior, from low to high, which are other numbers for those without.
+    """
+
+    like: Likelihood
+    priors: list[tuple[Prior, Array]]
+    theta: Float[Array, " all"]
+    present: Int[Array, " par"]
+    bounded: Bool[Array, " par"]
+    low: Float[Array, " par"]
+    high: Float[Array, " par"]
+
+    def full(self, values: Float[Array, " par"]) -> Float[Array, " all"]:
+        """The vector of all parameters."""
+        return self.theta.at[self.present].set(values)
+
+    def log_prob(self, values: Float[Array, " par"]) -> Float[Array, ""]:
+        """Log posterior of parameters within their uniform priors, without constants."""
+        theta = self.full(values)
+        value = prior_terms(theta, self.priors)[0]
+        return -self.like.total(theta[self.like.cells()]) / 2 - value
+
+
 class Posterior:
     """-log posterior of the parameters that any cell has, within bounds.
 
@@ -221,6 +247,14 @@ class Posterior:
                 name += f" in {counts} ({pixels[bad & own].sum()} of {pixels[own].sum()} pixels)"
             named.append(name)
         return ", ".join(named[:6]) + (f" and {len(named) - 6} more" if named[6:] else "")
+
+    def density(self, theta: np.ndarray) -> Density:
+        """The same for compiled programs, with a vector of all parameters."""
+        present = np.flatnonzero(self.present)
+        low, high = self.low[present], self.high[present]
+        bounded = np.isfinite(low)
+        limits = (bounded, np.where(bounded, low, 0.0), np.where(bounded, high, 1.0))
+        return Density(self.like, self.priors, *map(jnp.asarray, (theta, present, *limits)))
 
     def derivatives(self, theta: np.ndarray) -> Derivatives:
         """-ln L of each cell and its derivatives, as arrays of numpy; priors left out."""

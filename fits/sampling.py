@@ -45,11 +45,11 @@ RARE = 1e-3
 
 @partial(jax.jit, static_argnames="structure")
 def _log_probs(positions, leaves, structure):
-    unbounded = jax.tree.unflatten(structure, leaves)
+    density = jax.tree.unflatten(structure, leaves)
 
     def one(x):
-        inside = (x >= unbounded.low) & (x <= unbounded.high) | ~unbounded.bounded
-        value = unbounded.log_prob(x)
+        inside = (x >= density.low) & (x <= density.high) | ~density.bounded
+        value = density.log_prob(x)
         # Outside the prior the model may not even be finite.
         return jnp.where(inside.all() & jnp.isfinite(value), value, -jnp.inf)
 
@@ -78,7 +78,7 @@ def _ensemble(
             f"not nwalkers={nwalkers}, nsteps={nsteps}."
         )
     # Taken apart once rather than at each step, where it takes a third of the time.
-    leaves, structure = jax.tree.flatten(unbounded)
+    leaves, structure = jax.tree.flatten(unbounded.density)
 
     def log_probs(theta: np.ndarray) -> np.ndarray:
         # At the start, too, in the halves that emcee moves: one program instead of two.
@@ -136,7 +136,7 @@ def agreement(
 
 @jax.jit
 def _begun(unbounded, z):
-    return jax.vmap(lambda x: blackjax.nuts.init(x, unbounded.density))(z)
+    return jax.vmap(lambda x: blackjax.nuts.init(x, unbounded.log_density))(z)
 
 
 @partial(jax.jit, static_argnames="steps")
@@ -151,7 +151,7 @@ def _advanced(unbounded, begun, key, first, nwarmup, steps):
         warming = number < nwarmup
         size = jnp.exp(jnp.where(warming, tuning.log_step_size, tuning.log_step_size_avg))
         keys = jax.random.split(jax.random.fold_in(key, number), len(chains.logdensity))
-        chains, info = jax.vmap(lambda k, c: kernel(k, c, unbounded.density, size, metric))(
+        chains, info = jax.vmap(lambda k, c: kernel(k, c, unbounded.log_density, size, metric))(
             keys, chains
         )
         new = tuned(tuning, jnp.mean(jnp.nan_to_num(info.acceptance_rate)))
@@ -363,7 +363,7 @@ def sample(
         details = run(unbounded, labels, seed, report, **options)
     details["tau"] = dict(zip(labels, details["tau"].tolist(), strict=True))
     best = np.unravel_index(np.argmax(details["log_prob"]), details["log_prob"].shape)
-    theta = np.array(unbounded.theta)
+    theta = np.array(unbounded.density.theta)
     theta[posterior.present] = details["chain"][best]
     result = fit._replace(
         method=method,

@@ -13,10 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from fits.posterior import Likelihood, Posterior, prior_terms
-from fits.priors import Prior
+from fits.posterior import Density, Posterior
 from fits.systems import degenerate
 
 #: Samples for each parameter, from which on they tell more than the curvature at the best fit.
@@ -27,55 +26,37 @@ NEAR = 0.25
 
 
 class Unbounded(NamedTuple):
-    """The posterior of the parameters of regions with pixels, and numbers to move in.
+    """Numbers to move in: those without bounds are center + root z, or root times z if a vector.
 
-    Parameters
-    ----------
-    like, priors : the likelihood, and priors that are not uniform
-    theta, present : the vector of all parameters, and positions of those that are sampled
-    bounded, low, high : whether they have a uniform prior, and its range (any other number if not)
-    center, root : the unbounded numbers are center + root z, or root times z if it is a vector
-    cut, middle, lean : parameters that are cut by their prior, about where they are, and what is
-        added to the numbers of the others for each unit of distance from there
+    `cut` are parameters that are cut by their prior, `middle` is about where they are, and `lean`
+    is added to the numbers of the others for each unit of distance from there.
     """
 
-    like: Likelihood
-    priors: list[tuple[Prior, Array]]
-    theta: Float[Array, " all"]
-    present: Int[Array, " par"]
-    bounded: Bool[Array, " par"]
-    low: Float[Array, " par"]
-    high: Float[Array, " par"]
+    density: Density
     center: Float[Array, " par"]
     root: Float[Array, "*par par"]
     cut: Bool[Array, " par"]
     middle: Float[Array, " par"]
     lean: Float[Array, "*par par"]
 
-    def log_prob(self, values: Float[Array, " par"]) -> Float[Array, ""]:
-        """Log posterior of parameters within their uniform priors, without constants."""
-        theta = self.theta.at[self.present].set(values)
-        value = prior_terms(theta, self.priors)[0]
-        return -self.like.total(theta[self.like.cells()]) / 2 - value
-
     def values(self, z: Float[Array, " par"]) -> tuple[Float[Array, " par"], Float[Array, ""]]:
         """Parameters, and the log of the Jacobian of the logistic map."""
-        width = self.high - self.low
+        low, width = self.density.low, self.density.high - self.density.low
         if self.root.ndim == 1:
             y = self.center + self.root * z
         else:
             y = self.center + self.root @ z
-            moved = self.low + width * jax.nn.sigmoid(y) - self.middle
+            moved = low + width * jax.nn.sigmoid(y) - self.middle
             y = y + self.lean @ jnp.where(self.cut, moved, 0.0)
-        inside = self.low + width * jax.nn.sigmoid(y)
+        inside = low + width * jax.nn.sigmoid(y)
         jacobian = jnp.log(width) + jax.nn.log_sigmoid(y) + jax.nn.log_sigmoid(-y)
-        values = jnp.where(self.bounded, inside, y)
-        return values, jnp.sum(jnp.where(self.bounded, jacobian, 0.0))
+        values = jnp.where(self.density.bounded, inside, y)
+        return values, jnp.sum(jnp.where(self.density.bounded, jacobian, 0.0))
 
-    def density(self, z: Float[Array, " par"]) -> Float[Array, ""]:
+    def log_density(self, z: Float[Array, " par"]) -> Float[Array, ""]:
         """Log density of z."""
         values, jacobian = self.values(z)
-        return self.log_prob(values) + jacobian
+        return self.density.log_prob(values) + jacobian
 
     def coordinates(self, values: Float[np.ndarray, "sample par"]) -> np.ndarray:
         """The z of parameters, where there is a matrix."""
@@ -84,9 +65,10 @@ class Unbounded(NamedTuple):
         return np.linalg.solve(self.root, (rest - moved @ np.asarray(self.lean).T).T).T
 
     def _unbounded(self, values: np.ndarray) -> np.ndarray:
-        unit = np.where(self.bounded, (values - self.low) / (self.high - self.low), 0.5)
+        bounded, low, high = map(np.asarray, self.density[4:])
+        unit = np.where(bounded, (values - low) / (high - low), 0.5)
         # At an edge to rounding, the number is not infinite.
-        return np.where(self.bounded, scipy.special.logit(np.clip(unit, 1e-15, 1 - 1e-15)), values)
+        return np.where(bounded, scipy.special.logit(np.clip(unit, 1e-15, 1 - 1e-15)), values)
 
     def adapted(self, values: Float[np.ndarray, "sample par"]) -> "Unbounded":
         """With the covariance of samples; the same if they are too few, or do not move."""
@@ -97,7 +79,7 @@ class Unbounded(NamedTuple):
         if not np.isfinite(spread).all() or not spread.min() > 0:
             return self
         y = (y - center) / spread
-        cut = np.asarray(self.bounded) & (spread > NEAR)
+        cut = np.asarray(self.density.bounded) & (spread > NEAR)
         first, rest = np.flatnonzero(cut), np.flatnonzero(~cut)
         width = values[:, first].std(axis=0)
         # The others as linear functions of cut parameters and of their unbounded numbers.
@@ -126,10 +108,8 @@ def unbounded_posterior(posterior: Posterior, theta: np.ndarray) -> tuple[Unboun
 
     Also the labels of parameters that it does not determine.
     """
-    present = np.flatnonzero(posterior.present)
-    bounded = np.isfinite(posterior.low[present])
-    low = np.where(bounded, posterior.low[present], 0.0)
-    high = np.where(bounded, posterior.high[present], 1.0)
+    density = posterior.density(theta)
+    present, bounded, low, high = map(np.asarray, density[3:])
     width = high - low
 
     def derivatives(theta):
@@ -162,8 +142,8 @@ def unbounded_posterior(posterior: Posterior, theta: np.ndarray) -> tuple[Unboun
     if isinstance(matrix, np.ndarray) and not unknown:
         root, cut, lean = _straightened(matrix * scale * scale[:, None], bounded, scale, jacobian)
     center = np.where(bounded, np.log(unit / (1 - unit)), theta[present])
-    numbers = (theta, present, bounded, low, high, center, root, cut, theta[present], lean)
-    return Unbounded(posterior.like, posterior.priors, *map(jnp.asarray, numbers)), unknown
+    numbers = (center, root, cut, theta[present], lean)
+    return Unbounded(posterior.density(theta), *map(jnp.asarray, numbers)), unknown
 
 
 def _straightened(matrix, bounded, scale, jacobian):

@@ -38,17 +38,8 @@ def gram(
 ) -> Float[Array, "band stokes row row"]:
     """Weighted inner products of (data, templates, 1), for each band and Stokes parameter.
 
-    Parameters
-    ----------
-    data : observed maps
-    templates : maps that the model is a combination of
-    weights : 1/sigma^2, zero where masked; broadcasts against the data
-    chunk : pixels per pass
-
-    Returns
-    -------
-    Symmetric matrices with rows data, template 0 ... K-1, constant. Results for disjoint sets
-    of pixels add up to that of their union.
+    Weights are 1/sigma^2, zero where masked, and broadcast against the data; `chunk` pixels are
+    taken at once. Results for disjoint sets of pixels add up to that of their union.
     """
     bands, stokes, npix = data.shape
     weights = jnp.broadcast_to(weights, data.shape)
@@ -94,12 +85,9 @@ BLOCK = 4096
 
 
 class Layout(NamedTuple):
-    """Stokes parameters that share a mixing matrix.
+    """Stokes parameters, by position, that share a mixing matrix.
 
-    Parameters
-    ----------
-    joint : Q and U in one system, their rows one after the other; else one system each
-    stokes : the Stokes parameters, by position
+    If `joint`, Q and U are in one system, their rows one after the other; else each has its own.
     """
 
     joint: bool
@@ -217,9 +205,7 @@ def gathered(
 ) -> tuple[Pixels, Array | None]:
     """The pixels in blocks, each of a single cell and filled up with zeros of unit weight.
 
-    Returns
-    -------
-    Pixels (block, group, row, pix), and the cell of each block, None if they are in order.
+    With the cell of each block, None if they are in order.
     """
     pixels = np.flatnonzero(used)
     own = np.zeros(len(pixels), np.int32) if cells.of_pixel is None else cells.of_pixel[pixels]

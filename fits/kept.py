@@ -60,12 +60,7 @@ class ChainFile(emcee.backends.HDFBackend):
 
     HDF5 damages a file if it is stopped while it changes it, or finds the disk full. So changes
     are made in memory, and what is on disk is always a whole file: a state from which the chain
-    goes on exactly as if it had not stopped.
-
-    Parameters
-    ----------
-    filename, name : file, and name of the chain in it
-    every : seconds between the times at which steps are written
+    goes on exactly as if it had not stopped. Steps are written `every` so many seconds.
     """
 
     def __init__(
@@ -142,11 +137,7 @@ class ChainFile(emcee.backends.HDFBackend):
 def kept_chain(path: Path, name: str, size: tuple[int, int], mark: str) -> ChainFile:
     """The place of a chain in its file, to begin there or to go on.
 
-    Parameters
-    ----------
-    path, name : file, and name of the chain in it
-    size : number of walkers and of parameters
-    mark : of all that the chain depends on
+    Its size is the number of walkers and of parameters, its mark that of all that it depends on.
     """
     backend, mark = ChainFile(path, name), f"{mark} {size}"
     held = _held(path, name)
@@ -197,16 +188,11 @@ def kept_realisations(
     mark: str = "",
     report: Callable[[int, int], None] = QUIET.advance,
 ) -> list[np.ndarray]:
-    """Results of a function of a random key, stacked over realisations.
+    """Named results of a function of a random key, stacked over realisations.
 
-    Parameters
-    ----------
-    make : the function; a realisation depends on the seed and its own number only
-    names : of its results
-    count, seed : number of realisations, and what their keys are made of
-    path : file that keeps what is done; what it holds already is not made again
-    mark : of all that the results depend on; a file with another one is refused
-    report : called with the number of realisations done, and that of all
+    A realisation depends on the seed and its own number only. What the file holds already is not
+    made again; one with another mark, that of all that the results depend on, is refused. `report`
+    is called with the number of realisations done, and that of all.
     """
     check_seed("seed", seed)
     done = [] if path is None else _load(path, mark, names)

@@ -58,13 +58,8 @@ def check_folder(
 ) -> None:
     """Whether realisations with these settings may be written to a folder.
 
-    Others of the same settings may be there: a Monte Carlo is split over processes so.
-
-    Parameters
-    ----------
-    out, settings : the folder, and what is simulated
-    resume, overwrite : keep or replace what is there
-    indices : numbers of the realisations; by default all
+    Others of the same settings may be there: a Monte Carlo is split over processes so. Indices are
+    the numbers of the realisations, by default all.
     """
     log = out / LOG
     if overwrite:
@@ -94,10 +89,7 @@ def check_folder(
 def changed_tables(maps: Path, settings: Experiment) -> list[str]:
     """Tables that say something else about a sky than those with which its maps were simulated.
 
-    Parameters
-    ----------
-    maps : folder of a realisation; without its log beside it nothing is known to be different
-    settings : of the experiment
+    Without the log next to the folder of the maps nothing is known to be different.
     """
     try:
         there = json.loads((maps.parent / LOG).read_text())["settings"]
@@ -263,20 +255,9 @@ def run(
     """Simulate realisations into files, one for each band; files that are there are kept.
 
     A realisation depends on the seed and its number only. The folder is touched when the first
-    map is ready: what goes wrong before costs nothing.
-
-    Parameters
-    ----------
-    settings, setup : from `jaxsky.experiment`; sources are removed from it when they have served
-    out : folder, see `check_folder`
-    indices : numbers of the realisations
-    overwrite : remove all maps that are in the folder
-    note : called with sentences that a user should know
-    begun : called when the folder has its log, and what was to be removed from it is
-
-    Returns
-    -------
-    The files, as they are written.
+    map is ready: what goes wrong before costs nothing. Sources are removed from `setup` when they
+    have served. `note` is called with sentences that a user should know, `begun` when the folder
+    has its log, and what was to be removed from it (`overwrite`) is.
     """
     observation = setup.observation
     terms = prepared = None

@@ -135,14 +135,10 @@ class Observation(eqx.Module):
 class HarmonicSource(NamedTuple):
     """A component in harmonic space, ready to be seen in any band.
 
-    Parameters
-    ----------
-    alms : coefficients of the template times each term of its law, with the beam that it has
-    weights : of the terms in each band; None where bands are averaged one by one
-    component : where they are, the law, with parameters at the resolution of the observation
-    template : where they are, the template
-    fwhm : beam [arcmin]
-    repaired : multipoles whose matrix of correlated small scales was repaired
+    Coefficients are those of the template times each term of its law, with its beam, `fwhm`
+    [arcmin]; `weights` are those of the terms in each band. Where bands are averaged one by one
+    there are no weights, but the law, with parameters at the resolution of the observation, and the
+    template. At `repaired` multipoles the matrix of correlated small scales was repaired.
     """
 
     alms: tuple[Float[Array, "stokes alm"], ...]
@@ -206,10 +202,7 @@ def plan_terms(
 ) -> dict[str, Terms | None]:
     """Terms of each source for `harmonic_sources`, chosen from values that are not being traced.
 
-    Parameters
-    ----------
-    sources, observation : what is observed, and how
-    tolerance : error of varying laws relative to the maps of a band
+    The tolerance is the error of varying laws relative to the maps of a band.
     """
     # Terms are for the ranges of the maps as they are used.
     components = {n: _at(source.component, observation.nside) for n, source in sources.items()}
@@ -261,16 +254,11 @@ def harmonic_sources(
     *,
     release: bool = False,
 ) -> dict[str, HarmonicSource]:
-    """Sources with their small scales, in harmonic space.
+    """Sources with their small scales, which the key is for, in harmonic space.
 
-    Parameters
-    ----------
-    key : of jax.random, for the small scales
-    sources : by name
-    observation : how they are observed
-    terms : from `plan_terms`, by default made here; None for a source averages its bands one by
-        one, as is necessary where its parameters that are maps are being traced
-    release : take each source out of `sources`, a dict, when it has served, to free its memory
+    Terms are those of `plan_terms`, by default made here; None for a source averages its bands one
+    by one, as is necessary where its parameters that are maps are being traced. `release` takes
+    each source out of `sources`, a dict, when it has served, to free its memory.
     """
     _check_sources(sources, observation)
     terms = plan_terms(sources, observation) if terms is None else terms

@@ -70,20 +70,11 @@ def observe_bands(
     components: bool = False,
     names: Sequence[str] | None = None,
 ) -> Iterator[tuple[str, dict[str, Float[Array, "stokes pix"]]]]:
-    """The maps of each channel in turn, so that only one is in memory.
+    """Names of the channels and their maps [uK_RJ] in turn, so that only one is in memory.
 
-    Parameters
-    ----------
-    key : of jax.random, for CMB and noise
-    prepared : from `harmonic_sources`; may be empty
-    observation : the experiment
-    cmb : spectra TT, EE, BB, TE [uK_CMB^2] up to 2 nside at least, or None for no CMB
-    components : give the map of each component, of "cmb" and "noise" as well as the "total"
-    names : channels to give, by default all; what they show does not depend on it
-
-    Returns
-    -------
-    Name of the channel, and maps [uK_RJ] by name, shape (stokes, pix); each in turn.
+    The key is for CMB and noise. Spectra of the CMB are TT, EE, BB, TE [uK_CMB^2] up to 2 nside at
+    least. There is the "total", and with `components` the map of each of these, of "cmb" and
+    "noise". What the channels show does not depend on which are asked for (`names`, default all).
     """
     nside, lmax, stokes = observation.nside, observation.lmax, observation.stokes
     if taken := {"cmb", "noise", "total"} & set(prepared):

@@ -24,7 +24,6 @@ transforms = {{
     "analysis": (lambda m: analysis(m, LMAX), maps),
     "smooth": (lambda m: smooth(m, 60.0), maps),
     "rotate": (lambda a: rotate(a, "G", "C"), alm),
-    "healpy": (lambda a: synthesis(a, NSIDE, engine="healpy"), alm),
 }}
 
 def call(name, gradient=False):
@@ -69,7 +68,7 @@ def ends(*cases: str) -> list[int]:
     [
         ("smooth rotate", True),
         ("synthesis analysis", True),
-        ("synthesis analysis smooth rotate healpy", False),
+        ("synthesis analysis smooth rotate", False),
     ],
 )
 def test_a_script_may_end_in_any_transform(names, gradient):

@@ -29,13 +29,8 @@ def low_multipoles(
 ) -> Float[Array, "stokes alm"]:
     """Packed coefficients up to lmax of maps that have higher multipoles, too.
 
-    Multipoles beyond those that are analysed leak into them, so more are than are kept.
-
-    Parameters
-    ----------
-    maps : shape (stokes, pix), RING; one row is I, two are Q, U, three are I, Q, U
-    lmax : largest multipole kept; above 2 nside of the maps coefficients are zero
-    iterations : of `analysis`
+    Multipoles beyond those that are analysed leak into them, so more are than are kept. Above
+    2 nside of the maps coefficients are zero.
     """
     resolved = 2 * healpy.npix2nside(maps.shape[-1])
     return resize(analysis(maps, min(resolved, MARGIN * lmax), iterations), lmax)
@@ -52,16 +47,9 @@ def resample(
     """Maps times a window in l, at another resolution: smoothing and degrading in one.
 
     Linear in the maps, with an exact transpose. Multipoles above those of the window are cut,
-    so a degraded map is band-limited rather than averaged over pixels.
-
-    Parameters
-    ----------
-    maps : shape (stokes, pix), RING; one row is I, two are Q, U, three are I, Q, U
-    window : factor for each multipole 0 ... lmax; above 2 nside of the input nothing is left
-    nside : resolution of the result
-    iterations : of `analysis`
-    fine : a window that ends below this fraction of the nside of the maps takes an analysis
-        without steps, of its own multipoles only
+    so a degraded map is band-limited rather than averaged over pixels; above 2 nside of the input
+    nothing is left. A window that ends below the fraction `fine` of the nside of the maps takes an
+    analysis without steps (`iterations`), of its own multipoles only.
     """
     lmax = len(window) - 1
     if lmax <= fine * healpy.npix2nside(maps.shape[-1]):
@@ -118,10 +106,7 @@ def average_pixels(maps: Float[Array, "... pix"], nside: int) -> Float[Array, ".
 class Preparation(eqx.Module):
     """Smooth to a common beam and degrade to a common nside, or average pixels only.
 
-    Parameters
-    ----------
-    window : factor for each multipole; None averages pixels and leaves the beam as it is
-    nside_in, nside : resolution of the maps, and of the result
+    The window has a factor for each multipole; None averages pixels and leaves the beam as it is.
     """
 
     window: Float[Array, " ell"] | None

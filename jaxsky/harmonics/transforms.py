@@ -1,4 +1,4 @@
-"""Synthesis, analysis and rotation: ducc0 through jaxbind, with healpy as the reference."""
+"""Synthesis, analysis and rotation: ducc0 through jaxbind, inside jit and with gradients."""
 
 import atexit
 import contextlib
@@ -25,8 +25,6 @@ from jaxtyping import Array, Float, Int
 from jaxsky.checks import check_double
 from jaxsky.harmonics.packing import alm_from_healpy, alm_to_healpy, lmax_of
 
-#: Who computes the transforms: ducc0, inside jit and with gradients, or healpy, the reference.
-ENGINES = ("ducc", "healpy")
 #: Coordinates between which coefficients are rotated.
 COORDINATES = ("G", "E", "C")
 
@@ -74,61 +72,22 @@ def _blocks(stokes: int, spin: int) -> list[tuple[slice, int]]:
 def _transform(nside: int, lmax: int, spin: int):
     # jaxbind passes the geometry of the rings as 64-bit numbers, whatever the maps are.
     check_double("A spherical harmonic transform")
+    _finish_at_exit()
     return get_healpix_sht(nside, lmax, lmax, spin, nthreads=0)
 
 
-def _check_engine(engine: str) -> None:
-    """Refuse an unknown engine, and have the process wait for the known ones when it ends."""
-    if engine not in ENGINES:
-        raise ValueError(f"Argument `engine` must be one of {', '.join(ENGINES)}, not {engine!r}.")
-    _finish_at_exit()
-
-
-@partial(jax.jit, static_argnames=("nside", "engine", "spin"))
+@partial(jax.jit, static_argnames=("nside", "spin"))
 def synthesis(
-    alm: Float[Array, "stokes alm"], nside: int, engine: str = "ducc", spin: int = 2
+    alm: Float[Array, "stokes alm"], nside: int, spin: int = 2
 ) -> Float[Array, "stokes pix"]:
     """Maps I, or Q, U, or I, Q, U from packed coefficients I, or E, B, or I, E, B.
 
-    Parameters
-    ----------
-    alm : packed coefficients, shape (stokes, (lmax+1)^2)
-    nside : resolution of the maps; lmax may exceed 3 nside - 1, the maps are then samples
-    engine : "ducc", or "healpy", which has no gradients
-    spin : of the last two rows, if there are two; 2 for polarization
+    Above lmax = 3 nside - 1 the maps are samples. `spin` is that of the last two rows.
     """
-    _check_engine(engine)
     lmax = lmax_of(alm)
-    if engine == "healpy":
-        shape = jax.ShapeDtypeStruct((len(alm), healpy.nside2npix(nside)), alm.dtype)
-        return jax.pure_callback(partial(_healpy_synthesis, nside=nside, spin=spin), shape, alm)
     return jnp.concatenate(
         [_transform(nside, lmax, s)(alm[rows])[0] for rows, s in _blocks(len(alm), spin)]
     )
-
-
-def _healpy_synthesis(alm: np.ndarray, nside: int, spin: int) -> np.ndarray:
-    """`synthesis` by healpy."""
-    lmax = lmax_of(alm)
-    maps = [
-        healpy.alm2map(parts[0], nside, lmax=lmax)[None]
-        if s == 0
-        else healpy.alm2map_spin(list(parts), nside, s, lmax)
-        for rows, s in _blocks(len(alm), spin)
-        for parts in [alm_to_healpy(alm[rows], lmax)]
-    ]
-    return np.concatenate(maps)
-
-
-def _healpy_analysis(maps: np.ndarray, lmax: int, iterations: int) -> np.ndarray:
-    """`analysis` by healpy."""
-    maps = np.asarray(maps)
-    full = np.concatenate([np.zeros((3 - len(maps), maps.shape[-1])), maps])
-    if len(maps) == 1:
-        alm = healpy.map2alm(maps[0], lmax=lmax, iter=iterations, use_weights=True)[None]
-    else:
-        alm = healpy.map2alm(full, lmax=lmax, iter=iterations, use_weights=True)[-len(maps) :]
-    return alm_from_healpy(alm, lmax)
 
 
 @partial(jax.jit, static_argnames=("lmax", "spin"))
@@ -141,37 +100,24 @@ def adjoint_synthesis(
     return jax.linear_transpose(partial(synthesis, nside=nside, spin=spin), empty)(maps)[0]
 
 
-@partial(jax.jit, static_argnames=("lmax", "iterations", "engine", "spin"))
+@partial(jax.jit, static_argnames=("lmax", "iterations", "spin"))
 def analysis(
     maps: Float[Array, "stokes pix"],
     lmax: int,
     iterations: int | None = None,
-    engine: str = "ducc",
     spin: int = 2,
 ) -> Float[Array, "stokes alm"]:
     """Packed coefficients of maps I, or Q, U, or I, Q, U: the inverse of `synthesis`.
 
     Ring-weighted quadrature, refined by Jacobi steps on the residual map. For a map without
     multipoles above lmax the rms error is below 1e-6 of the rms coefficient up to lmax = 2 nside,
-    at nside 512 about 1e-7; above, no number of steps is enough.
-
-    Parameters
-    ----------
-    maps : shape (stokes, pix), RING; one row is I, two are Q, U, three are I, Q, U
-    lmax : largest multipole, at most 3 nside - 1
-    iterations : Jacobi steps; by default one up to lmax = 1.5 nside and two above, and one more
-        below nside 128, where the quadrature is worse
-    engine : "ducc", or "healpy", which has no gradients and no other spin
-    spin : of the last two rows, if there are two; 2 for polarization
+    at nside 512 about 1e-7; above, no number of steps (`iterations`) is enough. There are by
+    default one up to lmax = 1.5 nside and two above, and one more below nside 128, where the
+    quadrature is worse. Maps are in RING order, lmax at most 3 nside - 1.
     """
-    _check_engine(engine)
     nside = healpy.npix2nside(maps.shape[-1])
     if iterations is None:
         iterations = 1 + (2 * lmax > 3 * nside) + (nside < 128)
-    if engine == "healpy":
-        shape = jax.ShapeDtypeStruct((len(maps), (lmax + 1) ** 2), maps.dtype)
-        call = partial(_healpy_analysis, lmax=lmax, iterations=iterations)
-        return jax.pure_callback(call, shape, maps)
     weights = jnp.asarray(_ring_weights(nside), maps.dtype)[_rings(nside)]
     alm = adjoint_synthesis(weights * maps, lmax, spin)
     for _ in range(iterations):
@@ -196,37 +142,20 @@ def _same(alm, **_):
 _rotation = get_linear_call(_turn, partial(_turn, inverse=True), _same, _same)
 
 
-@partial(jax.jit, static_argnames=("source", "target", "engine"))
-def rotate(
-    alm: Float[Array, "stokes alm"], source: str, target: str, engine: str = "ducc"
-) -> Float[Array, "stokes alm"]:
+@partial(jax.jit, static_argnames=("source", "target"))
+def rotate(alm: Float[Array, "stokes alm"], source: str, target: str) -> Float[Array, "stokes alm"]:
     """Packed coefficients in other coordinates; those of polarization as scalars E and B.
 
-    Parameters
-    ----------
-    alm : packed coefficients, shape (stokes, (lmax+1)^2)
-    source, target : "G" Galactic, "E" ecliptic or "C" celestial (equatorial), both J2000
-    engine : "ducc", or "healpy", which has no gradients
+    These are "G" Galactic, "E" ecliptic or "C" celestial (equatorial), both J2000.
     """
-    _check_engine(engine)
     for name, value in {"source": source, "target": target}.items():
         if value not in COORDINATES:
             known = ", ".join(COORDINATES)
             raise ValueError(f"Argument `{name}` must be one of {known}, not {value!r}.")
     check_double("A rotation")
-    if engine == "healpy":
-        call = partial(_healpy_rotation, coordinates=(source, target))
-        return jax.pure_callback(call, jax.ShapeDtypeStruct(alm.shape, alm.dtype), alm)
+    _finish_at_exit()
     angles = tuple(map(float, healpy.rotator.coordsys2euler_zyz((source, target))))
     return _rotation(alm, lmax=lmax_of(alm), angles=angles)[0]
-
-
-def _healpy_rotation(alm: np.ndarray, coordinates: tuple[str, str]) -> np.ndarray:
-    """`rotate` by healpy."""
-    lmax = lmax_of(alm)
-    rotator = healpy.Rotator(coord=list(coordinates))
-    rows = [rotator.rotate_alm(row, lmax=lmax) for row in alm_to_healpy(alm, lmax)]
-    return alm_from_healpy(np.stack(rows), lmax)
 
 
 # The end of a Python process in which transforms run.

@@ -21,12 +21,7 @@ def gaussian_beam(fwhm: ArrayLike, lmax: int) -> Float[Array, " ell"]:
     """Window b_l = exp(-l (l+1) sigma^2 / 2) of a Gaussian beam, differentiable in its width.
 
     The same window serves temperature and polarization, as in the paper; healpy's polarized
-    one differs by exp(2 sigma^2), 1.0001 for 1 degree.
-
-    Parameters
-    ----------
-    fwhm : full width at half maximum [arcmin]
-    lmax : largest multipole
+    one differs by exp(2 sigma^2), 1.0001 for 1 degree. The width is in arcmin.
     """
     return _gaussian(fwhm, 0.0, lmax)
 
@@ -44,13 +39,8 @@ def beam_ratio(
 ) -> Float[Array, " ell"]:
     """Window that takes a map from its own beam to a target, differentiable in both.
 
-    Between two Gaussians that is the Gaussian of sqrt(target^2 - own^2).
-
-    Parameters
-    ----------
-    target, own : full width at half maximum of a Gaussian [arcmin], or a table b_l, l = 0 ...
-    lmax : largest multipole
-    what : what has its own beam, for the message
+    Each is the full width at half maximum of a Gaussian [arcmin], or a table b_l, l = 0 ...;
+    between two Gaussians that is the Gaussian of sqrt(target^2 - own^2). `what` has its own beam.
     """
     target, own = jnp.asarray(target, float), jnp.asarray(own, float)
     if not target.ndim and not own.ndim:

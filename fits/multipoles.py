@@ -120,13 +120,9 @@ def _check_full_sky(band: int, maps: np.ndarray) -> None:
 
 
 class Multipoles(NamedTuple):
-    """Beams and noise of the bands at l = 0 ... lmax.
+    """Beams and noise of the bands at l = 0 ... lmax, of which those from lmin on are used.
 
-    Parameters
-    ----------
-    lmin : smallest multipole that is used
-    inverse : 1 / b_l; 0 where a band is left out
-    weights : b_l^2 / N_l, likewise
+    `inverse` is 1 / b_l and `weights` b_l^2 / N_l, both 0 where a band is left out.
     """
 
     lmin: int

@@ -37,11 +37,8 @@ def bare(name: str, value: object) -> np.ndarray:
 class Noise(NamedTuple):
     """Gaussian noise, independent between pixels and bands; see `as_noise`.
 
-    Parameters
-    ----------
-    sigma : standard deviation, (band, stokes, 1 or pix)
-    pixel_sigma : factor on it in each pixel; infinite where masked
-    covariance : of Q and U, instead
+    There are standard deviations, with a factor on them in each pixel that is infinite where it is
+    masked, or covariances of Q and U instead.
     """
 
     sigma: Float[np.ndarray, "band stokes #pix"] | None

@@ -151,7 +151,7 @@ def _deviance(theta, args):
 def fit_knee(
     maps: Float[Array, "stokes pix"], used: Bool[Array, " pix"], lmax: int
 ) -> tuple[float, float, float]:
-    """White level, knee and slope (`knee_spectrum`) of the noise of Q, U maps.
+    """White level, knee and slope (`knee_spectrum`) of the noise of Q, U maps, up to lmax.
 
     The most probable values given the spectrum (EE + BB)/2 of the masked maps divided by the
     fraction of the sky, whose values are taken as independent between multipoles. Whatever the

@@ -15,8 +15,8 @@ CACHE = Path(__file__).parent / ".cache"
 os.environ["JAXSKY_CACHE"] = str(CACHE)
 keep_programs(CACHE / "programs")
 
-#: Of memory, from which on programs are forgotten; the programs of so many take about 1 GB.
-MOST_PIECES = 10_000
+#: Of memory, from which on programs are forgotten; the programs of so many take about 0.4 GB.
+MOST_PIECES = 2_500
 DATA = Path(os.environ.get("JAXSKY_DATA", Path(__file__).parents[1] / "shared" / "data"))
 
 

@@ -12,83 +12,30 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from settings_fuzz import written
+from systems import small_experiment
+
 COMMANDS = ("fit", "simulate", "compare", "separate", "paper")
+FREE = {"dust.beta_dust": {"start": 1.6, "uniform": [0.5, 2.5]}}
+FIT = {"regions": ["full"], "stokes": ["Q", "U"], "methods": ["mcmc"], "likelihood": "diagonal"}
 #: Small settings of each command, on the embedded sky: most of a run is to start and compile.
 SETTINGS = {
-    "fit": """
-[sky]
-embedded = { nside = 16 }
-[[bands]]
-instrument = "planck"
-channels = ["44", "70"]
-[common]
-nside = 8
-fwhm = 600.0
-[free]
-"dust.beta_dust" = { start = 1.6, uniform = [0.5, 2.5] }
-[fit]
-regions = ["full"]
-stokes = ["Q", "U"]
-methods = ["mcmc"]
-likelihood = "diagonal"
-nwalkers = 8
-nsteps = 500
-""",
-    "simulate": """
-[sky]
-embedded = { nside = 16 }
-[[bands]]
-instrument = "core"
-channels = ["45", "105"]
-[simulate]
-nside = 16
-fwhm = 600.0
-sheet = false
-""",
-    "compare": """
-[sky]
-embedded = { nside = 16 }
-[[bands]]
-instrument = "planck"
-channels = ["70"]
-[common]
-nside = 8
-fwhm = 600.0
-[compare]
-regions = ["full"]
-nsims = 30
-lmax = 12
-width = 4
-""",
-    "separate": """
-[sky]
-embedded = { nside = 16 }
-[[bands]]
-instrument = "litebird"
-channels = ["40", "100", "140", "280"]
-[common]
-nside = 8
-fwhm = 600.0
-[free]
-"dust.beta_dust" = { start = 1.6, uniform = [0.5, 2.5] }
-[separate]
-nsims = 20
-sampler = "emcee"
-nsteps = 100
-width = 3
-""",
-    "paper": """
-[sky]
-embedded = { nside = 64 }
-[[bands]]
-instrument = "planck"
-channels = ["44", "70"]
-[common]
-nside = 16
-fwhm = 300.0
-[free]
-"dust.beta_dust" = { start = 1.6, uniform = [0.5, 2.5] }
-""",
+    "fit": small_experiment(("44", "70"), free=FREE, fit=FIT | {"nwalkers": 8, "nsteps": 500}),
+    "simulate": small_experiment(
+        ("45", "105"), "core", simulate={"nside": 16, "fwhm": 600.0, "sheet": False}
+    ),
+    "compare": small_experiment(
+        ("70",), compare={"regions": ["full"], "nsims": 30, "lmax": 12, "width": 4}
+    ),
+    "separate": small_experiment(
+        ("40", "100", "140", "280"),
+        "litebird",
+        free=FREE,
+        separate={"nsims": 20, "sampler": "emcee", "nsteps": 100, "width": 3},
+    ),
+    "paper": small_experiment(
+        ("44", "70"), nside=64, free=FREE, common={"nside": 16, "fwhm": 300.0}
+    ),
 }
 OPTIONS = {"simulate": ("--nsims", "4"), "paper": ("--only", "1", "--only", "table 1")}
 #: What says when and how long a run was, and how it was called.
@@ -99,8 +46,7 @@ PATIENCE = 30.0
 
 def start(name: str, out: Path, *options: str) -> subprocess.Popen:
     """The command in a process of its own, its words in a file beside the folder."""
-    settings = out.with_name(f"{name}.toml")
-    settings.write_text(SETTINGS[name])
+    settings = written(out.with_name(f"{name}.toml"), SETTINGS[name])
     code = "from fits.app import main; main()"
     arguments = [name, str(settings), "--out", str(out), *OPTIONS.get(name, ()), *options]
     with said_by(out).open("w") as said:
@@ -171,14 +117,7 @@ def content(out: Path) -> dict:
 
 
 class Killing:
-    """Kills of a command, chained, against an undisturbed run.
-
-    Parameters
-    ----------
-    name : of the command
-    folder : an empty one
-    seed : of the moments
-    """
+    """Kills of a command, chained, against an undisturbed run in an empty folder."""
 
     def __init__(self, name: str, folder: Path, seed: int = 0) -> None:
         self.name, self.out, self.rng = name, folder / "out", np.random.default_rng(seed)

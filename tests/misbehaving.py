@@ -235,16 +235,8 @@ def fetch_command(address, folder, name):
 def kill_fetches(address, folder, kills, seed=0):
     """Fetch a product again and again, kill it at random moments, and compare what is there.
 
-    Parameters
-    ----------
-    address : of a server as above, which sends the file in about a second
-    folder : the cache
-    kills : number of processes to kill; a file that was complete before is removed
-    seed : of the moments: most while the file comes, some before, at the end or after it
-
-    Returns
-    -------
-    The numbers of bytes with which transfers began: more than zero where one was resumed.
+    Returns the bytes with which transfers began: more than zero where one was resumed. A file
+    that was complete before is removed.
     """
     # It has no hash in the catalogue, so that any FITS file may be it.
     name, rng = "LFI_RIMO_R2.50.fits", np.random.default_rng(seed)

@@ -72,13 +72,20 @@ def paths(table: Any, at: tuple = ()) -> Iterator[tuple]:
 
 
 def changed(raw: dict[str, Any], at: tuple, value: Any) -> dict[str, Any]:
-    """Settings with another value at a place, in a table that need not be there."""
+    """Settings with another value at a place, or none, in a table that need not be there."""
     raw = deepcopy(raw)
     table: Any = raw
     for key in at[:-1]:
         table = table.setdefault(key, {}) if isinstance(table, dict) else table[key]
     table[at[-1]] = value
+    if value is None:
+        del table[at[-1]]
     return raw
+
+
+def changed_at(raw: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """Settings with one entry changed, "/" between the parts of its key ("bands/0/noise")."""
+    return changed(raw, tuple(int(k) if k.isdecimal() else k for k in key.split("/")), value)
 
 
 def toml(value: Any) -> str:

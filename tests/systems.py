@@ -1,5 +1,7 @@
 """Small skies with known answers, shared by the tests."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -44,3 +46,15 @@ def dust_and_synchrotron(npix: int = NPIX) -> Sky:
             "synchrotron": Synchrotron(random_maps(4, npix=npix), 3.1),
         }
     )
+
+
+def small_experiment(
+    channels: tuple[str, ...], instrument: str = "planck", nside: int = 16, **tables: Any
+) -> dict[str, Any]:
+    """Settings on the embedded sky at a low resolution; tables are added, or replace others."""
+    return {
+        "title": "small",
+        "sky": {"embedded": {"nside": nside}},
+        "bands": [{"instrument": instrument, "channels": list(channels)}],
+        "common": {"nside": nside // 2, "fwhm": 600.0},
+    } | tables

@@ -2,8 +2,6 @@
 
 import json
 
-import h5py
-import healpy
 import jax
 import numpy as np
 import pytest
@@ -11,10 +9,11 @@ import pytest
 from commands import jaxsky, one_sentence, said
 from fits.commands.run import DEFAULTS
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe
-from jaxsky.harmonics import alm_ell, gaussian_beam, synthesis
+from jaxsky.harmonics import alm_ell, gaussian_beam, resample, synthesis
 from jaxsky.io import write_maps
 from jaxsky.noise import draw, uniform_covariance
 from jaxsky.settings import load
+from mapfiles import table, write
 
 NSIDE = 16
 TRUTH = {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}
@@ -84,10 +83,10 @@ def folder(tmp_path_factory):
         "70": (Bandpass.top_hat(70.0, 14.0), 150.0),
     }
     for i, (name, (band, fwhm)) in enumerate(bands.items()):
-        seen = synthesis_of(sky, band, fwhm, lmax)
+        seen = resample(observe(sky, [band])[0], gaussian_beam(fwhm, lmax), NSIDE)
         covariance = uniform_covariance(200.0, NSIDE)  # uK_CMB
         noise = np.asarray(draw(jax.random.key(i), covariance))
-        maps = 1e-6 * (seen / float(band.conversion("uK_CMB", "uK_RJ")) + noise)
+        maps = 1e-6 * (np.asarray(seen) / float(band.conversion("uK_CMB", "uK_RJ")) + noise)
         QQ, QU, UU = 1e-12 * np.asarray(covariance)[(0, 0, 1), (0, 1, 1)]
         columns = {
             "Q_STOKES": maps[0],
@@ -97,23 +96,10 @@ def folder(tmp_path_factory):
             "QU_COV": QU,
             "UU_COV": UU,
         }
-        nested = [healpy.reorder(c, r2n=True) for c in columns.values()]
-        healpy.write_map(
-            folder / f"{name}.fits",
-            nested,
-            nest=True,
-            coord="G",
-            column_names=list(columns),
-            column_units=["K_CMB", "K_CMB", "", "K_CMB^2", "K_CMB^2", "K_CMB^2"],
-            dtype=np.float64,
-        )
+        units = ["K_CMB"] * 2 + [""] + ["K_CMB^2"] * 3
+        nested = table(columns, units, form="D", ORDERING="NESTED")
+        write(folder / f"{name}.fits", nested)
     return folder
-
-
-def synthesis_of(sky, band, fwhm, lmax):
-    from jaxsky.harmonics import resample
-
-    return np.asarray(resample(observe(sky, [band])[0], gaussian_beam(fwhm, lmax), NSIDE))
 
 
 def write_settings(
@@ -180,20 +166,6 @@ def test_options_replace_settings_and_results_are_kept(folder, tmp_path, monkeyp
     assert jaxsky(monkeypatch, "fit", path, *options, "--resume") == 0
     again = json.loads((out / "result.json").read_text())
     assert again["results"] == json.loads(before)["results"]
-
-
-@pytest.mark.slow
-def test_resume_goes_on_with_a_cut_chain(folder, tmp_path, monkeypatch):
-    path, out = write_settings(folder, "resume"), tmp_path / "out"
-    options = ["--out", out, "--set", 'fit.stokes=["QU"]']
-    assert jaxsky(monkeypatch, "fit", path, *options) == 0
-    whole = json.loads((out / "result.json").read_text())
-    short = write_settings(folder, "short", **{"nsteps = 2200": "nsteps = 700"})
-    assert jaxsky(monkeypatch, "fit", short, *options, "--overwrite") == 0
-    with h5py.File(out / "chain.h5") as file:
-        assert file["full_QU"].attrs["iteration"] == 700
-    assert jaxsky(monkeypatch, "fit", path, *options, "--resume") == 0
-    assert json.loads((out / "result.json").read_text())["results"] == whole["results"]
 
 
 @pytest.mark.parametrize("noise", ["{ rms = 9e-7 }", "{ estimate_above = 0 }"])
@@ -273,19 +245,3 @@ def test_mistakes_are_one_sentence(folder, tmp_path, monkeypatch, capsys, old, n
     assert jaxsky(monkeypatch, "fit", path, "--out", out) == 2
     assert words in one_sentence(capsys)
     assert not list(out.glob("*")) if out.exists() else True
-
-
-def test_a_damaged_chain_is_named_and_kept(folder, tmp_path, monkeypatch, capsys):
-    (tmp_path / "chain.h5").write_text("no HDF5")
-    options = ["--out", tmp_path, "--resume", "--set", 'fit.stokes=["QU"]']
-    assert jaxsky(monkeypatch, "fit", write_settings(folder, "damaged"), *options) == 2
-    assert "chain.h5: is damaged; start again with --overwrite" in one_sentence(capsys)
-    assert (tmp_path / "chain.h5").read_text() == "no HDF5"
-
-
-def test_a_mistake_does_not_cost_the_old_results(folder, tmp_path, monkeypatch, capsys):
-    (tmp_path / "result.json").write_text("old")
-    path = write_settings(folder, "typo", **{'"dust.fits"': '"dsut.fits"'})
-    assert jaxsky(monkeypatch, "fit", path, "--out", tmp_path, "--overwrite") == 2
-    assert "dsut.fits" in one_sentence(capsys)
-    assert (tmp_path / "result.json").read_text() == "old"

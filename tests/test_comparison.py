@@ -19,38 +19,29 @@ from fits.inputs import inputs_of
 from fits.regions import region_masks
 from jaxsky.io import InputError
 from jaxsky.settings import Experiment, SettingsError, load
+from settings_fuzz import written
+from systems import small_experiment
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "wmap7_vw.toml"
-SETTINGS = """
-title = "small"
-seed = 3
-[sky]
-embedded = { nside = 32 }
-[[bands]]
-instrument = "planck"
-channels = ["44", "70"]
-[[bands]]
-instrument = "wmap"
-channels = ["K"]
-[common]
-nside = 16
-fwhm = 300.0
-[simulate]
-leakage = { "70" = 0.2 }
-[compare]
-regions = ["strip", "outside"]
-nsims = 30
-lmax = 25
-width = 8
-panel_nside = 8
-"""
+COMPARE = {"regions": ["strip", "outside"], "nsims": 30, "lmax": 25, "width": 8, "panel_nside": 8}
+PLANCK, WMAP = (
+    {"instrument": "planck", "channels": ["44", "70"]},
+    {"instrument": "wmap", "channels": ["K"]},
+)
+SETTINGS = small_experiment(
+    (),
+    nside=32,
+    seed=3,
+    bands=[PLANCK, WMAP],
+    common={"nside": 16, "fwhm": 300.0},
+    simulate={"leakage": {"70": 0.2}},
+    compare=COMPARE,
+)
 
 
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory):
-    path = tmp_path_factory.mktemp("compare") / "compare.toml"
-    path.write_text(SETTINGS)
-    return load(path)
+    return load(written(tmp_path_factory.mktemp("compare") / "compare.toml", SETTINGS))
 
 
 @pytest.fixture(scope="module")
@@ -276,24 +267,25 @@ def test_realisations_are_kept(prepared, model, regions, tmp_path):
 
 
 def test_what_cannot_be_compared_is_refused(settings, prepared, regions):
-    how = settings.compare.model_copy(update={"lmax": 33})
-    with pytest.raises(SettingsError, match="multipoles reach to 2 nside, 32, but 33 is asked"):
-        compare(settings.model_copy(update={"compare": how}), prepared, regions)
     with pytest.raises(SettingsError, match="region 'nothing' leaves fewer than 10 pixels"):
         compare(settings, prepared, {"nothing": np.zeros(3072, bool)})
-    how = settings.compare.model_copy(update={"width": 1})
-    with pytest.raises(SettingsError, match=r"compare.width: 1 makes 24 bins .*nsims is 30"):
-        compare(settings.model_copy(update={"compare": how}), prepared, regions)
-    how = settings.compare.model_copy(update={"patches": "K"})
-    with pytest.raises(SettingsError, match=r"patches_nside: 256 is finer than that of .*, 32"):
-        compare(settings.model_copy(update={"compare": how}), prepared, regions)
     # Of the other bands it does not matter.
     coarse = prepared._replace(sources=prepared.sources | {"band '44'": 16})
-    with pytest.raises(SettingsError, match=r"256 is finer than that of template .*, 32"):
-        compare(settings.model_copy(update={"compare": how}), coarse, regions)
-    how = how.model_copy(update={"patches_nside": 32})
-    with pytest.raises(SettingsError, match=r"patches_nside: 32 resolves l = 64, .* take 100"):
-        compare(settings.model_copy(update={"compare": how}), prepared, regions)
+    patches = {"patches": "K"}
+    for update, maps, words in (
+        ({"lmax": 33}, prepared, "multipoles reach to 2 nside, 32, but 33 is asked"),
+        ({"width": 1}, prepared, r"compare.width: 1 makes 24 bins .*nsims is 30"),
+        (patches, prepared, r"patches_nside: 256 is finer than that of .*, 32"),
+        (patches, coarse, r"256 is finer than that of template .*, 32"),
+        (
+            patches | {"patches_nside": 32},
+            coarse,
+            r"patches_nside: 32 resolves l = 64, .* take 100",
+        ),
+    ):
+        how = settings.compare.model_copy(update=update)
+        with pytest.raises(SettingsError, match=words):
+            compare(settings.model_copy(update={"compare": how}), maps, regions)
     for change, words in (
         ({"compare": {"patches": "353"}}, r"compare.patches: '353' is none of 44, 70, K"),
         ({"simulate": {"leakage": {"30": 0.1}}}, r"simulate.leakage: '30' is none of 44, 70, K"),
@@ -307,7 +299,7 @@ def test_what_cannot_be_compared_is_refused(settings, prepared, regions):
 
 
 def test_command_line(tmp_path, monkeypatch, capsys):
-    (tmp_path / "a.toml").write_text(SETTINGS)
+    written(tmp_path / "a.toml", SETTINGS)
     out = tmp_path / "out"
     assert jaxsky(monkeypatch, "compare", tmp_path / "a.toml", "--out", out) == 0
     pictures = {"scatter_strip", "scatter_outside", "maps_Q", "maps_U", "spectra", "leakage"}
@@ -323,11 +315,11 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     assert jaxsky(monkeypatch, *again, "--set", "seed=9") == 2
     assert "holds realisations of other data" in capsys.readouterr().err
     # What cannot work removes nothing; what works leaves nothing of the old.
-    (tmp_path / "bad.toml").write_text(SETTINGS.replace("lmax = 25", "lmax = 33"))
+    written(tmp_path / "bad.toml", SETTINGS | {"compare": COMPARE | {"lmax": 33}})
     assert jaxsky(monkeypatch, "compare", tmp_path / "bad.toml", "--out", out, "--overwrite") == 2
     assert (out / "comparison.json").exists()
-    tight = SETTINGS.replace('leakage = { "70" = 0.2 }', "").replace('"strip", ', "")
-    (tmp_path / "b.toml").write_text(tight)
+    tight = {"compare": COMPARE | {"regions": ["outside"]}, "simulate": {}}
+    written(tmp_path / "b.toml", SETTINGS | tight)
     assert jaxsky(monkeypatch, "compare", tmp_path / "b.toml", "--out", out, "--overwrite") == 0
     assert {p.stem for p in out.glob("*.png")} == pictures - {"scatter_strip", "leakage"}
 

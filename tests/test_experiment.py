@@ -467,17 +467,6 @@ def test_a_key_changes_the_maps(folder, reference, change):
     assert np.abs(maps / reference - 1).max() > 1e-3
 
 
-def test_diagonal_noise(folder):
-    fields = 'fields = ["QQ_COV", "QU_COV", "UU_COV"]'
-    noise = ("{ level = 300.0 }", f'{{ covariance = {{ file = "covariance.fits", {fields} }} }}')
-    only = ("nside = 8", 'nside = 8\ninclude = ["noise"]')
-    own = ("fwhm = 1200.0", 'fwhm = "own"')
-    one = simulated(write(folder, noise, only, own))
-    other = simulated(write(folder, noise, only, own, ("sheet = false", "diagonal_noise = true")))
-    np.testing.assert_array_equal(one[0, 0], other[0, 0])
-    assert not np.allclose(one[0, 1], other[0, 1])
-
-
 INSTRUMENT = """
 [[bands]]
 instrument = "core"

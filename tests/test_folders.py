@@ -266,8 +266,10 @@ def test_damaged_chains_are_refused(tmp_path):
     content = path.read_bytes()
 
     def refused():
+        held = path.read_bytes()
         with pytest.raises(InputError, match="h5: is damaged; start again with --overwrite"):
             kept_chain(path, "mcmc", (8, 2), "mark")
+        assert path.read_bytes() == held
 
     for size in (0, 1, 100, len(content) // 2, len(content) - 1):
         path.write_bytes(content[:size])

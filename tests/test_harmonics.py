@@ -328,40 +328,35 @@ def test_single_precision():
     assert resample(maps, gaussian_beam(jnp.float32(600.0), 16), 4).dtype == jnp.float32
 
 
-def test_refuses_beams_that_are_finer_than_the_maps_own():
-    maps = jnp.ones((1, 768))
-    with pytest.raises(
-        ValueError, match=r"target beam of 30 arcmin is finer than that of the map, 60 arcmin\."
-    ):
-        smooth(maps, 30.0, 60.0)
-    with pytest.raises(ValueError, match="finer than that of the dust, 60 arcmin"):
-        beam_ratio(30.0, 60.0, 10, what="the dust")
-    with pytest.raises(
-        ValueError, match=r"finer than that of the dust: at l = 80 their windows are .* and "
-    ):
-        beam_ratio(30.0, gaussian_beam(60.0, 100), 80, what="the dust")
-    # The tail of a measured table may be negative.
-    table = gaussian_beam(60.0, 100).at[90].set(-1e-3)
-    with pytest.raises(ValueError, match=r"at l = 90 their windows are 0\.799 and -0\.001\."):
-        beam_ratio(60.0, table, 100)
-    # By as much as tables scatter, it may be finer.
-    assert float(beam_ratio(table[:80] * 1.005, table, 79).max()) == pytest.approx(1.005)
+BEAM = gaussian_beam(60.0, 100)
+#: The tail of a measured table may be negative.
+TAIL = BEAM.at[90].set(-1e-3)
+ONES, FEW = jnp.ones((3, 48)), drawn(4)
 
 
-def test_refuses_tables_that_are_too_short():
-    table = gaussian_beam(60.0, 50)
-    with pytest.raises(ValueError, match="beam table of the dust ends at l = 50, not at 51"):
-        beam_ratio(90.0, table, 51, what="the dust")
-    with pytest.raises(ValueError, match="beam table of the target ends at l = 50, not at 51"):
-        beam_ratio(table, 30.0, 51, what="the dust")
-
-
-def test_refuses_coordinates_that_it_does_not_know():
-    alm = drawn(4)
-    with pytest.raises(ValueError, match="`source` must be one of G, E, C, not 'Q'"):
-        rotate(alm, "Q", "C")
-    with pytest.raises(ValueError, match="`target` must be one of G, E, C, not 'g'"):
-        rotate(alm, "G", "g")
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: smooth(ONES[:1], 30.0, 60.0),
+         r"target beam of 30 arcmin is finer than that of the map, 60 arcmin\."),
+        (lambda: beam_ratio(30.0, 60.0, 10, what="the dust"),
+         "finer than that of the dust, 60 arcmin"),
+        (lambda: beam_ratio(30.0, BEAM, 80, what="the dust"),
+         r"finer than that of the dust: at l = 80 their windows are .* and "),
+        (lambda: beam_ratio(60.0, TAIL, 100), r"at l = 90 their windows are 0\.799 and -0\.001\."),
+        (lambda: beam_ratio(90.0, BEAM[:51], 51, what="the dust"),
+         "beam table of the dust ends at l = 50, not at 51"),
+        (lambda: beam_ratio(BEAM[:51], 30.0, 51, what="the dust"),
+         "beam table of the target ends at l = 50, not at 51"),
+        (lambda: rotate(FEW, "Q", "C"), "`source` must be one of G, E, C, not 'Q'"),
+        (lambda: rotate(FEW, "G", "g"), "`target` must be one of G, E, C, not 'g'"),
+    ],
+)  # fmt: skip
+def test_refusals(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
+    # By as much as tables scatter, a target may be finer.
+    assert float(beam_ratio(TAIL[:80] * 1.005, TAIL, 79).max()) == pytest.approx(1.005)
 
 
 def test_refuses_single_precision_of_the_program():

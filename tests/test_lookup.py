@@ -16,6 +16,7 @@ from jaxsky.archive import cache_folder
 from jaxsky.experiment import simulation_inputs
 from jaxsky.io import InputError, write_maps
 from jaxsky.settings import Experiment, MapFile, SettingsError, find_file, found_files, load
+from settings_fuzz import changed_at, written
 
 KNOWN = "LFI_RIMO_R3.31.fits"
 MASK = "wmap_polarization_analysis_mask_r9_9yr_v5.fits"
@@ -165,89 +166,28 @@ def test_the_log_names_the_paths_that_were_taken(places, tmp_path):
     assert '"map.fits": "' + str(cache / "map.fits") in (tmp_path / "log.json").read_text()
 
 
-ANALYSIS = """
-[sky.dust]
-law = "dust"
-file = "dust.fits"
-nu_ref = 353.0
-{template}
-[[bands]]
-name = "44"
-file = "dust.fits"
-{band}
-bandpass = {bandpass}
-noise = {noise}
-[common]
-nside = 4
-{common}
-"""
-SEPARATION = """
-[common]
-nside = 4
-{common}
-[sky.dust]
-law = "dust"
-nu_ref = 353.0
-{component}
-[free]
-"dust.beta_dust" = {{ start = 1.5 {free} }}
-[[bands]]
-name = "353"
-file = "dust.fits"
-{band}
-bandpass = {{ center = 353.0, width = 0.0 }}
-noise = {{ rms = 1.0 }}
-"""
-FORECAST = """
-[[bands]]
-instrument = "core"
-[forecast]
-lmax = 7
-{forecast}
-[sky.dust]
-law = "dust"
-file = "dust.fits"
-nu_ref = 353.0
-"""
-EXPERIMENT = """
-[simulate]
-nside = 4
-fwhm = 1800.0
-include = ["cmb", "noise"]
-[sky]
-embedded = {{ nside = 8 }}
-{cmb}
-[[bands]]
-name = "44"
-bandpass = {bandpass}
-{beam}
-noise = {noise}
-"""
-PAPER = (
-    ANALYSIS
-    + """
-[sky.synchrotron]
-law = "synchrotron"
-file = "dust.fits"
-nu_ref = 30.0
-"""
-)
-PLAIN = {
-    "template": "",
-    "band": "",
-    "bandpass": "{ center = 44.0, width = 0.0 }",
-    "noise": "{ rms = 1.0 }",
-    "common": "",
-    "component": "",
-    "free": "",
-    "forecast": "",
-    "cmb": "",
-    "beam": "fwhm = 30.0",
+DUST = {"law": "dust", "file": "dust.fits", "nu_ref": 353.0}
+NARROW = {"center": 44.0, "width": 0.0}
+BAND = {"name": "44", "file": "dust.fits", "bandpass": NARROW, "noise": {"rms": 1.0}}
+COMMON = {"nside": 4}
+ANALYSIS = {"sky": {"dust": DUST}, "bands": [BAND], "common": COMMON}
+SEPARATION = ANALYSIS | {
+    "sky": {"dust": {"law": "dust", "nu_ref": 353.0}},
+    "free": {"dust.beta_dust": {"start": 1.5}},
 }
-NONE = 'file = "none.fits"'
-
-
-REGION = f"[regions]\na = {{ {NONE} }}\n"
+FORECAST = {
+    "sky": {"dust": DUST},
+    "bands": [{"instrument": "core"}],
+    "forecast": {"lmax": 7},
+}
+EXPERIMENT = {
+    "sky": {"embedded": {"nside": 8}},
+    "bands": [{"name": "44", "bandpass": NARROW, "noise": {"rms": 1.0}, "fwhm": 30.0}],
+    "simulate": COMMON | {"fwhm": 1800.0, "include": ["cmb", "noise"]},
+}
+SYNCHROTRON = DUST | {"law": "synchrotron", "nu_ref": 30.0}
+PAPER = ANALYSIS | {"sky": {"dust": DUST, "synchrotron": SYNCHROTRON}}
+NONE = {"file": "none.fits"}
 
 
 def fit(settings):
@@ -262,44 +202,46 @@ def paper(settings):
     sources.ame()
 
 
+BETA, REGIONS = "sky/dust/parameters/beta_dust", "free/dust.beta_dust/regions"
+
+
 @pytest.mark.parametrize(
-    ("command", "text", "changes"),
+    ("command", "raw", "changes"),
     [
-        (fit, ANALYSIS.replace('"dust.fits"', '"none.fits"', 1), {}),
-        (fit, ANALYSIS, {"template": f"parameters = {{ beta_dust = {{ {NONE} }} }}"}),
-        (fit, ANALYSIS, {"band": f"leakage = {{ {NONE} }}"}),
-        (fit, ANALYSIS, {"bandpass": f"{{ {NONE} }}"}),
-        (fit, ANALYSIS, {"noise": f"{{ rms = {{ {NONE} }} }}"}),
-        (fit, ANALYSIS, {"noise": f"{{ covariance = {{ {NONE}, fields = ['a', 'b', 'c'] }} }}"}),
-        (fit, ANALYSIS, {"noise": f"{{ hits = {{ {NONE}, fields = ['a'], sigma0 = 1.0 }} }}"}),
-        (fit, ANALYSIS, {"common": f"mask = {{ {NONE} }}"}),
-        (fit, ANALYSIS, {"common": f"{REGION}[fit]\nregions = ['a']"}),
-        (separation_data, SEPARATION.replace('"dust.fits"', '"none.fits"'), {}),
-        (separation_data, SEPARATION, {"common": f"mask = {{ {NONE} }}"}),
-        (separation_data, SEPARATION, {"component": f"parameters = {{ T_dust = {{ {NONE} }} }}"}),
-        (separation_data, SEPARATION, {"free": f", regions = {{ {NONE} }}"}),
-        (separation_data, SEPARATION,
-         {"free": f", regions = {{ clusters = 2, of = [{{ {NONE} }}] }}"}),
-        (forecast_inputs, FORECAST.replace('"dust.fits"', '"none.fits"'), {}),
-        (forecast_inputs, FORECAST, {"forecast": f"region = 'a'\n{REGION}"}),
-        (simulation_inputs, EXPERIMENT, {"beam": 'beam = "none.fits"'}),
-        (simulation_inputs, EXPERIMENT, {"bandpass": f"{{ {NONE} }}"}),
-        (simulation_inputs, EXPERIMENT, {"noise": f"{{ rms = {{ {NONE} }} }}"}),
-        (simulation_inputs, EXPERIMENT, {"cmb": '[cmb]\nspectra = "none.fits"'}),
-        (paper, PAPER.replace('"dust.fits"', '"none.fits"', 1), {}),
-        (paper, PAPER, {"common": f"[paper.ame]\nnu_ref = 23.0\n{NONE}"}),
-        (paper, PAPER, {"common": f"[paper.beta_syn]\n{NONE}"}),
-        (paper, PAPER,
-         {"common": "[paper.beta_syn]\nfile = 'beta.fits'\nsteepening = 'none.fits'"}),
+        (fit, ANALYSIS, {"sky/dust/file": "none.fits"}),
+        (fit, ANALYSIS, {BETA: NONE}),
+        (fit, ANALYSIS, {"bands/0/leakage": NONE}),
+        (fit, ANALYSIS, {"bands/0/bandpass": NONE}),
+        (fit, ANALYSIS, {"bands/0/noise": {"rms": NONE}}),
+        (fit, ANALYSIS, {"bands/0/noise": {"covariance": NONE | {"fields": ["a", "b", "c"]}}}),
+        (fit, ANALYSIS, {"bands/0/noise": {"hits": NONE | {"fields": ["a"], "sigma0": 1.0}}}),
+        (fit, ANALYSIS, {"common/mask": NONE}),
+        (fit, ANALYSIS, {"regions/a": NONE, "fit/regions": ["a"]}),
+        (separation_data, SEPARATION, {"bands/0/file": "none.fits"}),
+        (separation_data, SEPARATION, {"common/mask": NONE}),
+        (separation_data, SEPARATION, {"sky/dust/parameters/T_dust": NONE}),
+        (separation_data, SEPARATION, {REGIONS: NONE}),
+        (separation_data, SEPARATION, {REGIONS: {"clusters": 2, "of": [NONE]}}),
+        (forecast_inputs, FORECAST, {"sky/dust/file": "none.fits"}),
+        (forecast_inputs, FORECAST, {"forecast/region": "a", "regions/a": NONE}),
+        (simulation_inputs, EXPERIMENT, {"bands/0/fwhm": None, "bands/0/beam": "none.fits"}),
+        (simulation_inputs, EXPERIMENT, {"bands/0/bandpass": NONE}),
+        (simulation_inputs, EXPERIMENT, {"bands/0/noise": {"rms": NONE}}),
+        (simulation_inputs, EXPERIMENT, {"cmb/spectra": "none.fits"}),
+        (paper, PAPER, {"sky/dust/file": "none.fits"}),
+        (paper, PAPER, {"paper/ame": NONE | {"nu_ref": 23.0}}),
+        (paper, PAPER, {"paper/beta_syn": NONE}),
+        (paper, PAPER, {"paper/beta_syn": {"file": "beta.fits", "steepening": "none.fits"}}),
     ],
-)  # fmt: skip
-def test_all_settings_find_files_in_the_same_places(places, command, text, changes):
+)
+def test_all_settings_find_files_in_the_same_places(places, command, raw, changes):
     data, cache, _ = places
     maps = 1 + np.arange(2 * 12 * 4**2).reshape(2, -1)
     write_maps(data / "dust.fits", maps, names=["Q", "U"], unit="uK_RJ")
     write_maps(data / "beta.fits", 3.0 + 0.01 * maps[:1] / maps.max(), names=["BETA"], unit="")
-    path = data / "settings.toml"
-    path.write_text(text.format(**PLAIN | changes))
+    for key, value in changes.items():
+        raw = changed_at(raw, key, value)
+    path = written(data / "settings.toml", raw)
     words = f"none.fits: no such file, and none in the cache {cache}"
     with pytest.raises(ValueError, match=words):
         command(load(path))

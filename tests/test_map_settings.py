@@ -33,9 +33,6 @@ def template(folder, entry):
     return read_sky(settings)[0]["t"]
 
 
-POLARIZED = ["Q_POLARISATION", "U_POLARISATION"]
-
-
 def test_spass_with_files_of_its_noise(tmp_path):
     """IAU, a file for each Stokes parameter and each noise; all columns are called UNKNOWN1."""
     keys = {"POLCCONV": "IAU"}

@@ -3,10 +3,12 @@
 Functions are found by themselves, and each of their numbers is given as a quantity in turn.
 """
 
+import ast
 import importlib
 import inspect
 import pkgutil
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,15 +43,24 @@ def modules():
                 yield importlib.import_module(found.name)
 
 
-def test_what_users_need_is_in_the_packages_themselves():
-    for package in (jaxsky, fits):
-        submodules = {found.name for found in pkgutil.iter_modules(package.__path__)}
-        for name in package.__all__:
-            assert getattr(package, name).__name__ == name
-            assert name not in submodules
-            assert name in dir(package)
-        with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
-            package.nothing  # noqa: B018
+@pytest.mark.parametrize("package", [jaxsky, fits])
+def test_what_users_need_is_in_the_packages_themselves(package):
+    """Imported when it is asked for, and known to type checkers."""
+    (block,) = (
+        node for node in ast.parse(Path(package.__file__).read_text()).body if type(node) is ast.If
+    )
+    typed = {name.name: line.module for line in block.body for name in line.names}
+    assert sorted(typed) == package.__all__
+    submodules = {found.name for found in pkgutil.iter_modules(package.__path__)}
+    for name, module in typed.items():
+        found = getattr(package, name)
+        assert found is getattr(importlib.import_module(module), name)
+        assert found.__name__ == name
+        assert found.__doc__
+        assert name in dir(package)
+        assert name not in submodules
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        package.nothing  # noqa: B018
 
 
 def public():

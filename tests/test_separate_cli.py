@@ -1,7 +1,6 @@
 """`jaxsky separate`: files in, files out, and one sentence for a mistake."""
 
 import json
-import sys
 
 import healpy
 import jax
@@ -144,34 +143,6 @@ def test_multipoles_of_files(folder, tmp_path, monkeypatch):
         "parameters.fits",
         "parameters.png",
     }
-
-
-@pytest.mark.slow
-def test_a_stopped_run_goes_on(folder, tmp_path, monkeypatch, capsys):
-    from fits import cleaning as module
-
-    path, out = (
-        settings(folder, "stopped", **{'sampler = "emcee"': 'sampler = "none"'}),
-        tmp_path / "out",
-    )
-    monkeypatch.setattr(sys, "argv", ["jaxsky"])
-    realisations, progress = module.kept_realisations, []
-
-    def stopped(*arguments):
-        def report(done, of):
-            progress.append(done)
-            if len(progress) == 8:
-                raise KeyboardInterrupt
-
-        return realisations(*arguments[:-1], report)
-
-    monkeypatch.setattr(module, "kept_realisations", stopped)
-    assert jaxsky(monkeypatch, "separate", path, "--out", out) == 130
-    assert "Stopped; resume with --resume." in capsys.readouterr().err
-    monkeypatch.undo()
-    assert jaxsky(monkeypatch, "separate", path, "--out", out, "--resume") == 0
-    assert progress[-1] == 7
-    assert (out / "result.json").exists()
 
 
 @pytest.mark.parametrize(

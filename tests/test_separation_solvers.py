@@ -11,8 +11,8 @@ from fits.posterior import Posterior
 from fits.priors import Gaussian, Prior, Uniform
 from fits.profile_likelihood import spectral_likelihood
 from fits.results import FitError
-from test_separation import BANDS, NPIX, START, problem, random_sky
-from test_separation_regions import LABELS
+from test_separation import BANDS, START, problem, random_sky
+from test_separation_regions import with_empty_regions
 
 TOLERANCES = {"rtol": 1e-10, "atol": 1e-8}
 SOLVERS = {
@@ -33,11 +33,7 @@ def constant(size: float = 1.0):
 
 @cache
 def regions():
-    """With a region without pixels, and one with masked ones alone."""
-    _, data, given, _ = problem("separable")
-    data[..., :4] = np.nan
-    given[..., :4] = np.inf
-    labels = LABELS | {"dust.T_dust": np.where(np.arange(NPIX) < 4, 1, 2)}
+    data, given, labels = with_empty_regions()
     return spectral_likelihood(random_sky(), BANDS, data, given, START, labels=labels)
 
 
@@ -84,23 +80,6 @@ def test_units_of_parameters_do_not_matter():
     like = spectral_likelihood(random_sky(), BANDS, data, given, start)
     fit = best_fit(like, solver=SOLVERS["BFGS"])
     assert deviation(fit, best_fit(like)) < 1e-6
-
-
-def test_an_optimum_at_an_edge_is_reported_by_all():
-    like = constant()
-    T = best_fit(like).best_fit["dust.T_dust"]
-    start = {"dust.T_dust": T + 2}
-    priors = {"dust.T_dust": Uniform(T + 0.05, 40.0)}
-    default = best_fit(like, start, priors=priors, throw=False)
-    for solver in ("LevenbergMarquardt", "BFGS"):
-        fit = best_fit(like, start, priors=priors, solver=SOLVERS[solver], throw=False)
-        assert fit.message == default.message
-        assert "'dust.T_dust' lies at the edge" in fit.message
-        # Flat there, and residuals say nothing of how it curves.
-        assert fit.best_fit["dust.T_dust"] == pytest.approx(T + 0.05, abs=1e-6)
-        for name in ("dust.beta_dust", "synchrotron.beta_syn"):
-            assert abs(fit.best_fit[name] - default.best_fit[name]) < 1e-5 * default.sigma[name]
-            assert fit.sigma[name] == pytest.approx(default.sigma[name], rel=1e-6)
 
 
 class Wide(Prior):

@@ -9,8 +9,11 @@ from settings_fuzz import KINDS, changed, fault, faults, small, written
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_settings_load_or_are_refused(tmp_path, kind):
-    assert faults(kind, tmp_path / "settings.toml", every=2, build=False) == []
+@pytest.mark.parametrize(
+    ("every", "build"), [(2, False), pytest.param(11, True, marks=pytest.mark.slow)]
+)
+def test_settings_work_or_are_refused(tmp_path, kind, every, build):
+    assert faults(kind, tmp_path / "settings.toml", every, build) == []
 
 
 @pytest.mark.parametrize(

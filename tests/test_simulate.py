@@ -531,28 +531,10 @@ def test_refusals():
     three = {"s": Source(Synchrotron(template(3, 3), 3.1), OWN)}
     with pytest.raises(ValueError, match="'s' has 3 Stokes parameters, but QU are observed"):
         simulate(KEY, three, how)
-    three = {"s": Source(Synchrotron(template(3, 3), 3.1), OWN, SMALL)}
-    with pytest.raises(ValueError, match="small scales, which are added to Q and U only"):
-        simulate(KEY, three, observation(stokes="IQU"))
-    for leader in ("dust", "synchrotron", "ame"):
-        there = sources(small=SMALL, follow=leader)
-        if leader == "dust":
-            there["dust"] = Source(there["dust"].component, OWN)
-        with pytest.raises(ValueError, match=f"correlated with those of '{leader}'"):
-            simulate(KEY, there, how)
-    chain = sources(small=SMALL, follow="dust")
-    chain["ame"] = Source(chain["dust"].component, OWN, SMALL, "synchrotron")
-    with pytest.raises(ValueError, match="must not be correlated with yet another"):
-        simulate(KEY, chain, how)
-    with pytest.raises(ValueError, match=r"finer than that of component 'dust', 900 arcmin"):
-        simulate(KEY, sources(), observation(beam=850.0))
     with pytest.raises(ValueError, match=r"finer than that of the channel, 1200 arcmin"):
         simulate(KEY, {}, observation(target=1100.0, noise=1.0))
     with pytest.raises(ValueError, match="end at l = 10, but nside 8 needs 16"):
         simulate(KEY, {}, how, SPECTRA[:, :11])
-    steep = SmallScales((4, 20), (3, 8))
-    with pytest.raises(ValueError, match=r"Small scales of dust: .* from l = 4 to 20"):
-        simulate(KEY, {"dust": Source(Dust(TEMPLATES["dust"]), OWN, steep)}, how)
     with pytest.raises(ValueError, match="at least one channel"):
         Observation({}, NSIDE)
     with pytest.raises(ValueError, match="'QU' or 'IQU', not 'I'"):

@@ -524,12 +524,6 @@ def test_refuses_templates_without_power_or_of_the_wrong_shape(template):
             add_small_scales(KEY, maps, 0.0, 60.0, NSIDE, SMALL)
 
 
-def test_refuses_correlated_ranges_that_do_not_overlap(template):
-    small = [SMALL, SmallScales((32, 40), (32, 40))]
-    with pytest.raises(ValueError, match=r"need ranges that overlap, but they are \[\(5, 30\)"):
-        continue_templates(KEY, [template, template], [OWN, OWN], small, NSIDE)
-
-
 @pytest.mark.slow
 def test_a_coarse_template_is_correlated_with_what_is_known_of_a_finer_one(data_dir):
     # Dust is known up to l = 128, AME at 3 degrees up to l = 50: there it follows the dust's own

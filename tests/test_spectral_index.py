@@ -13,9 +13,7 @@ from fits.inputs import Band, Inputs, inputs_of
 from fits.optimize import best_fit
 from fits.regions import region_masks
 from fits.spectral_index import fit_regions
-from fits.template_likelihood import likelihood
-from jaxsky import Bandpass, Dust, Sky, observe
-from jaxsky.cmb import camb_spectra, realisation
+from jaxsky import Bandpass, Dust, observe
 from jaxsky.galaxy import embedded_sky
 from jaxsky.harmonics import (
     Preparation,
@@ -23,11 +21,9 @@ from jaxsky.harmonics import (
     analysis,
     gaussian_beam,
     power_spectrum,
-    resample,
     synthesis,
 )
 from jaxsky.inputs import Template
-from jaxsky.instrument import load_instrument
 from jaxsky.noise import draw, fit_knee, knee_spectrum, uniform_covariance
 from jaxsky.settings import SettingsError, load
 
@@ -270,107 +266,3 @@ def test_regions(quick_settings):
     np.testing.assert_array_equal(masks["strip"] ^ masks["outside"], masks["full"])
     # |b| <= 20 deg covers sin(20 deg) of the sphere.
     assert masks["strip"].mean() == pytest.approx(np.sin(np.radians(20)), abs=0.03)
-
-
-@pytest.fixture(scope="module")
-def pulls():
-    """(best fit - truth) / sigma over 500 skies at Planck's level, by likelihood and Stokes.
-
-    The embedded Galaxy is fixed; CMB and white noise are drawn at nside 128, seen with the
-    channels' beams, then smoothed to 1 degree and brought to nside 64 together with it.
-    """
-    nside_in, nside, fwhm, lmax, skies = 128, 64, 60.0, 191, 500
-    instrument = load_instrument("planck").select(["44", "70"])
-    bands = instrument.bands()
-    factors = jnp.stack([b.conversion("uK_CMB", "uK_RJ") for b in bands.values()])
-    own = [float(c.fwhm) for c in instrument]
-    noise = tuple(
-        uniform_covariance(c.noise * b.conversion(c.noise_unit, "uK_RJ"), nside_in)
-        for c, b in zip(instrument, bands.values(), strict=True)
-    )
-    preparations = tuple(Preparation.smoothing(nside_in, f, nside, fwhm, lmax) for f in own)
-    galaxy = embedded_sky(nside_in).sky("QU")
-    whole = Preparation.smoothing(nside_in, 0.0, nside, fwhm, lmax)
-    sky = Sky({n: prepare_component(galaxy[n], whole) for n in galaxy})
-    foregrounds = jnp.stack(
-        [
-            op(resample(m, gaussian_beam(f, 256), nside_in))
-            for m, f, op in zip(
-                observe(galaxy, list(bands.values())), own, preparations, strict=True
-            )
-        ]
-    )
-    spectra = jnp.asarray(camb_spectra(256))
-    windows = jnp.stack([gaussian_beam(fwhm, lmax)] * 2)
-    model = Fluctuations(
-        preparations,
-        noise,
-        (None, None),
-        spectra[1:3, : lmax + 1],
-        windows,
-        factors,
-        ("44", "70"),
-    )
-    latitude = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)[1]
-    sigma = jnp.where(np.abs(latitude) <= 20, model.sigma(), jnp.inf)
-
-    @jax.jit
-    def fluctuate(key):
-        cmb_key, *keys = jax.random.split(key, 3)
-        alm = realisation(cmb_key, spectra)
-        maps = []
-        for f, beam, op, n, k in zip(factors, own, preparations, noise, keys, strict=True):
-            seen = f * synthesis(alm * gaussian_beam(beam, 256)[alm_ell(256)], nside_in)
-            maps.append(op(seen + draw(k, n)))
-        return jnp.stack(maps)
-
-    start = {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}
-    truth = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1}
-    covariances = {}
-
-    def covariance_of(stokes):
-        def cached(rows):
-            if stokes not in covariances:
-                covariances[stokes] = model.covariance(rows)
-            return covariances[stokes]
-
-        return cached
-
-    values = {}
-    for i, key in enumerate(jax.random.split(jax.random.key(2016), skies)):
-        data = foregrounds + fluctuate(key)
-        for stokes in ("Q", "U", "QU"):
-            for kind in ("exact", "diagonal"):
-                if kind == "diagonal" and (stokes != "QU" or i >= 100):
-                    continue
-                like = likelihood(
-                    sky,
-                    bands,
-                    data,
-                    sigma,
-                    start,
-                    stokes=stokes,
-                    covariance_of=covariance_of(stokes) if kind == "exact" else None,
-                )
-                fit = best_fit(like, start)
-                for name, value in truth.items():
-                    pull = (fit.best_fit[name] - value) / fit.sigma[name]
-                    values.setdefault((kind, stokes, name), []).append(pull)
-    return {key: np.array(pull) for key, pull in values.items()}
-
-
-@pytest.mark.slow
-def test_errors_are_honest(pulls):
-    for (kind, stokes, name), pull in pulls.items():
-        print(f"{kind} {stokes} {name}: mean {pull.mean():+.3f}, std {pull.std(ddof=1):.3f}")
-    for key, pull in pulls.items():
-        if key[0] == "exact":
-            assert abs(pull.mean()) < 0.15, key
-            assert 0.9 < pull.std(ddof=1) < 1.1, key
-
-
-@pytest.mark.slow
-def test_the_diagonal_likelihood_misstates_its_errors(pulls):
-    """Why it is only the named option: correlated noise and the CMB are left out of it."""
-    worst = max(p.std(ddof=1) for key, p in pulls.items() if key[0] == "diagonal")
-    assert worst > 1.2

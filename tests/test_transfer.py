@@ -23,7 +23,6 @@ from misbehaving import (
     SHA,
     Handler,
     fetch_command,
-    kill_fetches,
     product,
     serving,
 )
@@ -392,12 +391,6 @@ def test_leftovers_of_a_process_that_ended_are_removed(server, tmp_path):
         (tmp_path / name).touch()
     fetch(product(f"{server}/good/{NAME}"), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [NAME]
-
-
-@pytest.mark.slow
-def test_killed_downloads_are_resumed(server, tmp_path):
-    begun = kill_fetches(server, tmp_path, kills=2)
-    assert len(begun) >= 2
 
 
 @pytest.mark.slow

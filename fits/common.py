@@ -13,7 +13,7 @@ from fits.fluctuations import Fluctuations
 from fits.inputs import Inputs
 from fits.kept import fingerprint
 from fits.template_likelihood import CovarianceOf, SkyLikelihood, likelihood
-from fits.template_noise import prepared_variance
+from fits.template_noise import TemplateErrors
 from jaxsky import Bandpass, Sky, observe
 from jaxsky.checks import Numeric
 from jaxsky.components import Component
@@ -30,8 +30,8 @@ class CommonMaps(NamedTuple):
 
     `sky` is None where there are no templates. `leakage` is what was subtracted from the data, by
     band, and `sources` the nside of each template and map as they were given. `covariance_of` is
-    that of the fluctuations, which remembers what it was asked for last, `template_variances` that
-    of the noise of each template where it is known.
+    that of the fluctuations, which remembers what it was asked for last. `template_errors` is the
+    noise of the templates where it is known, None where there is none.
     """
 
     sky: Sky | None
@@ -43,7 +43,7 @@ class CommonMaps(NamedTuple):
     leakage: dict[str, Float[Array, "stokes pix"]]
     sources: dict[str, int]
     covariance_of: CovarianceOf
-    template_variances: dict[str, Float[Array, "stokes pix"]]
+    template_errors: TemplateErrors | None
 
     def model(self) -> Float[Array, "band stokes pix"]:
         """What the templates show in the bands [uK_RJ]."""
@@ -62,7 +62,8 @@ class CommonMaps(NamedTuple):
 
         Parameters
         ----------
-        start : free parameters by name
+        start : free parameters by name; where templates have noise, the errors that it causes are
+            those at these values
         stokes : "Q", "U" or "QU"
         region : pixels to use, of those that can be; default all
         kind : "exact", or "diagonal" for the paper's sum over pixels
@@ -79,7 +80,19 @@ class CommonMaps(NamedTuple):
             start,
             stokes=stokes,
             covariance_of=self.covariance_of if kind == "exact" else None,
+            template_errors=self.template_errors,
         )
+
+    def noise_shares(self, region: Bool[np.ndarray, " pix"], stokes: str) -> dict[str, float]:
+        """Part of the weighted power of each template that is its noise."""
+        assert self.sky is not None
+        assert self.template_errors is not None  # as called
+        keep = np.array([s in stokes for s in "QU"])
+        inside = self.used & region & np.isfinite(self.sigma) & keep[:, None]
+        weights = np.where(inside, 1 / np.asarray(self.sigma) ** 2, 0.0)
+        templates = np.stack([c.amplitude for c in self.sky.components.values()])
+        shares = self.template_errors.shares(np.where(self.used, templates, 0.0), weights)
+        return dict(zip(self.sky, shares.tolist(), strict=True))
 
 
 def prepared_maps(settings: Experiment, inputs: Inputs) -> CommonMaps:
@@ -161,12 +174,7 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         leakage,
         nsides,
         _remembered(fluctuations.covariance),
-        {
-            name: prepared_variance(
-                noise, inputs.templates[name].fwhm, operators[f"template {name!r}"], fwhm
-            )
-            for name, noise in inputs.template_noise.items()
-        },
+        _template_errors(inputs, operators, kept, fluctuations, lmax if fwhm else 4 * nside),
     )
 
 
@@ -197,7 +205,7 @@ def _fluctuations(
             windows = windows * pixel_window(nside, lmax)
         spectra = jnp.asarray(inputs.cmb(lmax)[1:3])
     noise = tuple(
-        band.noise if own is None else pixel_covariance(band.noise, op.nside_in) * own
+        _without_holes(band.noise, op, own)
         for op, band, own in zip(operators, bands, kept, strict=True)
     )
     correlated = tuple(
@@ -213,6 +221,54 @@ def _fluctuations(
         factors,
         tuple(inputs.bands),
     )
+
+
+def _without_holes(noise: Numeric, operator: Preparation, kept: np.ndarray | None) -> Numeric:
+    """Noise of the pixels that are kept."""
+    return noise if kept is None else pixel_covariance(noise, operator.nside_in) * kept
+
+
+def _template_errors(
+    inputs: Inputs,
+    operators: Mapping[str, Preparation],
+    kept: Mapping[str, np.ndarray | None],
+    fluctuations: Fluctuations,
+    lmax: int,
+) -> TemplateErrors | None:
+    """Noise of the templates at the common resolution; None where there is none."""
+    noises, names = inputs.template_noise, list(inputs.templates)
+    own = [name for name, one in noises.items() if one.own]
+    bands = [b for b in fluctuations.names if any(b in one.shared for one in noises.values())]
+    if not own and not bands:
+        return None
+    preparations = [operators[f"template {name!r}"] for name in own]
+    noise = [
+        _without_holes(noises[name].noise, op, kept[f"template {name!r}"])
+        for name, op in zip(own, preparations, strict=True)
+    ]
+    spectra = [
+        prepared_spectrum(noises[name].correlated, op, lmax)
+        for name, op in zip(own, preparations, strict=True)
+    ]
+    which = list(map(fluctuations.names.index, bands))
+    sources = Fluctuations(
+        (*preparations, *(fluctuations.preparations[b] for b in which)),
+        (*noise, *(fluctuations.noise[b] for b in which)),
+        (*spectra, *(fluctuations.correlated[b] for b in which)),
+        None,
+        None,
+        jnp.ones(len(own) + len(bands)),
+        (*own, *bands),
+    )
+    shared = [noises[n].shared if n in noises else {} for n in names]
+    parts = [
+        [float(n == name) for name in own] + [one.get(band, 0.0) for band in bands]
+        for n, one in zip(names, shared, strict=True)
+    ]
+    of_band = [[0.0] * len(own) + [float(b == name) for b in bands] for name in fluctuations.names]
+    variance = jnp.nan_to_num(sources.sigma() ** 2)
+    covariance_of = _remembered(sources.covariance)
+    return TemplateErrors(covariance_of, np.array(parts), np.array(of_band), variance)
 
 
 def prepare_component(

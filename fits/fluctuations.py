@@ -173,6 +173,8 @@ def _products(
 
     The rows at the resolution of the noise are kept in its precision.
     """
+    if not np.ndim(noise) and not noise:
+        return np.zeros((len(rows), len(rows)))
     noise = pixel_covariance(noise, preparation.nside_in)
     before = [
         np.asarray(preparation.transpose(row).astype(noise.dtype).block_until_ready())

@@ -4,8 +4,10 @@ Templates and data are brought to a common resolution; the parameters are then f
 region, to Q, to U and to both, on a grid, by gradient and by MCMC.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -18,16 +20,19 @@ from fits.inputs import Inputs
 from fits.kept import fingerprint, kept_chain
 from fits.optimize import best_fit
 from fits.posterior import chi2
-from fits.priors import priors_of
+from fits.priors import Prior, priors_of
 from fits.results import FitResult
 from fits.sampling import sample
-from fits.template_noise import Attenuation, attenuation
+from fits.template_likelihood import SkyLikelihood, TemplateLikelihood
 from jaxsky import observe_components, parameter_names, set_parameters
 from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 
 #: A band in which each template has less than this part of its weight has none.
 WEIGHTLESS = 1e-6
+
+#: A fit whose coefficients change its own errors is repeated until it moves by less [sigma].
+SETTLED = 0.01
 
 
 class RegionFit(NamedTuple):
@@ -36,7 +41,9 @@ class RegionFit(NamedTuple):
     `chi2` is the paper's sum over pixels at the best fit of each method, with `dof` degrees of
     freedom; `chi2_amplitudes` and `dof_amplitudes` are those of the exact likelihood, which
     compares the amplitudes of the templates only. Bands without weight (`weightless`) are not
-    counted in either. `attenuation` is what the noise of the templates does, where it is known.
+    counted in either. `noise_shares`
+    says which part of the weighted power of each template is noise, where there is any, and
+    `corrected` whether the fits know of it.
     """
 
     region: str
@@ -46,7 +53,8 @@ class RegionFit(NamedTuple):
     dof: int
     dof_amplitudes: int | None
     weightless: tuple[str, ...] = ()
-    attenuation: Attenuation | None = None
+    noise_shares: Mapping[str, float] = MappingProxyType({})
+    corrected: bool = True
 
     def probability_to_exceed(self, method: str) -> float | None:
         """Probability of a larger chi^2 of the amplitudes; None for the diagonal likelihood."""
@@ -65,6 +73,29 @@ def known_truth(inputs: Inputs, fits: Sequence[RegionFit]) -> dict[str, float] |
     if inputs.truth is None:
         return None
     return {name: inputs.truth[name] for name in all_free(fits) if name in inputs.truth}
+
+
+def settled(
+    make: Callable[[Mapping[str, float]], SkyLikelihood],
+    start: Mapping[str, float],
+    priors: Mapping[str, Prior],
+) -> SkyLikelihood:
+    """The likelihood whose covariance is that at its own best fit.
+
+    `make` gives the likelihood with the covariance at given parameters. Within one the weights
+    are fixed, so that its best fit is unbiased.
+    """
+    like, values = make(start), dict(start)
+    for _ in range(5):
+        found = best_fit(like, start, priors=priors, throw=False)
+        moved = [
+            abs(found.best_fit[n] - values[n]) / s for n, s in found.sigma.items() if np.isfinite(s)
+        ]
+        values = dict(found.best_fit)
+        if not found.converged or max(moved, default=0.0) < SETTLED:
+            break
+        like = make(values)
+    return like
 
 
 def _fit_pixels(
@@ -86,12 +117,17 @@ def _fit_pixels(
     priors = {name: prior for name, prior in priors_of(settings, "fit").items() if name in start}
     progress.step(f"{region}, {stokes}: inner products")
     with at_key("free"):
-        diagonal = prepared.likelihood(start, stokes=stokes, region=used, kind="diagonal")
+        plain = prepared._replace(template_errors=None)
+        diagonal = plain.likelihood(start, stokes=stokes, region=used, kind="diagonal")
     like, dof_amplitudes = diagonal, None
     nothing = weightless(prepared, start, used, stokes)
     weighty = 1 - len(nothing) / len(prepared.bands)
-    if settings.fit.likelihood == "exact":
-        like = prepared.likelihood(start, stokes=stokes, region=used)
+    exact = settings.fit.likelihood == "exact"
+    if exact or prepared.template_errors is not None:
+        kind = settings.fit.likelihood
+        make = partial(prepared.likelihood, stokes=stokes, region=used, kind=kind)
+        like = make(start) if prepared.template_errors is None else settled(make, start, priors)
+    if exact:
         dof_amplitudes = round(like.residuals(start).size * weighty) - len(start)
     results: dict[str, FitResult] = {}
     for method in settings.fit.methods:
@@ -129,13 +165,13 @@ def _fit_pixels(
     results = {
         method: r.judged(values[method], dof, start, expected) for method, r in results.items()
     }
-    lost = None
-    variances = prepared.template_variances
-    if any(bool(values.any()) for values in variances.values()) and prepared.sky is not None:
-        result = next(iter(results.values()))
-        sky, sigma = prepared.sky, prepared.sigma
-        lost = attenuation(like, result, sky, variances, sigma, used, stokes)
-    return RegionFit(region, stokes, results, values, dof, dof_amplitudes, nothing, lost)
+    shares: dict[str, float] = {}
+    if prepared.template_errors is not None:
+        shares = prepared.noise_shares(used, stokes)
+    corrected = isinstance(like, TemplateLikelihood)
+    return RegionFit(
+        region, stokes, results, values, dof, dof_amplitudes, nothing, shares, corrected
+    )
 
 
 def _expected(

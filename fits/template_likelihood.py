@@ -30,6 +30,7 @@ from jaxtyping import Array, Float
 from fits.compress import gram, square_root
 from fits.mixing import Mixing, named_bands, unit_sky
 from fits.posterior import Likelihood
+from fits.template_noise import TemplateErrors
 from jaxsky import Bandpass, Sky, observe_components, parameter_names
 from jaxsky.checks import UNSEEN, Numeric, as_array, check_double, check_shape
 from jaxsky.interpolation import NodeCounts, Nodes
@@ -151,6 +152,7 @@ def likelihood(
     stokes: str | None = None,
     covariance_of: CovarianceOf | None = None,
     pixelwise: bool = False,
+    template_errors: TemplateErrors | None = None,
 ) -> SkyLikelihood:
     """The likelihood of maps as a function of the parameters named in `start`.
 
@@ -168,6 +170,8 @@ def likelihood(
     covariance_of : covariance of inner products with the data, for the exact likelihood;
         None for the paper's diagonal one
     pixelwise : evaluate pixel by pixel even where inner products would do
+    template_errors : noise of the templates, which is taken out of the inner products; its part
+        of their covariance is that at `start`. Likelihoods pixel by pixel leave it out.
 
     Returns
     -------
@@ -206,17 +210,37 @@ def likelihood(
 
     mixing = dataclasses.replace(mixing, sky=unit_sky(sky, len(labels)))
     templates = jnp.stack([c.amplitude for c in sky.components.values()])
-    products = np.asarray(gram(data, templates, weights))[:, keep]
-    if covariance_of is None:
-        matrix = _matrix(np.asarray(square_root(products)), keep, len(labels))
-        values = int(np.sum(np.asarray(weights)[:, keep] > 0))
-    else:
-        # A constant row tells offsets from templates.
-        rows = [*templates, *([jnp.ones_like(templates[0])] if offsets else [])]
-        whitening = _whitening(covariance_of, _weighted(jnp.stack(rows), weights), keep)
-        matrix = _matrix(products[:, :, 1 : len(rows) + 1], keep, len(labels), whitening)
-        values = len(whitening)
-    return TemplateLikelihood(params, jnp.asarray(values), mixing, labels, matrix)
+    products = np.asarray(gram(data, templates, weights))
+    values = int(np.sum(np.asarray(weights)[:, keep] > 0))
+    like = TemplateLikelihood(params, jnp.asarray(values), mixing, labels, jnp.zeros((0, 0)))
+    if covariance_of is None and template_errors is None:
+        matrix = _matrix(np.asarray(square_root(products[:, keep])), keep, len(labels))
+        return dataclasses.replace(like, matrix=matrix)
+    # A constant row tells offsets from templates.
+    maps = [*templates, *([jnp.ones_like(templates[0])] if offsets else [])]
+    rows = _one_stokes_each(_weighted(jnp.stack(maps), weights))
+    used = slice(1, len(maps) + 1)
+    if covariance_of is not None:
+        covariance = np.asarray(covariance_of(rows))
+    else:  # that of T^T W n, with white noise n, is T^T W T
+        covariance = scipy.linalg.block_diag(
+            *products[..., used, used].reshape(-1, *2 * [len(maps)])
+        )
+    blocks = products[:, :, used]
+    if template_errors is not None:
+        seen = np.repeat(np.asarray(like.coefficients(params)), len(maps), axis=1)
+        covariance = covariance + template_errors.covariance(rows, seen)
+        blocks = blocks - template_errors.mean_products(weights)[:, :, used]
+        _check_signal(blocks[:, keep, : len(templates), used][..., : len(templates)])
+    whitening = _whitening(_of_kept(covariance, rows, keep))
+    matrix = _matrix(blocks[:, keep], keep, len(labels), whitening)
+    if covariance_of is not None:
+        return dataclasses.replace(like, values=jnp.asarray(len(whitening)), matrix=matrix)
+    # What no combination of the templates explains is the same for all parameters.
+    left = products[:, keep, : used.stop, : used.stop]
+    constant = jnp.zeros_like(matrix[:1]).at[0, keep[0] * products.shape[-1]]
+    unexplained = constant.set(np.sqrt(np.sum(1 / np.linalg.inv(left)[..., 0, 0])))
+    return dataclasses.replace(like, matrix=jnp.concatenate([matrix, unexplained]))
 
 
 @jax.jit
@@ -250,19 +274,34 @@ def _one_stokes_each(rows: Array) -> Float[Array, "band row stokes pix"]:
     return split.reshape(bands, stokes * templates, stokes, npix)
 
 
-def _whitening(
-    covariance_of: CovarianceOf, rows: Float[Array, "band template stokes pix"], keep: np.ndarray
+def _of_kept(
+    covariance: Float[np.ndarray, "row row"],
+    rows: Float[Array, "band row stokes pix"],
+    keep: np.ndarray,
 ) -> Float[np.ndarray, "row row"]:
-    """W with W^T W the inverse covariance of the products of rows with the data.
+    """The covariance of the rows of the Stokes parameters kept, cut out of that of all.
 
-    One product for each of the Stokes parameters kept, cut out of the covariance of all Stokes
-    parameters, which is the same whatever is kept.
+    That of all is the same whatever is kept.
     """
-    bands, templates, stokes, _ = rows.shape
-    total = np.asarray(covariance_of(_one_stokes_each(rows)))
-    total = total.reshape(2 * (bands, stokes, templates))
-    size = bands * len(keep) * templates
-    covariance = total[:, keep][:, :, :, :, keep].reshape(size, size)
+    bands, count, stokes, _ = rows.shape
+    split = covariance.reshape(2 * (bands, stokes, count // stokes))
+    size = bands * len(keep) * count // stokes
+    return split[:, keep][:, :, :, :, keep].reshape(size, size)
+
+
+def _check_signal(products: Float[np.ndarray, "band stokes template template"]) -> None:
+    """Raise ValueError where the noise of templates leaves none of their power, or less."""
+    total = products.sum(axis=(0, 1))
+    scale = np.sqrt(np.abs(np.diagonal(total)))
+    if np.linalg.eigvalsh(total / scale / scale[:, None])[0] <= 0:
+        raise ValueError(
+            "The noise of the templates is all that they hold in this region, or more than that; "
+            "look at its level and unit."
+        )
+
+
+def _whitening(covariance: Float[np.ndarray, "row row"]) -> Float[np.ndarray, "row row"]:
+    """W with W^T W the inverse of a covariance of products."""
     scale = np.sqrt(np.diagonal(covariance))
     safe = np.where(scale > 0, scale, 1.0)
     correlation = covariance / safe[:, None] / safe
@@ -289,10 +328,11 @@ def _on_pixels(params, mixing, data, weights, labels, keep, covariance_of):
         maps = list(observe_components(at_start, mixing.bandpasses, nodes=nodes).values())
         if any(name.startswith("offset.") for name in params):
             maps.append(jnp.ones_like(data))
-        whole = _weighted(jnp.stack(maps, axis=1), weights)
-        whitening = jnp.asarray(_whitening(covariance_of, whole, keep))
+        rows = _one_stokes_each(_weighted(jnp.stack(maps, axis=1), weights))
+        covariance = _of_kept(np.asarray(covariance_of(rows)), rows, keep)
+        whitening = jnp.asarray(_whitening(covariance))
         kept = (keep[:, None] * len(maps) + np.arange(len(maps))).ravel()
-        rows = _one_stokes_each(whole)[:, kept]
+        rows = rows[:, kept]
         values = jnp.array(len(whitening))
     root = jnp.sqrt(used)
     return PixelLikelihood(params, values, mixing, labels, data, root, nodes, rows, whitening)

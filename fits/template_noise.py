@@ -1,53 +1,53 @@
-"""Noise of the templates: how much it attenuates them, and where that moves a fit.
+"""Noise of the templates: taken out of the inner products of a fit, and added to its errors.
 
-The products of a noisy template with itself hold its noise as well, those with the data do not,
-so the amplitudes that a fit finds are too small. Nothing is corrected here: what the noise does is
-computed to first order and said.
+With templates T = t + n the products with the data have the mean t^T W d, but those of templates
+with each other t^T W t + <n^T W n>: amplitudes come out too small, and indices are moved. The
+mean of the noise is known where its covariance is, and is subtracted (errors in variables; Fuller
+1987, Measurement Error Models, ch. 2). What is left, sum_j c_j T_k^T W n_j in a band where
+template j is seen with the coefficient c_j, is the same noise in all bands; its covariance joins
+that of the data, at the coefficients of the best fit.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import healpy
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from fits.compress import gram
-from fits.posterior import Likelihood
-from fits.results import FitResult
-from fits.template_likelihood import TemplateLikelihood
-from jaxsky import Sky
-from jaxsky.harmonics import Preparation, gaussian_beam, pixel_window
+from jaxsky.checks import Numeric
+from jaxsky.harmonics import gaussian_beam
 from jaxsky.inputs import Template
-from jaxsky.noise import pixel_covariance
 from jaxsky.noise_inputs import read_noise
 from jaxsky.settings import ComponentTable, SettingsError
 from jaxsky.units import conversion
 
 
 class TemplateNoise(NamedTuple):
-    """Noise of Q and U of a template; without both it has none.
+    """Noise of Q and U of a template; without any of these it has none.
 
-    `level` is that of white noise seen through the template's own beam [uK_RJ arcmin], and
-    `covariance` that of each pixel of its map [uK_RJ^2].
+    `noise` is that of the pixels of its map, a level [uK_RJ arcmin] or the covariance of Q and U in
+    each [uK_RJ^2]; `correlated` the spectrum C_l of noise that is correlated between pixels
+    [uK_RJ^2]. `shared` says how many times the noise of a band, by name, is in the template, too.
     """
 
-    level: float = 0.0
-    covariance: Float[Array, "2 2 pix"] | None = None
+    noise: Numeric = 0.0
+    correlated: Float[Array, " ell"] | None = None
+    shared: Mapping[str, float] = MappingProxyType({})
+
+    @property
+    def own(self) -> bool:
+        """Whether there is noise that is not a band's."""
+        return bool(np.ndim(self.noise)) or bool(self.noise) or self.correlated is not None
 
 
-class Attenuation(NamedTuple):
-    """What the noise of the templates does to a fit.
-
-    `shares` is the part of each template's weighted power that is noise, by which its amplitude is
-    attenuated; `shifts` what that adds to each parameter, to first order.
-    """
-
-    shares: dict[str, float]
-    shifts: dict[str, float]
+def level_spectrum(level: float, fwhm: float, lmax: int) -> Float[Array, " ell"]:
+    """Spectrum of white noise of a level [uK_RJ arcmin], seen through a beam of fwhm [arcmin]."""
+    white = (level * np.radians(1 / 60)) ** 2 * jnp.asarray(gaussian_beam(fwhm, lmax)) ** 2
+    return white.at[:2].set(0.0)
 
 
 def read_template_noise(
@@ -57,82 +57,93 @@ def read_template_noise(
     noise, where = spec.noise, f"sky.{name}.noise"
     assert noise is not None  # as called
     if noise.rms == 0 or noise.level == 0:
-        return TemplateNoise()
+        return TemplateNoise(shared=noise.shared)
     if spec.angles is not None:
         raise SettingsError(
             f"{where}: is not known for a template with the angles of another; write "
             "{ rms = 0.0 } to take it as exact."
         )
     nu_ref = float(template.component.nu_ref)  # type: ignore[attr-defined]
+    nside = healpy.npix2nside(template.used.size)
     if noise.level is not None:
-        unit = noise.unit or template.unit
-        return TemplateNoise(noise.level * float(conversion(unit, "uK_RJ", nu_ref)))
-    maps = template.component.amplitude
-    nside, used = healpy.npix2nside(template.used.size), template.used
+        level = noise.level * float(conversion(noise.unit or template.unit, "uK_RJ", nu_ref))
+        spectrum = level_spectrum(level, template.fwhm, 4 * nside)
+        return TemplateNoise(correlated=spectrum, shared=noise.shared)
     found, _ = read_noise(
-        folder, noise, nu_ref, nside, where, template.unit, own=spec, maps=maps, used=used
+        folder,
+        noise,
+        nu_ref,
+        nside,
+        where,
+        template.unit,
+        own=spec,
+        maps=template.component.amplitude,
+        used=template.used,
     )
-    return TemplateNoise(covariance=pixel_covariance(found, nside))
+    return TemplateNoise(found, shared=noise.shared)
 
 
-def prepared_variance(
-    noise: TemplateNoise, own_fwhm: float, preparation: Preparation, fwhm: float
-) -> Float[Array, "2 pix"]:
-    """Variance of a template's noise in each pixel at the common resolution [uK_RJ^2]."""
-    npix = healpy.nside2npix(preparation.nside)
-    if noise.covariance is not None:
-        return preparation.variance([noise.covariance[s, s] for s in range(2)])
-    if preparation.window is None:
-        lmax = 4 * preparation.nside
-        window = gaussian_beam(own_fwhm, lmax) * pixel_window(preparation.nside, lmax)
-    else:
-        window = gaussian_beam(fwhm, preparation.window.size - 1)
-    ell = np.arange(2, window.size)
-    power = (noise.level * np.radians(1 / 60)) ** 2 * np.asarray(window)[2:] ** 2
-    return jnp.asarray(np.full((2, npix), np.sum((2 * ell + 1) * power) / (4 * np.pi)))
+class TemplateErrors(NamedTuple):
+    """Noise of templates at the common resolution, as a sum of independent sources.
 
+    Sources are the noise of each template that no other map has, and that of bands which
+    templates share.
 
-def attenuation(
-    like: Likelihood,
-    result: FitResult,
-    sky: Sky,
-    variances: Mapping[str, Float[Array, "stokes pix"]],
-    sigma: Float[Array, "band stokes pix"],
-    used: Bool[np.ndarray, " pix"],
-    stokes: str,
-) -> Attenuation:
-    """What the noise of templates does to the fit of one region and choice of Stokes parameters.
-
-    `sky` has the templates at the common resolution, and `variances` are those of their noise;
-    templates that it does not name are exact. No shifts are known for parameters that are maps.
+    Attributes
+    ----------
+    covariance_of : covariance of the products of rows with each source, by
+        `fits.fluctuations.Fluctuations.covariance`
+    parts : of each source in each template, shape (template, source)
+    of_band : 1 where a source is the noise of a band, shape (band, source)
+    variance : of each source in each pixel [uK_RJ^2], shape (source, stokes, pix)
     """
-    weights = jnp.where(used & jnp.isfinite(sigma), 1 / sigma**2, 0.0)
-    templates = jnp.stack([c.amplitude for c in sky.components.values()])
-    spread = jnp.stack([variances.get(n, jnp.zeros_like(templates[0])) for n in sky])
-    keep = np.array(["QU".index(s) for s in stokes])
-    noise = jnp.einsum("bsp,ksp->bsk", weights, spread)[:, keep]
-    products = gram(jnp.zeros_like(sigma), templates, weights)[:, keep, 1:, 1:]
-    power = jnp.einsum("bskk->bsk", products)[..., :-1]
-    totals = np.asarray(noise.sum(axis=(0, 1)) / power.sum(axis=(0, 1)))
-    shares = dict(zip(sky, totals.tolist(), strict=True))
-    if not isinstance(like, TemplateLikelihood):
-        return Attenuation(shares, {})
-    params = {name: jnp.asarray(value) for name, value in result.best_fit.items()}
-    lost = like.coefficients(params)[:, keep] * noise
-    # The amplitudes that the products with the data lack, with a constant if an offset is free.
-    count = lost.shape[-1] + any(name.startswith("offset.") for name in params)
-    lost = jnp.pad(lost, ((0, 0), (0, 0), (0, count - lost.shape[-1])))
-    lacking = jnp.linalg.solve(products[..., :count, :count], lost[..., None])[..., 0]
-    lacking = jnp.pad(lacking, ((0, 0), (0, 0), (0, len(templates) + 1 - count)))
-    vector = jnp.zeros((len(sigma), sigma.shape[1], len(templates) + 2))
-    moved = like.matrix @ vector.at[:, keep, 1:].set(-lacking).ravel()
-    gradient = jax.vjp(like.residuals, params)[1](moved)[0]
-    slope = np.array([float(gradient[name]) for name in result.free])
-    # A parameter at the edge of its prior has no error, and stays there.
-    covariance = np.asarray(result.covariance)
-    shifts = -np.nan_to_num(covariance) @ slope
-    shifts[np.isnan(np.diagonal(covariance))] = np.nan
-    return Attenuation(shares, dict(zip(result.free, shifts.tolist(), strict=True)))
+
+    covariance_of: Callable[[Float[Array, "source row stokes pix"]], Float[np.ndarray, "row row"]]
+    parts: Float[np.ndarray, "template source"]
+    of_band: Float[np.ndarray, "band source"]
+    variance: Float[Array, "source stokes pix"]
+
+    def mean_products(
+        self, weights: Float[Array, "band stokes pix"]
+    ) -> Float[np.ndarray, "band stokes row row"]:
+        """Means of what noise adds to the products of (data, templates, 1), as `gram` has them."""
+        power = np.einsum("bsp,usp->bsu", weights, self.variance)
+        bands, stokes, _ = power.shape
+        size = len(self.parts) + 2
+        total = np.zeros((bands, stokes, size, size))
+        total[..., 1:-1, 1:-1] = np.einsum("bsu,ku,ju->bskj", power, self.parts, self.parts)
+        with_data = np.einsum("bsu,bu,ku->bsk", power, self.of_band, self.parts)
+        total[..., 0, 1:-1] = total[..., 1:-1, 0] = with_data
+        return total
+
+    def covariance(
+        self,
+        rows: Float[Array, "band row stokes pix"],
+        coefficients: Float[np.ndarray, "band row template"],
+    ) -> Float[np.ndarray, "bandrow bandrow"]:
+        """What noise of templates adds to the covariance of products of rows with residuals.
+
+        `coefficients` are those of the templates in what each row is multiplied with.
+        """
+        bands, count, stokes, npix = rows.shape
+        number, size = len(self.variance), bands * count
+        flat = jnp.broadcast_to(rows.reshape(1, size, stokes, npix), (number, size, stokes, npix))
+        total = self.covariance_of(flat).reshape(number, size, number, size)
+        own = np.repeat(self.of_band, count, axis=0)
+        seen = own - np.asarray(coefficients).reshape(size, -1) @ self.parts
+        each = np.einsum("umun->umn", total)
+        return np.einsum("umn,mu,nu->mn", each, seen, seen) - np.einsum(
+            "umn,mu,nu->mn", each, own, own
+        )
+
+    def shares(
+        self,
+        templates: Float[np.ndarray, "template stokes pix"],
+        weights: Float[np.ndarray, "band stokes pix"],
+    ) -> np.ndarray:
+        """The part of each template's weighted power that is noise."""
+        noise = np.einsum("bsp,usp,ku->k", weights, self.variance, self.parts**2)
+        return noise / np.einsum("bsp,ksp,ksp->k", weights, templates, templates)
 
 
 def unknown_noise(names: Sequence[str]) -> str:
@@ -144,5 +155,5 @@ def unknown_noise(names: Sequence[str]) -> str:
         "200 for synchrotron, fits to Planck's 44 and 70 GHz get beta_dust wrong by -0.007 (-0.8 "
         "sigma) and beta_syn by +0.036 (+2.7 sigma) at |b| < 20 deg, -0.019 (-2.1 sigma) and "
         "+0.076 (+5.3 sigma) on the full sky. State it in the templates, noise = { level = 34.0 }, "
-        "or noise = { rms = 0.0 } for exact templates."
+        "and the fit is corrected for it, or noise = { rms = 0.0 } for exact templates."
     )

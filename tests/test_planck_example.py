@@ -12,20 +12,25 @@ from fits import inputs as fit_inputs
 from fits.commands.fit import fit_numbers, fit_warnings
 from fits.commands.run import DEFAULTS
 from fits.common import common_maps
+from fits.compress import gram
+from fits.fluctuations import Fluctuations
 from fits.inputs import Band, Inputs, read_band
+from fits.posterior import chi2
 from fits.spectral_index import fit_regions
-from fits.template_noise import TemplateNoise, prepared_variance
+from fits.template_likelihood import _one_stokes_each
+from fits.template_noise import TemplateNoise, level_spectrum
 from fits.writing import leaks
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, inputs, observe
 from jaxsky.harmonics import Preparation, alm_ell, gaussian_beam, resample, synthesis
 from jaxsky.inputs import Template
 from jaxsky.io import write_maps
-from jaxsky.noise import draw, uniform_covariance
+from jaxsky.noise import draw, pixel_covariance, uniform_covariance
 from jaxsky.settings import BandTable, Experiment, SettingsError, load
 
 NSIDE = 8
 NPIX = healpy.nside2npix(NSIDE)
 START = {"dust.beta_dust": 1.5, "synchrotron.beta_syn": 3.0}
+TRUTH = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1}  # the laws' defaults
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SHIPPED = EXAMPLES / "planck_44_70.toml"
 
@@ -172,12 +177,10 @@ def sky_of(seed: int, scale: float = 100.0) -> Sky:
     return Sky({"dust": Dust(maps()), "synchrotron": Synchrotron(maps())})
 
 
-def settings_of() -> Experiment:
-    return Experiment(
-        common={"nside": NSIDE, "fwhm": 0.0},
-        free={name: {"start": value} for name, value in START.items()},
-        fit={"methods": ["gradient"], "stokes": ["QU"]},
-    )
+def settings_of(**more) -> Experiment:
+    free = {name: {"start": value} for name, value in START.items()}
+    fit = {"methods": ["gradient"], "stokes": ["QU"]}
+    return Experiment(common={"nside": NSIDE, "fwhm": 0.0}, **{"free": free, "fit": fit} | more)
 
 
 def inputs_of(sky: Sky, seen: dict[str, tuple[float, float]], noise=(), templates=None) -> Inputs:
@@ -188,8 +191,11 @@ def inputs_of(sky: Sky, seen: dict[str, tuple[float, float]], noise=(), template
         covariance = uniform_covariance(level, NSIDE)
         maps = observe(sky, [Bandpass.delta(nu)])[0] + draw(jax.random.key(int(nu)), covariance)
         bands[name] = Band(maps, used, Bandpass.delta(nu), 0.0, covariance)
-    given = {n: Template(c, 0.0, used) for n, c in (templates or sky).components.items()}
-    return Inputs(given, bands, None, None, "", dict(noise))
+    return Inputs(templates_of(templates or sky.components), bands, None, None, "", dict(noise))
+
+
+def templates_of(components) -> dict[str, Template]:
+    return {n: Template(c, 0.0, np.ones(NPIX, bool)) for n, c in components.items()}
 
 
 @pytest.mark.slow
@@ -208,27 +214,127 @@ def test_a_band_without_weight_is_named_and_not_counted():
     assert found["results"]["all"]["QU"]["gradient"]["bands_without_weight"] == ["70"]
 
 
+TEMPLATE_NOISE = uniform_covariance(2000.0, NSIDE)
+
+
 @pytest.mark.slow
-def test_noise_of_templates_moves_a_fit_as_computed():
-    """The mean over many noisy templates, against the first order from one of them."""
-    sky, settings, inside = sky_of(3), settings_of(), {"all": np.ones(NPIX, bool)}
-    bands = {str(nu): (nu, 1.0) for nu in (30.0, 44.0, 353.0)}
-    covariance = uniform_covariance(2000.0, NSIDE)
-    noise = {"dust": TemplateNoise(), "synchrotron": TemplateNoise(covariance=covariance)}
-    clean = fitted(inputs_of(sky, bands, noise), settings, inside)
-    moved, computed = [], []
-    for seed in range(30):
-        noisy = sky["synchrotron"].amplitude + draw(jax.random.key(seed), covariance)
-        templates = Sky({"dust": sky["dust"], "synchrotron": Synchrotron(noisy)})
-        fit = fitted(inputs_of(sky, bands, noise, templates), settings, inside)
-        result = fit.results["gradient"]
-        moved.append([result.best_fit[n] - clean.results["gradient"].best_fit[n] for n in START])
-        computed.append([fit.attenuation.shifts[n] for n in START])
-        assert fit.attenuation.shares["dust"] == 0
-    mean, error = np.mean(moved, axis=0), np.std(moved, axis=0) / np.sqrt(len(moved))
-    assert abs(mean[1]) > 10 * error[1]
-    np.testing.assert_allclose(mean[1], np.mean(computed, axis=0)[1], rtol=0.1)
-    np.testing.assert_allclose(mean[0], np.mean(computed, axis=0)[0], atol=4 * error[0])
+@pytest.mark.parametrize("likelihood", ["exact", "diagonal"])
+@pytest.mark.parametrize("shared", [{}, {"44": 0.7}])
+def test_fits_with_noisy_templates_are_unbiased(likelihood, shared):
+    """Pulls over noisy templates, whose noise moves a fit that does not know it."""
+    sky, inside = sky_of(3), {"all": np.ones(NPIX, bool)}
+    settings = settings_of(
+        fit={"methods": ["gradient"], "stokes": ["QU"], "likelihood": likelihood}
+    )
+    bands = {"30": (30.0, 500.0), "44": (44.0, 500.0), "353": (353.0, 500.0)}
+    given = TemplateNoise(TEMPLATE_NOISE, shared=shared)
+    pulls = {"given": [], "not": []}
+    for seed in range(100):
+        key = jax.random.key(seed)
+        observed, noise = noisy_bands(sky, bands, key)
+        moved = draw(jax.random.fold_in(key, 99), TEMPLATE_NOISE)
+        moved += sum(factor * noise[band] for band, factor in shared.items())
+        templates = sky.components | {
+            "synchrotron": Synchrotron(sky["synchrotron"].amplitude + moved)
+        }
+        for what, one in {"given": given, "not": TemplateNoise()}.items():
+            noises = {"dust": TemplateNoise(), "synchrotron": one}
+            made = observed._replace(templates=templates_of(templates), template_noise=noises)
+            result = fitted(made, settings, inside).results["gradient"]
+            pulls[what].append(
+                [(result.best_fit[n] - TRUTH[n]) / result.sigma[n] for n in result.free]
+            )
+    means = {what: np.mean(rows, axis=0) for what, rows in pulls.items()}
+    deviation = np.std(pulls["given"], axis=0)
+    # Of N standard normal values the mean scatters by 1 / sqrt(N), the deviation by 1 / sqrt(2 N).
+    assert np.all(np.abs(means["given"]) < 3 / np.sqrt(100)), means
+    assert np.all(np.abs(deviation - 1) < 3 / np.sqrt(200)), deviation
+    assert np.abs(means["not"]).max() > 1
+
+
+def noisy_bands(sky, seen, key):
+    """Bands, and their noise by name."""
+    made = inputs_of(sky, seen)
+    noise = {
+        name: draw(jax.random.fold_in(key, i), band.noise)
+        for i, (name, band) in enumerate(made.bands.items())
+    }
+    clean = observe(sky, [Bandpass.delta(nu) for nu, _ in seen.values()])
+    bands = {
+        name: band._replace(maps=maps + noise[name])
+        for (name, band), maps in zip(made.bands.items(), clean, strict=True)
+    }
+    return made._replace(bands=bands), noise
+
+
+def test_a_level_without_effect_changes_nothing():
+    """The diagonal form of a template with noise is another sum of squares, and the same chi^2."""
+    sky, bands = sky_of(5), {"30": (30.0, 10.0), "353": (353.0, 10.0)}
+    params = {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 2.9, "offset.30.Q": 3.0}
+    made = common_maps(
+        inputs_of(sky, bands, {"dust": TemplateNoise(1e-12 * TEMPLATE_NOISE)}), 8, 0.0
+    )
+    assert made.template_errors is not None
+    for kind in ("exact", "diagonal"):
+        for stokes in ("Q", "QU"):
+            with_errors = made.likelihood(params, stokes=stokes, kind=kind)
+            plain = made._replace(template_errors=None).likelihood(params, stokes=stokes, kind=kind)
+            for shift in (0.0, 0.1):
+                at = params | {"dust.beta_dust": 1.6 + shift}
+                np.testing.assert_allclose(chi2(with_errors, at), chi2(plain, at), rtol=1e-7)
+            assert with_errors.dof(3) == plain.dof(3)
+
+
+def test_noise_of_templates_in_products_and_their_covariance():
+    """Against the mean and scatter of the products over many realisations of the noise."""
+    sky, bands, level = sky_of(6), {"30": (30.0, 10.0), "44": (44.0, 2000.0)}, TemplateNoise
+    noises = {
+        "dust": level(correlated=level_spectrum(3000.0, 600.0, 4 * NSIDE), shared={"44": 0.8}),
+        "synchrotron": level(TEMPLATE_NOISE, shared={"44": -0.3}),
+    }
+    made = common_maps(inputs_of(sky, bands, noises), NSIDE, 0.0)
+    errors, weights = made.template_errors, 1 / np.asarray(made.sigma) ** 2
+    templates = jnp.stack([c.amplitude for c in sky.components.values()])
+    rows = _one_stokes_each(weights[:, None] * templates)
+    coefficients = np.random.default_rng(1).normal(size=(2, 4, 2))
+    coefficients[:, :2], coefficients[:, 2:] = coefficients[:, :1], coefficients[:, 2:3]
+    window = jnp.sqrt(noises["dust"].correlated)[alm_ell(4 * NSIDE)]
+
+    @jax.jit
+    def products(key):
+        keys = jax.random.split(key, 4)
+        data = jnp.stack([draw(k, b.noise) for k, b in zip(keys[:2], made_bands, strict=True)])
+        own = jax.random.normal(keys[2], (2, window.size)) * window
+        noise = jnp.stack([synthesis(own, NSIDE), draw(keys[3], TEMPLATE_NOISE)])
+        noise = noise + jnp.array([0.8, -0.3])[:, None, None] * data[1]
+        seen = data[:, None, :, :] - jnp.einsum("brk,ksp->brsp", coefficients, noise)
+        return gram(data, noise, weights), jnp.einsum("brsp,brsp->br", rows, seen).ravel()
+
+    made_bands = tuple(inputs_of(sky, bands).bands.values())
+    both = [products(jax.random.key(i)) for i in range(400)]
+    found = np.mean([mean for mean, _ in both], axis=0)[..., :-1, :-1]
+    scatter = np.std([mean for mean, _ in both], axis=0)[..., :-1, :-1] / np.sqrt(400)
+    expected = errors.mean_products(weights)[..., :-1, :-1]
+    found[..., 0, 0] = expected[..., 0, 0]  # of the data with themselves: not of templates
+    assert np.all(np.abs(found - expected) < 5 * scatter)
+    covariance = made.fluctuations.covariance(rows) + errors.covariance(rows, coefficients)
+    measured = np.cov(np.array([product for _, product in both]).T)
+    scale = np.sqrt(np.diagonal(covariance))
+    np.testing.assert_allclose(
+        measured / scale / scale[:, None],
+        covariance / scale / scale[:, None],
+        atol=5 / np.sqrt(400),
+    )
+
+
+def test_noise_that_is_all_of_a_template_is_refused():
+    noisy = {"dust": TemplateNoise(1e6 * TEMPLATE_NOISE)}
+    made = common_maps(
+        inputs_of(sky_of(5), {"30": (30.0, 10.0), "353": (353.0, 10.0)}, noisy), 8, 0
+    )
+    for kind in ("exact", "diagonal"):
+        with pytest.raises(ValueError, match="noise of the templates is all that they hold"):
+            made.likelihood(START, kind=kind)
 
 
 def fitted(made, settings, inside):
@@ -240,7 +346,12 @@ def test_a_level_is_seen_through_the_beam():
     """White noise of a level, smoothed by a template's beam, and its variance when prepared."""
     lmax, own, fwhm = 23, 300.0, 600.0
     preparation = Preparation.smoothing(16, own, NSIDE, fwhm, lmax)
-    variance = prepared_variance(TemplateNoise(1000.0), own, preparation, fwhm)
+    before = level_spectrum(1000.0, own, lmax)
+    spectrum = before * preparation.window**2
+    noise = Fluctuations(
+        (preparation,), (None,), (spectrum,), None, None, jnp.ones(1), ("x",), (None,)
+    )
+    variance = noise.sigma() ** 2
     ell = alm_ell(48)
     level = np.radians(1000.0 / 60)
     maps = []
@@ -248,7 +359,7 @@ def test_a_level_is_seen_through_the_beam():
         alm = level * np.random.default_rng(seed).normal(size=(2, ell.size)) * (ell > 1)
         seen = synthesis(jnp.asarray(alm) * gaussian_beam(own, 48)[ell], 16)
         maps.append(preparation(seen))
-    np.testing.assert_allclose(np.var(maps), variance[0, 0], rtol=0.05)
+    np.testing.assert_allclose(np.var(maps), variance[0, 0, 0], rtol=0.05)
 
 
 def test_templates_without_a_word_on_their_noise_are_warned_of():
@@ -263,18 +374,32 @@ def test_templates_without_a_word_on_their_noise_are_warned_of():
     exact = dict.fromkeys(("dust", "synchrotron"), TemplateNoise())
     made = inputs_of(sky, bands, exact)
     assert fit_warnings(made, settings, [fitted(made, settings, inside)]) == []
-    noisy = dict.fromkeys(("dust", "synchrotron"), TemplateNoise(level=300.0))
-    made = inputs_of(sky, bands, noisy)
-    (said,) = fit_warnings(made, settings, [fitted(made, settings, inside)])
+    noisy = dict.fromkeys(("dust", "synchrotron"), TemplateNoise(TEMPLATE_NOISE / 1e4))
+    drawn = [draw(jax.random.key(i), TEMPLATE_NOISE / 1e4) for i in range(2)]
+    maps = {
+        name: type(one)(one.amplitude + more)
+        for (name, one), more in zip(sky.components.items(), drawn, strict=True)
+    }
+    made = inputs_of(sky, bands, noisy, maps)
+    fit = fitted(made, settings, inside)
+    assert fit_warnings(made, settings, [fit]) == []
+    said = fit_numbers(made, settings, [fit])["results"]["all"]["QU"]["gradient"]["template_noise"]
+    assert said["corrected"]
+    assert 0 < said["shares"]["dust"] < 0.1
+    index = jnp.where(jnp.arange(NPIX) < 9, 3.099, 3.1)
+    maps["synchrotron"] = Synchrotron(maps["synchrotron"].amplitude, index)
+    settings = settings_of(free={"dust.beta_dust": {"start": 1.5}})
+    made = inputs_of(sky, bands, noisy, maps)
+    said = fit_warnings(made, settings, [fitted(made, settings, inside)])[0]
     assert said.startswith("all, QU: the noise of the templates attenuates dust by ")
-    assert "sigma), to first order; the fit is not corrected for it." in said
+    assert said.endswith("not corrected for it, as there are parameters with maps of values.")
 
 
 def test_the_embedded_templates_are_exact():
     bands = [{"instrument": "planck", "channels": ["44", "70"]}]
     made = fit_inputs.inputs_of(Experiment(sky={"embedded": {"nside": 16}}, bands=bands))
     assert list(made.template_noise) == list(made.templates)
-    assert not any(n.level for n in made.template_noise.values())
+    assert not any(n.own for n in made.template_noise.values())
 
 
 TEMPLATES = """
@@ -302,7 +427,7 @@ noise = {{ rms = 5e-5 }}
     ("noise", "level", "variance"),
     [
         ("{ rms = 0.0 }", 0.0, None),
-        ("{ level = 0 }", 0.0, None),
+        ('{ level = 0, shared = { "44" = 0.5 } }', 0.0, None),
         ("{ level = 1e-4 }", 1e-4, None),
         ("{ rms = 5e-5 }", 0.0, 2.5e-9),
         ('{ rms = { file = "map.fits", fields = ["RMS"] } }', 0.0, 2.5e-9),
@@ -314,12 +439,15 @@ def test_noise_of_templates_from_settings(folder, noise, level, variance):
     path.write_text(TEMPLATES.format(noise=noise))
     found = fit_inputs.inputs_of(load(path)).template_noise["dust"]
     factor = float(Bandpass.delta(353.0).conversion("K_CMB", "uK_RJ"))
-    assert found.level == pytest.approx(level * factor)
-    if variance is None:
-        assert found.covariance is None
+    assert found.shared == ({"44": 0.5} if "shared" in noise else {})
+    if level:
+        expected = (level * factor * np.radians(1 / 60)) ** 2
+        np.testing.assert_allclose(found.correlated[2:], expected, rtol=1e-6)  # no beam is given
     else:
-        np.testing.assert_allclose(found.covariance[0, 0], variance * factor**2)
-        np.testing.assert_allclose(found.covariance[0, 1], 0)
+        assert found.correlated is None
+    covariance = pixel_covariance(found.noise, NSIDE)
+    np.testing.assert_allclose(covariance[0, 0], (variance or 0.0) * factor**2)
+    np.testing.assert_allclose(covariance[0, 1], 0)
 
 
 @pytest.mark.parametrize(
@@ -329,6 +457,7 @@ def test_noise_of_templates_from_settings(folder, noise, level, variance):
         ("{ rms = -1.0 }", r"sky.dust.noise.rms: .*greater than or equal to 0"),
         ("{ level = 1.0, rms = 1.0 }", r"sky.dust.noise: give the noise as exactly one of"),
         ("{}", r"sky.dust.noise: give the noise as exactly one of level, rms"),
+        ('{ rms = 0, shared = { "45" = 1.0 } }', "sky.dust.noise.shared: there is no band '45'"),
     ],
 )
 def test_noise_of_templates_that_cannot_be(folder, noise, words):

@@ -6,6 +6,7 @@ there is nothing to test.
 
 import importlib.util
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,10 +15,14 @@ from fits.commands.run import DEFAULTS
 from fits.common import common_maps
 from fits.inputs import inputs_of
 from fits.optimize import best_fit
+from fits.priors import priors_of
 from fits.regions import region_masks
+from fits.spectral_index import settled
 from jaxsky.settings import load
 
 TRUTH = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1}
+#: Noise of the templates [uK_RJ arcmin], about that of Commander's.
+LEVELS = {"dust": 34.0, "synchrotron": 200.0}
 SEEDS = range(1, 51)
 
 
@@ -48,16 +53,29 @@ def settings(data_dir, tmp_path_factory):
     return load(path)
 
 
-def test_pulls_over_fifty_skies(maker, settings, monkeypatch):
+@pytest.mark.parametrize("noisy", [False, True], ids=["exact", "noisy"])
+def test_pulls_over_fifty_skies(maker, settings, monkeypatch, noisy):
+    """Those of templates without noise, and with about that of Commander's."""
     folder, start, pulls = settings.data_dir, settings.start("fit"), []
+    if noisy:
+        components = settings.sky.components
+        levels = {name: {"level": LEVELS[name]} for name in components}
+        sky = {
+            name: one.model_dump(exclude_unset=True) | {"noise": levels[name]}
+            for name, one in components.items()
+        }
+        settings = settings.model_copy(update={"sky": type(settings.sky)(**sky)})
+    priors = priors_of(settings, "fit")
     for seed in SEEDS:
         line = ["make_files.py", folder, "--nside", "128", "--seed", str(seed)]
+        line += ["--template-noise", str(int(noisy))]
         monkeypatch.setattr(sys, "argv", line)
         maker.main()
         prepared = common_maps(inputs_of(settings), settings.common.nside, settings.common.fwhm)
         row = []
         for inside in region_masks(settings, settings.fit.regions).values():
-            fit = best_fit(prepared.likelihood(start, region=inside), start)
+            like = settled(partial(prepared.likelihood, region=inside), start, priors)
+            fit = best_fit(like, start, priors=priors)
             row.append([(fit.best_fit[n] - truth) / fit.sigma[n] for n, truth in TRUTH.items()])
         pulls.append(row)
     means, deviations = np.mean(pulls, axis=0), np.std(pulls, axis=0, ddof=1)

@@ -3,8 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
 from fits.common import prepared_maps
@@ -64,8 +62,8 @@ def _result(fit: RegionFit, method: str) -> dict[str, Any]:
         }
     if fit.weightless:
         numbers["bands_without_weight"] = list(fit.weightless)
-    if fit.attenuation is not None:
-        numbers["template_noise"] = fit.attenuation._asdict()
+    if fit.noise_shares:
+        numbers["template_noise"] = {"shares": fit.noise_shares, "corrected": fit.corrected}
     for key in ("tau", "acceptance", "discard", "steps"):
         if key in result.details:
             numbers[key] = result.details[key]
@@ -147,19 +145,11 @@ def fit_warnings(inputs: Inputs, settings: Experiment, fits: Sequence[RegionFit]
 
 
 def _attenuated(fit: RegionFit) -> str | None:
-    """What the noise of the templates does to a fit, if it does anything."""
-    lost = fit.attenuation
-    if lost is None:
+    """What the noise of the templates does to a fit that is not corrected for it."""
+    if fit.corrected or not fit.noise_shares:
         return None
-    shares = ", ".join(f"{name} by {100 * share:.2g} %" for name, share in lost.shares.items())
-    sentence = f"{fit.region}, {fit.stokes}: the noise of the templates attenuates {shares}"
-    if not lost.shifts:
-        return f"{sentence}; what this does to parameters with maps of values is not known."
-    # What is at the edge of its prior stays there.
-    shifts = ", ".join(
-        f"{name} by {lost.shifts[name]:+.2g} ({lost.shifts[name] / error:+.1f} sigma)"
-        for name, error in next(iter(fit.results.values())).sigma.items()
-        if np.isfinite(error)
+    shares = ", ".join(f"{name} by {100 * share:.2g} %" for name, share in fit.noise_shares.items())
+    return (
+        f"{fit.region}, {fit.stokes}: the noise of the templates attenuates {shares}; the fit is "
+        "not corrected for it, as there are parameters with maps of values."
     )
-    moves = f", which moves {shifts}, to first order" if shifts else ""
-    return f"{sentence}{moves}; the fit is not corrected for it."

@@ -256,6 +256,10 @@ class Experiment(SettingsTable):
             raise MistakeAt("forecast.free", "is empty, and so is the table free")
         if "cmb" in (self.simulate.include or ()) and not self.cmb.include:
             raise MistakeAt("simulate.include", "has 'cmb', but cmb.include is false")
+        for name, one in self.sky.given.items():
+            for band in one.noise.shared if one.noise else ():
+                if band not in names:
+                    raise MistakeAt(f"sky.{name}.noise.shared", f"there is no band {band!r}")
         components = list(self.sky.components)
         simulated = [*components, "cmb", "noise"]
         known: dict[str, Collection[str]] = {

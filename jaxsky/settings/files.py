@@ -126,7 +126,8 @@ class NoiseTable(SettingsTable):
     the second table of WMAP's maps. `unit` is that of level, rms, covariance (squared) and
     sigma0, by default that of the map, or uK_CMB where there is no map. `plausible` says that noise
     is meant which is far from the rms of its map; `correlated`, that noise estimated from a map has
-    a spectrum.
+    a spectrum. `shared` says how many times a template has the noise of a band, by name, besides
+    its own: of maps that were made from the same bands.
     """
 
     KINDS: ClassVar[tuple[str, ...]] = (
@@ -147,6 +148,7 @@ class NoiseTable(SettingsTable):
     estimate_above: float | None = Field(None, ge=0, lt=90)
     correlated: bool = False
     plausible: bool = False
+    shared: dict[str, float] = Field(default={})
     unit: str | None = None
 
     @field_validator("unit")

@@ -261,6 +261,8 @@ class BandTable(BeamedKeys):
             raise MistakeAt("samples", "is of a top-hat, but the bandpass has no width")
         if self.noise is not None and 0 in (self.noise.level, self.noise.rms):
             raise MistakeAt("noise", "must be greater than 0, not 0")
+        if self.noise is not None and self.noise.shared:
+            raise MistakeAt("noise.shared", "is of templates, which share the noise of bands")
         if self.file is None:
             if self.leakage is not None:
                 raise MistakeAt("leakage", "is subtracted from a map, but file is missing")

@@ -348,9 +348,7 @@ def test_a_level_is_seen_through_the_beam():
     preparation = Preparation.smoothing(16, own, NSIDE, fwhm, lmax)
     before = level_spectrum(1000.0, own, lmax)
     spectrum = before * preparation.window**2
-    noise = Fluctuations(
-        (preparation,), (None,), (spectrum,), None, None, jnp.ones(1), ("x",), (None,)
-    )
+    noise = Fluctuations((preparation,), (0.0,), (spectrum,), None, None, jnp.ones(1), ("x",))
     variance = noise.sigma() ** 2
     ell = alm_ell(48)
     level = np.radians(1000.0 / 60)
@@ -383,7 +381,7 @@ def test_templates_without_a_word_on_their_noise_are_warned_of():
     made = inputs_of(sky, bands, noisy, maps)
     fit = fitted(made, settings, inside)
     assert fit_warnings(made, settings, [fit]) == []
-    said = fit_numbers(made, settings, [fit])["results"]["all"]["QU"]["gradient"]["template_noise"]
+    said = fit_numbers(settings, [fit], None)["results"]["all"]["QU"]["gradient"]["template_noise"]
     assert said["corrected"]
     assert 0 < said["shares"]["dust"] < 0.1
     index = jnp.where(jnp.arange(NPIX) < 9, 3.099, 3.1)

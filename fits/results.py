@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from fits.writing import with_error
 from jaxsky.checks import Numeric
+from jaxsky.printed import Summary, as_html, as_text
 
 if TYPE_CHECKING:
     from getdist import MCSamples
@@ -84,17 +85,23 @@ class FitResult(NamedTuple):
         return tuple(self.best_fit)
 
     def __str__(self) -> str:
-        lines = []
+        return as_text(self.summary())
+
+    def _repr_html_(self) -> str:
+        return as_html(self.summary())
+
+    def summary(self) -> Summary:
+        """A heading, and values with errors; of several regions their medians."""
+        rows = []
         for name, value in self.best_fit.items():
             known = np.isfinite(value)
             both = (np.asarray(x)[known] for x in (value, self.sigma[name]))
             shown = with_error(*map(np.median, both)) if known.any() else "unknown"
             regions = f", median of {known.sum()} regions" if np.ndim(value) else ""
-            lines.append(f"{name} = {shown}{regions}")
-        lines.append(f"chi2 = {self.chi2:.1f} for {self.dof} degrees of freedom")
-        if not self.converged:
-            lines.append(f"not converged: {self.message}")
-        return "\n".join(lines)
+            rows.append((name, f"{shown}{regions}"))
+        rows.append(("chi2", f"{self.chi2:.1f} for {self.dof} degrees of freedom"))
+        state = "converged" if self.converged else f"not converged: {self.message}"
+        return f"Fit by {self.method}, {state}", rows
 
     def of_row(self, values: Mapping[str, Any], label: str) -> Any:
         """The entry of values by name that a row of the covariance is of."""

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.checks import Numeric, as_array, check_finite, check_positive, is_concrete
+from jaxsky.printed import Printed, shown
 from jaxsky.sed import cmb_derivative
 from jaxsky.units import band_conversion, parse_unit
 
@@ -26,7 +27,7 @@ CONVENTIONS: dict[str, Callable[[Array], Array]] = {
 MAX_NU = 1e6
 
 
-class Bandpass(eqx.Module):
+class Bandpass(Printed, eqx.Module):
     """The response of a detector to the frequencies of a band.
 
     A band observes the weighted mean of the antenna temperature, int W S dnu / int W dnu (the
@@ -97,6 +98,15 @@ class Bandpass(eqx.Module):
             raise ValueError(f"Argument `samples` must be at least 2, but is {samples}.")
         nu = _across(center, width, samples)
         return cls(nu, np.ones(samples, nu.dtype), convention)
+
+    def summary(self):
+        rows = [
+            ("center", shown(self.center, "GHz")),
+            ("from", shown(self.nu[0], "GHz")),
+            ("to", shown(self.nu[-1], "GHz")),
+            ("samples", str(self.nu.size)),
+        ]
+        return f"Bandpass, weights by the convention {self.convention!r}", rows
 
     @property
     def quadrature(self) -> Float[Array, " sample"]:

@@ -14,10 +14,11 @@ from jaxtyping import Array
 from jaxsky.bandpass import Bandpass
 from jaxsky.checks import Parameter, as_number, check_positive, is_concrete
 from jaxsky.observation import ObservedBand
+from jaxsky.printed import Printed, shown
 from jaxsky.units import parse_unit
 
 
-class Channel(eqx.Module):
+class Channel(Printed, eqx.Module):
     """A channel: a top-hat band [GHz], a Gaussian beam [arcmin], white noise of Q and U.
 
     The unit of the noise [noise_unit arcmin] is one of temperature in `jaxsky.units`.
@@ -38,12 +39,17 @@ class Channel(eqx.Module):
             check_positive("center - width / 2", lowest)
         parse_unit(self.noise_unit)
 
+    def summary(self):
+        units = {"center": "GHz", "width": "GHz", "fwhm": "arcmin"}
+        units["noise"] = f"{self.noise_unit} arcmin"
+        return f"Channel {self.name}", [(k, shown(getattr(self, k), u)) for k, u in units.items()]
+
     def band(self, samples: int = 51) -> Bandpass:
         """The top-hat band; see `Bandpass.top_hat`."""
         return Bandpass.top_hat(self.center, self.width, samples=samples)
 
 
-class Instrument(eqx.Module):
+class Instrument(Printed, eqx.Module):
     """Channels in order, looked up by their names, which differ.
 
     Examples
@@ -67,6 +73,12 @@ class Instrument(eqx.Module):
             raise ValueError("Argument `channels` must have at least one channel.")
         if len(set(self.names)) < len(self.names):
             raise ValueError(f"Channels must have different names, but are {list(self.names)}.")
+
+    def summary(self):
+        table = [dict(channel.summary()[1]) for channel in self]
+        rows = [("channel", *table[0])]
+        rows += [(c.name, *values.values()) for c, values in zip(self, table, strict=True)]
+        return f"Instrument {self.name}", rows
 
     @property
     def names(self) -> tuple[str, ...]:

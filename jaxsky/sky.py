@@ -12,9 +12,10 @@ from jaxsky.bandpass import Bandpass
 from jaxsky.checks import as_array
 from jaxsky.components import Component, check_value, declared
 from jaxsky.interpolation import Nodes, band_sed, choose_nodes
+from jaxsky.printed import Printed
 
 
-class Sky(eqx.Module):
+class Sky(Printed, eqx.Module):
     """A sum of named components on the same pixels.
 
     Parameters
@@ -67,6 +68,10 @@ class Sky(eqx.Module):
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.components)
+
+    def summary(self):
+        rows = [(name, *row) for name, one in self.components.items() for row in one.summary()[1]]
+        return f"Sky of {', '.join(self)}", rows
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -193,11 +193,13 @@ def by_each(like, start):
 
 def test_results_are_printed_written_and_given_to_getdist(like):
     fit = best_fit(like, START, priors=PRIORS)
-    first, second, last = str(fit).splitlines()
+    heading, first, second, last = str(fit).splitlines()
     value, sigma = fit.best_fit["dust.beta_dust"], fit.sigma["dust.beta_dust"]
-    assert first == f"dust.beta_dust = {with_error(value, sigma)}"
-    assert second.startswith("synchrotron.beta_syn = ")
-    assert last == f"chi2 = {fit.chi2:.1f} for {fit.dof} degrees of freedom"
+    assert heading == "Fit by gradient, converged"
+    assert first.split(maxsplit=1) == ["dust.beta_dust", with_error(value, sigma)]
+    assert second.startswith("  synchrotron.beta_syn  ")
+    assert last.split(maxsplit=1) == ["chi2", f"{fit.chi2:.1f} for {fit.dof} degrees of freedom"]
+    assert f"<td>{with_error(value, sigma)}</td>" in fit._repr_html_()
     numbers = fit.to_dict()
     assert numbers["free"] == tuple(sorted(START))
     assert numbers["sigma"] is fit.sigma

@@ -1,5 +1,6 @@
 """Skies, parameters by name, and what is refused."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ from jaxsky import (
     Sky,
     Synchrotron,
     get_parameters,
+    load_instrument,
     observe,
     observe_band,
     parameter_names,
@@ -115,3 +117,33 @@ def test_importing_jaxsky_touches_neither_healpy_nor_precision():
         "assert not jax.config.read('jax_enable_x64')"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize(
+    ("what", "lines"),
+    [
+        (Dust(np.full((2, 12), 3.0), beta_dust=np.linspace(1.4, 1.6, 12)),
+         ["Dust, law 'dust'", "  amplitude  Q, U in 12 pixels, rms 3 uK_RJ",
+          "  beta_dust  map from 1.4 to 1.6, median 1.5", "  T_dust     21 K"]),
+        (Sky({"dust": Dust(np.ones((3, 12)), (1.6, 2.7), (9.4, 16.2), (0.49, 1.0))}),
+         ["Sky of dust", "  dust  amplitude  I, Q, U in 12 pixels, rms 1 uK_RJ",
+          "  dust  beta_dust  1.6, 2.7", "  dust  T_dust     9.4 K, 16.2 K"]),
+        (Bandpass.top_hat(44.0, 8.0),
+         ["Bandpass, weights by the convention 'RJ'", "  center   44 GHz", "  from     40 GHz"]),
+        (load_instrument("litebird").select(["40", "402"]),
+         ["Instrument LiteBIRD", "  channel  center   width      fwhm         noise",
+          "  40       40 GHz   12 GHz     70.5 arcmin  37.42 uK_CMB arcmin"]),
+        (load_instrument("litebird")["40"], ["Channel 40", "  center  40 GHz"]),
+    ],
+)  # fmt: skip
+def test_objects_print_their_values_with_units(what, lines):
+    assert str(what).splitlines()[: len(lines)] == lines
+    for line in lines[1:]:
+        for cell in line.strip().split("  "):
+            assert f"<td>{cell.strip()}</td>" in what._repr_html_() or not cell
+
+
+def test_objects_print_while_jax_traces():
+    seen = []
+    jax.jit(lambda sky: seen.append(str(sky)) or 0)(Sky({"dust": Dust(np.ones((2, 12)))}))
+    assert "unknown while JAX traces" in seen[0]

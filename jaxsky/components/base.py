@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.checks import as_array, check_finite, check_positive, check_shape, is_concrete
+from jaxsky.printed import Printed, shown, shown_maps
 
 #: Components by the name of their law, or module and class, from the moment a class is defined.
 _LAWS: dict[str, type["Component"]] = {}
@@ -77,7 +78,7 @@ def _converted(value: Any) -> Any:
         return value
 
 
-class Component(eqx.Module):
+class Component(Printed, eqx.Module):
     """Base class: `amplitude` (stokes, pix) times `sed(nu)`.
 
     Stokes parameters are I, Q, U (3 rows) or Q, U (2 rows), in uK_RJ at the component's
@@ -135,6 +136,14 @@ class Component(eqx.Module):
     def template(self) -> Float[Array, "stokes pix"]:
         """What the law multiplies; the amplitude, unless parameters other than spectral act."""
         return self.amplitude
+
+    def summary(self):
+        rows = [("amplitude", shown_maps(self.amplitude, self.unit))]
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if "positive" in field.metadata and value is not None:
+                rows.append((field.name, shown(value, field.metadata["unit"])))
+        return f"{type(self).__name__}, law {self.law!r}", rows
 
     def __check_init__(self) -> None:
         amplitude = as_array("amplitude", self.amplitude)

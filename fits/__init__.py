@@ -9,25 +9,21 @@ import jaxsky.bare  # before all else
 from jaxsky.exports import exported
 
 if TYPE_CHECKING:
-    from fits.cleaning import separate
     from fits.commands.forecast import forecast
     from fits.comparison import compare
-    from fits.discs import prepare_patches
     from fits.fisher import fisher_errors
     from fits.grid import grid_fit
-    from fits.multipoles import harmonic_coefficients, harmonic_likelihood, white_spectrum
+    from fits.multipoles import harmonic_coefficients, harmonic_likelihood
     from fits.noise import as_noise
     from fits.optimize import Newton, best_fit
-    from fits.patches import fit_patches
-    from fits.posterior import chi2, fisher_matrix, hessian
+    from fits.posterior import chi2, fisher_matrix
     from fits.priors import Gaussian, Uniform
     from fits.profile_likelihood import spectral_likelihood
     from fits.pseudo_cl import band_powers, bin_edges, masked_spectra
-    from fits.regions import apodize, clusters, latitude_bands, superpixels
+    from fits.regions import apodize, clusters, superpixels
     from fits.results import FitError, FitResult
     from fits.sampling import sample
-    from fits.separated_data import separation_data
-    from fits.separated_maps import component_maps, harmonic_component_maps, residual_maps
+    from fits.separated_maps import component_maps, harmonic_component_maps, separate
     from fits.template_likelihood import likelihood
     from fits.tensor_ratio import fit_tensors, power_model
 

@@ -73,7 +73,7 @@ class Separation(NamedTuple):
         return np.where(self.data.used, np.asarray(values[name])[labels], np.nan)
 
 
-def separate(
+def separate_data(
     settings: Experiment,
     data: PixelData | MultipoleData,
     out: Path | None = None,

@@ -1,6 +1,6 @@
 """Maps of the components for given spectral parameters, and how well they describe the data."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -14,11 +14,17 @@ from jaxtyping import ArrayLike, Float
 from fits import amplitudes
 from fits.amplitudes import Pixels
 from fits.compress import Layout, used_pixels
+from fits.mixing import spectral_names
 from fits.multipoles import check_alm, multipoles_of
 from fits.noise import Noise, as_noise, bare, chunks
-from fits.profile_likelihood import SpectralLikelihood
+from fits.optimize import best_fit
+from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
+from fits.results import FitResult
+from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.checks import Numeric, as_array, check_finite, check_shape
+from jaxsky.components import component_class
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
+from jaxsky.instrument import Instrument
 
 
 class ComponentMaps(NamedTuple):
@@ -296,3 +302,64 @@ def harmonic_component_maps(
         count,
         probability,
     )
+
+
+class Separated(NamedTuple):
+    """What `separate` finds: the fit of the laws, and the maps of the components."""
+
+    fit: FitResult
+    maps: ComponentMaps
+
+
+def separate(
+    components: Sequence[str] | Mapping[str, Component],
+    instrument: Instrument | Mapping[str, Bandpass] | Sequence[Bandpass],
+    data: Numeric,
+    free: Sequence[str] | Mapping[str, Numeric] | None = None,
+    *,
+    noise: Noise | Numeric | None = None,
+    unit: str = "uK_CMB",
+) -> Separated:
+    """Fit the laws of components to maps in bands, and separate the components.
+
+    Parameters
+    ----------
+    components : names of laws ("cmb", "dust", "synchrotron"), or components by name, of which the
+        laws count and not the amplitudes
+    instrument : an instrument, or its bands by name or as a list
+    data : observed maps, shape (band, stokes, pix) with Stokes Q, U or I, Q, U
+    free : names of the free parameters, which start at the values of the components, or start
+        values by name; by default the spectral indices, all that are called "beta..."
+    noise : standard deviations or covariances in the unit of the data (`fits.as_noise`); by default
+        the white noise of the instrument
+    unit : of the data, "uK_RJ", "uK_CMB" or the like
+
+    Returns
+    -------
+    The fit, and maps of the components: amplitudes in uK at their reference frequencies.
+
+    Raises
+    ------
+    ValueError
+        For unknown laws, bands without noise, and what `spectral_likelihood` refuses.
+    """
+    data = bare("data", data)
+    if not isinstance(components, Mapping):
+        nothing = jnp.zeros((data.shape[1] if data.ndim == 3 else 2, 1))
+        components = {law: component_class(law)(nothing) for law in components}
+    sky = Sky(components)
+    if free is None:
+        free = [name for name in spectral_names(sky) if name.split(".")[1].startswith("beta")]
+    start = free if isinstance(free, Mapping) else get_parameters(sky, free)
+    if noise is None:
+        if not isinstance(instrument, Instrument):
+            raise ValueError("Argument `noise` is missing: the bands do not say what they have.")
+        pixel = healpy.nside2resol(healpy.npix2nside(data.shape[-1]), arcmin=True)
+        levels = [
+            one.noise * one.band().conversion(one.noise_unit, unit) / pixel for one in instrument
+        ]
+        noise = np.array(levels)
+    bands = instrument.bands() if isinstance(instrument, Instrument) else instrument
+    like = spectral_likelihood(sky, bands, data, noise, start, unit=unit)
+    fit = best_fit(like)
+    return Separated(fit, component_maps(like, fit.best_fit, data, noise))

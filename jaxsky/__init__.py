@@ -18,13 +18,11 @@ if TYPE_CHECKING:
     from jaxsky.harmonics import smooth
     from jaxsky.instrument import load_instrument
     from jaxsky.io import (
-        from_quantity,
         read_bandpass,
         read_beam,
         read_maps,
         read_mask,
         read_spectra,
-        unit_factor,
         write_maps,
     )
     from jaxsky.observation import Observation, ObservedBand, Source

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fits import cleaning as module
-from fits.cleaning import separate
+from fits.cleaning import separate_data
 from fits.commands import separate as command
 from fits.commands.run import DEFAULTS
 from fits.commands.separate import separation_warnings
@@ -56,7 +56,7 @@ def settings(**changes):
 def separated(domain: str = "pixel", nsims: int = 20, sampler: str = "none"):
     how = settings(separate={"domain": domain, "nsims": nsims, "sampler": sampler})
     given = separation_data(how)
-    return how, given, separate(how, given)
+    return how, given, separate_data(how, given)
 
 
 @pytest.mark.slow
@@ -155,7 +155,7 @@ def test_a_law_that_is_wrong_shows_in_r():
         regions={"wide": "|b| > 10"},
         separate={"sampler": "none", "region": "wide"},
     )
-    found = separate(how, separation_data(how))
+    found = separate_data(how, separation_data(how))
     _, _, right = separated()
     assert abs(found.tensors.shift(found.left)) > 10 * abs(right.tensors.shift(right.left))
     assert found.left.sum() > 10 * right.left.sum()
@@ -169,7 +169,7 @@ def test_regions_have_values_of_their_own():
     free = {name: value | {"regions": regions.get(name)} for name, value in FREE.items()}
     how = settings(free=free, regions={"wide": "|b| > 15"}, separate={"region": "wide"})
     given = separation_data(how)
-    found = separate(how, given)
+    found = separate_data(how, given)
     assert np.shape(found.fit.best_fit["dust.beta_dust"]) == (2,)
     assert np.shape(found.sigma["synchrotron.beta_syn"]) == (3,)
     assert found.chain.labels == found.fit.labels
@@ -227,7 +227,7 @@ def test_lensing_is_what_the_settings_say():
     """In the simulations that set errors as well as in the model."""
     _, given, whole = separated()
     how = settings(cmb={"A_lens": 0.25}, separate={"sampler": "none"})
-    found = separate(how, given)
+    found = separate_data(how, given)
     one, other = whole.tensors.model, found.tensors.model
     leak = whole.spectra.windows[1, :, 0] @ camb_spectra(whole.spectra.lmax)[1]
     np.testing.assert_allclose(other.lensing - leak, (one.lensing - leak) / 4, rtol=1e-9)
@@ -244,7 +244,7 @@ def test_more_parameters_than_can_be_sampled_are_named(monkeypatch):
     monkeypatch.setattr(command, "SAMPLED", 2)
     _, given, _ = separated()
     how = settings()
-    found = separate(how, given)
+    found = separate_data(how, given)
     assert found.chain is None
     assert "not sampled: 3 parameters are more than 2" in " ".join(separation_warnings(found, how))
 
@@ -257,16 +257,16 @@ def test_simulations_are_kept_and_gone_on_with(tmp_path):
         def advance(self, done, of):
             counts.append(done)
 
-    again = separate(how, given, tmp_path, Counted())
+    again = separate_data(how, given, tmp_path, Counted())
     assert counts == list(range(21))
     counts.clear()
     more = how.model_copy(update={"separate": how.separate.model_copy(update={"nsims": 22})})
-    found = separate(more, given, tmp_path, Counted())
+    found = separate_data(more, given, tmp_path, Counted())
     assert counts == [20, 21, 22]
     np.testing.assert_array_equal(found.simulated.total[:20], again.simulated.total)
     other = settings(cmb={"A_lens": 0.5}, separate={"sampler": "none"})
     with pytest.raises(InputError, match="holds realisations of other data or settings"):
-        separate(other, given, tmp_path)
+        separate_data(other, given, tmp_path)
 
 
 def test_the_settings_that_come_along_are_valid():
@@ -339,4 +339,4 @@ def test_spectra_that_cannot_be_taken_are_refused(changes, words):
     _, given, _ = separated()
     how = settings(separate=changes)
     with pytest.raises(SettingsError, match=words):
-        separate(how, given)
+        separate_data(how, given)

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import healpy
 import jax
 import numpy as np
 import optimistix as optx
@@ -14,8 +15,19 @@ from fits.posterior import chi2, fisher_matrix, hessian
 from fits.priors import Uniform
 from fits.profile_likelihood import spectral_likelihood
 from fits.results import FitError
-from fits.separated_maps import component_maps, residual_maps
-from jaxsky import AME, CMB, Bandpass, Dust, Sky, Synchrotron, observe
+from fits.separated_maps import component_maps, residual_maps, separate
+from jaxsky import (
+    AME,
+    CMB,
+    Bandpass,
+    Dust,
+    Sky,
+    Synchrotron,
+    get_parameters,
+    load_instrument,
+    observe,
+    set_parameters,
+)
 from jaxsky.constants import H_OVER_K, T_CMB
 
 NPIX = 48
@@ -365,3 +377,37 @@ def test_uniform_priors_bound_the_fit_and_edges_are_reported():
     assert kept.sigma["dust.beta_dust"] == pytest.approx(fixed.sigma["dust.beta_dust"], rel=1e-6)
     with pytest.raises(ValueError, match=r"Start value 21 of 'dust.T_dust' is not inside"):
         best_fit(like, priors={"dust.T_dust": Uniform(30.0, 40.0)})
+
+
+def test_separate_is_fit_and_component_maps_in_one_call():
+    """Laws by name, start values by default and noise of the instrument, against each step."""
+    instrument = load_instrument("litebird").select(["50", "78", "119", "195", "280", "402"])
+    bands, ones = instrument.bands(), np.ones((2, 1))
+    laws = {"cmb": CMB(ones), "dust": Dust(ones), "synchrotron": Synchrotron(ones)}
+    rng, names = np.random.default_rng(3), ["dust.beta_dust", "synchrotron.beta_syn"]
+    truth = {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}
+    maps = {name: rng.normal(size=(2, 192)) * 30 for name in laws}
+    sky = Sky({name: type(one)(maps[name]) for name, one in laws.items()})
+    factors = np.array([band.conversion("uK_RJ", "uK_CMB") for band in bands.values()])
+    seen = observe(set_parameters(sky, truth), list(bands.values())) * factors[:, None, None]
+    levels = np.array([c.noise for c in instrument]) / healpy.nside2resol(4, arcmin=True)
+    data = seen + levels[:, None, None] * rng.normal(size=seen.shape)
+    found = separate(list(laws), instrument, data)
+    assert found.fit.free == tuple(names)
+    for name, value in truth.items():
+        assert abs(found.fit.best_fit[name] - value) < 4 * found.fit.sigma[name]
+    start = get_parameters(sky, names)
+    like = spectral_likelihood(laws, bands, data, levels, start, unit="uK_CMB")
+    fit = best_fit(like)
+    assert found.fit.best_fit == pytest.approx(fit.best_fit)
+    expected = component_maps(like, fit.best_fit, data, levels).amplitude
+    np.testing.assert_allclose(found.maps.amplitude, expected)
+    again = separate(laws, bands, data, {"dust.beta_dust": 1.5}, noise=levels)
+    assert again.fit.free == ("dust.beta_dust",)
+    with pytest.raises(ValueError, match="`noise` is missing"):
+        separate(laws, bands, data)
+    with pytest.raises(ValueError, match="there is no law 'stars'"):
+        separate(["stars"], instrument, data)
+    intensity = np.concatenate([data[:, :1], data], axis=1)
+    maps = separate([*laws, "free_free"], instrument, intensity, free=names).maps
+    assert maps.components == ("cmb", "dust", "free_free", "synchrotron")

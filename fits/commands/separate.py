@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from fits.cleaning import SAMPLED, Separation, separate
+from fits.cleaning import SAMPLED, Separation, separate_data
 from fits.commands import separate_pictures as pictures
 from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
@@ -216,7 +216,7 @@ def _work(settings: Experiment, command: Run) -> Report:
     data = separation_data(settings)
     command.begin()
     try:
-        found = separate(settings, data, command.out, command.steps)
+        found = separate_data(settings, data, command.out, command.steps)
     except FitError as error:
         raise ValueError(f"The spectral parameters were not found. {error}") from None
     warnings = separation_warnings(found, settings)

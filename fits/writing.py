@@ -1,36 +1,13 @@
 """How a run writes its numbers: with errors, as JSON, and with a log of its circumstances."""
 
 import json
-import platform
-import sys
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxsky.io import write_text
-from jaxsky.settings import Experiment, found_files, leakage_warning
-
-PACKAGES = (
-    "jaxsky",
-    "jax",
-    "numpy",
-    "healpy",
-    "optimistix",
-    "emcee",
-    "blackjax",
-    "getdist",
-    "camb",
-    "ducc0",
-)
-
-
-def leaks(settings: Experiment) -> list[str]:
-    """Warnings about maps that are known to hold leakage which is not subtracted."""
-    bands = [band for band in settings.bands if band.leakage is None]
-    return list(filter(None, (leakage_warning(str(band.name), band.files) for band in bands)))
+from jaxsky.settings import Experiment, circumstances
 
 
 def _digits(size: float) -> int:
@@ -86,14 +63,6 @@ def write_json(path: Path, results: dict[str, Any]) -> None:
 
 def write_log(path: Path, settings: Experiment, seconds: float) -> None:
     """When, where, how long, with which versions, settings and files a run was made."""
-    log = {
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": sys.argv,
-        "seconds": round(seconds, 2),
-        "python": platform.python_version(),
-        "machine": platform.platform(),
-        "versions": {name: version(name) for name in PACKAGES},
-        "settings": settings.model_dump(mode="json", exclude_none=True),
-        "files": found_files(settings),
-    }
+    said = settings.model_dump(mode="json", exclude_none=True)
+    log = {**circumstances(settings), "seconds": round(seconds, 2), "settings": said}
     write_text(path, json.dumps(log, indent=2) + "\n")

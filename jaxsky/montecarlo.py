@@ -1,13 +1,10 @@
 """Realisations of a simulation as files: in any order, in any number of processes, resumed."""
 
 import json
-import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from datetime import UTC, datetime
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,11 +19,10 @@ from jaxsky.io.folders import alone
 from jaxsky.io.observations import observed_tables
 from jaxsky.keys import realisation_key
 from jaxsky.observation import harmonic_sources, plan_terms
-from jaxsky.settings import Experiment, found_files
+from jaxsky.settings import Experiment, circumstances
 from jaxsky.simulation import observe_bands
 
 LOG = "simulation.json"
-PACKAGES = ("jaxsky", "jax", "numpy", "healpy", "ducc0", "jaxbind", "camb")
 #: Settings that do not change what a realisation is.
 LAYOUT: Any = {"simulate": {"sheet"}}
 #: Tables of settings that simulations depend on.
@@ -122,13 +118,7 @@ def _claim(out: Path, settings: Experiment, overwrite: bool) -> None:
             # Another process may have left it since the folder was checked.
             check_folder(out, settings, resume=True, overwrite=False)
             return
-        content = {
-            "date": datetime.now(UTC).isoformat(timespec="seconds"),
-            "python": platform.python_version(),
-            "versions": {name: version(name) for name in PACKAGES},
-            "settings": _content(settings),
-            "files": found_files(settings),
-        }
+        content = circumstances(settings) | {"settings": _content(settings)}
         write_text(out / LOG, json.dumps(content, indent=2) + "\n")
 
 

@@ -19,7 +19,6 @@ from fits.posterior import chi2
 from fits.spectral_index import fit_regions
 from fits.template_likelihood import _one_stokes_each
 from fits.template_noise import TemplateNoise, level_spectrum
-from fits.writing import leaks
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, inputs, observe
 from jaxsky.harmonics import Preparation, alm_ell, gaussian_beam, resample, synthesis
 from jaxsky.inputs import Template
@@ -54,7 +53,7 @@ def test_no_example_has_noise_in_a_unit_of_its_own_or_leakage(path):
     settings = load(path)
     assert len(settings.bands) >= 2
     assert all(band.noise.rms is None for band in settings.bands)
-    assert leaks(settings) == []
+    assert settings.leaks() == []
 
 
 @pytest.mark.parametrize(
@@ -76,7 +75,7 @@ def test_no_example_has_noise_in_a_unit_of_its_own_or_leakage(path):
     ],
 )  # fmt: skip
 def test_maps_that_hold_leakage_are_known_by_name(name, corrected, correction):
-    (warning,) = leaks(Experiment(bands=[band_of(name)]))
+    (warning,) = Experiment(bands=[band_of(name)]).leaks()
     for word in ("bands.x", Path(name).name, corrected, correction):
         assert word in warning
 
@@ -94,7 +93,7 @@ def test_maps_that_hold_leakage_are_known_by_name(name, corrected, correction):
     ],
 )
 def test_other_maps_are_not(name):
-    assert leaks(Experiment(bands=[band_of(name)])) == []
+    assert Experiment(bands=[band_of(name)]).leaks() == []
 
 
 def test_a_leakage_that_is_subtracted_is_no_leak():
@@ -102,7 +101,7 @@ def test_a_leakage_that_is_subtracted_is_no_leak():
         "LFI_SkyMap_044_1024_R3.00_full.fits",
         leakage={"file": "LFI_CorrMap_044-BPassCorr_1024_R3.00_full.fits"},
     )
-    assert leaks(Experiment(bands=[band])) == []
+    assert Experiment(bands=[band]).leaks() == []
 
 
 def band_of(file: str, **more) -> BandTable:

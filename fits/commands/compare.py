@@ -16,7 +16,7 @@ from fits.comparison import (
 from fits.full_sky import FIELDS
 from fits.inputs import inputs_of
 from fits.regions import region_masks
-from fits.writing import leaks, probability, with_error
+from fits.writing import probability, with_error
 from jaxsky.settings import Experiment
 
 #: A comparison with a smaller probability is pointed out.
@@ -37,12 +37,11 @@ def _work(settings: Experiment, command: Run) -> Report:
     if settings.compare.patches is not None:
         command.steps.step("patches")
         patches = compare_patches(settings, inputs)
-    warnings = comparison_warnings(found, settings)
     return Report(
         inputs.description,
         [_table(found)],
-        warnings,
-        {"warnings": warnings, **_numbers(found, patches)},
+        comparison_warnings(found, settings),
+        _numbers(found, patches),
         _pictures(found, settings, patches),
     )
 
@@ -115,7 +114,7 @@ def _table(comparison: Comparison) -> ResultTable:
 
 def comparison_warnings(comparison: Comparison, settings: Experiment) -> list[str]:
     """What a user should know before using the numbers, a sentence each."""
-    sentences = leaks(settings)
+    sentences = settings.leaks()
     if not comparison.spectra:
         missing = int((~comparison.prepared.used).sum())
         sentences.append(

@@ -11,7 +11,7 @@ from fits.posterior_plots import plot_grids, plot_marginals, plot_posterior
 from fits.regions import region_masks
 from fits.spectral_index import RegionFit, all_free, fit_regions, known_truth
 from fits.template_noise import unknown_noise
-from fits.writing import leaks, with_errors
+from fits.writing import with_errors
 from jaxsky.settings import Experiment
 
 #: A fit with a smaller probability to exceed its chi^2 is pointed out.
@@ -35,12 +35,11 @@ def _work(settings: Experiment, command: Run) -> Report:
     chains = command.out / CHAINS
     fits = fit_regions(settings, prepared, regions, chains, command.steps)
     truth = known_truth(inputs, fits)
-    warnings = fit_warnings(inputs, settings, fits)
     return Report(
         inputs.description,
         [_table(fits, truth)],
-        warnings,
-        {"warnings": warnings, **fit_numbers(settings, fits, truth)},
+        fit_warnings(inputs, settings, fits),
+        fit_numbers(settings, fits, truth),
         {name: (plot, fits, truth, settings.title) for name, plot in PICTURES.items()},
         [chains] if chains.exists() else [],
     )
@@ -114,7 +113,7 @@ def _table(fits: Sequence[RegionFit], truth: Mapping[str, float] | None) -> Resu
 
 def fit_warnings(inputs: Inputs, settings: Experiment, fits: Sequence[RegionFit]) -> list[str]:
     """What a user should know before using the numbers, a sentence each, the gravest first."""
-    sentences = [*leaks(settings), *settings.left_out("fit")]
+    sentences = [*settings.leaks(), *settings.left_out("fit")]
     if unknown := [name for name in inputs.templates if name not in inputs.template_noise]:
         sentences.append(unknown_noise(unknown))
     for band in dict.fromkeys(name for fit in fits for name in fit.weightless):

@@ -136,7 +136,8 @@ def _write(settings: Experiment, report: Report, command: Run) -> list[Path]:
         return []
     command.steps.step("drawing")
     written = [command.out / command.results[0], command.out / CIRCUMSTANCES]
-    write_json(written[0], {"description": report.description, **report.numbers})
+    said = {"description": report.description, "warnings": report.warnings}
+    write_json(written[0], {**said, **report.numbers})
     for name, (draw, *drawn) in report.pictures.items():
         if draw(command.out / name, *drawn) is not False:
             written.append(command.out / name)

@@ -11,7 +11,7 @@ from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
 from fits.results import FitError
 from fits.separated_data import PixelData, separation_data
-from fits.writing import leaks, probability, with_error
+from fits.writing import probability, with_error
 from jaxsky.inputs import parameter_unit
 from jaxsky.io import write_maps
 from jaxsky.settings import Experiment
@@ -117,7 +117,7 @@ def _table(found: Separation) -> ResultTable:
 
 def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
     """What a user should know before using the numbers, a sentence each."""
-    sentences = [*leaks(settings), *settings.left_out("separate")]
+    sentences = [*settings.leaks(), *settings.left_out("separate")]
     fit, ratio, simulated = found.fit, found.tensors, found.simulated
     sentences += [
         f"Band {band} carries no weight: its noise is too large. It is not counted in degrees of "
@@ -219,12 +219,11 @@ def _work(settings: Experiment, command: Run) -> Report:
         found = separate_data(settings, data, command.out, command.steps)
     except FitError as error:
         raise ValueError(f"The spectral parameters were not found. {error}") from None
-    warnings = separation_warnings(found, settings)
     return Report(
         data.description,
         [_table(found)],
-        warnings,
-        {"warnings": warnings, **_numbers(found, settings)},
+        separation_warnings(found, settings),
+        _numbers(found, settings),
         {name: (plot, found, settings) for name, plot in PICTURES.items()},
         _write_maps(command.out, found, settings),
     )

@@ -15,7 +15,14 @@ from jaxsky.settings.tables import (
     ComponentTable,
     RegionsTable,
     SmallScalesTable,
-    leakage_warning,
 )
-from jaxsky.settings.toml import at_key, find_file, found_files, load, named_files, of_file
+from jaxsky.settings.toml import (
+    at_key,
+    circumstances,
+    find_file,
+    found_files,
+    load,
+    named_files,
+    of_file,
+)
 from jaxsky.settings.types import SettingsError, check_signs

@@ -18,6 +18,7 @@ from jaxsky.settings.tables import (
     FreeParameter,
     SkyTable,
     SmallScalesTable,
+    without_leakage,
 )
 from jaxsky.settings.types import (
     WORDS,
@@ -298,6 +299,18 @@ class Experiment(SettingsTable):
             for name, one in self.free.items()
             if WORDS.get(name.split(".")[0], command) == command
         }
+
+    def leaks(self) -> list[str]:
+        """Warnings about maps that are known to hold leakage which is not subtracted."""
+        return [
+            f"bands.{band.name}: {file} holds intensity that has leaked into Q and U through the "
+            "bandpasses, and nothing is subtracted; indices fitted to it may be wrong by many "
+            f"sigma. {advice}."
+            for band in self.bands
+            if band.leakage is None
+            for file in (Path(file).name for file in band.files)
+            if (advice := without_leakage(file)) is not None
+        ]
 
     def left_out(self, command: str) -> list[str]:
         """Warnings about what is said of free parameters that a command does not have."""

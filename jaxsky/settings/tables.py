@@ -1,7 +1,6 @@
 """Tables of an experiment file that describe the sky and the bands in which it is observed."""
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -40,7 +39,7 @@ _LEAKY = re.compile(
 )
 
 
-def _without_leakage(name: str) -> str | None:
+def without_leakage(name: str) -> str | None:
     """What to take in place of a map that holds leakage, or None if it is not known to."""
     match = _LEAKY.fullmatch(name)
     if match is None or "bpasscorr" in name.lower():
@@ -55,18 +54,6 @@ def _without_leakage(name: str) -> str | None:
         corrected, beam = f"{start}-BPassCorrected_1024_R3.00_full.fits", "fwhm = 60.0"
         correction = f"LFI_CorrMap_{channel}-BPassCorr_0256_R2.01_full.fits"
     return f'Take {corrected}, or subtract it: leakage = {{ file = "{correction}", {beam} }}'
-
-
-def leakage_warning(name: str, files: Sequence[str]) -> str | None:
-    """A warning if the map of a band is known by its files to hold leakage."""
-    for file in (Path(file).name for file in files):
-        if (advice := _without_leakage(file)) is not None:
-            return (
-                f"bands.{name}: {file} holds intensity that has leaked into Q and U through the "
-                "bandpasses, and nothing is subtracted; indices fitted to it may be wrong by many "
-                f"sigma. {advice}."
-            )
-    return None
 
 
 #: Components of the embedded model, named as their laws.

@@ -2,10 +2,14 @@
 
 import json
 import os
+import platform
 import re
+import sys
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +19,8 @@ from jaxsky.io import InputError, MissingFileError, check_file
 from jaxsky.io.folders import cache_folder
 from jaxsky.settings.experiment import Experiment
 from jaxsky.settings.types import NamedFile, SettingsError, mistakes
+
+PACKAGES = "jaxsky jax numpy healpy ducc0 jaxbind camb optimistix emcee blackjax getdist"
 
 
 @contextmanager
@@ -176,6 +182,18 @@ def found_files(settings: Experiment) -> dict[str, str]:
         except InputError:
             continue  # not needed, or a folder of maps
     return found
+
+
+def circumstances(settings: Experiment) -> dict[str, Any]:
+    """When, where, how, with which versions and from which files results are made."""
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": sys.argv,
+        "python": platform.python_version(),
+        "machine": platform.platform(),
+        "versions": {name: version(name) for name in PACKAGES.split()},
+        "files": found_files(settings),
+    }
 
 
 def named_files(value: Any) -> Iterator[str]:

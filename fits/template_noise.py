@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsky.checks import Numeric
+from jaxsky.checks import Numeric, listed
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.inputs import Template
 from jaxsky.noise_inputs import read_noise
@@ -148,12 +148,12 @@ class TemplateErrors(NamedTuple):
 
 def unknown_noise(names: Sequence[str]) -> str:
     """A warning that nothing is said about the noise of templates, with the size of its effect."""
-    which = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
     return (
-        f"Nothing is said about the noise of the templates ({which}), which attenuates them and "
-        "moves the indices. At about the level of Commander's maps, 34 uK_RJ arcmin for dust and "
-        "200 for synchrotron, fits to Planck's 44 and 70 GHz get beta_dust wrong by -0.007 (-0.8 "
-        "sigma) and beta_syn by +0.036 (+2.7 sigma) at |b| < 20 deg, -0.019 (-2.1 sigma) and "
-        "+0.076 (+5.3 sigma) on the full sky. State it in the templates, noise = { level = 34.0 }, "
-        "and the fit is corrected for it, or noise = { rms = 0.0 } for exact templates."
+        f"Nothing is said about the noise of the templates ({listed(names)}), which attenuates "
+        "them and moves the indices. At about the level of Commander's maps, 34 uK_RJ arcmin for "
+        "dust and 200 for synchrotron, fits to Planck's 44 and 70 GHz get beta_dust wrong by "
+        "-0.007 (-0.8 sigma) and beta_syn by +0.036 (+2.7 sigma) at |b| < 20 deg, -0.019 (-2.1 "
+        "sigma) and +0.076 (+5.3 sigma) on the full sky. State it in the templates, noise = "
+        "{ level = 34.0 }, and the fit is corrected for it, or noise = { rms = 0.0 } for exact "
+        "templates."
     )

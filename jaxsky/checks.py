@@ -1,5 +1,6 @@
 """Types and checks of arguments, at construction and at the border: one sentence an error."""
 
+from collections.abc import Iterable
 from typing import TypeAlias
 
 import jax
@@ -35,6 +36,12 @@ def as_array(name: str, value: object) -> Array:
     if jnp.iscomplexobj(array):
         raise TypeError(f"Argument `{name}` must be real, but is complex.")
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
+
+
+def listed(words: Iterable[str]) -> str:
+    """Words as a list in a sentence: "a, b and c"."""
+    first = list(words)
+    return " and ".join(filter(None, (", ".join(first[:-1]), *first[-1:])))
 
 
 def check_shape(name: str, array: Array | np.ndarray, good: bool, form: str) -> None:

@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxsky import galaxy as model_galaxy
 from jaxsky.bandpass import Bandpass
+from jaxsky.checks import listed
 from jaxsky.components import AME, Component, component_class, parameter_declaration
 from jaxsky.galaxy import EmbeddedSky, GalaxyModel, embedded_sky
 from jaxsky.io import Maps, read_bandpass, read_beam, read_maps, unit_factor
@@ -276,12 +277,11 @@ def uK_RJ_per(unit: str, at: Bandpass | float, where: str) -> float:
 
 def check_stokes(where: str, found: Maps, wanted: str) -> None:
     """Refuse other Stokes parameters than wanted, Q and U of all three aside, or another number."""
-    listed = " and ".join(filter(None, (", ".join(wanted[:-1]), wanted[-1])))
     names, expected = ", ".join(found.names), "IQU" if len(found.names) == 3 else wanted
     if len(found.names) != len(expected) or not expected.endswith(wanted):
-        raise SettingsError(f"{where}: fields must name {listed}, not {names}.")
+        raise SettingsError(f"{where}: fields must name {listed(wanted)}, not {names}.")
     if any(s not in (None, w) for s, w in zip(found.stokes, expected, strict=True)):
-        raise SettingsError(f"{where}.fields: {names} are not {listed} by their names.")
+        raise SettingsError(f"{where}.fields: {names} are not {listed(wanted)} by their names.")
 
 
 def bandpass_of(folder: Path, spec: BandTable) -> Bandpass:

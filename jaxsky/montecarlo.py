@@ -82,20 +82,27 @@ def check_folder(
         )
 
 
-def changed_tables(maps: Path, settings: Experiment) -> list[str]:
-    """Tables that say something else about a sky than those with which its maps were simulated.
+def other_sky(settings: Experiment) -> list[str]:
+    """A warning about maps that were simulated with other settings than these.
 
     Without the log next to the folder of the maps nothing is known to be different.
     """
+    if (maps := settings.common.maps) is None:
+        return []
+    now = _content(settings)
     try:
-        there = json.loads((maps.parent / LOG).read_text())["settings"]
-        was, now = there, _content(settings)
+        was = json.loads((Path(settings.data_dir, maps).parent / LOG).read_text())["settings"]
         for key in ("stokes", "unit", "outputs", "precision"):  # of what is written only
             was["simulate"].pop(key, None)
             now["simulate"].pop(key, None)
+        changed = [name for name in now if name != "seed" and was.get(name) != now[name]]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return []
-    return [name for name in now if name != "seed" and was.get(name) != now[name]]
+    said = (
+        f"The maps in {maps} were simulated with other settings in the tables "
+        f"{', '.join(changed)}; bandpass, beam and noise are those of their files."
+    )
+    return [said] if changed else []
 
 
 def _maps(out: Path, indices: range | None = None) -> Iterator[Path]:

@@ -13,9 +13,10 @@ import commands
 from fits.commands.paper import NUMBERS, STEPS, Make, labels_of, make_figures
 from fits.commands.run import DEFAULTS
 from fits.paper import figures_model
+from fits.paper.figures import Impossible, Number, PaperFigure, picture_of
 from fits.paper.figures_model import core_observation, figure_patch, prepared_templates
-from fits.paper.items import Impossible, Item, Number, listed, picture_of
 from fits.paper.sky import PaperSky
+from jaxsky.checks import listed
 from jaxsky.harmonics import gaussian_beam, power_spectrum
 from jaxsky.io import read_maps
 from jaxsky.observation import Source, harmonic_sources
@@ -71,7 +72,7 @@ def small() -> Experiment:
 
 
 @pytest.fixture(scope="module")
-def made(small, tmp_path_factory) -> tuple[Path, dict[str, Item]]:
+def made(small, tmp_path_factory) -> tuple[Path, dict[str, PaperFigure]]:
     out = tmp_path_factory.mktemp("paper") / "embedded"
     return out, {item.label: item for item in make_figures(small, out, LABELS)}
 
@@ -88,7 +89,7 @@ def real(data_dir, tmp_path_factory) -> Experiment:
     return load(folder / "paper.toml")
 
 
-def numbers_of(items: dict[str, Item]) -> dict[str, Number]:
+def numbers_of(items: dict[str, PaperFigure]) -> dict[str, Number]:
     return {number.what: number for item in items.values() for number in item.numbers}
 
 
@@ -96,7 +97,7 @@ def value(number: Number) -> float:
     return float(number.ours.split(" ")[0])
 
 
-def check_items(out: Path, items: dict[str, Item]) -> None:
+def check_items(out: Path, items: dict[str, PaperFigure]) -> None:
     assert list(items) == [*LABELS, NUMBERS]
     for item in items.values():
         assert item.caption
@@ -108,7 +109,7 @@ def check_items(out: Path, items: dict[str, Item]) -> None:
     assert items["Table 1"].table.rows[0][1:4] == ("23.3", "14.0", "10.0")
 
 
-def check_slopes(settings: Experiment, items: dict[str, Item]) -> None:
+def check_slopes(settings: Experiment, items: dict[str, PaperFigure]) -> None:
     """Against healpy's transform of the templates."""
     sources, numbers = PaperSky(settings), numbers_of(items)
     for name in ("dust", "synchrotron"):
@@ -123,7 +124,7 @@ def check_slopes(settings: Experiment, items: dict[str, Item]) -> None:
             assert shown == pytest.approx(float(law.slope), abs=0.01)
 
 
-def check_correlations(settings: Experiment, items: dict[str, Item]) -> None:
+def check_correlations(settings: Experiment, items: dict[str, PaperFigure]) -> None:
     (ame, dust, *_), numbers = PaperSky(settings).ame(), numbers_of(items)
     for i, stokes in enumerate("QU"):
         r = np.corrcoef(np.asarray(ame[i]), np.asarray(dust[i]))[0, 1]
@@ -222,7 +223,9 @@ def drawn(
             if stop is not None and label == stopped:
                 raise stop("it takes a <map>.")
             picture.write_bytes(b"picture")
-            return Item(label, "a & b", "c", "d", picture.name, numbers=(Number("x", "1", "2"),))
+            return PaperFigure(
+                label, "a & b", "c", "d", picture.name, numbers=(Number("x", "1", "2"),)
+            )
 
         return make
 
@@ -243,8 +246,8 @@ def test_a_stopped_run_goes_on(small, tmp_path):
     assert made[3:] == ["Figure 1"]
     make_figures(small, tmp_path, ["2"], overwrite=True, steps=two)
     assert made[4:] == ["Figure 2"]
-    kept = json.loads((tmp_path / "items.json").read_text())
-    assert [item["numbers"][0]["what"] for item in kept["items"]] == ["x", "x"]
+    kept = json.loads((tmp_path / "figures.json").read_text())
+    assert [figure["numbers"][0][0] for figure in kept[1]] == ["x", "x"]
 
 
 def test_real_figures_are_not_made_again(small, made):
@@ -274,8 +277,8 @@ def test_other_settings_are_refused_or_replaced(small, tmp_path):
     items = make_figures(other, tmp_path, ["1"], overwrite=True, steps=steps)
     assert [item.label for item in items] == ["Figure 1", NUMBERS]
     assert [path.name for path in tmp_path.glob("*.png")] == ["figure_01.png"]
-    for damaged in ("{", "{}", '{"settings": {}, "items": [{"label": "Figure 1"}]}'):
-        (tmp_path / "items.json").write_text(damaged)
+    for damaged in ("{", "{}", '[{}, [{"label": "Figure 1"}]]'):
+        (tmp_path / "figures.json").write_text(damaged)
         with pytest.raises(ValueError, match="is damaged"):
             make_figures(other, tmp_path, steps=steps)
     make_figures(other, tmp_path, overwrite=True, steps=steps)
@@ -285,12 +288,12 @@ def test_what_fails_removes_nothing(small, tmp_path):
     """Of other settings, figures go when the first new one is there, and not before."""
     out, both = tmp_path / "out", ["figure_01.png", "figure_02.png"]
     make_figures(small, out, steps=drawn([]))
-    held = (out / "items.json").read_text()
+    held = (out / "figures.json").read_text()
     other = small.model_copy(update={"title": "another"})
     fails = drawn([], OSError, "Figure 1")
     with pytest.raises(OSError, match="it takes a <map>"):
         make_figures(other, out, steps=fails, overwrite=True)
-    assert (out / "items.json").read_text() == held
+    assert (out / "figures.json").read_text() == held
     assert sorted(path.name for path in out.glob("*.png")) == both
     items = make_figures(other, out, ["2"], steps=fails, overwrite=True)
     assert [item.label for item in items] == ["Figure 2", NUMBERS]

@@ -10,6 +10,9 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, Trans
 from fits.commands.console import console, print_tables
 from fits.commands.endings import interruptible
 from fits.commands.page import ResultTable
+from jaxsky import archive
+from jaxsky.io import InputError
+from jaxsky.io.folders import cache_folder
 
 data_commands = typer.Typer(
     help="Official data products: what there is, download, and checks.", no_args_is_help=True
@@ -23,35 +26,37 @@ Words = Annotated[
     ),
 ]
 Folder = Annotated[
-    Path | None, typer.Option("--dir", help="Where files are kept; default $JAXSKY_CACHE, or the "
-                              "platform's folder for caches.")
-]  # fmt: skip
+    Path,
+    typer.Option(
+        "--dir",
+        default_factory=cache_folder,
+        help="Where files are kept.",
+        show_default="$JAXSKY_CACHE, or the platform's folder for caches",
+    ),
+]
 
 
 @data_commands.command("list")
-def _list(products: Words = None, folder: Folder = None) -> None:
+def _list(folder: Folder, products: Words = None) -> None:
     """Name the products and sets of them, and say which are there."""
-    from jaxsky.archive import cache_folder, find, product_sets, total_size
-
-    folder = folder or cache_folder()
     rows: list[tuple[str, ...]] = []
     group = None
-    for product in find(products or []):
+    for product in archive.find(products or []):
         if product.group != group:
             group = product.group
             rows += [(), (group, product.title)]
         path = folder / product.name
         here = path.is_file()
         known = product._replace(size=path.stat().st_size) if here else product
-        size = total_size([known]) if known.size or known.about else ""
+        size = archive.total_size([known]) if known.size or known.about else ""
         nside, kept = str(product.nside or ""), "yes" if here else ""
         rows.append((product.name, product.what, nside, product.unit or "", size, kept))
     if not products:
         rows += [(), ("sets", "files of an analysis")]
-        for name, found in product_sets().items():
-            members = find([name])
+        for name, found in archive.product_sets().items():
+            members = archive.find([name])
             held = f"{sum((folder / p.name).is_file() for p in members)} of {len(members)}"
-            rows.append((name, found.title, "", "", total_size(members), held))
+            rows.append((name, found.title, "", "", archive.total_size(members), held))
     header = ("file", "what", "nside", "unit", "size", "here")
     table = ResultTable(header, tuple(rows), title=f"Kept in {folder}", words=6)
     print_tables([table], width=None if console.is_terminal else 200)
@@ -65,7 +70,7 @@ def _fetch(
             metavar="PRODUCT ...", help="Names of files, groups, sets, or parts of the first two."
         ),
     ],
-    folder: Folder = None,
+    folder: Folder,
     mirror: Annotated[
         str | None,
         typer.Option(envvar="JAXSKY_MIRROR", help="Address of a folder with the files."),
@@ -75,9 +80,6 @@ def _fetch(
     ] = False,
 ) -> None:
     """Download products, unless they are there; what was cut is resumed."""
-    from jaxsky import archive
-
-    folder = folder or archive.cache_folder()
     wanted = archive.find(products)
     if len(wanted) > 1:
         console.print(f"{len(wanted)} files, {archive.total_size(wanted)}.")
@@ -90,11 +92,9 @@ def _fetch(
     )
     with interruptible("; fetch it again to resume"), bar as progress:
         for product in wanted:
-            task = progress.add_task(product.name, total=product.size)
-            report = partial(progress.update, task)
-            waiting = partial(
-                console.print, f"{product.name}: another process fetches it; waiting."
-            )
+            report = partial(progress.update, progress.add_task(product.name, total=product.size))
+            words = f"{product.name}: another process fetches it; waiting."
+            waiting = partial(console.print, words)
             path = archive.fetch(
                 product, folder, mirror=mirror, accept=accept, report=report, waiting=waiting
             )
@@ -104,12 +104,8 @@ def _fetch(
 
 
 @data_commands.command("verify")
-def _verify(products: Words = None, folder: Folder = None) -> None:
+def _verify(folder: Folder, products: Words = None) -> None:
     """Check files that are there: size, hash, columns, units, and that they are complete."""
-    from jaxsky import archive
-    from jaxsky.io import InputError
-
-    folder = folder or archive.cache_folder()
     wanted = archive.find(products or [])
     if not products:
         wanted = [product for product in wanted if (folder / product.name).exists()]

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,9 +10,9 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from fits.commands.page import ResultTable, Section, write_page
-from fits.commands.run import PAGE, Command, Report, Run
+from fits.commands.run import CIRCUMSTANCES, PAGE, Command, Report, Run
 from fits.paper import figures_data, figures_model
-from fits.paper.items import Impossible, Item, described, picture_of
+from fits.paper.figures import Impossible, PaperFigure, described, picture_of
 from fits.paper.sky import PaperSky
 from fits.writing import write_log
 from jaxsky.io import write_text
@@ -20,9 +20,9 @@ from jaxsky.programs import forget_programs
 from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import Experiment
 
-#: Figures that are made, kept so that a stopped run goes on.
-KEPT = "items.json"
-#: Label of the table that is collected from all items.
+#: File of the settings and the figures that are made with them, from which a stopped run resumes.
+KEPT, FILE = "figures.json", TypeAdapter(tuple[dict[str, Any], list[PaperFigure]])
+#: Label of the table of the numbers of all figures.
 NUMBERS = "Numbers of the text"
 PAPER = (
     "Hervías-Caimapo, Bonaldi & Brown (2016), “A new model of the microwave polarized sky for CMB "
@@ -30,9 +30,9 @@ PAPER = (
 )
 #: Figures of observed maps.
 OBSERVED = {f"Figure {n}" for n in range(5, 12)}
-#: From what is shared between figures and the file of the picture, which is written whole, to an
-#: item; raises `Impossible` where the settings do not allow the figure.
-Make = Callable[[PaperSky, Path], Item]
+#: From what is shared between figures and the file of the picture, which is written whole, to a
+#: figure; raises `Impossible` where the settings do not allow the figure.
+Make = Callable[[PaperSky, Path], PaperFigure]
 #: In the order of the paper.
 STEPS: dict[str, Make] = {
     "Figure 1": figures_model.figure_templates,
@@ -53,16 +53,8 @@ STEPS: dict[str, Make] = {
 }
 
 
-@dataclass(frozen=True)
-class Figures:
-    """The items in a folder, and the settings that they are of."""
-
-    settings: dict[str, Any]
-    items: list[Item]
-
-
 def labels_of(words: Iterable[str], known: Iterable[str] = STEPS) -> list[str]:
-    """Labels of items by number or label, in order; all without any."""
+    """Labels of figures by number or label, in order; all without any."""
     labels, wanted = {label.lower(): label for label in known}, set()
     for word in words:
         name = " ".join(word.lower().split())
@@ -84,117 +76,113 @@ def make_figures(
     begin: Callable[[], None] = lambda: None,
     progress: Progress = QUIET,
     steps: Mapping[str, Make] = STEPS,
-) -> list[Item]:
+) -> list[PaperFigure]:
     """Make the figures and tables that are missing, and `index.html`, which shows all there are.
 
-    `only` has numbers of figures or labels; `steps` is what makes each item. With `overwrite` what
+    `only` has numbers of figures or labels; `steps` is what makes each. With `overwrite` what
     is wanted is made again; what else is in the folder is kept if it is of these settings, and
     removed when the first new figure is there if not. `begin` is called when nothing is wrong with
-    what is wanted, before anything is written. The items of the page are returned, those that
+    what is wanted, before anything is written. The figures of the page are returned, those that
     were there already among them.
     """
     started = time.perf_counter()
     wanted = labels_of(only, steps)
     mark = settings.model_dump(mode="json", exclude_none=True)
-    items, other = _kept(out, mark, overwrite)
+    figures, other = _kept(out, mark, overwrite)
     begin()
     out.mkdir(parents=True, exist_ok=True)
     paper = PaperSky(settings)
-    made = {
-        i.label for i in items.values() if i.table or (i.picture and (out / i.picture).is_file())
-    }
+    made = {f.label for f in figures.values() if f.table or (out / (f.picture or "")).is_file()}
     todo = [label for label in wanted if overwrite or label not in made]
     for done, label in enumerate(todo):
         progress.step(label)
         progress.advance(done, len(todo))
-        start, picture = time.perf_counter(), out / picture_of(label)
+        start = time.perf_counter()
         try:
-            item = steps[label](paper, picture)
+            figure = steps[label](paper, out / picture_of(label))
         except Impossible as reason:
-            item = Item(label, "not made", "", f"Not made: {reason}")
-        for name in other - {item.picture}:
+            figure = PaperFigure(label, "not made", "", f"Not made: {reason}")
+        for name in other - {figure.picture}:
             (out / name).unlink(missing_ok=True)
         other = set()
-        items[label] = replace(item, seconds=round(time.perf_counter() - start, 1))
-        kept = Figures(mark, list(items.values()))
-        write_text(out / KEPT, TypeAdapter(Figures).dump_json(kept, indent=2).decode())
-        _write_page(paper, out, items, steps)
+        figures[label] = replace(figure, seconds=round(time.perf_counter() - start, 1))
+        write_text(out / KEPT, FILE.dump_json((mark, list(figures.values())), indent=2).decode())
+        _write_page(paper, out, figures, steps)
         if OBSERVED.isdisjoint(todo[done + 1 :]):
             paper.forget_bands()
         # No two figures have programs in common, and what these hold adds up.
         forget_programs()
-    shown = _write_page(paper, out, items, steps)
-    write_log(out / "log.json", settings, time.perf_counter() - started)
+    shown = _write_page(paper, out, figures, steps)
+    write_log(out / CIRCUMSTANCES, settings, time.perf_counter() - started)
     return shown
 
 
-def _kept(out: Path, settings: dict[str, Any], overwrite: bool) -> tuple[dict[str, Item], set[str]]:
-    """Items of these settings that are in a folder, and the pictures of items of others."""
+def _kept(
+    out: Path, settings: dict[str, Any], overwrite: bool
+) -> tuple[dict[str, PaperFigure], set[str]]:
+    """Figures of these settings that are in a folder, and the pictures of those of others."""
     path = out / KEPT
     if not path.exists():
         return {}, set()
     try:
-        found = TypeAdapter(Figures).validate_json(path.read_bytes())
+        made_with, figures = FILE.validate_json(path.read_bytes())
     except ValidationError:
         if overwrite:
             return {}, set()
         raise ValueError(f"{path}: is damaged; start again with --overwrite.") from None
-    if found.settings == settings:
-        return {item.label: item for item in found.items}, set()
+    if made_with == settings:
+        return {figure.label: figure for figure in figures}, set()
     if not overwrite:
         raise ValueError(
             f"{out}: holds figures of other settings; choose another --out, or start again with "
             "--overwrite."
         )
-    return {}, {item.picture for item in found.items if item.picture is not None}
+    return {}, {figure.picture for figure in figures if figure.picture is not None}
 
 
 def _write_page(
-    paper: PaperSky, out: Path, items: Mapping[str, Item], order: Iterable[str]
-) -> list[Item]:
-    """Write the page of all items in order and the table of their numbers; returns these."""
-    shown = [items[label] for label in order if label in items]
-    rows = tuple(
-        (number.what, number.paper, number.ours, number.note, item.label)
-        for item in shown
-        for number in item.numbers
-    )
+    paper: PaperSky, out: Path, figures: Mapping[str, PaperFigure], order: Iterable[str]
+) -> list[PaperFigure]:
+    """Write the page of all figures in order and the table of their numbers; returns these."""
+    shown = [figures[label] for label in order if label in figures]
+    rows = tuple((n.what, n.paper, n.ours, n.note, f.label) for f in shown for n in f.numbers)
     if rows:
         table = ResultTable(("quantity", "paper", "here", "about it", "see"), rows)
         shown.append(described(NUMBERS, table=table))
-    seconds = sum(item.seconds or 0 for item in shown)
+    seconds = sum(figure.seconds or 0 for figure in shown)
     write_page(
         out / PAGE,
         f"A model of the microwave polarized sky: {paper.settings.title}",
         [paper.description, f"Figures and tables of {PAPER}, made again and numbered as there."],
-        [_section(item) for item in shown],
+        [_section(figure) for figure in shown],
         f"Written by `jaxsky paper` in {seconds:.0f} s,",
     )
     return shown
 
 
-def _section(item: Item) -> Section:
-    note = item.differs if item.label == NUMBERS else f"Differs from the paper: {item.differs}"
-    title = f"{item.label}: {item.title}"
-    return Section(title, item.caption, item.picture, item.table, note)
+def _section(figure: PaperFigure) -> Section:
+    own = figure.label == NUMBERS
+    note = figure.differs if own else f"Differs from the paper: {figure.differs}"
+    title = f"{figure.label}: {figure.title}"
+    return Section(title, figure.caption, figure.picture, figure.table, note)
+
+
+def _work(settings: Experiment, command: Run, *, only: Sequence[str]) -> Report:
+    figures = make_figures(
+        settings,
+        command.out,
+        only,
+        overwrite=command.overwrite,
+        # What is replaced is seen to figure by figure.
+        begin=lambda: command.steps.keep(command.log),
+        progress=command.steps,
+    )
+    missing = [f"{f.label}: {f.differs}" for f in figures if not (f.picture or f.table)]
+    remark = f"{len(figures)} figures and tables ({command.steps.seconds:.1f} s)."
+    page = [command.out / PAGE]
+    return Report("", warnings=missing, written=page, remark=remark, page=False)
 
 
 def paper_command(only: Sequence[str]) -> Command:
     """The command that makes some figures, or all."""
-
-    def work(settings: Experiment, command: Run) -> Report:
-        items = make_figures(
-            settings,
-            command.out,
-            only,
-            overwrite=command.overwrite,
-            # What is replaced is seen to figure by figure.
-            begin=lambda: command.steps.keep(command.log),
-            progress=command.steps,
-        )
-        missing = [f"{i.label}: {i.differs}" for i in items if not (i.picture or i.table)]
-        remark = f"{len(items)} figures and tables ({command.steps.seconds:.1f} s)."
-        page = [command.out / PAGE]
-        return Report("", warnings=missing, written=page, remark=remark, page=False)
-
-    return Command("paper", work, (KEPT,))
+    return Command("paper", partial(_work, only=only), (KEPT,))

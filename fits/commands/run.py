@@ -113,10 +113,12 @@ def run_command(
     ):
         import matplotlib as mpl
 
+        from jaxsky.montecarlo import other_sky
+
         mpl.use("Agg")  # pictures go to files
         running = Run(out, resume, overwrite, command.results, folder, steps, part)
         report = command.work(settings, running)
-        report = report._replace(warnings=[*report.warnings, *_other_sky(settings)])
+        report = report._replace(warnings=[*report.warnings, *other_sky(settings)])
         written = [*_write(settings, report, running), *report.written]
         if report.page:
             written.insert(0, _show(out, settings.title, report, written, steps.seconds))
@@ -188,32 +190,11 @@ def results_folder(
             raise
 
 
-def _other_sky(settings: Experiment) -> list[str]:
-    """A warning about maps that were simulated with other settings than these."""
-    if settings.common.maps is None:
-        return []
-    from jaxsky.montecarlo import changed_tables
-
-    maps = Path(settings.data_dir) / str(settings.common.maps)
-    if not (changed := changed_tables(maps, settings)):
-        return []
-    return [
-        f"The maps in {settings.common.maps} were simulated with other settings in the tables "
-        f"{', '.join(changed)}; bandpass, beam and noise are those of their files."
-    ]
-
-
 def _show(out: Path, title: str, report: Report, written: Sequence[Path], seconds: float) -> Path:
     """Write the page of a command's tables and pictures."""
-    tables = [
-        Section(table.title or f"Results {i}", table.caption, table=table)
-        for i, table in enumerate(report.tables, 1)
-    ]
-    pictures = [
-        Section(path.stem.replace("_", " "), picture=path.name)
-        for path in written
-        if path.suffix == ".png"
-    ]
+    tables = [Section(f"Results {i}", t.caption, table=t) for i, t in enumerate(report.tables, 1)]
+    drawn = [path for path in written if path.suffix == ".png"]
+    pictures = [Section(path.stem.replace("_", " "), picture=path.name) for path in drawn]
     intro = [report.description, *(f"(!) {sentence}" for sentence in report.warnings)]
     end = f"Written by `{' '.join(['jaxsky', *sys.argv[1:2]])}` in {seconds:.0f} s,"
     write_page(out / PAGE, title or "jaxsky", intro, [*tables, *pictures], end)

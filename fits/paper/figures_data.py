@@ -8,12 +8,13 @@ import numpy as np
 from fits.commands import compare_pictures as pictures
 from fits.common import prepared_maps
 from fits.comparison import Comparison, compare_patches, template_patches
-from fits.paper.items import TEXTS, Impossible, Item, Number, described, filled, listed
+from fits.paper.figures import TEXTS, Impossible, Number, PaperFigure, described, filled
 from fits.paper.sky import PaperSky
 from fits.posterior_plots import plot_grids
 from fits.regions import region_masks, region_words
 from fits.spectral_index import fit_regions, known_truth
 from fits.writing import probability, with_error, with_errors
+from jaxsky.checks import listed
 from jaxsky.settings import SettingsError
 
 #: Spectra by experiment: figure, bands, and that of which the paper gives the largest error.
@@ -52,7 +53,7 @@ def _pixels_here(paper: PaperSky) -> str:
     return _here(paper, f"nside is {nside} rather than 64" * (nside != 64), bands, SHOWN)
 
 
-def figure_scatter(paper: PaperSky, picture: Path) -> Item:
+def figure_scatter(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 5: observed against modelled pixels along the plane."""
     settings, found = paper.settings, paper.comparison
     bands = _chosen(found)
@@ -75,7 +76,7 @@ def figure_scatter(paper: PaperSky, picture: Path) -> Item:
     )
 
 
-def figure_maps(paper: PaperSky, picture: Path) -> Item:
+def figure_maps(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 6: observed maps next to the model."""
     settings, found = paper.settings, paper.comparison
     nside = min(settings.compare.panel_nside, settings.common.nside)
@@ -84,7 +85,7 @@ def figure_maps(paper: PaperSky, picture: Path) -> Item:
     return described("Figure 6", nside=nside, maps=maps, here=here)
 
 
-def figure_full_sky(experiment: str, paper: PaperSky, picture: Path) -> Item:
+def figure_full_sky(experiment: str, paper: PaperSky, picture: Path) -> PaperFigure:
     """Figures 7 and 8: spectra of Planck's or WMAP's bands."""
     label, wanted, largest = FULL_SKY[experiment]
     settings, found = paper.settings, paper.comparison
@@ -117,7 +118,7 @@ def figure_full_sky(experiment: str, paper: PaperSky, picture: Path) -> Item:
     )
 
 
-def figure_leakage(paper: PaperSky, picture: Path) -> Item:
+def figure_leakage(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 9: BB at 70 GHz before and after leakage is subtracted."""
     settings, texts, numbers = paper.settings, TEXTS["Figure 9"], []
     leaky = [s for s in paper.comparison.spectra if s.uncorrected is not None]
@@ -138,7 +139,7 @@ def figure_leakage(paper: PaperSky, picture: Path) -> Item:
     return described("Figure 9", numbers, leakage=leakage)
 
 
-def figure_patches(paper: PaperSky, picture: Path) -> Item:
+def figure_patches(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 10: power laws on small patches."""
     settings, numbers = paper.settings, []
     if settings.compare.patches is None:
@@ -155,7 +156,7 @@ def figure_patches(paper: PaperSky, picture: Path) -> Item:
     return described("Figure 10", numbers, band=found.band, maps=paper.maps_differ)
 
 
-def _template_patches(paper: PaperSky, picture: Path) -> Item:
+def _template_patches(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 10 without a band to compare with: BB against EE of the dust."""
     dust = paper.template("dust")
     found = template_patches(dust.maps, dust.fwhm)
@@ -171,7 +172,7 @@ def _template_patches(paper: PaperSky, picture: Path) -> Item:
     return described("Figure 10", numbers, texts=texts, sky=sky)
 
 
-def figure_probability(paper: PaperSky, picture: Path) -> Item:
+def figure_probability(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 11: the probability of beta_dust and beta_syn on a grid, from Q and from U."""
     settings, inputs = paper.settings, paper.inputs
     bands = {name: inputs.bands[name] for name in FITTED if name in inputs.bands} or inputs.bands

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from fits.commands.forecast import forecast
 from fits.commands.forecast_pictures import plot_b_modes
 from fits.commands.page import ResultTable
-from fits.paper.items import TEXTS, Impossible, Item, Number, described, filled, listed
+from fits.paper.figures import TEXTS, Impossible, Number, PaperFigure, described, filled
 from fits.paper.sky import NSIDE, PAPER_FWHM, SYMBOLS, PaperSky
 from fits.plots import (
     COLORS,
@@ -29,6 +29,7 @@ from fits.plots import (
 from fits.pseudo_cl import PIVOT, sky_fraction
 from fits.regions import region_words, superpixels
 from fits.writing import with_error
+from jaxsky.checks import listed
 from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import analysis, expand, gaussian_beam, lmax_of, power_spectrum, synthesis
 from jaxsky.instrument import band_tables, load_instrument
@@ -68,7 +69,7 @@ def _row(title: str, Q: Float[ArrayLike, " pix"]) -> list[MapPanel]:
     return [MapPanel(title, Q, color_limit(Q), UNITS["uK_RJ"])]
 
 
-def figure_templates(paper: PaperSky, picture: Path) -> Item:
+def figure_templates(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 1: Q of both templates."""
     rows, beams = [], {}
     for name in ("dust", "synchrotron"):
@@ -80,7 +81,7 @@ def figure_templates(paper: PaperSky, picture: Path) -> Item:
     return described("Figure 1", beams=beams, sky=paper.sky_differs)
 
 
-def figure_indices(paper: PaperSky, picture: Path) -> Item:
+def figure_indices(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 3: maps of both spectral indices."""
     rows, origins, numbers = [], [], []
     for name, word, symbol in (("beta_dust", "dust", "d"), ("beta_syn", "synchrotron", "s")):
@@ -114,7 +115,7 @@ def _steepening(by: float | None) -> Number:
     )
 
 
-def figure_ame(paper: PaperSky, picture: Path) -> Item:
+def figure_ame(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 4: Q of AME, and Pearson's correlation with the dust, with jackknife errors."""
     ame, dust, resolution, origin = paper.ame()
     plot_maps(picture, [_row("AME, $Q$, 23 GHz, 1 % polarized", ame[0])])
@@ -138,7 +139,7 @@ def figure_ame(paper: PaperSky, picture: Path) -> Item:
     )
 
 
-def figure_spectra(paper: PaperSky, picture: Path) -> Item:
+def figure_spectra(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 2: EE of both templates, of what continues them, and of both together."""
     fwhm, numbers = paper.settings.paper.fwhm, []
     with draw_panels(picture, "", (COLUMN, 5.2), 2, sharex=True) as panels:
@@ -207,7 +208,7 @@ def _draw_patches(
             axes.label_outer()
 
 
-def figure_randomised(paper: PaperSky, picture: Path) -> Item:
+def figure_randomised(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 14: a patch of the synchrotron, its small scales, and two others."""
     layer, nside = paper.template("synchrotron"), paper.nside_fine
     fwhm, center = paper.settings.paper.fwhm, paper.settings.paper.center
@@ -261,7 +262,7 @@ def forecast_settings(paper: PaperSky) -> Experiment:
     return settings.model_copy(update=changes)
 
 
-def figure_b_modes(paper: PaperSky, picture: Path) -> Item:
+def figure_b_modes(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 12: BB of the foregrounds in three bands of COrE, and of gravitational waves."""
     try:
         settings = forecast_settings(paper)
@@ -312,7 +313,7 @@ def prepared_templates(paper: PaperSky, observation: Observation) -> dict[str, H
     }
 
 
-def figure_patch(paper: PaperSky, picture: Path) -> Item:
+def figure_patch(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 13: Q of the CMB and of three bands in a patch."""
     settings, center = paper.settings, paper.settings.paper.center
     observation = core_observation(paper)
@@ -355,7 +356,7 @@ def _brightest(band: str, inside: Mapping[str, Float[np.ndarray, " inside"]]) ->
     return Number(f"brightest in the patch at {band} GHz", names[0], note)
 
 
-def table_core(paper: PaperSky, picture: Path) -> Item:
+def table_core(paper: PaperSky, picture: Path) -> PaperFigure:
     """Table 1: COrE."""
     channels = list(load_instrument("core"))
     header = ("Band [GHz]", *(f"{float(channel.center):g}" for channel in channels))

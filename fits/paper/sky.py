@@ -13,9 +13,10 @@ from jaxtyping import Array, Float
 from fits.common import prepared_maps
 from fits.comparison import Comparison, compare
 from fits.inputs import Inputs, inputs_of
-from fits.paper.items import TEXTS, Impossible, filled, listed
+from fits.paper.figures import TEXTS, Impossible, filled
 from fits.regions import region_masks
 from jaxsky import AME, Dust, Synchrotron
+from jaxsky.checks import listed
 from jaxsky.cmb import gaussian_fields
 from jaxsky.galaxy import EmbeddedSky
 from jaxsky.harmonics import gaussian_beam, synthesis

@@ -2,10 +2,10 @@
 
 import re
 import tomllib
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fits.commands.page import ResultTable
 
@@ -19,8 +19,7 @@ class Impossible(ValueError):
     """A figure that the settings do not allow, and why in one sentence: the others go on."""
 
 
-@dataclass(frozen=True)
-class Number:
+class Number(NamedTuple):
     """A number of the paper's text next to ours, and what is to be known about it."""
 
     what: str
@@ -30,7 +29,7 @@ class Number:
 
 
 @dataclass(frozen=True)
-class Item:
+class PaperFigure:
     """A figure or a table, by the paper's number ("Figure 1").
 
     `differs` is a line on what differs from the paper, and why. The table is shown instead of the
@@ -64,8 +63,8 @@ def described(
     table: ResultTable | None = None,
     texts: str | None = None,
     **words: Any,
-) -> Item:
-    """An item with the texts of its label, words filled in, and what the paper says of its numbers.
+) -> PaperFigure:
+    """A figure with the texts of its label, filled in, and what the paper says of its numbers.
 
     Other `texts` than those of the label are named by their heading in `paper.toml`.
     """
@@ -73,11 +72,5 @@ def described(
     published, otherwise = own.get("published", {}), own.get("otherwise", "not given")
     title, caption, differs = (filled(own[key], **words) for key in ("title", "caption", "differs"))
     picture = picture_of(label) if table is None else None
-    said = [replace(one, paper=published.get(one.what, otherwise)) for one in numbers]
-    return Item(label, title, caption, differs, picture, table, tuple(said))
-
-
-def listed(words: Iterable[str]) -> str:
-    """Words as a list in a sentence: "a, b and c"."""
-    first = list(words)
-    return " and ".join(filter(None, (", ".join(first[:-1]), *first[-1:])))
+    said = [one._replace(paper=published.get(one.what, otherwise)) for one in numbers]
+    return PaperFigure(label, title, caption, differs, picture, table, tuple(said))

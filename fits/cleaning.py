@@ -16,7 +16,7 @@ from fits.profile_likelihood import SpectralLikelihood
 from fits.pseudo_cl import LEAST_WINDOW, MaskedSpectra, band_powers, bin_edges, masked_spectra
 from fits.results import FitResult, misfit
 from fits.sampling import sample
-from fits.separated_data import MultipoleData, PixelData
+from fits.separated_data import FullSkyData, PixelData
 from fits.tensor_ratio import TensorFit, fit_tensors, power_model
 from jaxsky.checks import check_double
 from jaxsky.cmb import tensor_spectra
@@ -34,15 +34,16 @@ SAMPLED = 500
 class Separation(NamedTuple):
     """What a separation finds; spectra are of the cleaned CMB [uK_CMB^2].
 
-    `fit` has the most probable spectral parameters with the errors that the likelihood gives. In
-    pixels that takes smoothed noise as independent between pixels, so `sigma`, by name, and
-    `covariance`, in the order of `fit.labels` and None for too many parameters, are those of the
-    simulations. `found` are the components with all that is known of them, and `maps` they at one
-    beam. `residuals` are maps of the data less components, and `left` the band powers of the
-    foregrounds that are left in the CMB, None where they are not known.
+    `fit` has the most probable spectral parameters with the errors that the likelihood gives. It
+    takes smoothed noise as independent between pixels, and multipoles of a masked sky as
+    independent, so `sigma`, by name, and `covariance`, in the order of `fit.labels` and None for
+    too many parameters, are those of the simulations, but for multipoles of the full sky. `found`
+    are the components with all that is known of them, and `maps` they at one beam. `residuals` are
+    maps of the data less components, and `left` the band powers of the foregrounds that are left
+    in the CMB, None where they are not known.
     """
 
-    data: PixelData | MultipoleData
+    data: PixelData | FullSkyData
     like: SpectralLikelihood
     fit: FitResult
     sigma: dict[str, Any]
@@ -75,7 +76,7 @@ class Separation(NamedTuple):
 
 def separate_data(
     settings: Experiment,
-    data: PixelData | MultipoleData,
+    data: PixelData | FullSkyData,
     out: Path | None = None,
     progress: Progress = QUIET,
 ) -> Separation:
@@ -100,7 +101,8 @@ def separate_data(
     progress.step("components")
     best = like.named(jnp.asarray(response.theta))
     found = data.components(like, best, data.observed)
-    maps = data.maps(found)
+    maps = data.maps(found, like, best, data.observed)
+    amplitude = maps if data.in_pixels else found.amplitude
     row = found.components.index("cmb")
 
     progress.step("simulations")
@@ -110,7 +112,7 @@ def separate_data(
         tensors = tensor_spectra(highest, **settings.cmb.cosmology)
     # Simulated and modelled, lensing is what the settings say.
     lensed = cmb_spectra(settings, highest, r=0.0)
-    foregrounds = np.array(found.amplitude)
+    foregrounds = np.array(amplitude)
     foregrounds[row] = 0.0
     emission = data.emission(like, best, foregrounds)
     simulation = Realisation(data, like, best, response, emission, spectra, window, lensed)
@@ -141,7 +143,7 @@ def separate_data(
     if data.foregrounds is not None:
         alone = simulation.cleaned(best, data.foregrounds)
         left = band_powers(spectra, jnp.asarray(alone))[1]
-    sigma, covariance = _errors(settings, like, fit, simulated)
+    sigma, covariance = _errors(data, like, fit, simulated)
     chain = None
     ratio = fit_tensors(model, band_powers(spectra, maps[row])[1])
     if spec.sampler != "none" and len(fit.labels) <= SAMPLED:
@@ -155,7 +157,7 @@ def separate_data(
         covariance=covariance,
         found=found,
         maps=maps,
-        residuals=data.residuals(like, best, found),
+        residuals=data.residuals(like, best, amplitude),
         simulated=simulated,
         spectra=spectra,
         tensors=ratio,
@@ -188,16 +190,16 @@ def _spectra(
     return window, masked_spectra(mask, edges, window=window, pure=pure)
 
 
-def _mark(settings: Experiment, data: PixelData | MultipoleData) -> str:
+def _mark(settings: Experiment, data: PixelData | FullSkyData) -> str:
     """What the simulations depend on."""
     left_out = {"separate": {"nsims", "sampler", "nsteps"}}
     said = settings.model_dump_json(exclude=left_out)
     return f"{fingerprint((data.observed, data.mask))} {said}"
 
 
-def _errors(settings, like, fit, simulated):
+def _errors(data, like, fit, simulated):
     """Standard deviations by name, and the covariance."""
-    if settings.separate.domain == "harmonic":
+    if data.exact:
         return fit.sigma, fit.covariance
     sigma = simulated.theta.std(axis=0, ddof=1)
     determined = np.isfinite(np.asarray(like.flat(fit.best_fit))) & (sigma > 0)
@@ -210,7 +212,7 @@ def _errors(settings, like, fit, simulated):
 
 
 def _chain(settings, data, like, fit, simulated, out, progress):
-    """Samples of the posterior; in pixels with the errors of the simulations."""
+    """Samples of the posterior; with the errors of the simulations if it is not exact."""
     spec = settings.separate
     size = int(np.isfinite(np.asarray(like.flat(fit.best_fit))).sum())
     nwalkers = max(WALKERS, 2 * size + 2)
@@ -229,7 +231,7 @@ def _chain(settings, data, like, fit, simulated, out, progress):
         progress=progress.advance,
         throw=False,
     )
-    if spec.domain == "harmonic" or not samples.details:
+    if data.exact or not samples.details:
         return samples
     at = [fit.labels.index(label) for label in samples.labels]
     center = np.asarray(like.flat(fit.best_fit))[at]

@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fits.template_noise import TemplateNoise, read_template_noise
-from jaxsky import Bandpass
+from jaxsky import Bandpass, Component, Sky, set_parameters
 from jaxsky.checks import Numeric
+from jaxsky.components import component_class
 from jaxsky.experiment import SimulationInputs, cmb_spectra, simulation_inputs
 from jaxsky.galaxy import EmbeddedSky
 from jaxsky.inputs import (
@@ -24,6 +25,7 @@ from jaxsky.inputs import (
     embedded_galaxy,
     narrow,
     read,
+    read_parameters,
     read_sky,
     uK_RJ_per,
 )
@@ -33,7 +35,7 @@ from jaxsky.keys import realisation_key
 from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import Observation, ObservedBand, harmonic_sources
-from jaxsky.settings import BandTable, Experiment, SettingsError, at_key, find_file
+from jaxsky.settings import BandTable, Experiment, MapFile, SettingsError, at_key, find_file
 from jaxsky.simulation import observe_bands
 
 
@@ -278,3 +280,24 @@ def _estimated_noise(noise, maps, used):
     white, knee, slope = fit_knee(maps, quiet, 2 * nside)
     excess = knee_spectrum(white, knee, slope, 4 * nside) - white
     return float(np.degrees(np.sqrt(white)) * 60), excess.at[:2].set(0.0)
+
+
+def modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
+    """The laws, on one pixel, or on all if parameters are maps; and where these are known."""
+    folder, nside = Path(settings.data_dir), settings.common.nside
+    laws = {name: settings.sky.components[name] for name in settings.modelled()}
+    given = laws.values()
+    maps = any(isinstance(value, MapFile) for c in given for value in c.parameters.values())
+    amplitude = jnp.ones((2, 12 * nside**2 if maps else 1))
+    components: dict[str, Component] = {"cmb": component_class("cmb")(amplitude)}
+    known = np.ones(12 * nside**2, bool)
+    for name, spec in laws.items():
+        numbers, has = read_parameters(folder, name, spec, nside, "common.nside")
+        known &= has
+        with at_key(f"sky.{name}"):
+            assert spec.law is not None  # as the settings see to
+            components[name] = component_class(spec.law)(amplitude, **numbers)
+    others = set(settings.sky.components) - set(laws)
+    fixed = {name: v for name, v in settings.fixed.items() if name.split(".")[0] not in others}
+    with at_key("fixed"):
+        return set_parameters(Sky(components), fixed), known

@@ -20,7 +20,7 @@ from fits.priors import Gaussian, Prior
 from fits.profile_likelihood import SpectralLikelihood
 from fits.pseudo_cl import MaskedSpectra, band_powers, mean_spectrum
 from fits.results import FitResult
-from fits.separated_data import MultipoleData, PixelData
+from fits.separated_data import FullSkyData, PixelData
 from fits.systems import Factor
 from jaxsky.checks import Numeric
 from jaxsky.cmb import realisation
@@ -109,7 +109,7 @@ class Realisation(NamedTuple):
     the beam of the maps, and `lensed` C_l of a CMB without tensors up to its end [uK_CMB^2].
     """
 
-    data: PixelData | MultipoleData
+    data: PixelData | FullSkyData
     like: SpectralLikelihood
     best: Mapping[str, Array]
     response: Response
@@ -121,7 +121,8 @@ class Realisation(NamedTuple):
     def cleaned(self, params: Mapping[str, Array], data: np.ndarray) -> np.ndarray:
         """The map of the CMB with these parameters."""
         found = self.data.components(self.like, params, data, covariance=False)
-        return self.data.maps(found)[found.components.index("cmb")]
+        maps = self.data.maps(found, self.like, params, data)
+        return maps[found.components.index("cmb")]
 
     def of(self, key: Array) -> Sequence[Array | np.ndarray]:
         """What `SimulatedNoise` holds of one realisation."""

@@ -5,8 +5,7 @@ Both have the same methods, so that a separation does not ask which one it has.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import healpy
 import jax.numpy as jnp
@@ -15,25 +14,29 @@ from jaxtyping import Array, Bool, Float
 
 from fits.common import prepared_maps
 from fits.fluctuations import Fluctuations, noise_alm
-from fits.inputs import Inputs, inputs_of
+from fits.inputs import Inputs, inputs_of, modelled_laws
 from fits.mixing import NOMINAL
 from fits.multipoles import harmonic_coefficients, harmonic_likelihood
 from fits.noise import Noise, as_noise
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.regions import apodize, parameter_labels, region_mask
 from fits.separated_maps import (
-    ComponentMaps,
     HarmonicMaps,
     component_maps,
     emission_maps,
     harmonic_component_maps,
 )
-from jaxsky import Bandpass, Component, Sky, set_parameters
+from jaxsky import Bandpass, Sky
 from jaxsky.checks import Numeric
-from jaxsky.components import component_class
-from jaxsky.harmonics import expand, gaussian_beam, lmax_of, synthesis
-from jaxsky.inputs import read_parameters
-from jaxsky.settings import Experiment, MapFile, SettingsError, at_key
+from jaxsky.harmonics import (
+    expand,
+    gaussian_beam,
+    lmax_of,
+    low_multipoles,
+    map_variance,
+    synthesis,
+)
+from jaxsky.settings import Experiment, SettingsError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +58,10 @@ class _Data:
     foregrounds: Float[np.ndarray, "band stokes _"] | None
     truth: dict[str, float] | None
     description: str
+
+    #: Whether the likelihood knows all correlations of the noise, and whether data are maps.
+    exact: ClassVar[bool] = False
+    in_pixels: ClassVar[bool] = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,13 +93,13 @@ class PixelData(_Data):
         """Amplitudes of the components with all that is known of them."""
         return component_maps(like, params, data, self.noise, **options)
 
-    def maps(self, found: ComponentMaps) -> Float[np.ndarray, "component stokes pix"]:
-        """Amplitudes as maps."""
+    def maps(self, found: Any, like: SpectralLikelihood, params: Mapping, data):
+        """Amplitudes as maps, those of `components` with the same arguments."""
         return found.amplitude
 
-    def residuals(self, like: SpectralLikelihood, params: Mapping, found: ComponentMaps):
+    def residuals(self, like: SpectralLikelihood, params: Mapping, amplitude):
         """Maps (band, stokes, pix) of the data less the components; NaN in masked pixels."""
-        return self.observed - emission_maps(like, params, found.amplitude)
+        return self.observed - emission_maps(like, params, amplitude)
 
     def emission(self, like: SpectralLikelihood, params: Mapping, amplitude):
         """What components show in the bands; zero in masked pixels."""
@@ -100,8 +107,49 @@ class PixelData(_Data):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MultipoleData(_Data):
-    """Coefficients that are separated multipole by multipole, each band with its own beam.
+class MaskedSkyData(PixelData):
+    """Maps on part of the sky that are separated multipole by multipole, all at one beam.
+
+    All bands have the same beam and mask, so the coefficients of the masked maps are those of the
+    masked components, mixed by the laws: what a mask mixes, E and B among it, it mixes alike in
+    all. `spectra` is N_l of the noise in them [unit^2 sr], which is what the beam of each band
+    leaves. The mask correlates multipoles, so errors come from simulations.
+    """
+
+    spectra: Float[np.ndarray, "band stokes ell"]
+    fwhm: float
+
+    def likelihood(self, data: Float[np.ndarray, "band stokes pix"]) -> SpectralLikelihood:
+        """The likelihood of data."""
+        alm, beams = self._alm(data), np.full(len(data), self.fwhm)
+        return harmonic_likelihood(
+            self.sky, self.bands, alm, self.spectra, self.start, beams=beams, unit=self.unit
+        )
+
+    def components(self, like: SpectralLikelihood, params: Mapping, data, **options):
+        """Amplitudes of the components with all that is known of them."""
+        alm, beams = self._alm(data), np.full(len(data), self.fwhm)
+        return harmonic_component_maps(like, params, alm, self.spectra, beams=beams, **options)
+
+    def maps(self, found: HarmonicMaps, like: SpectralLikelihood, params: Mapping, data):
+        """Amplitudes as maps; NaN where masked.
+
+        Those of pixels, plus what multipoles find beyond: the same of all components, so that only
+        the noise is another, and nothing of the sky is lost at the last multipole.
+        """
+        maps = component_maps(like, params, data, self.noise, covariance=False).amplitude
+        nside = healpy.npix2nside(self.mask.size)
+        known = np.stack([np.asarray(synthesis(jnp.asarray(a), nside)) for a in self._alm(maps)])
+        weight = np.where(self.used, self.mask, np.nan)
+        return maps + (found.maps(nside, self.fwhm) - known) / weight
+
+    def _alm(self, maps: Numeric) -> Float[np.ndarray, "_ stokes alm"]:
+        return _masked_alm(maps, self.mask, self.spectra.shape[-1] - 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FullSkyData(_Data):
+    """Multipoles of the full sky, each band with its own beam; the likelihood is exact.
 
     `fwhms` are those of the bands [arcmin], and `noise` is N_l of the maps as observed [unit^2 sr].
     To draw it there is the `white` noise of each band, a level [unit arcmin] or the covariance of Q
@@ -109,6 +157,8 @@ class MultipoleData(_Data):
     pixels. Maps of components have `nside` and `fwhm` [arcmin].
     """
 
+    exact: ClassVar[bool] = True
+    in_pixels: ClassVar[bool] = False
     fwhms: Float[np.ndarray, " band"]
     noise: Float[np.ndarray, "band stokes ell"]
     white: tuple[Numeric, ...]
@@ -132,13 +182,13 @@ class MultipoleData(_Data):
         """Amplitudes of the components with all that is known of them."""
         return harmonic_component_maps(like, params, data, self.noise, beams=self.fwhms, **options)
 
-    def maps(self, found: HarmonicMaps) -> Float[np.ndarray, "component stokes pix"]:
+    def maps(self, found: HarmonicMaps, like: SpectralLikelihood, params: Mapping, data):
         """Amplitudes as maps."""
         return found.maps(self.nside, self.fwhm)
 
-    def residuals(self, like: SpectralLikelihood, params: Mapping, found: HarmonicMaps):
+    def residuals(self, like: SpectralLikelihood, params: Mapping, amplitude):
         """Maps (band, stokes, pix) of the data less the components, each with its own beam."""
-        rest = self.observed - self.emission(like, params, found.amplitude)
+        rest = self.observed - self.emission(like, params, amplitude)
         return np.stack([np.asarray(synthesis(jnp.asarray(alm), self.nside)) for alm in rest])
 
     def emission(self, like: SpectralLikelihood, params: Mapping, amplitude):
@@ -147,7 +197,15 @@ class MultipoleData(_Data):
         return emission_maps(like, params, amplitude) * np.asarray(expand(windows))[:, None]
 
 
-def separation_data(settings: Experiment) -> PixelData | MultipoleData:
+def _masked_alm(
+    maps: Numeric, mask: Float[np.ndarray, " pix"], lmax: int
+) -> Float[np.ndarray, "_ stokes alm"]:
+    """Coefficients of maps times the mask."""
+    seen = np.where(mask > 0, maps, 0.0) * mask
+    return np.stack([np.asarray(low_multipoles(jnp.asarray(rows), lmax)) for rows in seen])
+
+
+def separation_data(settings: Experiment) -> PixelData | FullSkyData:
     """Read or simulate what the settings name, and check that it can work."""
     spec, common = settings.separate, settings.common
     if not settings.cmb.include:
@@ -166,7 +224,7 @@ def separation_data(settings: Experiment) -> PixelData | MultipoleData:
                 )
     inside = region_mask(settings, spec.region, common.nside)
     _check_some(inside)
-    sky, known = _sky(settings)
+    sky, known = modelled_laws(settings)
     inside &= known
     _check_some(inside, " in which parameters are known")
     inputs = inputs_of(settings, templates=False, foregrounds=True)
@@ -183,7 +241,8 @@ def separation_data(settings: Experiment) -> PixelData | MultipoleData:
         "description": inputs.description,
     }
     factors = [float(b.bandpass.conversion("uK_RJ", spec.unit)) for b in inputs.bands.values()]
-    make = _pixel_data if spec.domain == "pixel" else _multipole_data
+    whole = inside.all() and all(np.all(band.used) for band in inputs.bands.values())
+    make = _full_sky_data if spec.domain == "harmonic" and whole else _pixel_data
     return make(settings, inputs, inside, np.array(factors), shared)
 
 
@@ -209,8 +268,7 @@ def _pixel_data(
     prepared = prepared_maps(settings, inputs)
     used = prepared.used & inside
     _check_some(used)
-
-    sigma = np.asarray(prepared.sigma) * factors[:, None, None]
+    mask, sigma = _mask(settings, used), np.asarray(prepared.sigma) * factors[:, None, None]
 
     def scaled(maps):
         return np.where(used, np.asarray(maps) * factors[:, None, None], 0.0)
@@ -219,37 +277,60 @@ def _pixel_data(
     if inputs.foregrounds is not None:
         pairs = zip(fluctuations.preparations, inputs.foregrounds.values(), strict=True)
         alone = scaled(jnp.stack([operator(maps) for operator, maps in pairs]))
-    return PixelData(
-        **shared,
-        used=used,
-        mask=_mask(settings, used),
-        observed=scaled(prepared.data),
-        foregrounds=alone,
-        labels=parameter_labels(settings, used),
-        noise=as_noise(np.where(used, sigma, np.inf), sigma.shape),
-        fluctuations=fluctuations,
-        factors=factors,
+    shared |= {
+        "mask": mask,
+        "observed": scaled(prepared.data),
+        "foregrounds": alone,
+        "labels": parameter_labels(settings, used),
+        "fluctuations": fluctuations,
+        "factors": factors,
+    }
+    if settings.separate.domain == "harmonic":
+        used = mask > 0
+    noise = as_noise(np.where(used, sigma, np.inf), sigma.shape)
+    if settings.separate.domain == "pixel":
+        return PixelData(**shared, used=used, noise=noise)
+    spectra = _masked_noise(fluctuations, np.where(used, sigma, 0.0), factors, mask)
+    return MaskedSkyData(
+        **shared, used=used, noise=noise, spectra=spectra, fwhm=settings.common.fwhm
     )
 
 
-def _multipole_data(
+def _masked_noise(
+    fluctuations: Fluctuations,
+    sigma: Float[np.ndarray, "band stokes pix"],
+    factors: Float[np.ndarray, " band"],
+    mask: Float[np.ndarray, " pix"],
+) -> Float[np.ndarray, "band stokes ell"]:
+    """N_l of masked noise: white as the beam of each band leaves it, and what is correlated."""
+    preparations = fluctuations.preparations
+    lmax = 2 * min(op.nside_in for op in preparations)
+    lmax, area = min(lmax, 2 * healpy.npix2nside(mask.size)), np.mean(mask**2)
+    spectra = np.zeros((len(sigma), 2, lmax + 1))
+    for i, (op, spectrum) in enumerate(zip(preparations, fluctuations.correlated, strict=True)):
+        assert op.window is not None  # there is a common beam
+        shape, correlated = np.asarray(op.window[: lmax + 1]) ** 2, np.zeros(lmax + 1)
+        if spectrum is not None:
+            correlated = np.asarray(spectrum[: lmax + 1]) * factors[i] ** 2
+        white = np.mean((sigma[i] * mask) ** 2) - map_variance(correlated) * area
+        spectra[i] = white / map_variance(shape) * shape + correlated * area
+    return spectra
+
+
+def _full_sky_data(
     settings: Experiment,
     inputs: Inputs,
     inside: Bool[np.ndarray, " pix"],
     factors: Float[np.ndarray, " band"],
     shared: dict[str, Any],
-) -> MultipoleData:
-    """Coefficients of the bands; `factors` are the unit of the data per uK_RJ."""
+) -> FullSkyData:
+    """Coefficients of the bands as observed."""
     bands, common = inputs.bands, settings.common
     for name, band in bands.items():
-        if missing := int(np.sum(~np.asarray(band.used))):
-            raise SettingsError(
-                f"bands.{name}: {missing} pixels have no value; the domain 'harmonic' takes maps "
-                "of the full sky."
-            )
         if np.ndim(band.beam):
             raise SettingsError(
-                f"bands.{name}.beam: is a table; the domain 'harmonic' takes Gaussian beams, fwhm."
+                f"bands.{name}.beam: is a table; the domain 'harmonic' takes Gaussian beams, fwhm, "
+                "on the full sky."
             )
         if band.leakage is not None:
             raise SettingsError(
@@ -277,7 +358,7 @@ def _multipole_data(
         return harmonic_coefficients(scaled, lmax)
 
     alone = inputs.foregrounds
-    return MultipoleData(
+    return FullSkyData(
         **shared,
         used=inside,
         mask=_mask(settings, inside),
@@ -290,28 +371,3 @@ def _multipole_data(
         nside=common.nside,
         fwhm=common.fwhm,
     )
-
-
-def _sky(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
-    """The laws, on one pixel, or on all if parameters are maps; and where these are known."""
-    folder, nside = Path(settings.data_dir), settings.common.nside
-    laws = {name: settings.sky.components[name] for name in settings.modelled()}
-    given = laws.values()
-    maps = any(isinstance(value, MapFile) for c in given for value in c.parameters.values())
-    amplitude = jnp.ones((2, 12 * nside**2 if maps else 1))
-    components: dict[str, Component] = {"cmb": component_class("cmb")(amplitude)}
-    known = np.ones(12 * nside**2, bool)
-    for name, spec in laws.items():
-        numbers, has = read_parameters(folder, name, spec, nside, "common.nside")
-        known &= has
-        with at_key(f"sky.{name}"):
-            assert spec.law is not None  # as the settings see to
-            components[name] = component_class(spec.law)(amplitude, **numbers)
-    fixed = {n: v for n, v in settings.fixed.items() if n.split(".")[0] not in _others(settings)}
-    with at_key("fixed"):
-        return set_parameters(Sky(components), fixed), known
-
-
-def _others(settings: Experiment) -> set[str]:
-    """Components that are not modelled."""
-    return set(settings.sky.components) - set(settings.modelled())

@@ -68,7 +68,7 @@ def power_spectrum(
     return sums.reshape(*alm.shape[:-1], -1) / (2 * jnp.arange(lmax + 1) + 1)
 
 
-def map_variance(spectrum: Float[Array, " ell"]) -> float:
+def map_variance(spectrum: Float[Array | np.ndarray, " ell"]) -> float:
     """Variance of a pixel of maps that have a spectrum."""
     return float(np.sum((2 * np.arange(spectrum.size) + 1) * np.asarray(spectrum)) / (4 * np.pi))
 

@@ -59,9 +59,11 @@ class _Data:
     truth: dict[str, float] | None
     description: str
 
-    #: Whether the likelihood knows all correlations of the noise, and whether data are maps.
+    #: Whether the likelihood knows all correlations of the noise, whether data are maps, and
+    #: whether these are separated pixel by pixel.
     exact: ClassVar[bool] = False
     in_pixels: ClassVar[bool] = True
+    by_pixel: ClassVar[bool] = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +118,7 @@ class MaskedSkyData(PixelData):
     leaves. The mask correlates multipoles, so errors come from simulations.
     """
 
+    by_pixel: ClassVar[bool] = False
     spectra: Float[np.ndarray, "band stokes ell"]
     fwhm: float
 
@@ -159,6 +162,7 @@ class FullSkyData(_Data):
 
     exact: ClassVar[bool] = True
     in_pixels: ClassVar[bool] = False
+    by_pixel: ClassVar[bool] = False
     fwhms: Float[np.ndarray, " band"]
     noise: Float[np.ndarray, "band stokes ell"]
     white: tuple[Numeric, ...]

@@ -128,11 +128,12 @@ def test_maps_of_ones_own(folder, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_multipoles_of_files(folder, tmp_path, monkeypatch):
+@pytest.mark.parametrize("region", ["full", "outside"])
+def test_multipoles_of_files(folder, tmp_path, monkeypatch, region):
     path = settings(folder, "harmonic", regions="REGIONS", **{", regions = REGIONS": ""})
     out = tmp_path / "out"
-    domain = "separate.domain=harmonic"
-    assert jaxsky(monkeypatch, "separate", path, "--out", out, "--set", domain) == 0
+    options = ["--set", "separate.domain=harmonic", "--set", f"separate.region={region}"]
+    assert jaxsky(monkeypatch, "separate", path, "--out", out, *options) == 0
     result = json.loads((out / "result.json").read_text())
     for name, truth in {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}.items():
         found = result["parameters"][name]

@@ -10,7 +10,7 @@ from fits.commands import separate_pictures as pictures
 from fits.commands.page import ResultTable
 from fits.commands.run import Command, Report, Run
 from fits.results import FitError
-from fits.separated_data import PixelData, separation_data
+from fits.separated_data import separation_data
 from fits.writing import probability, with_error
 from jaxsky.inputs import parameter_unit
 from jaxsky.io import write_maps
@@ -29,7 +29,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
     fit, ratio, spectra = found.fit, found.tensors, found.spectra
     bands, truth, simulated = list(found.data.bands), found.data.truth or {}, found.simulated
     small = None
-    if isinstance(found.data, PixelData):
+    if found.data.by_pixel:
         values = found.found.probability[np.isfinite(found.found.probability)]
         small = {f"below_{p:g}": float(np.mean(values < p)) for p in (0.05, 0.01, 0.001)}
     results: dict[str, Any] = {
@@ -157,7 +157,7 @@ def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
 
 def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path]:
     """Maps of components, residuals, and parameters that have regions."""
-    mask, in_pixels = np.isfinite(found.maps).all(axis=(0, 1)), isinstance(found.data, PixelData)
+    mask, in_pixels = np.isfinite(found.maps).all(axis=(0, 1)), found.data.by_pixel
     components: list[Column] = []
     for name, maps in zip(found.components, found.maps, strict=True):
         unit, head = "uK_CMB" if name == "cmb" else "uK_RJ", name.upper()

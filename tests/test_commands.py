@@ -69,7 +69,7 @@ def test_headings_of_sections_are_bold(monkeypatch, capsys):
 
 
 def test_page(tmp_path):
-    table = ResultTable(("name", "value"), (("beta", "1.53"), (), ("T", "20")), title="A <table>")
+    table = ResultTable(("name", "value"), (("beta", "1.53"), (), ("T", "20")), "A <table>")
     sections = [
         Section("Results: all", "What & why", table=table, note="Note: read <this>"),
         Section("picture", picture="a b.png"),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import commands
+from fits.commands.page import Section
 from fits.commands.paper import NUMBERS, STEPS, Make, labels_of, make_figures
 from fits.commands.run import DEFAULTS
 from fits.paper import figures_model
@@ -100,13 +101,14 @@ def value(number: Number) -> float:
 def check_items(out: Path, items: dict[str, PaperFigure]) -> None:
     assert list(items) == [*LABELS, NUMBERS]
     for item in items.values():
-        assert item.caption
-        assert item.differs
-        assert item.table or (out / item.picture).read_bytes().startswith(b"\x89PNG")
-    rows = items[NUMBERS].table.rows
+        assert item.section.caption
+        assert item.section.note
+        picture = item.section.picture
+        assert item.section.table or (out / picture).read_bytes().startswith(b"\x89PNG")
+    rows = items[NUMBERS].section.table.rows
     assert [row[0] for row in rows] == [n.what for i in items.values() for n in i.numbers]
-    assert len(items["Table 1"].table.header) == 16
-    assert items["Table 1"].table.rows[0][1:4] == ("23.3", "14.0", "10.0")
+    assert len(items["Table 1"].section.table.header) == 16
+    assert items["Table 1"].section.table.rows[0][1:4] == ("23.3", "14.0", "10.0")
 
 
 def check_slopes(settings: Experiment, items: dict[str, PaperFigure]) -> None:
@@ -139,7 +141,7 @@ def test_embedded_sky(small, made):
     check_correlations(small, items)
     for label in LABELS:
         known = label in ("Figure 3", "Table 1")  # these show nothing of the model
-        assert ("embedded model" in items[label].differs) != known
+        assert ("embedded model" in items[label].section.note) != known
     numbers = numbers_of(items)
     assert value(numbers["mean of β_dust"]) == pytest.approx(1.53, abs=1e-3)
     assert value(numbers["mean of β_syn"]) == pytest.approx(2.9, abs=1e-3)
@@ -164,8 +166,8 @@ def test_real_sky(real, data_dir, tmp_path):
         assert value(numbers[f"mean of β_{name}"]) == pytest.approx(beta.mean(), abs=1e-3)
         assert value(numbers[f"scatter of β_{name}"]) == pytest.approx(beta.std(), abs=1e-3)
     assert numbers["steepening of β_syn from 0.49 ... 2.12 to 20 ... 30 GHz"].ours == "0.13"
-    assert "with the other sign, made steeper by 0.13" in items["Figure 3"].differs
-    assert "embedded" not in items["Figure 4"].differs
+    assert "with the other sign, made steeper by 0.13" in items["Figure 3"].section.note
+    assert "embedded" not in items["Figure 4"].section.note
 
 
 def test_patch_shows_the_small_scales_of_the_spectra(small):
@@ -204,11 +206,12 @@ class Page(html.parser.HTMLParser):
 def test_page(made):
     out, items = made
     page = Page(out / "index.html")
-    assert page.headings[: len(items)] == [f"{item.label}: {item.title}" for item in items.values()]
+    assert page.headings[: len(items)] == [item.section.title for item in items.values()]
     assert not page.tags & {"script", "link", "iframe", "object"}
     for link in page.links:
         assert link[1:] in page.ids if link[0] == "#" else (out / link).is_file()
-    assert len(page.links) == len(items) + 2 * sum(i.picture is not None for i in items.values())
+    pictures = [item for item in items.values() if item.section.picture is not None]
+    assert len(page.links) == len(items) + 2 * len(pictures)
     assert "not data" in (out / "index.html").read_text()
 
 
@@ -223,9 +226,8 @@ def drawn(
             if stop is not None and label == stopped:
                 raise stop("it takes a <map>.")
             picture.write_bytes(b"picture")
-            return PaperFigure(
-                label, "a & b", "c", "d", picture.name, numbers=(Number("x", "1", "2"),)
-            )
+            section = Section(f"{label}: a & b", "c", picture.name, note="d")
+            return PaperFigure(label, section, (Number("x", "1", "2"),))
 
         return make
 
@@ -247,7 +249,7 @@ def test_a_stopped_run_goes_on(small, tmp_path):
     make_figures(small, tmp_path, ["2"], overwrite=True, steps=two)
     assert made[4:] == ["Figure 2"]
     kept = json.loads((tmp_path / "figures.json").read_text())
-    assert [figure["numbers"][0][0] for figure in kept[1]] == ["x", "x"]
+    assert [figure[2][0][0] for figure in kept[1]] == ["x", "x"]
 
 
 def test_real_figures_are_not_made_again(small, made):
@@ -261,9 +263,9 @@ def test_a_figure_that_cannot_be_made_is_said_and_left_out(small, tmp_path):
     made = []
     steps = drawn(made, Impossible, "Figure 1")
     items = make_figures(small, tmp_path, steps=steps)
-    assert items[0].differs == "Not made: it takes a <map>."
+    assert items[0].section.note == "Not made: it takes a <map>."
     assert "it takes a &lt;map&gt;." in (tmp_path / "index.html").read_text()
-    assert items[1].picture == "figure_02.png"
+    assert items[1].section.picture == "figure_02.png"
     make_figures(small, tmp_path, steps=steps)
     assert made == ["Figure 1", "Figure 2", "Figure 1"]
 

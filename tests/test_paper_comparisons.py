@@ -48,11 +48,11 @@ def test_figures(made):
     assert set(LABELS) <= set(items)
     for label in LABELS:
         item = items[label]
-        assert item.caption
-        assert item.differs
-        assert (out / item.picture).read_bytes().startswith(b"\x89PNG")
+        assert item.section.caption
+        assert item.section.note
+        assert (out / item.section.picture).read_bytes().startswith(b"\x89PNG")
     page = (out / "index.html").read_text()
-    assert all(items[label].picture in page for label in LABELS)
+    assert all(items[label].section.picture in page for label in LABELS)
 
 
 @pytest.mark.slow
@@ -97,8 +97,8 @@ def test_without_bands_of_the_paper(data_dir, monkeypatch, tmp_path):
     settings = settings.model_copy(update={"compare": how})
     figures = make_figures(settings, tmp_path / "out", [str(n) for n in range(5, 13)])
     items = {item.label: item for item in figures}
-    assert items["Figure 7"].differs.startswith("Not made: None of the bands 30, 44, 70, 353")
-    assert items["Figure 9"].differs.startswith("Not made: No band has a map of leakage")
+    assert items["Figure 7"].section.note.startswith("Not made: None of the bands 30, 44, 70, 353")
+    assert items["Figure 9"].section.note.startswith("Not made: No band has a map of leakage")
     shown = numbers(items)
     assert {"slope, V, Q and U", "slope, W, Q and U"} <= set(shown)
     # Planck finds half as much power in B as in E (intermediate results 30).

@@ -3,7 +3,7 @@
 from typing import Any
 
 from fits.commands import compare_pictures as pictures
-from fits.commands.page import ResultTable
+from fits.commands.page import ResultTable, Row
 from fits.commands.run import Command, Report, Run
 from fits.common import prepared_maps
 from fits.comparison import (
@@ -46,20 +46,8 @@ def _work(settings: Experiment, command: Run) -> Report:
     )
 
 
-COMMAND = Command(
-    "compare",
-    _work,
-    (
-        "comparison.json",
-        "log.json",
-        "simulations.npz",
-        "scatter_*.png",
-        "maps_[QU].png",
-        "spectra.png",
-        "leakage.png",
-        "patches.png",
-    ),
-)
+PICTURES = ("scatter_*.png", "maps_[QU].png", "spectra.png", "leakage.png", "patches.png")
+COMMAND = Command("compare", _work, ("comparison.json", "simulations.npz", *PICTURES))
 
 
 def _numbers(comparison: Comparison, patches: PatchComparison | None) -> dict[str, Any]:
@@ -95,7 +83,7 @@ def _table(comparison: Comparison) -> ResultTable:
     """Slopes, correlations and probabilities."""
     header = ("band", "region", "", "slope", "r", "rms", "exp.", "PTE", "EE", "BB")
     spectra = {s.band: s for s in comparison.spectra}
-    rows: list[tuple[str, ...]] = []
+    rows: list[Row] = []
     for band in comparison.prepared.bands:
         powers = [probability(p) for p in spectra[band].pte] if band in spectra else ["", ""]
         for i, s in enumerate(s for s in comparison.scatters if s.band == band):
@@ -109,7 +97,7 @@ def _table(comparison: Comparison) -> ResultTable:
         "that expected of noise and CMB, in uK_RJ; PTE: probability that noise and CMB alone give "
         "a larger chi2, in pixels, EE and BB."
     )
-    return ResultTable(header, tuple(rows), caption=caption, words=3)
+    return ResultTable(header, rows, caption, words=3)
 
 
 def comparison_warnings(comparison: Comparison, settings: Experiment) -> list[str]:

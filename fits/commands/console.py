@@ -42,7 +42,6 @@ def print_tables(tables: Sequence[ResultTable], width: int | None = None) -> Non
     out = Console(width=width, **PLAIN)
     for table in tables:
         shown = RichTable(
-            title=table.title or None,
             caption=table.caption or None,
             box=box.SIMPLE,
             pad_edge=False,

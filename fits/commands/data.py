@@ -9,7 +9,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, Trans
 
 from fits.commands.console import console, print_tables
 from fits.commands.endings import interruptible
-from fits.commands.page import ResultTable
+from fits.commands.page import ResultTable, Row
 from jaxsky import archive
 from jaxsky.io import InputError
 from jaxsky.io.folders import cache_folder
@@ -39,8 +39,7 @@ Folder = Annotated[
 @data_commands.command("list")
 def _list(folder: Folder, products: Words = None) -> None:
     """Name the products and sets of them, and say which are there."""
-    rows: list[tuple[str, ...]] = []
-    group = None
+    rows, group = list[Row](), None
     for product in archive.find(products or []):
         if product.group != group:
             group = product.group
@@ -58,7 +57,7 @@ def _list(folder: Folder, products: Words = None) -> None:
             held = f"{sum((folder / p.name).is_file() for p in members)} of {len(members)}"
             rows.append((name, found.title, "", "", archive.total_size(members), held))
     header = ("file", "what", "nside", "unit", "size", "here")
-    table = ResultTable(header, tuple(rows), title=f"Kept in {folder}", words=6)
+    table = ResultTable(header, rows, f"Kept in {folder}", words=6)
     print_tables([table], width=None if console.is_terminal else 200)
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fits.commands.page import ResultTable
+from fits.commands.page import ResultTable, Row
 from fits.commands.run import Command, Report, Run
 from fits.common import prepared_maps
 from fits.inputs import Inputs, inputs_of
@@ -45,7 +45,7 @@ def _work(settings: Experiment, command: Run) -> Report:
     )
 
 
-COMMAND = Command("fit", _work, ("result.json", "log.json", *PICTURES, CHAINS))
+COMMAND = Command("fit", _work, ("result.json", *PICTURES, CHAINS))
 
 
 def _result(fit: RegionFit, method: str) -> dict[str, Any]:
@@ -89,7 +89,7 @@ def _short_names(names: Sequence[str]) -> list[str]:
 def _table(fits: Sequence[RegionFit], truth: Mapping[str, float] | None) -> ResultTable:
     """The best fits and 68 % intervals, and the truth if there is one."""
     free = all_free(fits)
-    rows: list[tuple[str, ...]] = []
+    rows: list[Row] = []
     for fit in fits:
         for method, result in fit.results.items():
             values = [
@@ -103,12 +103,9 @@ def _table(fits: Sequence[RegionFit], truth: Mapping[str, float] | None) -> Resu
     if truth is not None:
         known = [f"{truth[name]:g}" if name in truth else "" for name in free]
         rows.append(("truth", "", "", *known, ""))
-    return ResultTable(
-        ("region", "", "method", *_short_names(free), "chi2/dof"),
-        tuple(rows),
-        caption="best fit and central 68 % interval; chi2 counts pixels with the noise alone",
-        words=3,
-    )
+    header = ("region", "", "method", *_short_names(free), "chi2/dof")
+    caption = "best fit and central 68 % interval; chi2 counts pixels with the noise alone"
+    return ResultTable(header, rows, caption, words=3)
 
 
 def fit_warnings(inputs: Inputs, settings: Experiment, fits: Sequence[RegionFit]) -> list[str]:

@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from fits import tensor_ratio
-from fits.commands.page import ResultTable
+from fits.commands.page import ResultTable, Row
 from fits.commands.run import Command, Report, Run
 from fits.common import prepare_component
 from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors, foreground_names
+from fits.full_sky import FIELDS
 from fits.mixing import unit_sky
 from fits.plots import spread
 from fits.pseudo_cl import (
@@ -39,9 +40,6 @@ from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 from jaxsky.sky import unknown_parameter
 
-#: What is in the folder of the results.
-RESULTS = ("forecast.json", "log.json", "bb.png", "fisher.png")
-FIELDS = ("EE", "BB")
 #: Of the foregrounds' spectra, what may be free.
 KINDS = ("amplitude", "slope", "correlation")
 #: Spectra are taken in so many bands, if the settings name none.
@@ -97,9 +95,8 @@ def forecast_inputs(settings: Experiment) -> ForecastInputs:
         raise SettingsError("bands: there are none.")
     pixels = map_nside(settings, templates)
     bands = {str(one.name): read_channel(settings, one, pixels) for one in settings.bands}
-    for name, band in bands.items():
-        if band.noise is None:
-            raise SettingsError(f"bands.{name}.noise: is missing.")
+    if silent := [name for name, band in bands.items() if band.noise is None]:
+        raise SettingsError(f"bands.{silent[0]}.noise: is missing.")
     shown = spec.bands or spread(tuple(bands), SHOWN)
     fwhm = max(template.fwhm for template in templates.values())
     nside = min(healpy.npix2nside(template.used.size) for template in templates.values())
@@ -287,41 +284,22 @@ def _numbers(found: Forecast, settings: Experiment) -> dict[str, Any]:
 
 def _tables(found: Forecast) -> list[ResultTable]:
     """The foregrounds in bands, and the errors."""
-    ranges = [f"r, {where}" for where in next(iter(found.equal_r.values()))]
-    bands = [
-        (
-            name,
-            f"{law.amplitude:.3g}",
-            f"{law.slope:.2f}",
-            *(f"{r:.3g}" for r in found.equal_r[name].values()),
-        )
-        for name, law in found.laws.items()
-    ]
-    errors = found.errors
-    numbers: list[tuple[str, ...]] = [
-        (
-            name,
-            f"{errors.fiducial[name]:.4g}",
-            f"{errors.sigma(name):.2g}",
-            f"{errors.known[name]:.2g}",
-            f"{errors.priors[name]:.2g}" if name in errors.priors else "",
-        )
-        for name in errors.free
-    ]
+    bands, numbers, errors = list[Row](), list[Row](), found.errors
+    for name, law in found.laws.items():
+        equal = [f"{r:.3g}" for r in found.equal_r[name].values()]
+        bands.append((name, f"{law.amplitude:.3g}", f"{law.slope:.2f}", *equal))
+    for name in errors.free:
+        widths = errors.sigma(name), errors.known[name], errors.priors.get(name)
+        shown = ("" if width is None else f"{width:.2g}" for width in widths)
+        numbers.append((name, f"{errors.fiducial[name]:.4g}", *shown))
     if found.without_foregrounds is not None:
         numbers += [(), ("r, without foregrounds", "", f"{found.without_foregrounds:.2g}", "", "")]
-    return [
-        ResultTable(
-            ("band", "D_l / uK_CMB^2", "slope of C_l", *ranges),
-            tuple(bands),
-            caption=f"BB of foregrounds at l = {PIVOT}, and the r that has as much",
-        ),
-        ResultTable(
-            ("parameter", "value", "error", "others known", "prior"),
-            tuple(numbers),
-            caption="errors of 68 %, all free parameters marginalised",
-        ),
-    ]
+    ranges = [f"r, {where}" for where in next(iter(found.equal_r.values()))]
+    header = ("band", "D_l / uK_CMB^2", "slope of C_l", *ranges)
+    caption = f"BB of foregrounds at l = {PIVOT}, and the r that has as much"
+    other = ("parameter", "value", "error", "others known", "prior")
+    marginal = "errors of 68 %, all free parameters marginalised"
+    return [ResultTable(header, bands, caption), ResultTable(other, numbers, marginal)]
 
 
 def forecast_warnings(found: Forecast) -> list[str]:
@@ -363,4 +341,4 @@ def _work(settings: Experiment, command: Run) -> Report:
     )
 
 
-COMMAND = Command("forecast", _work, RESULTS, resumable=False)
+COMMAND = Command("forecast", _work, ("forecast.json", "bb.png", "fisher.png"), resumable=False)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jaxsky
 from jaxsky.io import write_text
@@ -30,6 +30,9 @@ a { color: #0072b2; }
 """
 
 
+Row: TypeAlias = tuple[str, ...]
+
+
 class ResultTable(NamedTuple):
     """A table as text, for the terminal and for a page.
 
@@ -37,9 +40,8 @@ class ResultTable(NamedTuple):
     numbers. Behind an empty row begins a new section; a row that is cut short is its heading.
     """
 
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    title: str = ""
+    header: Row
+    rows: list[Row]
     caption: str = ""
     words: int = 1
 

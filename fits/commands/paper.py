@@ -2,17 +2,16 @@
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from fits.commands.page import ResultTable, Section, write_page
+from fits.commands.page import ResultTable, Row, Section, write_page
 from fits.commands.run import CIRCUMSTANCES, PAGE, Command, Report, Run
 from fits.paper import figures_data, figures_model
-from fits.paper.figures import Impossible, PaperFigure, described, picture_of
+from fits.paper.figures import TEXTS, Impossible, PaperFigure, picture_of
 from fits.paper.sky import PaperSky
 from fits.writing import write_log
 from jaxsky.io import write_text
@@ -92,7 +91,11 @@ def make_figures(
     begin()
     out.mkdir(parents=True, exist_ok=True)
     paper = PaperSky(settings)
-    made = {f.label for f in figures.values() if f.table or (out / (f.picture or "")).is_file()}
+    made = {
+        label
+        for label, (_, section, *_) in figures.items()
+        if section.table or (out / (section.picture or "")).is_file()
+    }
     todo = [label for label in wanted if overwrite or label not in made]
     for done, label in enumerate(todo):
         progress.step(label)
@@ -101,11 +104,11 @@ def make_figures(
         try:
             figure = steps[label](paper, out / picture_of(label))
         except Impossible as reason:
-            figure = PaperFigure(label, "not made", "", f"Not made: {reason}")
-        for name in other - {figure.picture}:
+            figure = PaperFigure(label, Section(f"{label}: not made", note=f"Not made: {reason}"))
+        for name in other - {figure.section.picture}:
             (out / name).unlink(missing_ok=True)
         other = set()
-        figures[label] = replace(figure, seconds=round(time.perf_counter() - start, 1))
+        figures[label] = figure._replace(seconds=round(time.perf_counter() - start, 1))
         write_text(out / KEPT, FILE.dump_json((mark, list(figures.values())), indent=2).decode())
         _write_page(paper, out, figures, steps)
         if OBSERVED.isdisjoint(todo[done + 1 :]):
@@ -137,7 +140,7 @@ def _kept(
             f"{out}: holds figures of other settings; choose another --out, or start again with "
             "--overwrite."
         )
-    return {}, {figure.picture for figure in figures if figure.picture is not None}
+    return {}, {f.section.picture for f in figures if f.section.picture is not None}
 
 
 def _write_page(
@@ -145,26 +148,21 @@ def _write_page(
 ) -> list[PaperFigure]:
     """Write the page of all figures in order and the table of their numbers; returns these."""
     shown = [figures[label] for label in order if label in figures]
-    rows = tuple((n.what, n.paper, n.ours, n.note, f.label) for f in shown for n in f.numbers)
+    rows: list[Row] = [(n.what, n.paper, n.ours, n.note, f.label) for f in shown for n in f.numbers]
     if rows:
         table = ResultTable(("quantity", "paper", "here", "about it", "see"), rows)
-        shown.append(described(NUMBERS, table=table))
-    seconds = sum(figure.seconds or 0 for figure in shown)
+        texts, head = TEXTS[NUMBERS], f"{NUMBERS}: {TEXTS[NUMBERS]['title']}"
+        section = Section(head, texts["caption"], None, table, texts["note"])
+        shown.append(PaperFigure(NUMBERS, section))
+    seconds = sum(figure.seconds for figure in shown)
     write_page(
         out / PAGE,
         f"A model of the microwave polarized sky: {paper.settings.title}",
         [paper.description, f"Figures and tables of {PAPER}, made again and numbered as there."],
-        [_section(figure) for figure in shown],
+        [figure.section for figure in shown],
         f"Written by `jaxsky paper` in {seconds:.0f} s,",
     )
     return shown
-
-
-def _section(figure: PaperFigure) -> Section:
-    own = figure.label == NUMBERS
-    note = figure.differs if own else f"Differs from the paper: {figure.differs}"
-    title = f"{figure.label}: {figure.title}"
-    return Section(title, figure.caption, figure.picture, figure.table, note)
 
 
 def _work(settings: Experiment, command: Run, *, only: Sequence[str]) -> Report:
@@ -177,7 +175,8 @@ def _work(settings: Experiment, command: Run, *, only: Sequence[str]) -> Report:
         begin=lambda: command.steps.keep(command.log),
         progress=command.steps,
     )
-    missing = [f"{f.label}: {f.differs}" for f in figures if not (f.picture or f.table)]
+    sections = {figure.label: figure.section for figure in figures}
+    missing = [f"{n}: {s.note}" for n, s in sections.items() if not (s.picture or s.table)]
     remark = f"{len(figures)} figures and tables ({command.steps.seconds:.1f} s)."
     page = [command.out / PAGE]
     return Report("", warnings=missing, written=page, remark=remark, page=False)

@@ -63,7 +63,7 @@ class Run(NamedTuple):
     def begin(self) -> None:
         """Nothing is wrong with the input: what is to be replaced goes, and the log begins."""
         if self.overwrite:
-            self.folder.remove(self.results)
+            self.folder.remove((*self.results, CIRCUMSTANCES))
             self.folder.narrow(self.part)  # others may make the rest
         self.steps.keep(self.log)
 

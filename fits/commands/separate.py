@@ -7,8 +7,9 @@ import numpy as np
 
 from fits.cleaning import SAMPLED, Separation, separate_data
 from fits.commands import separate_pictures as pictures
-from fits.commands.page import ResultTable
+from fits.commands.page import ResultTable, Row
 from fits.commands.run import Command, Report, Run
+from fits.posterior_plots import plot_chains
 from fits.results import FitError
 from fits.separated_data import separation_data
 from fits.writing import probability, with_error
@@ -95,7 +96,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
 def _table(found: Separation) -> ResultTable:
     """Parameters and r, with the truth if it is known."""
     fit, truth, ratio = found.fit, found.data.truth or {}, found.tensors
-    rows: list[tuple[str, ...]] = []
+    rows: list[Row] = []
     for name in fit.free:
         value, sigma = np.asarray(fit.best_fit[name]), np.asarray(found.sigma[name])
         shown = with_error(float(np.nanmedian(value)), float(np.nanmedian(sigma)))
@@ -112,7 +113,7 @@ def _table(found: Separation) -> ResultTable:
     rows.append(("noise of CMB, times that without foregrounds", degradation, ""))
     header, columns = ("parameter", "best fit", "truth"), 3 if truth else 2
     caption = f"standard deviations; chi2/dof {fit.chi2 / fit.dof:.4f}"
-    return ResultTable(header[:columns], tuple(row[:columns] for row in rows), caption=caption)
+    return ResultTable(header[:columns], [row[:columns] for row in rows], caption)
 
 
 def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
@@ -205,8 +206,8 @@ PICTURES = {
     "spectra.png": pictures.plot_spectra,
     "r.png": pictures.plot_ratio,
     "parameters.png": pictures.plot_parameters,
-    "posterior.png": pictures.plot_posterior,
 }
+POSTERIOR = "posterior.png"
 MAPS = ("components.fits", "residuals.fits", "parameters.fits")
 KEPT = ("simulations.npz", "chain.h5")
 
@@ -219,14 +220,17 @@ def _work(settings: Experiment, command: Run) -> Report:
         found = separate_data(settings, data, command.out, command.steps)
     except FitError as error:
         raise ValueError(f"The spectral parameters were not found. {error}") from None
+    drawn: dict[str, Any] = {name: (plot, found, settings) for name, plot in PICTURES.items()}
+    if (chain := found.chain) is not None:
+        drawn[POSTERIOR] = plot_chains, {chain.method: chain}, data.truth, settings.title
     return Report(
         data.description,
         [_table(found)],
         separation_warnings(found, settings),
         _numbers(found, settings),
-        {name: (plot, found, settings) for name, plot in PICTURES.items()},
+        drawn,
         _write_maps(command.out, found, settings),
     )
 
 
-COMMAND = Command("separate", _work, ("result.json", "log.json", *MAPS, *PICTURES, *KEPT))
+COMMAND = Command("separate", _work, ("result.json", *MAPS, *PICTURES, POSTERIOR, *KEPT))

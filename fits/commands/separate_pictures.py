@@ -19,7 +19,6 @@ from fits.plots import (
     spread,
     stokes_panels,
 )
-from fits.posterior_plots import plot_chains
 from fits.writing import two_digits, with_error
 from jaxsky.settings import Experiment
 
@@ -132,11 +131,3 @@ def plot_ratio(path: Path, found: Separation, settings: Experiment) -> None:
         )
         axes.ticklabel_format(axis="x", style="sci", scilimits=(-2, 3), useMathText=True)
         legend_below(axes, 2, fontsize=7)
-
-
-def plot_posterior(path: Path, found: Separation, settings: Experiment) -> bool:
-    """Samples of the posterior; returns False, without a picture, if there are none."""
-    if found.chain is None:
-        return False
-    plot_chains(path, {found.chain.method: found.chain}, found.data.truth, settings.title)
-    return True

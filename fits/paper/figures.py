@@ -3,11 +3,10 @@
 import re
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fits.commands.page import ResultTable
+from fits.commands.page import ResultTable, Section
 
 #: Titles, captions, what differs from the paper, and numbers of its text, by label.
 TEXTS: dict[str, Any] = tomllib.loads(
@@ -28,22 +27,16 @@ class Number(NamedTuple):
     paper: str = ""
 
 
-@dataclass(frozen=True)
-class PaperFigure:
-    """A figure or a table, by the paper's number ("Figure 1").
+class PaperFigure(NamedTuple):
+    """A figure or a table, by the paper's number ("Figure 1"), and the seconds that it took.
 
-    `differs` is a line on what differs from the paper, and why. The table is shown instead of the
-    picture, a file in the folder of the page, or below it. The paper's text gives the numbers.
+    The note of its section is on what differs from the paper, whose text gives the numbers.
     """
 
     label: str
-    title: str
-    caption: str
-    differs: str
-    picture: str | None = None
-    table: ResultTable | None = None
+    section: Section
     numbers: tuple[Number, ...] = ()
-    seconds: float | None = None
+    seconds: float = 0.0
 
 
 def filled(text: str, **words: Any) -> str:
@@ -71,6 +64,12 @@ def described(
     own = TEXTS[texts or label]
     published, otherwise = own.get("published", {}), own.get("otherwise", "not given")
     title, caption, differs = (filled(own[key], **words) for key in ("title", "caption", "differs"))
-    picture = picture_of(label) if table is None else None
+    section = Section(
+        f"{label}: {title}",
+        caption,
+        picture_of(label) if table is None else None,
+        table,
+        f"Differs from the paper: {differs}",
+    )
     said = [one._replace(paper=published.get(one.what, otherwise)) for one in numbers]
-    return PaperFigure(label, title, caption, differs, picture, table, tuple(said))
+    return PaperFigure(label, section, tuple(said))

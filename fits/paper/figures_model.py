@@ -7,7 +7,7 @@ from pathlib import Path
 import healpy
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import ArrayLike, Float
 
 from fits.commands.forecast import forecast
 from fits.commands.forecast_pictures import plot_b_modes
@@ -219,15 +219,12 @@ def figure_randomised(paper: PaperSky, picture: Path) -> PaperFigure:
         f"steeper by {-TILT:g}": partial(paper.with_small_scales, tilt=TILT),
     }
 
-    def Q_of(maps: Float[Array, "2 pix"]) -> Float[np.ndarray, " pix"]:
-        return np.asarray(maps[0], np.float32)
-
-    original = f"template, {layer.fwhm / 60:.2g}°"
-    panels = {original: Q_of(polarization_template(layer.maps, layer.fwhm, layer.fwhm, nside))}
+    original = partial(polarization_template, layer.maps, layer.fwhm, layer.fwhm, nside)
+    panels = {f"template, {layer.fwhm / 60:.2g}°": np.asarray(original()[0], np.float32)}
     for title, make in makers.items():
         (alm,) = make("synchrotron").alms
         beam = gaussian_beam(fwhm, lmax_of(alm))
-        panels[title] = Q_of(synthesis(alm * expand(beam), nside))
+        panels[title] = np.asarray(synthesis(alm * expand(beam), nside)[0], np.float32)
     template, *rest = [_disc(values, center, SIZE) for values in panels.values()]
     middle = float(template.mean())
     limit = color_limit(rest[0] - middle, 0.995)
@@ -360,9 +357,9 @@ def table_core(paper: PaperSky, picture: Path) -> PaperFigure:
     """Table 1: COrE."""
     channels = list(load_instrument("core"))
     header = ("Band [GHz]", *(f"{float(channel.center):g}" for channel in channels))
-    rows = (
+    rows = [
         ("Beam FWHM [arcmin]", *(f"{float(channel.fwhm):.1f}" for channel in channels)),
         ("Noise [µK_RJ arcmin]", *(f"{float(channel.noise):.2f}" for channel in channels)),
         ("Width [GHz]", *(f"{float(channel.width):.3g}" for channel in channels)),
-    )
+    ]
     return described("Table 1", table=ResultTable(header, rows))

@@ -7,6 +7,7 @@ import contextlib
 import ctypes
 import sys
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +18,7 @@ import jaxsky
 from fits.commands.console import print_written, replace_unprintable
 from fits.commands.data import data_commands
 from fits.commands.endings import print_error, prompt
-from fits.commands.run import DEFAULTS, run_command
+from fits.commands.run import DEFAULTS, Command, run_command
 from jaxsky.io.folders import cache_folder
 from jaxsky.programs import keep_programs
 
@@ -101,15 +102,13 @@ def _simulate(
     overwrite: Overwrite = False,
 ) -> None:
     """Simulate maps of the microwave sky as an experiment observes it."""
-    from fits.commands.simulate import simulate_command
+    from fits.commands.simulate import make_realisations
 
     if only is not None and only not in ONLY:
         raise ValueError(f"--only must be one of {', '.join(ONLY)}, not {only!r}.")
-    indices = range(first, first + nsims)
-    command = simulate_command(indices, only)
-    run_command(
-        command, settings_file, out, values, resume=resume, overwrite=overwrite, part=indices
-    )
+    command = Command("simulate", partial(make_realisations, only=only))
+    part = range(first, first + nsims)
+    run_command(command, settings_file, out, values, resume=resume, overwrite=overwrite, part=part)
 
 
 def _analysis(name: str) -> Callable[..., None]:

@@ -48,10 +48,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
         },
         "labels": fit.labels,
         "covariance": found.covariance,
-        "chi2": fit.chi2,
-        "dof": fit.dof,
-        "converged": fit.converged,
-        "message": fit.message,
+        **{key: getattr(fit, key) for key in ("chi2", "dof", "converged", "message")},
         "solver": {key: fit.details[key] for key in ("solver", "steps", "distance")},
         "pixels_with_small_probability": small,
         "cmb_noise_degradation": found.degradation,
@@ -80,13 +77,10 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
         },
         "simulations": len(simulated.theta),
     }
-    if found.chain is not None:
-        chain = found.chain
+    if (chain := found.chain) is not None:
         results["posterior"] = {
             "sampler": chain.method,
-            "interval_68": {
-                label: chain.of_row(chain.interval_68, label) for label in chain.labels
-            },
+            "interval_68": {n: chain.of_row(chain.interval_68, n) for n in chain.labels},
             "converged": chain.converged,
             "message": chain.message,
         }

@@ -2,14 +2,13 @@
 
 import statistics
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 
 import healpy
 import jax.numpy as jnp
 import numpy as np
 
-from fits.commands.run import Command, Report, Run
+from fits.commands.run import Report, Run
 from fits.plots import UNITS, color_limit, draw_map, draw_panels, draw_spectra, plain, spread
 from jaxsky import experiment, montecarlo
 from jaxsky.harmonics import analysis, power_spectrum
@@ -20,14 +19,6 @@ from jaxsky.settings import Experiment
 SHOWN, LMAX_SHOWN = 5, 1024
 #: Spectra are shown down to this fraction of the largest.
 DEPTH = 1e-7
-
-
-def simulate_command(indices: range, only: str | None = None) -> Command:
-    """The command that makes some realisations, of one thing only if that is asked for.
-
-    What is kept and what is replaced is seen to map by map.
-    """
-    return Command("simulate", partial(_work, indices=indices, only=only))
 
 
 def _restricted(settings: Experiment, only: str) -> Experiment:
@@ -42,7 +33,9 @@ def _restricted(settings: Experiment, only: str) -> Experiment:
     return settings.model_copy(update={"simulate": spec})
 
 
-def _work(settings: Experiment, command: Run, *, indices: range, only: str | None) -> Report:
+def make_realisations(settings: Experiment, command: Run, *, only: str | None) -> Report:
+    """Some realisations, of one thing only if that is asked for; kept or replaced map by map."""
+    indices = command.part
     if only is not None:
         settings = _restricted(settings, only)
     out, steps, overwrite = command.out, command.steps, command.overwrite

@@ -165,9 +165,9 @@ def _paper(
     overwrite: Overwrite = False,
 ) -> None:
     """Make the figures and tables of the paper again, and a page that shows them."""
-    from fits.commands.paper import paper_command
+    from fits.commands.paper import KEPT, report_figures
 
-    command = paper_command(only or ())
+    command = Command("paper", partial(report_figures, only=only or ()), (KEPT,))
     run_command(command, settings_file, out, values, resume=resume, overwrite=overwrite)
 
 

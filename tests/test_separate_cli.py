@@ -96,7 +96,7 @@ def test_maps_of_ones_own(folder, tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr()
     assert "dust.beta_dust, median of 2 regions" in printed.out
     names = {p.name for p in out.iterdir()}
-    assert names == {*COMMAND.results, "index.html", "log.txt"}
+    assert names == {*COMMAND.results, "index.html", "log.json", "log.txt"}
     for picture in out.glob("*.png"):
         assert picture.read_bytes().startswith(b"\x89PNG")
     result = json.loads((out / "result.json").read_text())
@@ -140,7 +140,7 @@ def test_multipoles_of_files(folder, tmp_path, monkeypatch, region):
         assert abs(found["best_fit"] - truth) < 5 * found["sigma"]
     assert not (out / "parameters.png").exists()
     names = {p.name for p in out.iterdir()}
-    assert names == {*COMMAND.results, "index.html", "log.txt"} - {
+    assert names == {*COMMAND.results, "index.html", "log.json", "log.txt"} - {
         "parameters.fits",
         "parameters.png",
     }

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from fits.commands.page import ResultTable, Row, Section, write_page
-from fits.commands.run import CIRCUMSTANCES, PAGE, Command, Report, Run
+from fits.commands.run import CIRCUMSTANCES, PAGE, Report, Run
 from fits.paper import figures_data, figures_model
 from fits.paper.figures import TEXTS, Impossible, PaperFigure, picture_of
 from fits.paper.sky import PaperSky
@@ -165,7 +165,8 @@ def _write_page(
     return shown
 
 
-def _work(settings: Experiment, command: Run, *, only: Sequence[str]) -> Report:
+def report_figures(settings: Experiment, command: Run, *, only: Sequence[str]) -> Report:
+    """Some figures, or all."""
     figures = make_figures(
         settings,
         command.out,
@@ -180,8 +181,3 @@ def _work(settings: Experiment, command: Run, *, only: Sequence[str]) -> Report:
     remark = f"{len(figures)} figures and tables ({command.steps.seconds:.1f} s)."
     page = [command.out / PAGE]
     return Report("", warnings=missing, written=page, remark=remark, page=False)
-
-
-def paper_command(only: Sequence[str]) -> Command:
-    """The command that makes some figures, or all."""
-    return Command("paper", partial(_work, only=only), (KEPT,))

@@ -129,7 +129,7 @@ class PaperSky:
 
     @property
     def sky_differs(self) -> str:
-        """The part of a line that says what the sky is, for an item that shows it."""
+        """The part of a line that says what the sky is, for a figure that shows it."""
         embedded = self.settings.sky.embedded
         if self.embedded and embedded is not None:
             return filled(WORDS["differs"]["model"], nside=embedded.nside)
@@ -141,7 +141,7 @@ class PaperSky:
 
     @property
     def maps_differ(self) -> str:
-        """The same for an item that shows observed maps."""
+        """The same for a figure that shows observed maps."""
         return filled(WORDS["differs"]["simulated"]) if self.simulated else self.sky_differs
 
     @cached_property

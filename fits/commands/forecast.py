@@ -253,8 +253,7 @@ def _numbers(found: Forecast, settings: Experiment) -> dict[str, Any]:
         "bins": {"first": spectra.edges[:-1], "last": [e - 1 for e in spectra.edges[1:]]},
         "foregrounds": {
             name: {
-                "EE": powers[0],
-                "BB": powers[1],
+                **dict(zip(FIELDS, powers, strict=True)),
                 "BB_law": found.laws[name]._asdict(),
                 "equal_r": found.equal_r[name],
             }
@@ -308,9 +307,8 @@ def forecast_warnings(found: Forecast) -> list[str]:
     errors, sky = found.errors, found.inputs.sky
     for name in errors.free:
         component, *field = name.split(".")
-        if component not in sky or not declared(type(sky[component]), field[0])["positive"]:
-            continue
-        if errors.sigma(name) > errors.fiducial[name]:
+        positive = component in sky and declared(type(sky[component]), field[0])["positive"]
+        if positive and errors.sigma(name) > errors.fiducial[name]:
             sentences.append(
                 f"{name}: the error is larger than the value; the Fisher matrix, good for small "
                 "errors, says only that this is not measured."

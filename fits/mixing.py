@@ -9,7 +9,7 @@ Names of parameters are those of the sky ("dust.beta_dust"), and of bands:
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -32,6 +32,12 @@ NOT_SPECTRAL = ("amplitude", "polarization_fraction", "nu_ref")
 CELLS = 512
 #: Relative error of interpolated laws.
 TOLERANCE = 1e-11
+
+
+def nominal(names: Iterable[str]) -> dict[str, float]:
+    """Values of parameters of bands that are as they should be, among some names."""
+    words = {name: name.split(".")[0] for name in names}
+    return {name: NOMINAL[word] for name, word in words.items() if word in NOMINAL}
 
 
 def spectral_names(sky: Sky) -> tuple[str, ...]:
@@ -64,7 +70,8 @@ class Mixing(eqx.Module):
     """Mixing matrices as a function of spectral parameters.
 
     A band with data in K_CMB is calibrated on the CMB: shifted or stretched, it shows the CMB as
-    before. In K_RJ it is calibrated on a source of constant antenna temperature.
+    before. In K_RJ it is calibrated on a source of constant antenna temperature, unless `on_cmb`:
+    then its data in K_CMB were converted for the band that is neither shifted nor stretched.
     """
 
     #: the laws, on a single pixel
@@ -74,12 +81,15 @@ class Mixing(eqx.Module):
     samples: Samples
     names: tuple[str, ...] = eqx.field(static=True)
     unit: str = eqx.field(static=True)
+    on_cmb: bool = eqx.field(static=True, default=False)
 
     @classmethod
-    def of(cls, sky: Sky, bands: Mapping[str, Bandpass], unit: str) -> "Mixing":
+    def of(
+        cls, sky: Sky, bands: Mapping[str, Bandpass], unit: str, on_cmb: bool = False
+    ) -> "Mixing":
         """With bands by name."""
         seen = tuple(bands.values())
-        return cls(sky, seen, stack_bands(seen), tuple(bands), unit)
+        return cls(sky, seen, stack_bands(seen), tuple(bands), unit, on_cmb)
 
     def band_parameters(self) -> tuple[str, ...]:
         """Names of the parameters of the bands."""
@@ -95,37 +105,44 @@ class Mixing(eqx.Module):
         given = [params.get(f"{kind}.{band}", NOMINAL[kind]) for band in self.names]
         return jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, given)))
 
-    def _moved(self, params: Mapping[str, Numeric]) -> Samples:
-        """Frequencies and weights of the bands, those with parameters shifted and stretched."""
-        samples = self.samples
-        for i, (name, band) in enumerate(zip(self.names, self.bandpasses, strict=True)):
-            if not {f"width.{name}", f"shift.{name}"} & set(params):
-                continue
-            band = band.stretched(params.get(f"width.{name}", 1.0))
-            band = band.shifted(params.get(f"shift.{name}", 0.0) * band.center)
-            missing = (0, samples.nu.shape[1] - band.nu.size)
-            samples = Samples(
-                samples.nu.at[i].set(jnp.pad(band.nu, missing, mode="edge")),
-                samples.quadrature.at[i].set(jnp.pad(band.quadrature, missing)),
-            )
-        return samples
+    def moved(self, params: Mapping[str, Numeric]) -> tuple[Bandpass, ...]:
+        """The bands, those with parameters shifted and stretched; the same if there are none."""
+        bands = self.bandpasses
+        for i, (name, band) in enumerate(zip(self.names, bands, strict=True)):
+            if {f"width.{name}", f"shift.{name}"} & set(params):
+                band = band.stretched(params.get(f"width.{name}", 1.0))
+                band = band.shifted(params.get(f"shift.{name}", 0.0) * band.center)
+                bands = (*bands[:i], band, *bands[i + 1 :])
+        return bands
 
-    def _calibrated(self, laws, samples, params):
-        """Rows of the matrix (band, component) in units of the data: amplitudes are uK."""
+    def _samples(self, bands: tuple[Bandpass, ...]) -> Samples:
+        return self.samples if bands is self.bandpasses else stack_bands(bands)
+
+    def factors(
+        self, bands: tuple[Bandpass, ...], params: Mapping[str, Numeric]
+    ) -> Float[Array, " band"]:
+        """What bands, moved as they are, show of 1 uK_RJ in the unit of the data."""
         size, kind = parse_unit(self.unit)
-        factor = jnp.asarray(1e-6 / size)
+        factor = 1e-6 / size * self.of_bands("gain", params)
+
+        def cmb(samples):
+            return jax.vmap(lambda band: average(cmb_derivative, band))(samples)
+
         if kind == "K_CMB":
-            factor = factor / jax.vmap(lambda b: average(cmb_derivative, b))(samples)[:, None]
-        return laws * factor * self.of_bands("gain", params)[:, None]
+            return factor / cmb(self._samples(bands))
+        if self.on_cmb and bands is not self.bandpasses:
+            return factor * cmb(self.samples) / cmb(self._samples(bands))
+        return factor
 
     def one(self, params: Mapping[str, Numeric]) -> Float[Array, "band component"]:
         """The matrix for parameters that are numbers."""
-        samples = self._moved(params)
+        bands = self.moved(params)
+        samples = self._samples(bands)
         laws = [
             jax.vmap(lambda band, c=c: average(c.sed, band))(samples)
             for c in self.laws(params).components.values()
         ]
-        return self._calibrated(jnp.stack(laws, axis=-1), samples, params)
+        return jnp.stack(laws, axis=-1) * self.factors(bands, params)[:, None]
 
     def _interpolated(self, params, cells) -> Float[Array, "cell band component"]:
         """The matrix in many cells; bands must not move."""
@@ -135,9 +152,8 @@ class Mixing(eqx.Module):
             nodes = choose_nodes(component, self.bandpasses, TOLERANCE)
             laws = band_seds(component, self.samples, nodes)
             columns.append(jnp.broadcast_to(laws, (cells, len(self.names))))
-        return jax.vmap(lambda laws, own: self._calibrated(laws, self.samples, own))(
-            jnp.stack(columns, axis=-1), params
-        )
+        factors = jax.vmap(lambda own: self.factors(self.bandpasses, own), axis_size=cells)(params)
+        return jnp.stack(columns, axis=-1) * factors[..., None]
 
     def __call__(
         self, params: Mapping[str, Float[Array, " cell"]], cells: int

@@ -37,7 +37,6 @@ MAP_HEIGHT = 1.85
 UNITS = {"uK_RJ": r"$\mu{\rm K}_{\rm RJ}$", "uK_CMB": r"$\mu{\rm K}_{\rm CMB}$"}
 #: What parameters of bands are called, and their unit.
 BAND_SYMBOLS = {
-    "calibration": ("g", ""),
     "gain": ("g", ""),
     "shift": (r"\Delta\nu/\nu", ""),
     "width": ("w", ""),

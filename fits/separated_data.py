@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from fits.common import prepared_maps
 from fits.fluctuations import Fluctuations, noise_alm
 from fits.inputs import Inputs, inputs_of, modelled_laws
-from fits.mixing import NOMINAL
+from fits.mixing import nominal
 from fits.multipoles import harmonic_coefficients, harmonic_likelihood
 from fits.noise import Noise, as_noise
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
@@ -234,8 +234,7 @@ def separation_data(settings: Experiment) -> PixelData | FullSkyData:
     inputs = inputs_of(settings, templates=False, foregrounds=True)
     truth = inputs.truth
     if truth is not None:  # bands are simulated as they are described
-        words = {name: name.split(".")[0] for name in free}
-        truth |= {name: NOMINAL[word] for name, word in words.items() if word in NOMINAL}
+        truth |= nominal(free)
     shared = {
         "sky": sky,
         "bands": {name: band.bandpass for name, band in inputs.bands.items()},

@@ -18,6 +18,7 @@ from fits.common import CommonMaps
 from fits.grid import grid_fit, grid_is_possible
 from fits.inputs import Inputs
 from fits.kept import fingerprint, kept_chain
+from fits.mixing import nominal
 from fits.optimize import best_fit
 from fits.posterior import chi2
 from fits.priors import Prior, priors_of
@@ -72,7 +73,10 @@ def known_truth(inputs: Inputs, fits: Sequence[RegionFit]) -> dict[str, float] |
     """The truth about the free parameters, if there is one."""
     if inputs.truth is None:
         return None
-    return {name: inputs.truth[name] for name in all_free(fits) if name in inputs.truth}
+    free = all_free(fits)
+    # Bands are simulated as they are described.
+    truth = inputs.truth | nominal(free)
+    return {name: truth[name] for name in free if name in truth}
 
 
 def settled(
@@ -119,14 +123,14 @@ def _fit_pixels(
     with at_key("free"):
         plain = prepared._replace(template_errors=None)
         diagonal = plain.likelihood(start, stokes=stokes, region=used, kind="diagonal")
-    like, dof_amplitudes = diagonal, None
+        like, dof_amplitudes = diagonal, None
+        exact = settings.fit.likelihood == "exact"
+        if exact or prepared.template_errors is not None:
+            kind = settings.fit.likelihood
+            make = partial(prepared.likelihood, stokes=stokes, region=used, kind=kind)
+            like = make(start) if prepared.template_errors is None else settled(make, start, priors)
     nothing = weightless(prepared, start, used, stokes)
     weighty = 1 - len(nothing) / len(prepared.bands)
-    exact = settings.fit.likelihood == "exact"
-    if exact or prepared.template_errors is not None:
-        kind = settings.fit.likelihood
-        make = partial(prepared.likelihood, stokes=stokes, region=used, kind=kind)
-        like = make(start) if prepared.template_errors is None else settled(make, start, priors)
     if exact:
         dof_amplitudes = round(like.residuals(start).size * weighty) - len(start)
     results: dict[str, FitResult] = {}

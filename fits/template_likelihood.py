@@ -12,8 +12,11 @@ dict of parameters, so the grid, the optimiser and the sampler share one definit
 Both exist on inner products formed once (`TemplateLikelihood`) and, for spectral parameters that
 vary from pixel to pixel, pixel by pixel (`PixelLikelihood`), and agree where both apply.
 
-Names of parameters are those of the sky ("dust.beta_dust"), "calibration.<band>", a factor on
-the model in a band, and "offset.<band>.<stokes>", a constant added to it [uK_RJ].
+Names of parameters are those of the sky ("dust.beta_dust"), those of bands (`fits.mixing`), which
+are calibrated on the CMB, and "offset.<band>.<stokes>", a constant added to the model [uK_RJ].
+
+Where an angle is free, Q of a band shows U of the templates, too, and its U their Q: they are
+templates like the others then, behind them.
 """
 
 import dataclasses
@@ -50,10 +53,17 @@ class SkyLikelihood(Likelihood):
     mixing: Mixing
     #: Stokes parameters of the maps
     stokes: str = eqx.field(static=True)
+    #: whether angles of bands may be free
+    angles: bool = eqx.field(static=True)
 
-    def calibration(self, params: Mapping[str, Array]) -> Float[Array, " band"]:
-        """Calibration factors, 1 unless given."""
-        return jnp.array([params.get(f"calibration.{band}", 1.0) for band in self.mixing.names])
+    def rotated(
+        self, seen: Float[Array, "band stokes x"], params: Mapping[str, Array]
+    ) -> tuple[Float[Array, "band stokes x"], Float[Array, "band stokes x"]]:
+        """What Stokes parameters of rotated bands show of the same of the sky, and of the other."""
+        sign = np.array([{"I": 0, "Q": -1, "U": 1}[s] for s in self.stokes])
+        angle = 2 * jnp.deg2rad(self.mixing.of_bands("angle", params))
+        angle = (angle[:, None] * sign)[..., None]
+        return jnp.cos(angle) * seen, jnp.sin(angle) * _swapped(seen)
 
     def offset(self, params: Mapping[str, Array]) -> Float[Array, "band stokes"]:
         """Offsets [uK_RJ], 0 unless given."""
@@ -65,7 +75,7 @@ class SkyLikelihood(Likelihood):
         if not params:
             raise ValueError("Argument `start` must name at least one free parameter.")
         names = self.mixing.names
-        bands = [f"calibration.{b}" for b in names]
+        bands = [*self.mixing.band_parameters()]
         bands += [f"offset.{b}.{s}" for b in names for s in self.stokes]
         of_sky = [n for n in parameter_names(self.mixing.sky) if not n.endswith(".amplitude")]
         for name, value in params.items():
@@ -73,6 +83,8 @@ class SkyLikelihood(Likelihood):
                 raise unknown_parameter(name, (*of_sky, *bands))
             if jnp.shape(value) != ():
                 raise ValueError(f"Free parameter {name!r} must be a number, not a map.")
+            if name.startswith("angle.") and not self.angles:
+                raise ValueError(f"Parameter {name!r} must be free in the likelihood already.")
         return {name: as_array(name, value).astype(float) for name, value in params.items()}
 
 
@@ -88,9 +100,10 @@ class TemplateLikelihood(SkyLikelihood):
 
     def coefficients(self, params: Mapping[str, Array]) -> Float[Array, "band stokes template"]:
         """What each template is multiplied with in each band."""
-        laws = self.mixing.one(params) * self.calibration(params)[:, None]
+        laws = self.mixing.one(params)[:, None]
         components = self.mixing.laws(params).components.values()
-        return laws[:, None] * jnp.concatenate([c.template for c in components], axis=1)
+        seen = laws * jnp.concatenate([c.template for c in components], axis=1)
+        return jnp.concatenate(self.rotated(seen, params), axis=-1) if self.angles else seen
 
     def residuals(self, params):
         coefficients = self.coefficients(params)
@@ -110,9 +123,12 @@ class PixelLikelihood(SkyLikelihood):
     whitening: Float[Array, "row row"] | None
 
     def residuals(self, params):
-        bands = self.mixing.bandpasses
+        bands = self.mixing.moved(params)
         seen = observe_components(self.mixing.laws(params), bands, nodes=self.nodes)
-        model = sum(seen.values()) * self.calibration(params)[:, None, None]
+        model = sum(seen.values()) * self.mixing.factors(bands, params)[:, None, None]
+        if self.angles:
+            same, other = self.rotated(model, params)
+            model = same + other
         model = model + self.offset(params)[..., None]
         if self.rows is None:
             return ((self.data - model) * self.root_weights).ravel()
@@ -196,23 +212,34 @@ def likelihood(
     if not stokes or set(stokes) - set(labels):
         raise ValueError(f"Argument `stokes` must be among {labels!r}, not {stokes!r}.")
     keep = np.array([labels.index(s) for s in stokes])
-    mixing = Mixing.of(sky, bands, "uK_RJ")
-    params = SkyLikelihood({}, 0, mixing, labels).check(start)
+    mixing = Mixing.of(sky, bands, "uK_RJ", on_cmb=True)
+    angles = [name for name in start if name.startswith("angle.")]
+    params = SkyLikelihood({}, 0, mixing, labels, bool(angles)).check(start)
     offsets = [name for name in params if name.startswith("offset.")]
-    for name in offsets:
-        if name[-1] not in stokes:
+    for name in (*offsets, *angles):
+        if name[-1] not in stokes if name in offsets else stokes == "I":
             raise ValueError(f"Parameter {name!r} has no effect on Stokes {stokes}.")
     sky = mixing.laws({n: value for n, value in params.items() if not n.endswith(OFFSET)})
     weights = _weights(data, sigma)
     if pixelwise or any(leaf.ndim == 1 for leaf in jax.tree.leaves(sky)):
         mixing = dataclasses.replace(mixing, sky=sky)
-        return _on_pixels(params, mixing, data, weights, labels, keep, covariance_of)
+        like = SkyLikelihood(params, 0, mixing, labels, bool(angles))
+        return _on_pixels(like, data, weights, keep, covariance_of)
 
+    if angles and template_errors is not None:
+        raise ValueError(
+            f"Parameter {angles[0]!r} cannot be free where noise of templates is given, as it is "
+            "not corrected for in bands that are rotated; leave out one of the two."
+        )
     mixing = dataclasses.replace(mixing, sky=unit_sky(sky, len(labels)))
     templates = jnp.stack([c.amplitude for c in sky.components.values()])
+    if angles:
+        templates = jnp.concatenate([templates, _swapped(templates)])
     products = np.asarray(gram(data, templates, weights))
     values = int(np.sum(np.asarray(weights)[:, keep] > 0))
-    like = TemplateLikelihood(params, jnp.asarray(values), mixing, labels, jnp.zeros((0, 0)))
+    like = TemplateLikelihood(
+        params, jnp.asarray(values), mixing, labels, bool(angles), jnp.zeros((0, 0))
+    )
     if covariance_of is None and template_errors is None:
         matrix = _matrix(np.asarray(square_root(products[:, keep])), keep, len(labels))
         return dataclasses.replace(like, matrix=matrix)
@@ -241,6 +268,11 @@ def likelihood(
     constant = jnp.zeros_like(matrix[:1]).at[0, keep[0] * products.shape[-1]]
     unexplained = constant.set(np.sqrt(np.sum(1 / np.linalg.inv(left)[..., 0, 0])))
     return dataclasses.replace(like, matrix=jnp.concatenate([matrix, unexplained]))
+
+
+def _swapped(maps: Float[Array, "*maps stokes x"]) -> Float[Array, "*maps stokes x"]:
+    """U in place of Q and Q in place of U; in place of I, which no angle changes, some other."""
+    return maps[..., [-2, -1, -2][-maps.shape[-2] :], :]
 
 
 @jax.jit
@@ -314,8 +346,9 @@ def _whitening(covariance: Float[np.ndarray, "row row"]) -> Float[np.ndarray, "r
     return scipy.linalg.solve_triangular(root, np.diag(1 / scale), lower=True)
 
 
-def _on_pixels(params, mixing, data, weights, labels, keep, covariance_of):
+def _on_pixels(like, data, weights, keep, covariance_of):
     """The likelihood of each pixel; its rows are the components' maps at the start values."""
+    mixing, params = like.mixing, like.start
     at_start = mixing.laws({n: value for n, value in params.items() if n.endswith(OFFSET)})
     used = jnp.zeros_like(weights).at[:, keep].set(weights[:, keep])
     data = jnp.where(used > 0, data, 0)
@@ -326,6 +359,8 @@ def _on_pixels(params, mixing, data, weights, labels, keep, covariance_of):
     values = jnp.sum(used > 0)
     if covariance_of is not None:
         maps = list(observe_components(at_start, mixing.bandpasses, nodes=nodes).values())
+        if like.angles:
+            maps += [_swapped(one) for one in maps]
         if any(name.startswith("offset.") for name in params):
             maps.append(jnp.ones_like(data))
         rows = _one_stokes_each(_weighted(jnp.stack(maps, axis=1), weights))
@@ -334,5 +369,5 @@ def _on_pixels(params, mixing, data, weights, labels, keep, covariance_of):
         kept = (keep[:, None] * len(maps) + np.arange(len(maps))).ravel()
         rows = rows[:, kept]
         values = jnp.array(len(whitening))
-    root = jnp.sqrt(used)
-    return PixelLikelihood(params, values, mixing, labels, data, root, nodes, rows, whitening)
+    more = data, jnp.sqrt(used), nodes, rows, whitening
+    return PixelLikelihood(params, values, mixing, like.stokes, like.angles, *more)

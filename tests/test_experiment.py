@@ -681,7 +681,7 @@ ALTERNATIVES = {
     "[cmb]": "cosmology spectra",
     "[common]": "mask components maps",
     "[regions]": "clean",
-    "[free]": "calibration.44 dust.beta_dust",
+    "[free]": "gain.44 angle.44 dust.beta_dust",
     "[fixed]": "dust.beta_dust",
     "[truth]": "synchrotron.curvature",
     "[simulate]": "nside include small_scales_seed leakage",

@@ -63,7 +63,7 @@ def test_parameters_are_recovered_without_noise():
 
 def test_covariance_is_the_inverse_hessian_of_a_linear_fit():
     sky, data, sigma = problem()
-    names = {"calibration.44": 1.0, "calibration.70": 1.0}
+    names = {"gain.44": 1.0, "gain.70": 1.0}
     found = best_fit(likelihood(sky, BANDS, data, sigma, names), names)
     model = np.asarray(observe(sky, list(BANDS.values())))
     information = np.sum((model / np.asarray(sigma)) ** 2, axis=(1, 2))
@@ -84,7 +84,7 @@ def test_fits_do_not_depend_on_units():
 
 def test_a_gaussian_prior_pulls_by_its_weight():
     sky, data, sigma = problem()
-    name = "calibration.44"
+    name = "gain.44"
     like = likelihood(sky, BANDS, data, sigma, {name: 1.0})
     free = best_fit(like, {name: 1.0})
     prior = Gaussian(free.best_fit[name] + 1.0, free.sigma[name])
@@ -148,7 +148,7 @@ def test_an_optimum_at_the_edge_of_a_prior_is_reported(like):
 
 def test_a_parameter_without_effect_is_reported():
     sky, data, sigma = problem(sky=Sky({"dust": Dust(problem()[0]["dust"].amplitude)}))
-    start = {"dust.nu_ref": 353.0, "calibration.44": 1.0, "calibration.70": 1.0}
+    start = {"dust.nu_ref": 353.0, "gain.44": 1.0, "gain.70": 1.0}
     like = likelihood(sky, BANDS, data, sigma, start)
     with pytest.raises(FitError, match=r"do not determine .*dust.nu_ref: parameters are degen"):
         best_fit(like, start)
@@ -156,7 +156,7 @@ def test_a_parameter_without_effect_is_reported():
 
 def test_a_grid_needs_one_or_two_parameters_with_ranges(like):
     with pytest.raises(ValueError, match=r"one or two free parameters, not 3"):
-        grid_fit(like, START | {"calibration.44": 1.0}, priors=PRIORS)
+        grid_fit(like, START | {"gain.44": 1.0}, priors=PRIORS)
     with pytest.raises(ValueError, match=r"uniform prior for 'synchrotron.beta_syn'"):
         grid_fit(like, START, priors={"dust.beta_dust": Uniform(1, 2)})
 

@@ -36,7 +36,7 @@ def test_any_name_is_drawn(tmp_path, name):
     draw_title(figure, f"{name}\n{name}")
     axes.set_title(plain(f"{name}: Q") + r", $\chi^2$")
     axes.set_xlabel(f"${in_formula(name)}$")
-    axes.set_ylabel(f"${label(f'calibration.{name}')}$, ${label(f'{name}.beta_dust')}$")
+    axes.set_ylabel(f"${label(f'gain.{name}')}$, ${label(f'{name}.beta_dust')}$")
     axes.plot([0, 1], label=plain(name))
     axes.legend(handles=axes.lines)
     save(figure, tmp_path / "figure.png")
@@ -93,7 +93,7 @@ def test_titles_are_as_wide_as_the_figure(width):
 
 
 def test_chains_of_any_name_are_drawn(tmp_path):
-    free = ("dust.$x_$", "calibration.44_%")
+    free = ("dust.$x_$", "gain.44_%")
     chain = np.random.default_rng(0).normal(size=(200, 8, 2))
     result = FitResult(
         "mcmc",

@@ -128,7 +128,7 @@ def test_names_that_are_long_dotted_or_taken(tmp_path, text):
     refused(tmp_path, words, text, band=long)
     refused(tmp_path, f"sky.{long}: a name has at most 40", text, component=long)
     refused(tmp_path, "sky.a.b: a name consists of", text, component="a.b")
-    taken = ["noise", "Total", "residual", "r", "A_lens", "calibration", "offset", "center"]
+    taken = ["noise", "Total", "residual", "r", "A_lens", "offset", "center"]
     for name in (*taken, "gain", "shift", "width", "angle", "cmb", "CMB"):
         words = f"sky.{name}: the name {name!r} has a meaning of its own in results"
         refused(tmp_path, words, text, component=name)

@@ -42,14 +42,14 @@ def test_settings_that_cannot_work_are_refused(tmp_path, kind, at, value):
 def test_what_a_command_leaves_out_of_free_parameters_is_said(tmp_path):
     free = {
         "dust.beta_dust": {"uniform": [0.5, 2.5], "regions": {"nside": 2}},
-        "calibration.44": {"gaussian": [1.0, 0.1]},
+        "offset.44.Q": {"gaussian": [1.0, 0.1]},
         "dust.T_dust": {},
     }
     settings = load(written(tmp_path / "settings.toml", {"free": free}))
     said = {name: settings.left_out(name) for name in ("fit", "separate", "forecast")}
     assert [len(sentences) for sentences in said.values()] == [1, 1, 3]
     assert "jaxsky fit does not have regions of parameters: dust.beta_dust." in said["fit"][0]
-    assert "jaxsky separate does not have them: calibration.44." in said["separate"][0]
+    assert "jaxsky separate does not have them: offset.44.Q." in said["separate"][0]
     assert "jaxsky forecast does not have uniform ones: dust.beta_dust." in said["forecast"][2]
     with pytest.raises(SettingsError, match=r"^free\.dust\.T_dust: start is missing\.$"):
         settings.start("fit")

@@ -12,7 +12,7 @@ from fits.regions import region_masks
 from fits.spectral_index import RegionFit, all_free, fit_regions, known_truth
 from fits.template_noise import unknown_noise
 from fits.writing import with_errors
-from jaxsky.settings import Experiment
+from jaxsky.settings import WORDS, Experiment
 
 #: A fit with a smaller probability to exceed its chi^2 is pointed out.
 UNLIKELY = 0.01
@@ -81,8 +81,8 @@ def fit_numbers(
 
 
 def _short_names(names: Sequence[str]) -> list[str]:
-    """Names without their component where that leaves them different."""
-    short = [name.split(".", 1)[1] for name in names]
+    """Names without their component where that leaves them different; those of bands are whole."""
+    short = [n if n.split(".")[0] in WORDS else n.split(".", 1)[1] for n in names]
     return [s if short.count(s) == 1 else name for name, s in zip(names, short, strict=True)]
 
 

@@ -25,4 +25,4 @@ from jaxsky.settings.toml import (
     named_files,
     of_file,
 )
-from jaxsky.settings.types import SettingsError, check_signs
+from jaxsky.settings.types import WORDS, SettingsError, check_signs

@@ -297,7 +297,7 @@ class Experiment(SettingsTable):
         return {
             name: one
             for name, one in self.free.items()
-            if WORDS.get(name.split(".")[0], command) == command
+            if command in WORDS.get(name.split(".")[0], [command])
         }
 
     def leaks(self) -> list[str]:

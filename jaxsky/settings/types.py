@@ -27,10 +27,10 @@ T = TypeVar("T")
 LONGEST = 40
 #: First parts of free parameters that are no components, and the commands that have them.
 WORDS = {
-    "calibration": "fit", "offset": "fit",
-    "gain": "separate", "shift": "separate", "width": "separate", "angle": "separate",
-    "r": "forecast", "A_lens": "forecast",
-}  # fmt: skip
+    "offset": ("fit",),
+    **dict.fromkeys(("gain", "shift", "width", "angle"), ("fit", "separate")),
+    **dict.fromkeys(("r", "A_lens"), ("forecast",)),
+}
 #: What else is called by a name in results and columns.
 RESERVED = ("cmb", "noise", "total", "residual", "center", "embedded", *map(str.lower, WORDS))
 

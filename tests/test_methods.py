@@ -150,7 +150,7 @@ def test_a_parameter_without_effect_is_reported():
     sky, data, sigma = problem(sky=Sky({"dust": Dust(problem()[0]["dust"].amplitude)}))
     start = {"dust.nu_ref": 353.0, "gain.44": 1.0, "gain.70": 1.0}
     like = likelihood(sky, BANDS, data, sigma, start)
-    with pytest.raises(FitError, match="determine dust.nu_ref, gain.*: parameters are degen"):
+    with pytest.raises(FitError, match=r"determine dust.nu_ref, gain.*: parameters are degen"):
         best_fit(like, start)
 
 

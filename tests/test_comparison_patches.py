@@ -92,7 +92,7 @@ def test_a_template_alone(inputs, tmp_path):
     fit = template_patches(maps, 0.0)
     expected = fit_patches(maps, prepare_patches(paper_patches(NSIDE), np.ones(2 * NSIDE + 1)))
     np.testing.assert_allclose(fit.A, expected.A)
-    plot_template_patches(tmp_path / "patches.png", fit, "dust")
+    plot_template_patches(tmp_path / "patches.png", fit, ["A", "alpha"], "dust")
     assert (tmp_path / "patches.png").stat().st_size > 10_000
 
 

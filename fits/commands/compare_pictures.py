@@ -220,11 +220,7 @@ def plot_patches(path: Path, patches: PatchComparison, title: str) -> None:
     _plot_patch_pairs(path, series, "model", "observed", heads, title)
 
 
-def plot_template_patches(path: Path, fit: PatchFits, title: str) -> None:
-    """A and alpha of the patches of one map, BB against EE."""
-    both = np.asarray(fit.detected.all(axis=1))
-    EE, BB = np.median(fit.alpha[both], axis=0)
-    ratio = f"median BB / EE: {np.median(fit.A[both, 1] / fit.A[both, 0]):.2f}"
-    heads = [ratio, f"median: EE {EE:.2f}, BB {BB:.2f}"]
-    series = [("EE and BB", both, (fit, 0), (fit, 1))]
+def plot_template_patches(path: Path, fit: PatchFits, heads: Sequence[str], title: str) -> None:
+    """A and alpha of the patches of one map, BB against EE, each with its head."""
+    series = [("EE and BB", np.all(fit.detected, axis=1), (fit, 0), (fit, 1))]
     _plot_patch_pairs(path, series, *FIELDS, heads, f"{title}\npatches of 400 square degrees")

@@ -50,8 +50,8 @@ COMMAND = Command("fit", _work, ("result.json", *PICTURES, CHAINS))
 
 def _result(fit: RegionFit, method: str) -> dict[str, Any]:
     result = fit.results[method]
-    known, kept = result.to_dict(), ("free", "best_fit", "interval_68", "covariance", "converged")
-    numbers = {key: known[key] for key in (*kept, "message")}
+    kept = ("free", "best_fit", "interval_68", "covariance", "converged", "message")
+    numbers = {key: getattr(result, key) for key in kept}
     numbers |= {"chi2": fit.chi2[method], "dof": fit.dof}
     if fit.dof_amplitudes is not None:
         numbers |= {

@@ -28,7 +28,7 @@ DEFAULTS = Path(__file__).parents[1] / "defaults"
 class Report(NamedTuple):
     """What a command has found: said on the terminal, and shown on a page unless `page` is False.
 
-    `numbers` go to the first file of the command's results, with the description, next to a log.
+    `numbers` go to the first file of the command's results, with description and warnings.
     `pictures` are names of files, each with a function and what it takes after the path; it returns
     False if there is nothing to draw. `written` are other files.
     """
@@ -71,7 +71,7 @@ class Run(NamedTuple):
 class Command(NamedTuple):
     """What a command is; its name is also that of the settings that it takes without a file.
 
-    `work` calls `Run.begin` before it writes; `results` are patterns of what is in the folder then.
+    `work` calls `Run.begin` before it writes; `results` are patterns of all files but the logs.
     """
 
     name: str

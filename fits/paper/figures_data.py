@@ -160,14 +160,12 @@ def _template_patches(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 10 without a band to compare with: BB against EE of the dust."""
     dust = paper.template("dust")
     found = template_patches(dust.maps, dust.fwhm)
-    pictures.plot_template_patches(picture, found, paper.settings.title)
     both = found.detected.all(axis=1)
     slopes = ", ".join(f"{slope:.2f}" for slope in np.median(found.alpha[both], axis=0))
-    ratio = np.median(found.A[both, 1] / found.A[both, 0])
-    numbers = [
-        Number("median A of BB / EE", f"{ratio:.2f}"),
-        Number("median alpha, EE, BB", slopes),
-    ]
+    ratio = f"{np.median(found.A[both, 1] / found.A[both, 0]):.2f}"
+    heads = f"median BB / EE: {ratio}", f"median of EE, BB: {slopes}"
+    pictures.plot_template_patches(picture, found, heads, paper.settings.title)
+    numbers = [Number("median A of BB / EE", ratio), Number("median alpha, EE, BB", slopes)]
     texts, sky = "Figure 10 of the template", paper.sky_differs
     return described("Figure 10", numbers, texts=texts, sky=sky)
 

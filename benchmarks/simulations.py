@@ -99,7 +99,7 @@ class _Beside:
     def __init__(self, folder: Path, nside: int, varying: bool) -> None:
         folder.mkdir()
         _write_inputs(folder, nside)
-        self.folder, self.names = folder, load_instrument("core").names
+        self.folder, self.names = folder, tuple(load_instrument("core"))
         self.settings = _write_settings(folder, nside, peer.FWHM, varying=varying)
         self.options = [] if varying else ["--constant"]
         self.runs = 0
@@ -237,8 +237,8 @@ def nside_2048(quick: bool) -> list[Row]:
     nside, template, finest = (128, 64, 60.0) if quick else (2048, 512, 3.0)
     small = (20, 60) if quick else (100, 600)
     bands = "".join(
-        f'[[bands]]\nname = "{c.name}"\ninstrument = "core"\nfwhm = {max(float(c.fwhm), finest)}\n'
-        for c in load_instrument("core")
+        f'[[bands]]\nname = "{n}"\ninstrument = "core"\nfwhm = {max(float(c.beam), finest)}\n'
+        for n, c in load_instrument("core").items()
     )
     scales = "".join(
         f"[sky.{name}.small_scales]\nEE = {list(small)}\nBB = {list(small)}\n"

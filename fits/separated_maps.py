@@ -355,10 +355,8 @@ def separate(
         if not isinstance(instrument, Instrument):
             raise ValueError("Argument `noise` is missing: the bands do not say what they have.")
         pixel = healpy.nside2resol(healpy.npix2nside(data.shape[-1]), arcmin=True)
-        levels = [
-            one.noise * one.band().conversion(one.noise_unit, unit) / pixel for one in instrument
-        ]
-        noise = np.array(levels)
+        factors = [band.conversion("uK_RJ", unit) for band in instrument.bands().values()]
+        noise = np.array([c.noise for c in instrument.values()]) * np.array(factors) / pixel
     bands = instrument.bands() if isinstance(instrument, Instrument) else instrument
     like = spectral_likelihood(sky, bands, data, noise, start, unit=unit)
     fit = best_fit(like)

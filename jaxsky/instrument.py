@@ -1,125 +1,33 @@
-"""An experiment as a list of channels: band, beam and noise, with presets as data."""
+"""Instruments as data: bands, beams and noise of channels."""
 
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
-import numpy as np
+import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxsky.bandpass import Bandpass
-from jaxsky.checks import Parameter, as_number, check_positive, is_concrete
 from jaxsky.observation import ObservedBand
-from jaxsky.printed import Printed, shown
-from jaxsky.units import parse_unit
+from jaxsky.printed import Printed
 
 
-class Channel(Printed, eqx.Module):
-    """A channel: a top-hat band [GHz], a Gaussian beam [arcmin], white noise of Q and U.
+class Instrument(Printed, dict[str, ObservedBand]):
+    """Channels by name, which print as a table."""
 
-    The unit of the noise [noise_unit arcmin] is one of temperature in `jaxsky.units`.
-    """
+    title = ""
 
-    name: str = eqx.field(static=True)
-    center: Parameter
-    width: Parameter
-    fwhm: Parameter
-    noise: Parameter
-    noise_unit: str = eqx.field(static=True, default="uK_CMB")
-
-    def __post_init__(self) -> None:
-        for name in ("center", "width", "fwhm", "noise"):
-            setattr(self, name, as_number(name, getattr(self, name), positive=True))
-        if is_concrete(self.center) and is_concrete(self.width):
-            lowest = np.asarray(self.center) - np.asarray(self.width) / 2
-            check_positive("center - width / 2", lowest)
-        parse_unit(self.noise_unit)
+    def bands(self) -> dict[str, Bandpass]:
+        """The bandpasses by name."""
+        return {name: channel.band for name, channel in self.items()}
 
     def summary(self):
-        units = {"center": "GHz", "width": "GHz", "fwhm": "arcmin"}
-        units["noise"] = f"{self.noise_unit} arcmin"
-        return f"Channel {self.name}", [(k, shown(getattr(self, k), u)) for k, u in units.items()]
-
-    def band(self, samples: int = 51) -> Bandpass:
-        """The top-hat band; see `Bandpass.top_hat`."""
-        return Bandpass.top_hat(self.center, self.width, samples=samples)
-
-
-class Instrument(Printed, eqx.Module):
-    """Channels in order, looked up by their names, which differ.
-
-    Examples
-    --------
-    >>> planck = load_instrument("planck").select(["30", "353"])
-    >>> planck.names, f"{planck['353'].center:.1f}"
-    (('30', '353'), '361.3')
-    """
-
-    name: str = eqx.field(static=True)
-    channels: Sequence[Channel]
-
-    def __post_init__(self) -> None:
-        self.channels = tuple(self.channels)
-        for i, channel in enumerate(self.channels):
-            if not isinstance(channel, Channel):
-                raise TypeError(
-                    f"Entry {i} of `channels` must be a Channel, not {type(channel).__name__}."
-                )
-        if not self.channels:
-            raise ValueError("Argument `channels` must have at least one channel.")
-        if len(set(self.names)) < len(self.names):
-            raise ValueError(f"Channels must have different names, but are {list(self.names)}.")
-
-    def summary(self):
-        table = [dict(channel.summary()[1]) for channel in self]
-        rows = [("channel", *table[0])]
-        rows += [(c.name, *values.values()) for c, values in zip(self, table, strict=True)]
-        return f"Instrument {self.name}", rows
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the channels."""
-        return tuple(channel.name for channel in self.channels)
-
-    def __getitem__(self, name: str) -> Channel:
-        try:
-            return self.channels[self.names.index(name)]
-        except ValueError:
-            known = ", ".join(self.names)
-            raise KeyError(f"{self.name} has no channel {name!r}; it has {known}.") from None
-
-    def __iter__(self) -> Iterator[Channel]:
-        return iter(self.channels)
-
-    def __len__(self) -> int:
-        return len(self.channels)
-
-    def select(self, names: Sequence[str]) -> "Instrument":
-        """The instrument with these channels only, in this order; KeyError for an unknown one."""
-        if isinstance(names, str):
-            raise TypeError(f"Argument `names` must be a list of names, not the string {names!r}.")
-        return Instrument(self.name, [self[name] for name in names])
-
-    def bands(self, samples: int = 51) -> dict[str, Bandpass]:
-        """The top-hat bands of all channels by name; see `Bandpass.top_hat`."""
-        return {channel.name: channel.band(samples) for channel in self.channels}
-
-    def observed(
-        self, target: Array | float | None = None, samples: int = 51
-    ) -> dict[str, ObservedBand]:
-        """All channels by name as `Observation` takes them, with noise in uK_RJ arcmin.
-
-        Target is the common beam of the maps [arcmin]; None leaves each its own.
-        """
-        found = {}
-        for c, band in zip(self, self.bands(samples).values(), strict=True):
-            noise = c.noise * band.conversion(c.noise_unit, "uK_RJ")
-            found[c.name] = ObservedBand(band, c.fwhm, target, noise)
-        return found
+        table = [dict(channel.summary()[1]) for channel in self.values()]
+        rows = [(name, *row.values()) for name, row in zip(self, table, strict=True)]
+        return f"Instrument {self.title}", [("channel", *table[0]), *rows]
 
 
 @cache
@@ -127,32 +35,52 @@ def _presets() -> dict[str, dict[str, Any]]:
     return tomllib.loads((files("jaxsky") / "instruments.toml").read_text())
 
 
-def load_instrument(name: str) -> Instrument:
-    """An instrument of `instruments.toml`, where the source of every figure is given.
+def load_instrument(
+    name: str,
+    channels: Sequence[str] | None = None,
+    *,
+    target: Array | float | None = None,
+    samples: int = 51,
+) -> Instrument:
+    """The channels of an instrument by name, as `Observation` takes them.
+
+    Each has a top-hat band, a Gaussian beam and white noise of Q and U [uK_RJ arcmin], with the
+    figures of `instruments.toml`, where the source of every one is given.
 
     Parameters
     ----------
     name : "planck", "wmap", "core" or "litebird"
+    channels : names of those that are wanted, in this order; by default all
+    target : common beam of the maps [arcmin]; None leaves each its own
+    samples : of each band; see `Bandpass.top_hat`
 
     Raises
     ------
     KeyError
-        If the name is unknown; lists the known ones.
+        If a name is unknown; lists the known ones.
+    TypeError
+        If `channels` is a string.
+
+    Examples
+    --------
+    >>> planck = load_instrument("planck", ["353", "30"])
+    >>> list(planck), f"{planck['353'].band.center:.1f}"
+    (['353', '30'], '361.3')
     """
-    presets = _presets()
-    if name not in presets:
-        raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(presets)}.")
-    channels = [
-        Channel(
-            band["name"],
-            **band["bandpass"],
-            fwhm=band["fwhm"],
-            noise=band["noise"]["level"],
-            noise_unit=band["noise"].get("unit", "uK_CMB"),
+    if name not in _presets():
+        raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(_presets())}.")
+    if isinstance(channels, str):
+        raise TypeError(
+            f"Argument `channels` must be a list of names, not the string {channels!r}."
         )
-        for band in presets[name]["bands"]
-    ]
-    return Instrument(presets[name]["title"], channels)
+    found = Instrument()
+    found.title = _presets()[name]["title"]
+    for table in band_tables(name, channels):
+        band = Bandpass.top_hat(**table["bandpass"], samples=samples)
+        noise = table["noise"]
+        level = noise["level"] * band.conversion(noise.get("unit", "uK_CMB"), "uK_RJ")
+        found[table["name"]] = ObservedBand(band, jnp.asarray(table["fwhm"]), target, level)
+    return found
 
 
 def band_tables(

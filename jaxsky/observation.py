@@ -30,6 +30,7 @@ from jaxsky.harmonics import (
 )
 from jaxsky.interpolation import Terms, choose_terms, term, term_weights
 from jaxsky.keys import stream
+from jaxsky.printed import Printed, shown
 from jaxsky.small_scales import SmallScales, continue_templates
 
 #: Types of numbers by the name of their precision.
@@ -57,7 +58,7 @@ class Source(eqx.Module):
     correlated_with: str | None = eqx.field(static=True, default=None)
 
 
-class ObservedBand(eqx.Module):
+class ObservedBand(Printed, eqx.Module):
     """How a band is observed.
 
     Parameters
@@ -75,6 +76,18 @@ class ObservedBand(eqx.Module):
     target: Float[Array, ""] | float | None = None
     noise: Float[Array, ""] | Float[Array, "stokes stokes pix"] | float | None = None
     diagonal: bool = eqx.field(static=True, default=False)
+
+    def summary(self):
+        beam, noise = self.beam, "none" if self.noise is None else "a covariance"
+        if self.noise is not None and not jnp.ndim(self.noise):
+            noise = shown(self.noise, "uK_RJ arcmin")
+        rows = [
+            ("center", shown(self.band.center, "GHz")),
+            ("width", shown(self.band.nu[-1] - self.band.nu[0], "GHz")),
+            ("beam", "a table b_l" if jnp.ndim(beam) else shown(beam, "arcmin")),
+            ("noise", noise),
+        ]
+        return "Observed band", rows
 
     @property
     def map_beam(self) -> Float[Array, ""] | Float[Array, " ell"] | float:

@@ -287,7 +287,7 @@ def test_laws_that_vary_and_coarse_masks(folder):
 
 def test_settings_that_come_along():
     default = load(DEFAULTS / "forecast.toml")
-    assert [band.name for band in default.bands] == list(load_instrument("core").names)
+    assert [band.name for band in default.bands] == list(load_instrument("core"))
     assert default.forecast.bands == ["45", "105", "315"]
     assert default.forecast.free == ["r", "amplitude", "slope", "correlation"]
     assert list(default.free_in("forecast")) == [

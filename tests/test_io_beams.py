@@ -41,7 +41,7 @@ def test_wmap_tables_hold_amplitudes(data_dir, band, lmax):
     # The instrument's beam size is the root of the solid angle, 4 pi / sum (2l+1) b_l for a beam
     # of unit peak. The tables give 2 to 19 % more; were they b_l^2, it would be 19 to 30 % less.
     angle = 4 * np.pi / np.sum((2 * np.arange(lmax + 1) + 1) * window)
-    size = float(load_instrument("wmap")[band].fwhm) / 60
+    size = float(load_instrument("wmap")[band].beam) / 60
     assert 1.0 < np.degrees(np.sqrt(angle)) / size < 1.2
     with refused(rf"wmap_beam_{band}.tbl: ends at l = {lmax}, but lmax is"):
         read_beam(path, lmax + 1)

@@ -26,9 +26,10 @@ pytestmark = pytest.mark.slow
 NSIDE = 64
 NPIX = healpy.nside2npix(NSIDE)
 UNIT = "uK_CMB"
-LITEBIRD = load_instrument("litebird")
-BANDS = LITEBIRD.bands(11)
-SIGMA = np.array([c.noise for c in LITEBIRD]) / healpy.nside2resol(NSIDE, arcmin=True)
+LITEBIRD = load_instrument("litebird", samples=11)
+BANDS = LITEBIRD.bands()
+LEVELS = [c.noise * c.band.conversion("uK_RJ", UNIT) for c in LITEBIRD.values()]
+SIGMA = np.array(LEVELS) / healpy.nside2resol(NSIDE, arcmin=True)
 LAWS = {
     "cmb": CMB(np.ones((2, 1))),
     "dust": Dust(np.ones((2, 1)), nu_ref=353.0),

@@ -286,7 +286,7 @@ def core_observation(paper: PaperSky) -> Observation:
     fwhm = paper.settings.paper.fwhm
     channels = {
         name: ObservedBand(one.band, max(float(one.beam), fwhm), noise=one.noise)
-        for name, one in load_instrument("core").select(BANDS).observed().items()
+        for name, one in load_instrument("core", BANDS).items()
     }
     return Observation(channels, paper.nside_fine, finest=fwhm, precision="single")
 
@@ -355,11 +355,11 @@ def _brightest(band: str, inside: Mapping[str, Float[np.ndarray, " inside"]]) ->
 
 def table_core(paper: PaperSky, picture: Path) -> PaperFigure:
     """Table 1: COrE."""
-    channels = list(load_instrument("core"))
-    header = ("Band [GHz]", *(f"{float(channel.center):g}" for channel in channels))
+    bands = band_tables("core")
+    header = ("Band [GHz]", *(f"{band['bandpass']['center']:g}" for band in bands))
     rows = [
-        ("Beam FWHM [arcmin]", *(f"{float(channel.fwhm):.1f}" for channel in channels)),
-        ("Noise [µK_RJ arcmin]", *(f"{float(channel.noise):.2f}" for channel in channels)),
-        ("Width [GHz]", *(f"{float(channel.width):.3g}" for channel in channels)),
+        ("Beam FWHM [arcmin]", *(f"{band['fwhm']:.1f}" for band in bands)),
+        ("Noise [µK_RJ arcmin]", *(f"{band['noise']['level']:.2f}" for band in bands)),
+        ("Width [GHz]", *(f"{band['bandpass']['width']:.3g}" for band in bands)),
     ]
     return described("Table 1", table=ResultTable(header, rows))

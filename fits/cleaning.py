@@ -1,27 +1,44 @@
-"""A component separation, from data to the cleaned CMB and the tensor-to-scalar ratio."""
+"""A component separation, from data to the cleaned CMB and the tensor-to-scalar ratio.
+
+Smoothed noise is correlated between pixels, which the spectral likelihood does not know. So its
+errors are taken from simulations: foregrounds as they were found, with new noise. To first order
+the parameters move by -H^-1 times the gradient of -ln L; the components are then separated with
+those parameters, so that residual foregrounds appear with the noise that caused them.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import healpy
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from fits.kept import fingerprint, kept_chain, kept_realisations
-from fits.noise_response import Realisation, Response, SimulatedNoise, widened
 from fits.optimize import best_fit
-from fits.priors import priors_of
+from fits.posterior import Likelihood, Posterior, value_and_gradient
+from fits.priors import Gaussian, Prior, priors_of
 from fits.profile_likelihood import SpectralLikelihood
-from fits.pseudo_cl import LEAST_WINDOW, MaskedSpectra, band_powers, bin_edges, masked_spectra
+from fits.pseudo_cl import (
+    LEAST_WINDOW,
+    MaskedSpectra,
+    band_powers,
+    bin_edges,
+    masked_spectra,
+    mean_spectrum,
+)
 from fits.results import FitResult, misfit
 from fits.sampling import sample
 from fits.separated_data import FullSkyData, PixelData
+from fits.systems import Factor
 from fits.tensor_ratio import TensorFit, fit_tensors, power_model
-from jaxsky.checks import check_double
-from jaxsky.cmb import tensor_spectra
+from jaxsky.checks import Numeric, check_double
+from jaxsky.cmb import realisation, tensor_spectra
 from jaxsky.experiment import cmb_spectra
-from jaxsky.harmonics import gaussian_beam
+from jaxsky.harmonics import expand, gaussian_beam, synthesis
+from jaxsky.keys import stream
 from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 
@@ -29,6 +46,80 @@ from jaxsky.settings import Experiment, SettingsError, at_key
 WALKERS = 32
 #: The posterior of more parameters is not sampled.
 SAMPLED = 500
+
+
+class Response:
+    """-H^-1 of a fit, with H the curvature of -log posterior.
+
+    `theta` is the best fit as a vector, with start values in regions without a pixel.
+    """
+
+    def __init__(
+        self,
+        like: Likelihood,
+        params: Mapping[str, Numeric],
+        priors: Mapping[str, Prior] | None = None,
+    ) -> None:
+        self._posterior = posterior = Posterior(like, priors)
+        self.theta = np.array(like.flat(like.check(params)))
+        self._keep = np.flatnonzero(posterior.present & ~posterior.edges(self.theta))
+        hessian = posterior.derivatives(self.theta).hessian
+        self._factor = Factor(posterior.curvature(self.theta, hessian, self._keep))
+        if not self._factor.positive:
+            raise ValueError("The best fit is no maximum of the posterior.")
+
+    def moved(self, like: Likelihood, key: Array) -> Float[np.ndarray, " par"]:
+        """The best fit to the data of `like`, within the bounds of uniform priors.
+
+        The means of Gaussian priors are drawn anew, too, since they were measured like the data.
+        """
+        gradient = np.array(value_and_gradient(like, self.theta)[1])
+        draws = np.asarray(jax.random.normal(key, gradient.shape))
+        for prior, where in self._posterior.priors:
+            assert isinstance(prior, Gaussian)  # the only one that is not a bound
+            gradient += np.where(where, draws / prior.sigma, 0.0)
+        theta = self.theta.copy()
+        theta[self._keep] -= self._factor.solve(gradient[self._keep])
+        return np.clip(theta, self._posterior.low, self._posterior.high)
+
+
+def widened(
+    samples: FitResult,
+    center: Float[np.ndarray, " par"],
+    hessian: Float[np.ndarray, "par par"],
+    errors: Float[np.ndarray, "sim par"],
+) -> FitResult:
+    """Samples of a posterior whose likelihood has wrong errors, stretched to the right ones.
+
+    About the best fit by S L^-1, with L L^T = H^-1 and S S^T the covariance of the estimates: the
+    open-faced sandwich of Shaby (2014, J. Comput. Graph. Stat. 23, 853). With too few simulations
+    for the covariance, each parameter by the ratio of its standard deviations. `center` is the best
+    fit in the order of the samples, with the `hessian` of -log posterior there.
+    """
+    inverse = np.linalg.inv(hessian)
+    if len(errors) > 4 * len(center):
+        wanted = np.atleast_2d(np.cov(errors.T))
+        turn = np.linalg.cholesky(wanted) @ np.linalg.inv(np.linalg.cholesky(inverse))
+    else:
+        turn = np.diag(errors.std(axis=0, ddof=1) / np.sqrt(np.diagonal(inverse)))
+    return samples.with_chain(center + (samples.details["chain"] - center) @ turn.T)
+
+
+class SimulatedNoise(NamedTuple):
+    """Of each simulation, the parameters less the best fit, and band powers D_b of BB [uK_CMB^2].
+
+    Those are of the noise in the cleaned CMB, the foregrounds that are left with these parameters,
+    both together, the sum with a CMB without tensors, and that CMB without its B modes: E that
+    pixels and mask turn into B. `spectrum` is C_l of noise and foregrounds in the masked map.
+    """
+
+    theta: Float[np.ndarray, "sim par"]
+    noise: Float[np.ndarray, "sim bin"]
+    residual: Float[np.ndarray, "sim bin"]
+    both: Float[np.ndarray, "sim bin"]
+    total: Float[np.ndarray, "sim bin"]
+    leaked: Float[np.ndarray, "sim bin"]
+    spectrum: Float[np.ndarray, "sim ell"]
 
 
 class Separation(NamedTuple):
@@ -115,17 +206,9 @@ def separate_data(
     foregrounds = np.array(amplitude)
     foregrounds[row] = 0.0
     emission = data.emission(like, best, foregrounds)
-    simulation = Realisation(data, like, best, response, emission, spectra, window, lensed)
-    made = kept_realisations(
-        simulation.of,
-        SimulatedNoise._fields,
-        spec.nsims,
-        settings.seed,
-        None if out is None else out / "simulations.npz",
-        _mark(settings, data),
-        progress.advance,
-    )
-    simulated = SimulatedNoise(*made)
+    path = None if out is None else out / "simulations.npz"
+    kept = spec.nsims, settings.seed, path, _mark(settings, data), progress.advance
+    simulated = simulated_noise(data, like, response, emission, spectra, window, lensed, *kept)
     progress.step("tensor-to-scalar ratio")
     # What the spectra know of E in B is part of the model.
     EE = lensed[1, : spectra.lmax + 1]
@@ -141,7 +224,7 @@ def separate_data(
     )
     left = None
     if data.foregrounds is not None:
-        alone = simulation.cleaned(best, data.foregrounds)
+        alone = cleaned_cmb(data, like, best, data.foregrounds)
         left = band_powers(spectra, jnp.asarray(alone))[1]
     sigma, covariance = _errors(data, like, fit, simulated)
     chain = None
@@ -164,6 +247,50 @@ def separate_data(
         left=left,
         chain=chain,
     )
+
+
+def cleaned_cmb(
+    data: PixelData | FullSkyData,
+    like: SpectralLikelihood,
+    params: Mapping[str, Array],
+    observed: np.ndarray,
+) -> Float[np.ndarray, "stokes pix"]:
+    """The map of the CMB in what is observed, with these parameters."""
+    found = data.components(like, params, observed, covariance=False)
+    return data.maps(found, like, params, observed)[found.components.index("cmb")]
+
+
+def simulated_noise(
+    data: PixelData | FullSkyData,
+    like: SpectralLikelihood,
+    response: Response,
+    emission: Float[np.ndarray, "band stokes _"],
+    spectra: MaskedSpectra,
+    window: Float[np.ndarray, " ell"],
+    lensed: Float[np.ndarray, "4 ell"],
+    *kept: Any,
+) -> SimulatedNoise:
+    """Simulated noise on top of the foregrounds that were found; `kept` for `kept_realisations`.
+
+    `response` is what noise does to the best fit, `emission` the foregrounds in the bands, `window`
+    the beam of the maps, and `lensed` C_l of a CMB without tensors up to its end [uK_CMB^2].
+    """
+    best = like.named(jnp.asarray(response.theta))
+
+    def make(key: Array) -> list[np.ndarray]:
+        noise = data.noise_realisation(key)
+        observed = emission + noise
+        moved = response.moved(data.likelihood(observed), stream(key, "priors"))
+        alone = cleaned_cmb(data, like, best, noise)
+        both = cleaned_cmb(data, like, like.named(jnp.asarray(moved)), observed)
+        nside = healpy.npix2nside(both.shape[-1])
+        alm = realisation(stream(key, "cmb"), lensed) * expand(jnp.asarray(window))
+        sky, E = synthesis(alm, nside), synthesis(alm.at[1].set(0.0), nside)
+        every = (alone, both - alone, both, both + sky, E)
+        powers = [band_powers(spectra, jnp.asarray(maps))[1] for maps in every]
+        return [moved - response.theta, *powers, mean_spectrum(spectra.mask, both, spectra.lmax)]
+
+    return kept_realisations(make, SimulatedNoise, *kept)
 
 
 def _spectra(

@@ -211,8 +211,7 @@ def simulated_fluctuations(
         squares = _sums_of_squares(noise + cmb, inside)
         return chi2, squares, spectra, power_spectrum(noise_alms)
 
-    names = ComparisonRealisations._fields
-    return ComparisonRealisations(*kept_realisations(make, names, *kept))
+    return kept_realisations(make, ComparisonRealisations, *kept)
 
 
 @jax.jit

@@ -8,12 +8,11 @@ import os
 import time
 import zipfile
 import zlib
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import emcee
 import h5py
@@ -33,6 +32,7 @@ RANDOM_STATE = 5
 #: What a damaged archive raises besides: RuntimeError for one that seems encrypted or packed in
 #: a way that is not known.
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, RuntimeError)
+Kind = TypeVar("Kind", bound=NamedTuple)
 
 
 def fingerprint(tree: Any) -> str:
@@ -181,20 +181,21 @@ def _held(path: Path, name: str) -> str | None:
 
 def kept_realisations(
     make: Callable[[Array], Sequence[Array | np.ndarray]],
-    names: Sequence[str],
+    kind: type[Kind],
     count: int,
     seed: int,
     path: Path | None = None,
     mark: str = "",
     report: Callable[[int, int], None] = QUIET.advance,
-) -> list[np.ndarray]:
-    """Named results of a function of a random key, stacked over realisations.
+) -> Kind:
+    """Results of a function of a random key, stacked over realisations, as a NamedTuple.
 
     A realisation depends on the seed and its own number only. What the file holds already is not
     made again; one with another mark, that of all that the results depend on, is refused. `report`
     is called with the number of realisations done, and that of all.
     """
     check_seed("seed", seed)
+    names = kind._fields
     done = [] if path is None else _load(path, mark, names)
     held, saved = len(done), time.monotonic()
     try:
@@ -208,7 +209,7 @@ def kept_realisations(
     finally:
         if path is not None and len(done) > held:
             _save(path, mark, names, done)
-    return list(map(np.stack, zip(*done[:count], strict=True)))
+    return kind._make(map(np.stack, zip(*done[:count], strict=True)))
 
 
 def _made(
@@ -220,19 +221,9 @@ def _made(
         key = stream(realisation_key(seed, number), "realisation")  # unlike what is observed
         return [np.asarray(x) for x in make(key)]
 
-    first, rest = numbers[:1], numbers[1:]
-    yield from map(one, first)  # alone, so that each program is compiled once
-    threads = os.cpu_count() or 1
-    pool = ThreadPoolExecutor(threads)
-    try:
-        pending = deque(pool.submit(one, number) for number in rest[:threads])
-        for number in rest[threads:]:
-            yield pending.popleft().result()
-            pending.append(pool.submit(one, number))
-        while pending:
-            yield pending.popleft().result()
-    finally:
-        pool.shutdown(cancel_futures=True)
+    yield from map(one, numbers[:1])  # alone, so that each program is compiled once
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        yield from pool.map(one, numbers[1:])
 
 
 def _save(path: Path, mark: str, names: Sequence[str], done: list[list[np.ndarray]]) -> None:

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from collections import namedtuple
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
@@ -304,8 +305,10 @@ def test_realisations_go_on_after_a_full_disk(tmp_path, monkeypatch):
 
         return [jax.random.normal(key, (100,)), jax.random.normal(key, ())]
 
+    Pair = namedtuple("Pair", "a b")
+
     def run(count=12):
-        return kept_realisations(make, ("a", "b"), count, 3, path, "mark")
+        return kept_realisations(make, Pair, count, 3, path, "mark")
 
     with limited(5000), pytest.raises(OSError, match=r"simulations.npz: cannot be written \("):
         run()

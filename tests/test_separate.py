@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from fits import cleaning as module
-from fits.cleaning import separate_data
+from fits.cleaning import Response, separate_data, widened
 from fits.commands import separate as command
 from fits.commands.run import DEFAULTS
 from fits.commands.separate import separation_warnings
-from fits.noise_response import Response, widened
 from fits.optimize import best_fit
 from fits.priors import priors_of
 from fits.pseudo_cl import band_powers

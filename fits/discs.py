@@ -1,6 +1,6 @@
 """The paper's small patches of the sky: discs at high latitude, and the field of BICEP2."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import healpy
@@ -20,15 +20,6 @@ BICEP2 = (50.0, -65.0, -50.0)
 EDGES = (40, 55, 70, 85, 101)
 #: Matrices of coupling that agree to this belong to the same mask, turned.
 SAME = 2e-3
-
-
-class Patch(NamedTuple):
-    """A part of the sky: Galactic coordinates of its middle [deg], and a weight of each pixel."""
-
-    name: str
-    lon: float
-    lat: float
-    mask: Float[np.ndarray, " pix"]
 
 
 def disc_centers(nside: int = 4, latitude: float = 45.0) -> Float[np.ndarray, "2 disc"]:
@@ -94,31 +85,29 @@ def bicep2_mask(nside: int, fwhm: float = APODIZATION) -> Float[np.ndarray, " pi
     return np.where(mask > 1e-3, np.minimum(mask, 1.0), 0.0)
 
 
-def paper_patches(nside: int) -> Iterator[Patch]:
-    """The paper's 48 discs at |b| > 45 deg, and the field of BICEP2."""
-    for lon, lat in disc_centers().T:
-        yield Patch(f"l {lon:.0f}, b {lat:.0f}", lon, lat, disc_mask(nside, lon, lat))
-    lon, lat = healpy.Rotator(coord=["C", "G"])(0.0, -57.5, lonlat=True)
-    yield Patch("BICEP2", float(lon), float(lat), bicep2_mask(nside))
+def paper_patches(nside: int) -> dict[str, Float[np.ndarray, " pix"]]:
+    """The paper's 48 discs at |b| > 45 deg, and the field of BICEP2, by name."""
+    discs = {
+        f"l {lon:.0f}, b {lat:.0f}": disc_mask(nside, lon, lat) for lon, lat in disc_centers().T
+    }
+    return discs | {"BICEP2": bicep2_mask(nside)}
 
 
 class PreparedPatches(NamedTuple):
     """Patches with all that does not depend on the maps; from `prepare_patches`.
 
-    `lon` and `lat` are Galactic coordinates of the middles [deg], `shapes` is the first patch with
-    the same mask but for its place, and `window` is b_l of the maps.
+    `shapes` is the first patch with the same mask but for its place, and `window` is b_l of the
+    maps.
     """
 
     names: tuple[str, ...]
-    lon: Float[np.ndarray, " patch"]
-    lat: Float[np.ndarray, " patch"]
     spectra: tuple[MaskedSpectra, ...]
     shapes: tuple[int, ...]
     window: Float[np.ndarray, " ell"]
 
 
 def prepare_patches(
-    patches: Iterable[Patch],
+    patches: Mapping[str, Float[np.ndarray, " pix"]],
     window: Float[np.ndarray, " ell"],
     *,
     edges: Sequence[int] = EDGES,
@@ -129,7 +118,7 @@ def prepare_patches(
 
     Parameters
     ----------
-    patches : for example `paper_patches(nside)`
+    patches : weight of each pixel by the name of the patch, for example `paper_patches(nside)`
     window : window b_l of the maps (beam and pixels)
     edges : first multipole of each bin, and the one after the last; three bins at least
     lmax : see `masked_spectra`
@@ -145,21 +134,18 @@ def prepare_patches(
         raise ValueError(
             f"Argument `edges` must give three bins at least, for two parameters, not {edges}."
         )
-    patches = tuple(patches)
     spectra: list[MaskedSpectra] = []
     shapes: list[int] = []
     if not patches:
         raise ValueError("Argument `patches` has no patch in it.")
-    for i, patch in enumerate(patches):
+    for i, (name, mask) in enumerate(patches.items()):
         try:
-            one = masked_spectra(patch.mask, edges, lmax=lmax, window=window, pure=pure)
+            one = masked_spectra(mask, edges, lmax=lmax, window=window, pure=pure)
         except ValueError as error:
-            raise ValueError(f"Patch {patch.name}: {error}") from error
+            raise ValueError(f"Patch {name}: {error}") from error
         close = SAME * np.abs(one.mixing).max()
         same = (j for j in set(shapes) if np.allclose(spectra[j].mixing, one.mixing, 0, close))
         shapes.append(next(same, i))
         spectra.append(one)
-    lon, lat = np.array([[patch.lon, patch.lat] for patch in patches]).T
-    names = tuple(patch.name for patch in patches)
     window = np.asarray(window, float)[: spectra[0].lmax + 1]
-    return PreparedPatches(names, lon, lat, tuple(spectra), tuple(shapes), window)
+    return PreparedPatches(tuple(patches), tuple(spectra), tuple(shapes), window)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fits.discs import EDGES, Patch, bicep2_mask, disc_centers, disc_mask, prepare_patches
+from fits.discs import EDGES, bicep2_mask, disc_centers, disc_mask, prepare_patches
 from fits.patches import BandCombinations, decorrelate, fit_patches, minimise
 from jaxsky.cmb import gaussian_fields
 from jaxsky.harmonics import gaussian_beam, synthesis
@@ -29,10 +29,9 @@ NOISE = np.where(ELL > 1, SEEN[1, 80], 0.0)
 @functools.cache
 def patches(count=None):
     """Discs that do not overlap: independent, and all of one shape."""
-    centers = [(lon, lat) for lon, lat in disc_centers(2, 15.0).T[:count]]
-    return prepare_patches(
-        [Patch(f"{lon:.0f}", lon, lat, disc_mask(NSIDE, lon, lat)) for lon, lat in centers], WINDOW
-    )
+    centers = disc_centers(2, 15.0).T[:count]
+    discs = {f"{lon:.0f} {lat:.0f}": disc_mask(NSIDE, lon, lat) for lon, lat in centers}
+    return prepare_patches(discs, WINDOW)
 
 
 @jax.jit
@@ -168,8 +167,9 @@ def test_decorrelated_bands():
 
 
 def test_patches_of_one_shape_share_their_covariance():
-    masks = [disc_mask(NSIDE, 10.0, 60.0), disc_mask(NSIDE, 200.0, -50.0), bicep2_mask(NSIDE)]
-    found = prepare_patches([Patch("", 0.0, 0.0, mask) for mask in masks], WINDOW)
+    north, south = disc_mask(NSIDE, 10.0, 60.0), disc_mask(NSIDE, 200.0, -50.0)
+    masks = {"north": north, "south": south, "field": bicep2_mask(NSIDE)}
+    found = prepare_patches(masks, WINDOW)
     assert found.shapes == (0, 0, 2)
     assert set(patches(4).shapes) == {0}
     fits = fit_patches(sky(jax.random.key(5), *jnp.asarray(SEEN)), found)
@@ -178,25 +178,25 @@ def test_patches_of_one_shape_share_their_covariance():
 
 
 def test_refusals():
-    disc = Patch("north", 0.0, 90.0, disc_mask(NSIDE, 0.0, 90.0))
-    small = Patch("dot", 0.0, 90.0, disc_mask(NSIDE, 0.0, 90.0, 2.0, 1.0))
+    mask = disc_mask(NSIDE, 0.0, 90.0)
+    disc, small = {"north": mask}, {"dot": disc_mask(NSIDE, 0.0, 90.0, 2.0, 1.0)}
     for given, window, edges, words in (
-        ([small], WINDOW, EDGES, "Patch dot: The mask leaves too few pixels"),
-        ([disc], WINDOW[:100], EDGES, "Patch north: Argument `window` ends at l = 99, not at 128"),
-        ([disc], WINDOW, (40, 70, 101), "`edges` must give three bins at least"),
-        ([disc], WINDOW, (40, 60, 50, 101), "Patch north: Argument `edges` must increase from 2"),
-        ([disc], WINDOW, (40, 90, 120, 150), "`lmax` must be between the end of the bins, 149"),
-        ([], WINDOW, EDGES, "Argument `patches` has no patch in it"),
+        (small, WINDOW, EDGES, "Patch dot: The mask leaves too few pixels"),
+        (disc, WINDOW[:100], EDGES, "Patch north: Argument `window` ends at l = 99, not at 128"),
+        (disc, WINDOW, (40, 70, 101), "`edges` must give three bins at least"),
+        (disc, WINDOW, (40, 60, 50, 101), "Patch north: Argument `edges` must increase from 2"),
+        (disc, WINDOW, (40, 90, 120, 150), "`lmax` must be between the end of the bins, 149"),
+        ({}, WINDOW, EDGES, "Argument `patches` has no patch in it"),
     ):
         with pytest.raises(ValueError, match=re.escape(words)):
             prepare_patches(given, window, edges=edges)
-    prepared = prepare_patches([disc], WINDOW)
+    prepared = prepare_patches(disc, WINDOW)
     maps = np.asarray(sky(jax.random.key(6), *jnp.asarray(SEEN)))
-    hole = np.where(disc.mask == 1, healpy.UNSEEN, maps)
+    hole = np.where(mask == 1, healpy.UNSEEN, maps)
     for given, options, words in (
         (maps[:1], {}, "Argument `maps` must have shape (2, 49152), but has shape (1, 49152)"),
         (hole, {}, "Argument `maps` has no value in"),
-        (maps, {"other": np.where(disc.mask > 0, np.nan, maps)}, "Argument `other` has no value"),
+        (maps, {"other": np.where(mask > 0, np.nan, maps)}, "Argument `other` has no value"),
         (maps, {"noise": -1.0}, "Argument `noise` has values that are negative or not finite"),
         (maps, {"noise": np.ones(100)}, "reach l = 128, but has shape (100,)"),
         (maps, {"noise": np.ones((3, 2, 200))}, "Argument `noise` must be a level or have shape"),
@@ -206,7 +206,7 @@ def test_refusals():
         with pytest.raises(ValueError, match=re.escape(words)):
             fit_patches(given, prepared, **options)
     # What is not used may hold anything.
-    outside = np.where(disc.mask > 0, maps, np.nan)
+    outside = np.where(mask > 0, maps, np.nan)
     np.testing.assert_array_equal(
         fit_patches(outside, prepared, other=outside).A, fit_patches(maps, prepared, other=maps).A
     )

@@ -1,24 +1,23 @@
 """Realisations of a simulation as files: in any order, in any number of processes, resumed."""
 
 import json
-import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float
 
 import jaxsky
 from jaxsky.experiment import SimulationInputs
+from jaxsky.interpolation import Terms
 from jaxsky.io import write_maps, write_text
 from jaxsky.io.files import check_guards
 from jaxsky.io.folders import alone
 from jaxsky.io.observations import observed_tables
 from jaxsky.keys import realisation_key
-from jaxsky.observation import harmonic_sources, plan_terms
+from jaxsky.observation import HarmonicSource, harmonic_sources, plan_terms
 from jaxsky.settings import Experiment, circumstances
 from jaxsky.simulation import observe_bands
 
@@ -27,13 +26,6 @@ LOG = "simulation.json"
 LAYOUT: Any = {"simulate": {"sheet"}}
 #: Tables of settings that simulations depend on.
 CONTENT = {"seed", "sky", "bands", "cmb", "fixed", "truth", "simulate"}
-
-
-class Written(NamedTuple):
-    """A file of a realisation, and the seconds since the one before it; None if it was there."""
-
-    path: Path
-    seconds: float | None
 
 
 def paths(out: Path, names: tuple[str, ...], index: int) -> dict[str, Path]:
@@ -92,7 +84,7 @@ def other_sky(settings: Experiment) -> list[str]:
     now = _content(settings)
     try:
         was = json.loads((Path(settings.data_dir, maps).parent / LOG).read_text())["settings"]
-        for key in ("stokes", "unit", "outputs", "precision"):  # of what is written only
+        for key in ("stokes", "unit", "components", "precision"):  # of what is written only
             was["simulate"].pop(key, None)
             now["simulate"].pop(key, None)
         changed = [name for name in now if name != "seed" and was.get(name) != now[name]]
@@ -163,14 +155,18 @@ def _ascii(text: str) -> str:
 
 
 def _columns(
-    maps: Mapping[str, Array], stokes: str, factor: float
+    settings: Experiment, setup: SimulationInputs, name: str, maps: Mapping[str, Array]
 ) -> tuple[list[str], Float[np.ndarray, "column pix"]]:
-    """Names of the columns of a file, and the columns: the total first."""
-    wanted = ["total", *(n for n in maps if n != "total")]
-    names = [s if name == "total" else f"{s}_{name}" for name in wanted for s in stokes]
-    if len(wanted) == 1 and factor == 1:
-        return names, np.asarray(maps["total"])
-    columns = np.concatenate([np.asarray(maps[name]) for name in wanted])
+    """Names of the columns of a band's file, and the columns: the total first."""
+    spec, total = settings.simulate, maps["total"]
+    if (leaked := setup.leakage.get(name)) is not None:
+        total = total.at[-2:].add(leaked)
+    shown = {"": total} | {f"_{which}": m for which, m in maps.items() if which != "total"}
+    names = [s + which for which in shown for s in spec.stokes]
+    factor = float(setup.observation.channels[name].band.conversion("uK_RJ", spec.unit))
+    if len(shown) == 1 and factor == 1:
+        return names, np.asarray(total)
+    columns = np.concatenate([np.asarray(one) for one in shown.values()])
     columns *= factor
     return names, columns
 
@@ -186,60 +182,6 @@ def _write(path: Path, columns: Float[np.ndarray, "column pix"], **options: Any)
     write_maps(path, columns, overwrite=True, **options)
 
 
-def _write_behind(jobs: Iterator[tuple[Path, Callable[[], None]]]) -> Iterator[Written]:
-    """Do each job while the next one is being made; the files, as they are done."""
-    start = time.perf_counter()
-    doing: list[tuple[Path, Future[None]]] = []
-
-    def done() -> Written:
-        nonlocal start
-        path, future = doing.pop(0)
-        future.result()
-        start, before = time.perf_counter(), start
-        return Written(path, start - before)
-
-    with ThreadPoolExecutor(1) as thread:
-        for path, job in jobs:
-            doing.append((path, thread.submit(job)))
-            del job  # and its maps with it, when it is done
-            if len(doing) > 1:
-                yield done()
-        if doing:
-            yield done()
-
-
-def _jobs(
-    settings: Experiment,
-    setup: SimulationInputs,
-    seen: Iterator[tuple[str, dict[str, Array]]],
-    files: Mapping[str, Path],
-    index: int,
-    claim: Callable[[], None],
-) -> Iterator[tuple[Path, Callable[[], None]]]:
-    """Each file of a realisation, and what writes it; `claim` is called when a map is ready."""
-    spec = settings.simulate
-    for name, maps in seen:
-        band = setup.observation.channels[name].band
-        if (leaked := setup.leakage.get(name)) is not None:
-            maps = {**maps, "total": maps["total"].at[-2:].add(leaked)}
-        factor = float(band.conversion("uK_RJ", spec.unit))
-        names, columns = _columns(maps, spec.stokes, factor)
-        claim()
-        job = partial(
-            _write,
-            files[name],
-            columns,
-            names=names,
-            unit=spec.unit,
-            extra_header=_header(settings, setup, name, index),
-            single=spec.precision == "single",
-            tables=observed_tables(setup.observed(name)),
-        )
-        del maps, columns  # or they would still be there when those of the next band are made
-        yield files[name], job
-        del job
-
-
 def run(
     settings: Experiment,
     setup: SimulationInputs,
@@ -248,13 +190,14 @@ def run(
     overwrite: bool = False,
     note: Callable[[str], None] = lambda message: None,
     begun: Callable[[], None] = lambda: None,
-) -> Iterator[Written]:
+) -> Iterator[bool]:
     """Simulate realisations into files, one for each band; files that are there are kept.
 
-    A realisation depends on the seed and its number only. The folder is touched when the first
-    map is ready: what goes wrong before costs nothing. Sources are removed from `setup` when they
-    have served. `note` is called with sentences that a user should know, `begun` when the folder
-    has its log, and what was to be removed from it (`overwrite`) is.
+    For each file, in turn, whether it was written. A realisation depends on the seed and its number
+    only. The folder is touched when the first map is ready: what goes wrong before costs nothing.
+    Sources are removed from `setup` when they have served. `note` is called with sentences that a
+    user should know, `begun` when the folder has its log, and what was to be removed from it
+    (`overwrite`) is.
     """
     observation = setup.observation
     terms = prepared = None
@@ -262,36 +205,64 @@ def run(
     random = setup.small_scales_seed is None and any(
         source.small_scales is not None for source in setup.sources.values()
     )
-    claimed = False
-
-    def claim() -> None:
-        nonlocal claimed
-        if not claimed:
-            _claim(out, settings, overwrite)
-            begun()
-            claimed = True
-
-    for index in indices:
-        files = paths(out, observation.names, index)
-        stale = overwrite and not claimed
-        missing = [name for name, path in files.items() if stale or not path.exists()]
-        yield from (Written(files[n], None) for n in files if n not in missing)
-        if not missing:
-            continue
-        key = realisation_key(settings.seed, index)
-        if prepared is None or random:
-            terms = plan_terms(setup.sources, observation) if terms is None else terms
-            small = key if random else setup.small_scales_key(key)
-            correlated = [n for n, source in setup.sources.items() if source.correlated_with]
-            prepared = harmonic_sources(
-                small, setup.sources, observation, terms, release=not random
+    claimed, writing = False, list[Future[None]]()
+    with ThreadPoolExecutor(1) as thread:
+        for index in indices:
+            files = paths(out, observation.names, index)
+            stale = overwrite and not claimed
+            missing = [name for name, path in files.items() if stale or not path.exists()]
+            yield from [False] * (len(files) - len(missing))
+            if not missing:
+                continue
+            key = realisation_key(settings.seed, index)
+            if prepared is None or random:
+                terms = plan_terms(setup.sources, observation) if terms is None else terms
+                prepared = _prepared(setup, setup.small_scales_key(key), terms, not random, note)
+            apart = settings.simulate.components
+            seen = observe_bands(
+                key, prepared, observation, setup.cmb, components=apart, names=missing
             )
-            for name in correlated:
-                if repaired := int(prepared[name].repaired):
-                    note(
-                        f"{name}: its extrapolated cross-spectra exceed what the auto-spectra "
-                        f"allow at {repaired} multipoles; correlations were reduced there."
-                    )
-        apart = "components" in settings.simulate.outputs
-        seen = observe_bands(key, prepared, observation, setup.cmb, components=apart, names=missing)
-        yield from _write_behind(_jobs(settings, setup, seen, files, index, claim))
+            for name, maps in seen:
+                names, columns = _columns(settings, setup, name, maps)
+                if not claimed:
+                    _claim(out, settings, overwrite)
+                    begun()
+                    claimed = True
+                # A file is written while the next band is made.
+                while writing:
+                    writing.pop().result()
+                    yield True
+                job = thread.submit(
+                    _write,
+                    files[name],
+                    columns,
+                    names=names,
+                    unit=settings.simulate.unit,
+                    extra_header=_header(settings, setup, name, index),
+                    single=settings.simulate.precision == "single",
+                    tables=observed_tables(setup.observed(name)),
+                )
+                writing.append(job)
+                del maps, columns  # or they would be there when those of the next band are made
+            while writing:
+                writing.pop().result()
+                yield True
+
+
+def _prepared(
+    setup: SimulationInputs,
+    key: Array,
+    terms: Mapping[str, Terms | None],
+    release: bool,
+    note: Callable[[str], None],
+) -> dict[str, HarmonicSource]:
+    """The sources in harmonic space, with the small scales of a key."""
+    correlated = [n for n, source in setup.sources.items() if source.correlated_with]
+    prepared = harmonic_sources(key, setup.sources, setup.observation, terms, release=release)
+    for name in correlated:
+        if repaired := int(prepared[name].repaired):
+            note(
+                f"{name}: its extrapolated cross-spectra exceed what the auto-spectra allow at "
+                f"{repaired} multipoles; correlations were reduced there."
+            )
+    return prepared

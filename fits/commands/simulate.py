@@ -1,6 +1,7 @@
 """`jaxsky simulate`."""
 
 import statistics
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -46,10 +47,13 @@ def make_realisations(settings: Experiment, command: Run, *, only: str | None) -
     seconds, count = [], len(indices) * len(names)
     steps.step("simulating")
     files = montecarlo.run(settings, setup, out, indices, overwrite, notes.append, command.begin)
-    for done, file in enumerate(files, 1):
+    before = time.perf_counter()
+    for done, written in enumerate(files, 1):
         steps.advance(done, count)
-        if file.seconds is not None:
-            seconds.append(file.seconds)
+        if written:
+            now = time.perf_counter()
+            seconds.append(now - before)
+            before = now
     if settings.simulate.sheet:
         steps.step("drawing")
         shown = montecarlo.paths(out, names, indices.start)

@@ -20,10 +20,9 @@ from jaxtyping import Array, Float
 
 from jaxsky.checks import Numeric, listed
 from jaxsky.harmonics import gaussian_beam
-from jaxsky.inputs import Template
+from jaxsky.inputs import Template, uK_RJ_per
 from jaxsky.noise_inputs import read_noise
 from jaxsky.settings import ComponentTable, SettingsError
-from jaxsky.units import conversion
 
 
 class TemplateNoise(NamedTuple):
@@ -63,16 +62,15 @@ def read_template_noise(
             f"{where}: is not known for a template with the angles of another; write "
             "{ rms = 0.0 } to take it as exact."
         )
-    nu_ref = float(template.component.nu_ref)  # type: ignore[attr-defined]
     nside = healpy.npix2nside(template.used.size)
     if noise.level is not None:
-        level = noise.level * float(conversion(noise.unit or template.unit, "uK_RJ", nu_ref))
+        level = noise.level * uK_RJ_per(noise.unit or template.unit, spec.nu_ref, where)
         spectrum = level_spectrum(level, template.fwhm, 4 * nside)
         return TemplateNoise(correlated=spectrum, shared=noise.shared)
     found, _ = read_noise(
         folder,
         noise,
-        nu_ref,
+        spec.nu_ref,
         nside,
         where,
         template.unit,

@@ -232,7 +232,7 @@ def _read_template(
     padded = not law.polarized and stokes == "IQU"
     check_stokes(f"sky.{name}", found, "I" if spec.angles or padded else stokes)
     parameters, known = read_parameters(folder, name, spec, found.nside)
-    factor = uK_RJ_per(found.unit, parameters["nu_ref"], f"sky.{name}")
+    factor = uK_RJ_per(found.unit, spec.nu_ref, f"sky.{name}")
     maps = jnp.asarray((found.maps * factor).astype(dtype))
     used = np.asarray(found.mask) & known
     with at_key(f"sky.{name}"):
@@ -269,7 +269,7 @@ def set_parameters_of(
     return changed
 
 
-def uK_RJ_per(unit: str, at: Bandpass | float, where: str) -> float:
+def uK_RJ_per(unit: str, at: Bandpass | float | None, where: str) -> float:
     """What a map is multiplied by to be in uK_RJ, at a frequency [GHz] or over a band."""
     with at_key(f"{where}.unit"):
         return float(unit_factor(unit, "uK_RJ", at))

@@ -37,7 +37,7 @@ _COLUMNS = {3: ("QQ", "QU", "UU"), 6: ("II", "IQ", "IU", "QQ", "QU", "UU")}
 def read_noise(
     folder: Path,
     noise: NoiseTable,
-    at: Bandpass | float,
+    at: Bandpass | float | None,
     nside: int,
     where: str,
     unit: str,

@@ -356,10 +356,10 @@ STRICT = [
         for name in ("cmb", "noise", "total", "", "a.b", "x" * 81)
     ),
     *(
-        settings("simulate", "simulate/outputs", value, "simulate.outputs")
-        for value in ([], ["all"], "total")
+        settings("simulate", "simulate/include", value, "simulate.include")
+        for value in ([], "dust", ["dust", "dust"])
     ),
-    settings("simulate", "simulate/outputs", ["total", "total"], "simulate.outputs"),
+    settings("simulate", "simulate/components", "dust", "simulate.components"),
     settings("simulate", "simulate/sheet", "true", "simulate.sheet"),
     settings("separate", "sky/dust/nu_ref", "353", "sky.dust.nu_ref"),
     settings("separate", "truth", {"dust.beta_dust": "1.5"}, "truth.dust.beta_dust", "1.5"),

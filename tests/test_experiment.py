@@ -119,7 +119,7 @@ def columns(path) -> dict[str, np.ndarray]:
     return dict(zip(names, read_maps(path, fields=names).maps, strict=True))
 
 
-COMPONENTS = ("sheet = false", 'sheet = false\noutputs = ["total", "components"]')
+COMPONENTS = ("sheet = false", "sheet = false\ncomponents = true")
 
 
 # What is written.

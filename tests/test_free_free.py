@@ -175,8 +175,17 @@ def test_laws_that_cannot_be(folder, monkeypatch, capsys, law, sentence):
     assert sentence in one_sentence(capsys)
 
 
-def test_a_class_of_ones_own_is_fitted(folder, monkeypatch):
-    (folder / "f.toml").write_text(FIT)
+@pytest.mark.parametrize("reference", ["a reference", "none"])
+def test_a_class_of_ones_own_is_fitted(folder, monkeypatch, reference):
+    text = FIT
+    if reference == "none":
+        law = MODULE.replace("    nu_ref: object = reference(30.0, within=(1.0, 1e3))\n", "")
+        (folder / "bare_law.py").write_text(law.replace("self.nu_ref", "30.0"))
+        text = FIT.replace("steep_law", "bare_law")
+        (folder / "f.toml").write_text(text)
+        assert jaxsky(monkeypatch, "fit", "f.toml", "--out", "fit") == 2  # nu_ref that it has not
+        text = text.replace("nu_ref = 30.0\n", "")
+    (folder / "f.toml").write_text(text)
     assert jaxsky(monkeypatch, "fit", "f.toml", "--out", "fit") == 0
     found = json.loads((folder / "fit" / "result.json").read_text())["results"]["full"]["QU"]
     value = found["gradient"]["best_fit"]["x.slope"]

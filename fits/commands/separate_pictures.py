@@ -28,10 +28,10 @@ CLEANED, NOISE, RESIDUAL, LEFT, LENSING, TRUTH = (*COLORS[:4], "0.5", COLORS[3])
 
 
 def _title(found: Separation, name: str) -> str:
-    component: Any = found.like.mixing.sky[name]
-    if component.unit == "uK_CMB":
-        return name.upper() if name == "cmb" else name
-    return f"{name}, {float(component.nu_ref):g} GHz"
+    if name == "cmb":
+        return "CMB"
+    nu_ref = getattr(found.like.mixing.sky[name], "nu_ref", None)
+    return name if nu_ref is None else f"{name}, {float(nu_ref):g} GHz"
 
 
 def plot_components(path: Path, found: Separation, settings: Experiment) -> None:

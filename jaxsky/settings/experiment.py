@@ -88,7 +88,7 @@ class SimulateTable(SettingsTable):
     fwhm: Positive | Literal["own"] = "own"
     stokes: Literal["QU", "IQU"] = "QU"
     unit: Literal["uK_RJ", "uK_CMB"] = "uK_RJ"
-    outputs: Several[Literal["total", "components"]] = Field(["total"])
+    components: bool = False
     precision: Literal["single", "double"] = "single"
     sheet: bool = True
     include: Several[Word] | None = None

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
-from jaxsky.components import AME, component_class
+from jaxsky.components import AME, component_class, declared
 from jaxsky.galaxy import GalaxyModel
 from jaxsky.instrument import band_tables
 from jaxsky.settings.files import BandpassSpec, BeamedKeys, BeamedMap, MapFile, MapKeys, NoiseTable
@@ -129,9 +129,10 @@ class ComponentTable(BeamedKeys):
             if self.angles or self.fwhm or self.noise:
                 raise ValueError("fwhm, angles and noise are of a map, but file is missing")
             return self
-        for key in ("law", "nu_ref"):
-            if getattr(self, key) is None:
-                raise ValueError(f"{key} is missing")
+        if self.law is None:
+            raise ValueError("law is missing")
+        if self.nu_ref is None and declared(component_class(self.law), "nu_ref"):
+            raise ValueError("nu_ref is missing")
         return self
 
     @property

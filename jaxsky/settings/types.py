@@ -211,7 +211,7 @@ def check_reference(law: str, nu_ref: float | None) -> None:
         return
     known = declared(component_class(law), "nu_ref")
     if not known:
-        raise ValueError(f"the law {law!r} has no nu_ref: its maps are in uK_CMB")
+        raise ValueError(f"the law {law!r} has no nu_ref")
     least, most = known["within"] or (0, math.inf)
     if not least <= nu_ref <= most:
         raise ValueError(

@@ -14,7 +14,7 @@ from benchmarks.table import Row, time_text
 from benchmarks.timing import interleave, seconds
 from fits.compress import gram
 from fits.grid import chi2_on_grid
-from fits.kept import ChainFile
+from fits.kept import KeptChain
 from fits.posterior import Likelihood
 from fits.priors import Uniform
 from fits.sampling import sample
@@ -146,10 +146,10 @@ def chain(quick: bool) -> list[Row]:
     nside, nsteps, part = (16, 500, 100) if quick else (64, 5000, 500)
     like = _problem(nside).likelihood()
     with tempfile.TemporaryDirectory() as folder:
-        files = (Path(folder) / f"{i}.h5" for i in itertools.count())
+        files = (Path(folder) / f"{i}.npz" for i in itertools.count())
 
         def ours(nsteps=nsteps):
-            backend = ChainFile(next(files))
+            backend = KeptChain(next(files))
             options = {"nwalkers": WALKERS, "backend": backend, "progress": False, "throw": False}
             return sample(like, START, priors=PRIORS, nsteps=nsteps, **options).chi2
 
@@ -159,7 +159,7 @@ def chain(quick: bool) -> list[Row]:
     scale = nsteps / part
     return [
         Row(
-            f"emcee, {WALKERS} walkers x {nsteps} steps into an HDF5 file, two indices",
+            f"emcee, {WALKERS} walkers x {nsteps} steps into a file, two indices",
             time_text(times["ours"]),
             "< 15 s",
             times["ours"] < 15,

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.kept import fingerprint, kept_chain, kept_realisations
+from fits.kept import KeptChain, fingerprint, kept_realisations
 from fits.optimize import best_fit
 from fits.posterior import Likelihood, Posterior, value_and_gradient
 from fits.priors import Gaussian, Prior, priors_of
@@ -345,7 +345,7 @@ def _chain(settings, data, like, fit, simulated, out, progress):
     nwalkers = max(WALKERS, 2 * size + 2)
     backend = None
     if spec.sampler == "emcee" and out is not None:
-        backend = kept_chain(out / "chain.h5", "mcmc", (nwalkers, size), _mark(settings, data))
+        backend = KeptChain(out / "chain.npz", f"{_mark(settings, data)} {nwalkers} {size}")
     samples = sample(
         like,
         fit.best_fit,

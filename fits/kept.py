@@ -8,14 +8,12 @@ import os
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import emcee
-import h5py
 import jax
 import numpy as np
 from jaxtyping import Array
@@ -27,8 +25,8 @@ from jaxsky.progress import QUIET
 
 #: Files are written after so many seconds, and when a run is stopped.
 SAVED_EVERY = 10.0
-#: Entries of numpy's random state, each an attribute of a chain in its file.
-RANDOM_STATE = 5
+#: Arrays of a chain in its file; the last two are numpy's random state.
+CHAIN = ("chain", "log_prob", "accepted", "random_keys", "random_rest")
 #: What a damaged archive raises besides: RuntimeError for one that seems encrypted or packed in
 #: a way that is not known.
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, RuntimeError)
@@ -47,136 +45,43 @@ def fingerprint(tree: Any) -> str:
     return digest.hexdigest()
 
 
-def _other(path: Path, what: str) -> InputError:
-    """The error for a file of a run with other data or settings."""
-    return InputError(
-        f"{path}: holds {what} of other data or settings; choose another --out, or start again "
-        "with --overwrite."
-    )
+class KeptChain(emcee.backends.Backend):
+    """A chain of emcee in memory, written to its file every few seconds.
 
-
-class ChainFile(emcee.backends.HDFBackend):
-    """emcee's HDF5 file, replaced by one with more steps every few seconds.
-
-    HDF5 damages a file if it is stopped while it changes it, or finds the disk full. So changes
-    are made in memory, and what is on disk is always a whole file: a state from which the chain
-    goes on exactly as if it had not stopped. Steps are written `every` so many seconds.
+    What the file holds is a state from which the chain goes on exactly as if it had not stopped; a
+    file with another mark, that of all that the chain depends on, is refused.
     """
 
-    def __init__(
-        self, filename: str | Path, name: str = "mcmc", every: float = SAVED_EVERY
-    ) -> None:
-        super().__init__(str(filename), name=name)
-        self.every = every
-        self._changed: h5py.File | None = None
-        self._pending: list[tuple[Any, np.ndarray]] = []
-        self._written, self._due = -1, time.monotonic() + every
-
-    @contextmanager
-    def open(self, mode: str = "r") -> Iterator[h5py.File]:
-        """The file to read from, or to change: what is changed in one `with` is written at once."""
-        if self._changed is not None:
-            yield self._changed
+    def __init__(self, path: Path, mark: str = "", every: float = SAVED_EVERY) -> None:
+        super().__init__()
+        self.path, self.mark, self.every = path, mark, every
+        self._written, self._due = 0, time.monotonic() + every
+        #: Steps that are complete, and with them acceptance and random state; replaced at once.
+        self._state: tuple[int, np.ndarray, Any] | None = None
+        held = _load(path, mark, CHAIN, "a chain", alike=2)
+        if held is None:
             return
-        path = Path(self.filename)
-        if mode == "r":
-            if not path.exists():
-                raise FileNotFoundError(f"{path}: is not there, or not any more.")
-            with h5py.File(path) as file:
-                yield file
-            return
-        with h5py.File.in_memory(path.read_bytes() if path.exists() else None) as file:
-            self._changed = file
-            try:
-                yield file
-            finally:
-                self._changed = None
-            file.flush()
-            image = file.id.get_file_image()
-        with whole(path) as beside:
-            beside.write_bytes(image)
+        self.reset(*held[0].shape[1:])
+        self.chain, self.log_prob, self.accepted, keys, rest = held
+        self.random_state = ("MT19937", keys, int(rest[0]), int(rest[1]), float(rest[2]))
+        self.iteration = self._written = len(self.chain)
 
-    def save_step(self, state: Any, accepted: np.ndarray) -> None:
+    def save_step(self, state: emcee.State, accepted: np.ndarray) -> None:
         """Keep a step, and write when it is time."""
-        if not self._pending:
-            self._written = int(self.iteration)
-        # emcee goes on to change the arrays of the state it hands over.
-        kept = emcee.State(
-            state.coords.copy(), state.log_prob.copy(), random_state=state.random_state
-        )
-        self._pending.append((kept, accepted.copy()))
+        super().save_step(state, accepted)
+        self._state = self.iteration, self.accepted.copy(), state.random_state
         if time.monotonic() > self._due:
             self.flush()
 
     def flush(self) -> None:
-        """Write the steps that are kept in memory."""
-        if not self._pending:
+        """Write the steps that the file does not have."""
+        if self._state is None or self._state[0] == self._written:
             return
-        start, found = time.monotonic(), self.iteration
-        if found == self._written:
-            self._append()
-        # Otherwise an interrupted call has written them already.
-        elif found != self._written + len(self._pending):
-            raise InputError(f"{self.filename}: was changed by another process meanwhile.")
-        self._pending, now = [], time.monotonic()
+        start, (steps, accepted, (_, keys, *rest)) = time.monotonic(), self._state
+        arrays = self.chain[:steps], self.log_prob[:steps], accepted, keys, np.array(rest, float)
+        _save(self.path, self.mark, dict(zip(CHAIN, arrays, strict=True)))
+        self._written, now = steps, time.monotonic()
         self._due = now + max(self.every, 20 * (now - start))
-
-    def _append(self) -> None:
-        states = [state for state, _ in self._pending]
-        with self.open("a") as file:
-            group = file[self.name]
-            new = slice(self._written, self._written + len(states))
-            group["chain"][new] = [state.coords for state in states]
-            group["log_prob"][new] = [state.log_prob for state in states]
-            group["accepted"][:] += sum(accepted for _, accepted in self._pending)
-            for i, value in enumerate(states[-1].random_state):
-                group.attrs[f"random_state_{i}"] = value
-            group.attrs["iteration"] = new.stop
-
-
-def kept_chain(path: Path, name: str, size: tuple[int, int], mark: str) -> ChainFile:
-    """The place of a chain in its file, to begin there or to go on.
-
-    Its size is the number of walkers and of parameters, its mark that of all that it depends on.
-    """
-    backend, mark = ChainFile(path, name), f"{mark} {size}"
-    held = _held(path, name)
-    if held is None:
-        with backend.open("a") as file:
-            backend.reset(*size)
-            file[name].attrs["fingerprint"] = mark
-    elif held != mark:
-        raise _other(path, "a chain")
-    return backend
-
-
-def _held(path: Path, name: str) -> str | None:
-    """The mark of a chain that is in a file and whole, None if there is none."""
-    if not path.exists():
-        return None
-    try:
-        with h5py.File(path) as file:
-            if name not in file:
-                return None
-            group = file[name]
-            done = int(group.attrs["iteration"])
-            size = int(group.attrs["nwalkers"]), int(group.attrs["ndim"])
-            chain, log_prob = group["chain"][:done], group["log_prob"][:done]
-            accepted, states = group["accepted"][:], [a for a in group.attrs if "random" in a]
-            mark = str(group.attrs.get("fingerprint"))
-        intact = (
-            chain.shape == (done, *size)
-            and log_prob.shape == (done, size[0])
-            and bool(np.isfinite(chain).all() and not np.isnan(log_prob).any())
-            # Steps that were counted but not written are zeros.
-            and bool(chain.any(axis=(1, 2)).all() and (accepted <= done).all())
-            and len(states) == (RANDOM_STATE if done else 0)
-        )
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError):
-        intact = False
-    if not intact:
-        raise InputError(f"{path}: is damaged; start again with --overwrite.")
-    return mark
 
 
 def kept_realisations(
@@ -196,20 +101,25 @@ def kept_realisations(
     """
     check_seed("seed", seed)
     names = kind._fields
-    done = [] if path is None else _load(path, mark, names)
+    there = None if path is None else _load(path, mark, names, "realisations")
+    done = [] if there is None else [list(row) for row in zip(*there, strict=True)]
     held, saved = len(done), time.monotonic()
+
+    def stacked() -> list[np.ndarray]:
+        return list(map(np.stack, zip(*done, strict=True)))
+
     try:
         report(held, count)
         for result in _made(make, seed, range(held, count)):
             done.append(result)
             report(len(done), count)
             if path is not None and time.monotonic() - saved > SAVED_EVERY:
-                _save(path, mark, names, done)
+                _save(path, mark, dict(zip(names, stacked(), strict=True)))
                 held, saved = len(done), time.monotonic()
     finally:
         if path is not None and len(done) > held:
-            _save(path, mark, names, done)
-    return kind._make(map(np.stack, zip(*done[:count], strict=True)))
+            _save(path, mark, dict(zip(names, stacked(), strict=True)))
+    return kind._make(array[:count] for array in stacked())
 
 
 def _made(
@@ -226,22 +136,31 @@ def _made(
         yield from pool.map(one, numbers[1:])
 
 
-def _save(path: Path, mark: str, names: Sequence[str], done: list[list[np.ndarray]]) -> None:
-    stacked = dict(zip(names, map(np.stack, zip(*done, strict=True)), strict=True))
+def _save(path: Path, mark: str, arrays: Mapping[str, np.ndarray]) -> None:
     with whole(path) as beside, beside.open("wb") as file:
-        np.savez(file, mark=mark, **stacked)  # type: ignore[arg-type]
+        np.savez(file, mark=mark, **arrays)  # type: ignore[arg-type]
 
 
-def _load(path: Path, mark: str, names: Sequence[str]) -> list[list[np.ndarray]]:
+def _load(
+    path: Path, mark: str, names: Sequence[str], what: str, alike: int | None = None
+) -> list[np.ndarray] | None:
+    """The arrays of a file, all or the first of which are as long; None if it is not there.
+
+    The error about another mark says `what` it holds.
+    """
     if not path.exists():
-        return []
+        return None
     try:
         with np.load(path) as archive:
             found = str(archive["mark"])
             arrays = [archive[name] for name in names]
-        rows = [list(row) for row in zip(*arrays, strict=True)]
+        if len(set(map(len, arrays[:alike]))) > 1:
+            raise ValueError("its arrays do not belong together")
     except (OSError, ValueError, KeyError, TypeError, EOFError, *ZIP_ERRORS) as error:
         raise InputError(f"{path}: is damaged ({error}); start again with --overwrite.") from None
     if found != mark:
-        raise _other(path, "realisations")
-    return rows
+        raise InputError(
+            f"{path}: holds {what} of other data or settings; choose another --out, or start again "
+            "with --overwrite."
+        )
+    return arrays

@@ -20,7 +20,7 @@ from blackjax.diagnostics import ess_bulk, rhat
 from jaxtyping import Array, Float
 from rich.progress import Progress as Bar
 
-from fits.kept import ChainFile
+from fits.kept import KeptChain
 from fits.optimize import best_fit
 from fits.posterior import Likelihood, Posterior
 from fits.priors import Prior
@@ -68,7 +68,7 @@ def _ensemble(
     report: Callable[[int, int], None],
     nsteps: int = 5000,
     nwalkers: int = 32,
-    backend: ChainFile | None = None,
+    backend: KeptChain | None = None,
 ) -> dict[str, Any]:
     """Steps of emcee's ensemble; those that a file already holds are not made again."""
     size = len(labels)
@@ -269,7 +269,7 @@ def sample(
     nchains: int | None = None,
     nwalkers: int | None = None,
     seed: int = 0,
-    backend: ChainFile | None = None,
+    backend: KeptChain | None = None,
     progress: bool | Callable[[int, int], None] = True,
     throw: bool = True,
 ) -> FitResult:

@@ -17,7 +17,7 @@ from jaxtyping import Bool
 from fits.common import CommonMaps
 from fits.grid import grid_fit, grid_is_possible
 from fits.inputs import Inputs
-from fits.kept import fingerprint, kept_chain
+from fits.kept import KeptChain, fingerprint
 from fits.mixing import nominal
 from fits.optimize import best_fit
 from fits.posterior import chi2
@@ -108,7 +108,7 @@ def _fit_pixels(
     used: Bool[np.ndarray, " pix"],
     region: str,
     stokes: str,
-    chains: Path | None = None,
+    out: Path | None = None,
     progress: Progress = QUIET,
 ) -> RegionFit:
     """The fits of one region and choice of Stokes parameters; see `fit_regions`."""
@@ -143,10 +143,10 @@ def _fit_pixels(
             results[method] = best_fit(like, start, priors=priors, throw=False)
         else:
             chain = None
-            if chains is not None:
-                mark = f"{fingerprint(like)} {settings.free} {settings.seed}"
-                size = (settings.fit.nwalkers, len(start))
-                chain = kept_chain(chains, f"{region}_{stokes}", size, mark)
+            if out is not None:
+                size = settings.fit.nwalkers, len(start)
+                mark = f"{fingerprint(like)} {settings.free} {settings.seed} {size}"
+                chain = KeptChain(out / f"chain_{region}_{stokes}.npz", mark)
             results[method] = sample(
                 like,
                 start,
@@ -220,12 +220,12 @@ def fit_regions(
     settings: Experiment,
     prepared: CommonMaps,
     regions: dict[str, Bool[np.ndarray, " pix"]],
-    chains: Path | None = None,
+    out: Path | None = None,
     progress: Progress = QUIET,
 ) -> list[RegionFit]:
     """All fits that the settings ask for, in each region.
 
-    `chains` is the file of the chains; steps that it already holds are not made again.
+    `out` is a folder that keeps the chains; steps that it already holds are not made again.
     """
     if not settings.free_in("fit"):
         raise SettingsError("free: name at least one parameter to fit.")
@@ -234,7 +234,7 @@ def fit_regions(
         if not pixels.any():
             raise SettingsError(f"fit.regions: region {region!r} leaves no pixel.")
     return [
-        _fit_pixels(settings, prepared, pixels, region, stokes, chains, progress)
+        _fit_pixels(settings, prepared, pixels, region, stokes, out, progress)
         for region, pixels in used.items()
         for stokes in settings.fit.stokes
     ]

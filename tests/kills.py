@@ -9,7 +9,6 @@ import sys
 import time
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from settings_fuzz import written
@@ -100,13 +99,6 @@ def content(out: Path) -> dict:
         elif path.suffix == ".npz":
             with np.load(path) as arrays:
                 found[name] = {key: arrays[key].tobytes() for key in arrays}
-        elif path.suffix == ".h5":
-            with h5py.File(path) as file:
-                for group in file.values():
-                    for key, data in group.items():
-                        found[f"{name}{data.name}"] = (key, data.shape, data[()].tobytes())
-                    attributes = {k: np.asarray(v).tobytes() for k, v in group.attrs.items()}
-                    found[f"{name}{group.name}"] = attributes
         elif name == "log.txt":
             continue  # times of steps
         elif path.suffix == ".html":

@@ -122,8 +122,8 @@ def test_fit_on_files_in_plancks_format(folder, tmp_path, monkeypatch, capsys):
     assert "beta_dust" in printed.out
     assert "result.json" in printed.err
     assert sorted(p.name for p in out.iterdir()) == [
-        "chain.h5", "grid.png", "index.html", "log.json", "log.txt", "marginals.png",
-        "posterior.png", "result.json",
+        "chain_full_Q.npz", "chain_full_QU.npz", "chain_full_U.npz", "grid.png", "index.html",
+        "log.json", "log.txt", "marginals.png", "posterior.png", "result.json",
     ]  # fmt: skip
     for picture in out.glob("*.png"):
         assert picture.read_bytes().startswith(b"\x89PNG")

@@ -14,12 +14,11 @@ from functools import partial
 
 import emcee
 import filelock
-import h5py
 import numpy as np
 import pytest
 
 from commands import jaxsky, said
-from fits.kept import ChainFile, fingerprint, kept_chain, kept_realisations
+from fits.kept import KeptChain, fingerprint, kept_realisations
 from jaxsky.io import InputError, whole, write_maps, write_text
 from jaxsky.io.folders import ALL, Owner, alone, occupied
 
@@ -216,84 +215,74 @@ def ensemble(backend, nsteps):
         initial = np.random.default_rng(1).normal(size=(8, 2))
         state = emcee.State(initial, random_state=np.random.RandomState(1).get_state())
     sampler.run_mcmc(state, nsteps - sampler.iteration)
-    if isinstance(backend, ChainFile):
+    if isinstance(backend, KeptChain):
         backend.flush()
     return sampler.get_chain()
 
 
 def test_a_chain_goes_on_after_a_full_disk(tmp_path):
     expected = ensemble(None, 400)
-    path = tmp_path / "chain.h5"
-    other = kept_chain(path, "other", (8, 2), "mark")
-    held = ensemble(other, 20)
-    backend = kept_chain(path, "mcmc", (8, 2), "mark")
+    path = tmp_path / "chain.npz"
+    backend = KeptChain(path, "mark")
+    ensemble(backend, 20)
     backend.every, backend._due = 0, 0
-    with limited(30_000), pytest.raises(OSError, match=r"chain.h5: cannot be written \("):
+    with limited(30_000), pytest.raises(OSError, match=r"chain.npz: cannot be written \("):
         ensemble(backend, 400)
-    assert names(tmp_path) == ["chain.h5"]
-    resumed = kept_chain(path, "mcmc", (8, 2), "mark")
-    assert 0 <= resumed.iteration < 400
+    assert names(tmp_path) == ["chain.npz"]
+    resumed = KeptChain(path, "mark")
+    assert 20 <= resumed.iteration < 400
     np.testing.assert_array_equal(ensemble(resumed, 400), expected)
-    theirs = emcee.backends.HDFBackend(str(path), read_only=True)
-    np.testing.assert_array_equal(theirs.get_chain(), expected)
-    np.testing.assert_array_equal(theirs.accepted, resumed.accepted)
-    np.testing.assert_array_equal(other.get_chain(), held)
+    with np.load(path) as held:
+        np.testing.assert_array_equal(held["chain"], expected)
+        np.testing.assert_array_equal(held["accepted"], resumed.accepted)
 
 
-def test_an_interrupted_flush_is_not_repeated(tmp_path, monkeypatch):
-    backend = ChainFile(tmp_path / "chain.h5")
-    write, stops = backend._append, iter([True, False])
+def test_a_step_counts_when_it_is_complete(tmp_path, monkeypatch):
+    """A run that is interrupted within a step is resumed from before it."""
+    path = tmp_path / "chain.npz"
+    backend, keep = KeptChain(path), emcee.backends.Backend.save_step
 
-    def interrupted():
-        write()
-        if next(stops):
+    def interrupted(self, state, accepted):
+        keep(self, state, accepted)
+        if self.iteration == 30:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(backend, "_append", interrupted)
+    monkeypatch.setattr(emcee.backends.Backend, "save_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        ensemble(backend, 30)
+        ensemble(backend, 40)
     backend.flush()
-    np.testing.assert_array_equal(ensemble(backend, 60), ensemble(None, 60))
-    # Nor are steps added to a file that has changed.
-    ensemble(ChainFile(tmp_path / "chain.h5"), 70)
-    backend._pending, backend._written = [None], 60
-    with pytest.raises(InputError, match="was changed by another process"):
-        backend.flush()
+    monkeypatch.setattr(emcee.backends.Backend, "save_step", keep)
+    resumed = KeptChain(path)
+    assert resumed.iteration == 29
+    np.testing.assert_array_equal(ensemble(resumed, 60), ensemble(None, 60))
 
 
 def test_damaged_chains_are_refused(tmp_path):
-    path = tmp_path / "chain.h5"
-    ensemble(kept_chain(path, "mcmc", (8, 2), "mark"), 50)
+    path = tmp_path / "chain.npz"
+    ensemble(KeptChain(path, "mark"), 50)
     content = path.read_bytes()
 
     def refused():
         held = path.read_bytes()
-        with pytest.raises(InputError, match="h5: is damaged; start again with --overwrite"):
-            kept_chain(path, "mcmc", (8, 2), "mark")
+        with pytest.raises(
+            InputError, match=r"npz: is damaged \(.*\); start again with --overwrite"
+        ):
+            KeptChain(path, "mark")
         assert path.read_bytes() == held
 
     for size in (0, 1, 100, len(content) // 2, len(content) - 1):
         path.write_bytes(content[:size])
         refused()
-
-    def change(do):
-        path.write_bytes(content)
-        with h5py.File(path, "a") as file:
-            do(file["mcmc"])
-        refused()
-
-    change(lambda group: group.attrs.__setitem__("iteration", 51))
-    change(lambda group: group.attrs.__setitem__("iteration", 10))  # more accepted than steps
-    change(lambda group: group.attrs.__delitem__("iteration"))
-    change(lambda group: group.attrs.__delitem__("random_state_3"))
-    change(lambda group: group["chain"].__setitem__(49, 0))
-    change(lambda group: group["chain"].__setitem__(0, np.nan))
-    change(lambda group: group.__delitem__("log_prob"))
-    change(lambda group: group["log_prob"].resize(30, axis=0))
+    middle = len(content) // 2
+    path.write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :])
+    refused()
+    with path.open("wb") as file:
+        np.savez(file, mark="mark", chain=np.zeros((3, 8, 2)))
+    refused()
     path.write_bytes(content)
-    with pytest.raises(InputError, match="other data or settings"):
-        kept_chain(path, "mcmc", (8, 3), "mark")
-    assert kept_chain(path, "mcmc", (8, 2), "mark").iteration == 50
+    with pytest.raises(InputError, match="a chain of other data or settings"):
+        KeptChain(path, "another mark")
+    assert KeptChain(path, "mark").iteration == 50
 
 
 def test_realisations_go_on_after_a_full_disk(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ import pytest
 import scipy.special
 import scipy.stats
 
-from fits.kept import ChainFile
+from fits.kept import KeptChain
 from fits.optimize import best_fit
 from fits.posterior import Posterior, value_and_gradient
 from fits.priors import Gaussian, Uniform
@@ -239,10 +239,10 @@ def test_how_steps_are_counted_does_not_matter():
 
 def test_a_stopped_ensemble_goes_on_as_if_it_had_not(tmp_path):
     whole = draw(strong(), "emcee", nsteps=40, throw=False)
-    path = tmp_path / "chain.h5"
-    draw(strong(), "emcee", nsteps=25, backend=ChainFile(path), throw=False)
+    path = tmp_path / "chain.npz"
+    draw(strong(), "emcee", nsteps=25, backend=KeptChain(path), throw=False)
     for _ in ("gone on with", "read: it is finished"):
-        again = draw(strong(), "emcee", nsteps=40, backend=ChainFile(path), throw=False)
+        again = draw(strong(), "emcee", nsteps=40, backend=KeptChain(path), throw=False)
         np.testing.assert_array_equal(again.details["chain"], whole.details["chain"])
 
 

@@ -230,9 +230,7 @@ def test_embedded_run_recovers_the_truth(quick_settings, tmp_path):
     prepared = common_maps(inputs, 16, 300.0)
     how = quick_settings.fit.model_copy(update={"stokes": ["U", "QU"]})
     quick_settings = quick_settings.model_copy(update={"fit": how})
-    fits = fit_regions(
-        quick_settings, prepared, region_masks(quick_settings, ["strip"]), tmp_path / "c.h5"
-    )
+    fits = fit_regions(quick_settings, prepared, region_masks(quick_settings, ["strip"]), tmp_path)
     assert [(f.region, f.stokes) for f in fits] == [("strip", "U"), ("strip", "QU")]
     for fit in fits:
         results = fit.results

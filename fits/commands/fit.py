@@ -22,7 +22,7 @@ PICTURES = {
     "marginals.png": plot_marginals,
     "posterior.png": plot_posterior,
 }
-CHAINS = "chain.h5"
+CHAINS = "chain_*.npz"
 
 
 def _work(settings: Experiment, command: Run) -> Report:
@@ -32,8 +32,7 @@ def _work(settings: Experiment, command: Run) -> Report:
     prepared = prepared_maps(settings, inputs)
     inputs = inputs._replace(bands={})  # their maps have served
     command.begin()
-    chains = command.out / CHAINS
-    fits = fit_regions(settings, prepared, regions, chains, command.steps)
+    fits = fit_regions(settings, prepared, regions, command.out, command.steps)
     truth = known_truth(inputs, fits)
     return Report(
         inputs.description,
@@ -41,7 +40,7 @@ def _work(settings: Experiment, command: Run) -> Report:
         fit_warnings(inputs, settings, fits),
         fit_numbers(settings, fits, truth),
         {name: (plot, fits, truth, settings.title) for name, plot in PICTURES.items()},
-        [chains] if chains.exists() else [],
+        sorted(command.out.glob(CHAINS)),
     )
 
 

@@ -203,7 +203,7 @@ PICTURES = {
 }
 POSTERIOR = "posterior.png"
 MAPS = ("components.fits", "residuals.fits", "parameters.fits")
-KEPT = ("simulations.npz", "chain.h5")
+KEPT = ("simulations.npz", "chain.npz")
 
 
 def _work(settings: Experiment, command: Run) -> Report:

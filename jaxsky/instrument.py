@@ -1,7 +1,7 @@
 """Instruments as data: bands, beams and noise of channels."""
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +18,9 @@ from jaxsky.printed import Printed
 class Instrument(Printed, dict[str, ObservedBand]):
     """Channels by name, which print as a table."""
 
-    title = ""
+    def __init__(self, title: str, channels: Mapping[str, ObservedBand]) -> None:
+        super().__init__(channels)
+        self.title = title
 
     def bands(self) -> dict[str, Bandpass]:
         """The bandpasses by name."""
@@ -73,14 +75,13 @@ def load_instrument(
         raise TypeError(
             f"Argument `channels` must be a list of names, not the string {channels!r}."
         )
-    found = Instrument()
-    found.title = _presets()[name]["title"]
+    found = {}
     for table in band_tables(name, channels):
         band = Bandpass.top_hat(**table["bandpass"], samples=samples)
         noise = table["noise"]
         level = noise["level"] * band.conversion(noise.get("unit", "uK_CMB"), "uK_RJ")
         found[table["name"]] = ObservedBand(band, jnp.asarray(table["fwhm"]), target, level)
-    return found
+    return Instrument(_presets()[name]["title"], found)
 
 
 def band_tables(

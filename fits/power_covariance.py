@@ -8,11 +8,10 @@ import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
-from fits.pseudo_cl import MaskedSpectra, band_powers, derivative_factors, pure_factors
-from jaxsky.cmb import gaussian_fields
-from jaxsky.harmonics import alm_to_healpy, analysis, lmax_of, synthesis
+from fits.pseudo_cl import MaskedSpectra, derivative_factors, pure_factors
+from jaxsky.harmonics import alm_to_healpy, analysis, lmax_of
 
 #: Part of a mask's variance that may depend on longitude about its middle for it to be a disc.
 ASYMMETRY = 1e-3
@@ -20,40 +19,6 @@ ASYMMETRY = 1e-3
 NOTHING = 1e-5
 #: Orders m of harmonics that are held at a time.
 CHUNK = 32
-
-
-def bandpower_covariance(
-    spectra: MaskedSpectra,
-    EE: Float[np.ndarray, " ell"],
-    BB: Float[np.ndarray, " ell"],
-    *,
-    simulations: int = 0,
-    key: Array | None = None,
-) -> Float[np.ndarray, "2 bin 2 bin"]:
-    """Covariance of band powers of a Gaussian field.
-
-    Exact for masks that do not depend on longitude about their middle, purified or not. For others
-    it is an approximation (`covariance_terms`), good to some 10 % but for purified B: in the lowest
-    bands, of the size of the mask, its errors are up to 50 % larger, which simulations correct:
-    standard deviations are taken from so many Gaussian skies, while the correlations stay; 200
-    measure them to 5 %. EE and BB are C_l of the maps, window and noise included.
-    """
-    fields = np.stack([EE, BB])[None, :, : spectra.lmax + 1]
-    covariance = 2 * covariance_terms(spectra, fields)[0, 0]
-    if not simulations:
-        return covariance
-    if simulations < 2 or key is None:
-        raise ValueError(
-            "Argument `simulations` must be 0, or 2 and more with a `key` of jax.random; "
-            f"it is {simulations}, with key = {key}."
-        )
-    nside, matrix = healpy.npix2nside(spectra.mask.size), jnp.eye(2)[..., None] * fields[0]
-    powers = [
-        band_powers(spectra, synthesis(gaussian_fields(one, matrix), nside))
-        for one in jax.random.split(key, simulations)
-    ]
-    scale = np.std(powers, axis=0, ddof=1) / np.sqrt(np.einsum("ibib->ib", covariance))
-    return covariance * scale[..., None, None] * scale
 
 
 def covariance_terms(
@@ -66,7 +31,8 @@ def covariance_terms(
     The covariance of the sum of fields with p_i times the spectra is 2 sum_ij p_i p_j terms[i, j].
     Exact for symmetric masks (`zonal`). For others pseudo-spectra are correlated as modes of the
     squared mask, and the spectra taken to vary little over the width of the mask's own spectrum
-    (Efstathiou 2004; Challinor & Chon 2005).
+    (Efstathiou 2004; Challinor & Chon 2005): good to some 10 % but for purified B, whose errors in
+    the lowest bands, of the size of the mask, are up to 50 % larger.
     """
     given = np.asarray(fields, float)[..., : spectra.lmax + 1]
     reach = min(2 * spectra.lmax, 2 * healpy.npix2nside(spectra.mask.size))

@@ -10,7 +10,7 @@ import pytest
 from commands import jaxsky, one_sentence
 from fits.commands.forecast import forecast, forecast_warnings
 from fits.commands.run import DEFAULTS
-from fits.power_covariance import bandpower_covariance
+from fits.power_covariance import covariance_terms
 from fits.pseudo_cl import bin_edges, masked_spectra, sky_fraction
 from fits.regions import apodize
 from fits.tensor_ratio import BandLaw, band_correlation, equal_r, fit_law, foreground_powers
@@ -102,7 +102,7 @@ def test_powers_of_a_known_sky(sky):
         np.testing.assert_allclose(found[name], D, rtol=2e-3)
         # On part of the sky, within the scatter of its modes.
         D = np.einsum("ibjl,jl->ib", cut.windows, C)
-        covariance = bandpower_covariance(cut, *(C * window)).reshape(D.size, D.size)
+        covariance = 2 * covariance_terms(cut, (C * window)[None])[0, 0].reshape(D.size, D.size)
         off = (found_cut[name] - D).ravel()
         chi2 = off @ np.linalg.solve(covariance, off)
         assert 0.1 * D.size < chi2 < 1.6 * D.size

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from fits import inputs as fit_inputs
-from fits.commands.fit import fit_numbers, fit_warnings
+from fits.commands.fit import _table, fit_numbers, fit_warnings
 from fits.commands.run import DEFAULTS
 from fits.common import common_maps
 from fits.compress import gram
 from fits.fluctuations import Fluctuations
 from fits.inputs import Band, Inputs, read_band
+from fits.plots import label
 from fits.posterior import chi2
-from fits.spectral_index import fit_regions
+from fits.spectral_index import fit_regions, known_truth
 from fits.template_likelihood import _one_stokes_each
 from fits.template_noise import TemplateNoise, level_spectrum
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, inputs, observe
@@ -29,6 +30,7 @@ from jaxsky.settings import BandTable, Experiment, SettingsError, load
 NSIDE = 8
 NPIX = healpy.nside2npix(NSIDE)
 START = {"dust.beta_dust": 1.5, "synchrotron.beta_syn": 3.0}
+TRUTH_OF_BANDS = {"angle.44": 0.0, "gain.30": 1.0}
 TRUTH = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1}  # the laws' defaults
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SHIPPED = EXAMPLES / "planck_44_70.toml"
@@ -339,6 +341,30 @@ def test_noise_that_is_all_of_a_template_is_refused():
 def fitted(made, settings, inside):
     (fit,) = fit_regions(settings, common_maps(made, NSIDE, 0.0), inside)
     return fit
+
+
+def test_parameters_of_bands_are_fitted_and_named():
+    sky, bands = sky_of(5), {"30": (30.0, 10.0), "44": (44.0, 10.0), "353": (353.0, 10.0)}
+    inside = {"all": np.ones(NPIX, bool)}
+    own = {"angle.44": {"gaussian": [0.0, 0.5]}, "gain.30": {"gaussian": [1.0, 0.01]}}
+    free = own | {name: {"start": value} for name, value in START.items()}
+    settings = settings_of(free=free, fit={"methods": ["gradient"], "stokes": ["Q"]})
+    assert settings.start("fit") == settings.start("separate") == TRUTH_OF_BANDS | START
+    made = inputs_of(sky, bands)._replace(truth=TRUTH)
+    fit = fitted(made, settings, inside)
+    truth, result = known_truth(made, [fit]), fit.results["gradient"]
+    assert truth == TRUTH_OF_BANDS | TRUTH
+    for name, value in truth.items():
+        assert abs(result.best_fit[name] - value) < 4 * result.sigma[name]
+    assert result.sigma["angle.44"] < 0.3  # so Q of this band has been compared with U
+    assert _table([fit], truth).header[3:-1] == ("angle.44", "beta_dust", "gain.30", "beta_syn")
+    assert [label(name) for name in own] == [r"\psi_{\rm 44}\ [^\circ]", r"g_{\rm 30}"]
+    noisy = dict.fromkeys(("dust", "synchrotron"), TemplateNoise(TEMPLATE_NOISE / 1e4))
+    words = "^free: Parameter 'angle.44' cannot be free where noise of templates is given"
+    with pytest.raises(SettingsError, match=words):
+        fitted(inputs_of(sky, bands, noisy), settings, inside)
+    del free["angle.44"]
+    assert fitted(inputs_of(sky, bands, noisy), settings_of(free=free), inside).corrected
 
 
 def test_a_level_is_seen_through_the_beam():

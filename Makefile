@@ -8,7 +8,7 @@ fit: .venv/.run
 	$(BIN)/jaxsky fit --out results/fit --overwrite
 
 test: .venv/.dev
-	$(BIN)/pytest -n auto --maxprocesses 4
+	$(BIN)/pytest -n auto --maxprocesses 4 --dist worksteal
 
 lint: .venv/.dev
 	$(BIN)/ruff check .

@@ -301,6 +301,7 @@ def test_what_cannot_be_compared_is_refused(settings, prepared, regions):
             Experiment.model_validate(settings.model_dump() | change)
 
 
+@pytest.mark.slow
 def test_command_line(tmp_path, monkeypatch, capsys):
     written(tmp_path / "a.toml", SETTINGS)
     out = tmp_path / "out"

@@ -229,6 +229,7 @@ def written(folder, name, old="", new=""):
     return path
 
 
+@pytest.mark.slow
 def test_command_on_files(folder, tmp_path, monkeypatch, capsys):
     path, out = written(folder, "whole"), tmp_path / "out"
     assert jaxsky(monkeypatch, "forecast", path, "--out", out) == 0

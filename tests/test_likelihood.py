@@ -211,7 +211,7 @@ def test_an_angle_does_not_change_the_intensity():
     assert rest == pytest.approx(float(chi2(plain, {"dust.beta_dust": 1.5})))
 
 
-@pytest.mark.parametrize("exact", [False, True])
+@pytest.mark.parametrize("exact", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_what_is_wrong_with_bands_is_found(exact):
     """The truth is within the errors, and found where there is no noise."""
     sky, _, sigma = problem()
@@ -267,7 +267,8 @@ def test_gain_offset_and_mask(pixelwise):
     assert float(chi2(like, params)) == pytest.approx(expected, rel=1e-11)
 
 
-@pytest.mark.parametrize("cmb", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("cmb", [False, True])
 def test_exact_covariance_is_the_dense_one(cmb):
     model = fluctuations(cmb)
     rows = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3, 2, NPIX)))

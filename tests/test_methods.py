@@ -214,6 +214,7 @@ def test_results_are_printed_written_and_given_to_getdist(like):
     assert samples.samples.shape == (used.shape[0] * used.shape[1], 2)
 
 
+@pytest.mark.slow
 def test_templates_take_newtons_method_and_the_no_u_turn_sampler(like):
     default = best_fit(like, START, priors=PRIORS)
     newton = best_fit(like, priors=PRIORS, solver=Newton())

@@ -99,6 +99,7 @@ def test_gradient_in_the_covariance(covariance, diagonal):
     np.testing.assert_allclose(drawn(covariance), eager, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradient_in_the_noise_level():
     hits = jnp.asarray(np.random.default_rng(0).uniform(5, 50, 12))
     rms = jnp.asarray(np.random.default_rng(1).uniform(1, 2, (2, 12)))

@@ -166,6 +166,7 @@ def test_decorrelated_bands():
     np.testing.assert_array_equal(decorrelate(covariance, np.array([1.0, 0.1])), np.eye(2))
 
 
+@pytest.mark.slow
 def test_patches_of_one_shape_share_their_covariance():
     north, south = disc_mask(NSIDE, 10.0, 60.0), disc_mask(NSIDE, 200.0, -50.0)
     masks = {"north": north, "south": south, "field": bicep2_mask(NSIDE)}

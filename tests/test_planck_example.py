@@ -385,6 +385,7 @@ def test_a_level_is_seen_through_the_beam():
     np.testing.assert_allclose(np.var(maps), variance[0, 0, 0], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_templates_without_a_word_on_their_noise_are_warned_of():
     sky, settings, inside = sky_of(4), settings_of(), {"all": np.ones(NPIX, bool)}
     bands = {"30": (30.0, 10.0), "353": (353.0, 10.0)}

@@ -215,6 +215,7 @@ def test_regions_have_values_of_their_own():
     assert set(shown[latitude > 45]) == {found.fit.best_fit["dust.beta_dust"][1]}
 
 
+@pytest.mark.slow
 def test_the_response_is_that_of_a_new_fit():
     """To first order in the noise; Gaussian priors draw their mean anew."""
     how, given, found = separated()

@@ -90,6 +90,7 @@ def settings(folder, name, regions="{ file = 'labels.fits' }", noise=None, **rep
     return path
 
 
+@pytest.mark.slow
 def test_maps_of_ones_own(folder, tmp_path, monkeypatch, capsys):
     path, out = settings(folder, "own"), tmp_path / "out"
     assert jaxsky(monkeypatch, "separate", path, "--out", out) == 0

@@ -56,7 +56,7 @@ def check(result, mean, width, within=0.1):
     assert np.abs(flat.std(axis=0) / width - 1).max() < 0.1
 
 
-@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("sampler", [pytest.param("nuts", marks=pytest.mark.slow), "emcee"])
 def test_samples_of_a_well_determined_problem_are_those_of_the_curvature(sampler):
     like = strong()
     fit = best_fit(like)

@@ -15,10 +15,9 @@ from typing import Annotated
 import typer
 
 import jaxsky
-from fits.commands.console import print_written, replace_unprintable
 from fits.commands.data import data_commands
-from fits.commands.endings import print_error, prompt
-from fits.commands.run import DEFAULTS, Command, run_command
+from fits.commands.report import print_written
+from fits.commands.run import DEFAULTS, Command, interruptible, print_error, run_command
 from jaxsky.io.folders import cache_folder
 from jaxsky.programs import keep_programs
 
@@ -190,9 +189,11 @@ def _return_memory() -> None:
 def main() -> None:
     """Run the command line: double precision on, mistakes as one sentence and exit code 2."""
     _return_memory()
-    replace_unprintable()
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # what a terminal's encoding lacks is replaced
+            stream.reconfigure(errors="replace")
     try:
-        with prompt():
+        with interruptible():
             import jax
 
             jax.config.update("jax_enable_x64", True)

@@ -18,7 +18,7 @@ the variance of the noise, and what tells parameters apart is the difference.
 """
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 
 from fits.mixing import Mixing
 from fits.pseudo_cl import PIVOT
-from jaxsky import Bandpass, Sky, get_parameters, parameter_names
+from jaxsky import Sky, get_parameters, parameter_names
 from jaxsky.checks import check_double
 from jaxsky.sky import unknown_parameter
 
@@ -59,11 +59,6 @@ class ForecastModel(eqx.Module):
     sky_fraction: Float[Array, ""]
     fields: tuple[str, ...] = eqx.field(static=True)
 
-    @classmethod
-    def of(cls, sky: Sky, bands: Mapping[str, Bandpass], *rest: Any) -> "ForecastModel":
-        """The model for bandpasses by name; the rest are the fields from `weights` on."""
-        return cls(Mixing.of(sky, bands, "uK_CMB"), *rest)
-
     @property
     def sky(self) -> Sky:
         """The foregrounds."""
@@ -73,43 +68,21 @@ class ForecastModel(eqx.Module):
 class Errors(NamedTuple):
     """Errors of a forecast of the free parameters about their fiducial values.
 
-    The covariance, in the order of `free`, has the priors in it; `known` is the error of each, were
-    all others known.
+    The covariance, in the order of `free`, has the priors in it, and so has `sigma`, the standard
+    deviation of each parameter, all others free; `known` is that were all others known.
     """
 
     free: tuple[str, ...]
     fiducial: dict[str, float]
+    sigma: dict[str, float]
     covariance: Float[np.ndarray, "par par"]
     known: dict[str, float]
     priors: dict[str, float]
 
-    def sigma(self, name: str) -> float:
-        """Standard deviation of a parameter, all others free."""
-        i = self.free.index(name)
-        return float(np.sqrt(self.covariance[i, i]))
-
     def correlation(self, first: str, second: str) -> float:
         """Correlation coefficient of two parameters."""
         i, j = self.free.index(first), self.free.index(second)
-        return float(self.covariance[i, j] / (self.sigma(first) * self.sigma(second)))
-
-
-def foreground_names(
-    components: Iterable[str], fields: Iterable[str], kinds: Sequence[str]
-) -> tuple[str, ...]:
-    """Names of parameters of foreground spectra, such as "BB.dust.amplitude".
-
-    Kinds are "amplitude" (D_l at l = 80, uK_RJ^2 at the reference frequency), "slope" (of C_l) and
-    "correlation" (of a pair, "BB.dust.synchrotron.correlation").
-    """
-    singles = list(components)
-    pairs = [".".join(pair) for pair in itertools.combinations(singles, 2)]
-    return tuple(
-        f"{field}.{which}.{kind}"
-        for field in fields
-        for kind in kinds
-        for which in (pairs if kind == "correlation" else singles)
-    )
+        return float(self.covariance[i, j] / (self.sigma[first] * self.sigma[second]))
 
 
 def _correlations(params: Mapping[str, Any], field: str, components: Sequence[str]) -> list[list]:
@@ -125,8 +98,9 @@ def fiducial(
 ) -> dict[str, float]:
     """All parameters of the covariance by name, with their values.
 
-    `foregrounds` are those of their spectra of all kinds (`foreground_names`), and `A_lens` is the
-    fraction of the lensing BB that is left.
+    `foregrounds` are those of their spectra: "BB.dust.amplitude" (D_l at l = 80, uK_RJ^2 at the
+    reference frequency), "BB.dust.slope" (of C_l), and for each pair of components
+    "BB.dust.synchrotron.correlation". `A_lens` is the fraction of the lensing BB that is left.
     """
     components = list(sky)
     for field in sorted({name.split(".")[0] for name in foregrounds}):
@@ -142,8 +116,8 @@ def fiducial(
                 "multipoles."
             )
     names = [name for name in parameter_names(sky) if not name.endswith(".amplitude")]
-    of_sky = {name: float(value) for name, value in get_parameters(sky, names).items()}
-    return {"r": r, "A_lens": A_lens} | of_sky | dict(foregrounds)
+    laws = {name: float(value) for name, value in get_parameters(sky, names).items()}
+    return {"r": r, "A_lens": A_lens, **laws, **foregrounds}
 
 
 def _laws(params: Mapping[str, Array], model: ForecastModel) -> Float[Array, "band component"]:
@@ -264,23 +238,20 @@ def fisher_errors(
     # Of F = V s^2 V^T, relative to the size of each parameter.
     _, singular, vectors = np.linalg.svd(root / size)
     singular = np.pad(singular, (0, len(free) - len(singular)))
-    _refuse_degenerate(vectors[singular < LEAST_CHANGE], free)
-    scaled = vectors.T / singular
-    return Errors(
-        free,
-        {name: float(params[name]) for name in free},
-        scaled @ scaled.T / np.outer(size, size),
-        {name: float(1 / s) for name, s in zip(free, size, strict=True)},
-        priors,
-    )
-
-
-def _refuse_degenerate(null: Float[np.ndarray, "combination par"], free: tuple[str, ...]) -> None:
-    """Name the parameters of combinations that the data do not see, if there are any."""
-    if len(null):
+    if len(null := vectors[singular < LEAST_CHANGE]):
         part = np.abs(null).max(axis=0) > LEAST_SHARE
         names = [name for name, within in zip(free, part, strict=True) if within]
         raise ValueError(
             f"The bands do not tell these parameters apart: {', '.join(names)}; hold "
             f"{'one' if len(null) == 1 else len(null)} of them, or give priors."
         )
+    scaled = vectors.T / singular
+    covariance = scaled @ scaled.T / np.outer(size, size)
+    return Errors(
+        free,
+        {name: float(params[name]) for name in free},
+        dict(zip(free, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        covariance,
+        dict(zip(free, (1 / size).tolist(), strict=True)),
+        priors,
+    )

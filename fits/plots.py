@@ -16,6 +16,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 
+from fits.results import FitResult
 from jaxsky.components import parameter_declaration
 from jaxsky.io import whole
 
@@ -30,6 +31,7 @@ STYLE: Any = {
 }
 #: Okabe & Ito's colours, which the colour-blind can tell apart.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222")
+TRUTH = {"color": COLORS[3], "linewidth": 1.6}
 #: Width of a column of a paper [inch].
 COLUMN = 3.5
 #: Height of a map in it, with its title [inch].
@@ -186,13 +188,13 @@ def draw_map(
 
 
 class MapPanel(NamedTuple):
-    """A map with its title and what `draw_map` takes."""
+    """A map with its title and what `draw_map` takes; nearly all values are within the limit."""
 
     title: str
     values: Float[np.ndarray, " pix"]
-    limit: float
     label: str
     middle: float | None = None
+    limit: float | None = None
 
 
 def stokes_panels(
@@ -204,7 +206,7 @@ def stokes_panels(
 ) -> list[MapPanel]:
     """Q beside U."""
     return [
-        MapPanel(plain(f"{name}: {stokes}"), values, limit, f"{stokes} [{UNITS[unit]}]", middle)
+        MapPanel(plain(f"{name}: {stokes}"), values, f"{stokes} [{UNITS[unit]}]", middle, limit)
         for values, stokes in zip(maps, "QU", strict=True)
     ]
 
@@ -215,7 +217,8 @@ def plot_maps(path: Path, rows: Sequence[Sequence[MapPanel]], title: str = "") -
     size = columns * COLUMN, len(rows) * MAP_HEIGHT + (0.4 if title else 0.0)
     with draw_panels(path, title, size, len(rows), columns) as panels:
         for axes, panel in zip(panels.flat, (one for row in rows for one in row), strict=True):
-            draw_map(axes, *panel[1:])
+            limit = panel.limit or color_limit(panel.values - (panel.middle or 0.0))
+            draw_map(axes, panel.values, limit, panel.label, panel.middle)
             axes.set_title(panel.title)
 
 
@@ -281,3 +284,34 @@ def draw_spectra(
     round_numbers(axes.xaxis, (1, 3))
     axes.set_xlabel(r"multipole $\ell$")
     axes.set_ylabel(rf"$\ell(\ell+1)C_\ell/2\pi$ [{UNITS[unit]}$^2$]")
+
+
+def plot_chains(
+    path: Path, results: Mapping[str, FitResult], truth: Mapping[str, float] | None, title: str
+) -> None:
+    """The posterior of chains of the same parameters by what they are of, a colour for each."""
+    from getdist import plots  # slow to import
+
+    samples = [result.to_getdist(plain(name), label) for name, result in results.items()]
+    rows = next(iter(results.values())).labels
+    plotter = plots.get_subplot_plotter(width_inch=max(4.0, 1.6 * len(rows)))
+    plotter.settings.axes_fontsize = 9
+    plotter.settings.axes_labelsize = 11
+    plotter.settings.legend_fontsize = 9
+    plotter.settings.title_limit_fontsize = 9
+    plotter.triangle_plot(
+        samples,
+        list(rows),
+        filled=True,
+        contour_colors=list(COLORS[: len(samples)]),
+        title_limit=1 if len(samples) == 1 else 0,
+        markers={n: v for n, v in (truth or {}).items() if n in rows},
+        marker_args={"color": TRUTH["color"], "lw": TRUTH["linewidth"], "ls": "-"},
+    )
+    for i, name in enumerate(rows):
+        for result, color in zip(results.values(), COLORS, strict=False):
+            interval = result.of_row(result.interval_68, name)
+            plotter.subplots[i, i].axvspan(*interval, color=color, alpha=0.15, linewidth=0)
+    draw_title(plotter.fig, f"{title}; 68 % shaded", fontsize=8, y=1.03)
+    with mpl.rc_context(STYLE | {"savefig.dpi": 200}):
+        save(plotter.fig, path)

@@ -7,7 +7,8 @@ errors from measured powers would pull it down, and at full sky it is the maximu
 likelihood.
 """
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import healpy
@@ -15,6 +16,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Float
 
+from fits.full_sky import FIELDS
 from fits.power_covariance import covariance_terms
 from fits.pseudo_cl import PIVOT, MaskedSpectra, band_powers
 from jaxsky import Bandpass, Sky, observe_band
@@ -107,29 +109,22 @@ def power_model(
         and for uniform noise only
     """
     lmax, bins = spectra.lmax, len(spectra.edges) - 1
-    given = {"lensed": lensed, "tensors": tensors, "window": window, "noise": noise}
-    rows = {name: np.asarray(values) for name, values in given.items()}
-    for name in ("lensed", "tensors"):
-        good = rows[name].ndim == 2 and rows[name].shape[1] > lmax
-        check_shape(name, rows[name], good, f"have shape (4, ell) up to l = {lmax}")
-    for name in ("window", "noise"):
-        good = rows[name].ndim == 1 and rows[name].size > lmax
-        check_shape(name, rows[name], good, f"reach l = {lmax}")
+    for name, given in {"lensed": lensed, "tensors": tensors}.items():
+        good = np.ndim(given) == 2 and np.shape(given)[1] > lmax
+        check_shape(name, np.asarray(given), good, f"have shape (4, ell) up to l = {lmax}")
+    for name, given in {"window": window, "noise": noise}.items():
+        good = np.ndim(given) == 1 and np.size(given) > lmax
+        check_shape(name, np.asarray(given), good, f"reach l = {lmax}")
     additive = np.asarray(additive, float)
     of_bins = f"have a value for each of {bins} bins"
     check_shape("additive", additive, additive.shape == (bins,), of_bins)
-    scalars = rows["lensed"][1:3, : lmax + 1] * np.array([[1.0], [A_lens]])
-    primordial = rows["tensors"][1:3, : lmax + 1]
-    squared = rows["window"][: lmax + 1] ** 2
-    fields = np.stack([primordial * squared, scalars * squared + rows["noise"][: lmax + 1]])
-    terms = 2 * covariance_terms(spectra, fields)[:, :, 1, :, 1]
-    windows = spectra.windows[1]
-    model = PowerModel(
-        np.einsum("bjl,jl->b", windows, primordial),
-        np.einsum("bjl,jl->b", windows, scalars),
-        additive,
-        terms,
-    )
+    primordial = np.asarray(tensors)[1:3, : lmax + 1]
+    scalars = np.asarray(lensed)[1:3, : lmax + 1] * np.array([[1.0], [A_lens]])
+    squared = np.asarray(window)[: lmax + 1] ** 2
+    fields = [primordial * squared, scalars * squared + np.asarray(noise)[: lmax + 1]]
+    terms = 2 * covariance_terms(spectra, np.stack(fields))[:, :, 1, :, 1]
+    binned, lensing = (np.einsum("bjl,jl->b", spectra.windows[1], C) for C in (primordial, scalars))
+    model = PowerModel(binned, lensing, additive, terms)
     if simulated is None:
         return model
     simulated = np.asarray(simulated)
@@ -158,17 +153,14 @@ def fit_tensors(model: PowerModel, powers: Float[np.ndarray, " bin"]) -> TensorF
             f"Argument `powers` must be {model.tensors.size} finite numbers, but has shape "
             f"{powers.shape} and {int(np.sum(~np.isfinite(powers)))} that are not finite."
         )
-    r = 0.0
+    r, before = 0.0, np.inf
     for _ in range(STEPS):
-        solved = np.linalg.solve(model.covariance(r), model.tensors)
-        information = float(model.tensors @ solved)
-        weights, before = solved / information, r
-        r = float(weights @ (powers - model.mean(0.0)))
-        if abs(r - before) < CLOSE / np.sqrt(information):
+        covariance = model.covariance(r)
+        solved = np.linalg.solve(covariance, model.tensors)
+        sigma = 1 / np.sqrt(float(model.tensors @ solved))
+        if abs(r - before) < CLOSE * sigma:
             break
-    covariance = model.covariance(r)
-    solved = np.linalg.solve(covariance, model.tensors)
-    sigma = 1 / np.sqrt(float(model.tensors @ solved))
+        r, before = float(solved @ (powers - model.mean(0.0))) * sigma**2, r
     rest = powers - model.mean(r)
     chi2, dof = float(rest @ np.linalg.solve(covariance, rest)), powers.size - 1
     grid, posterior = _posterior(model, powers, max(r, 0.0) + WIDTHS * sigma)
@@ -221,20 +213,18 @@ def foreground_powers(
     }
 
 
-def noise_level(band: ObservedBand) -> float:
-    """Noise of Q and U of a band [uK_CMB rad]; of noise that varies, pixels by their weights."""
+def noise_weights(band: ObservedBand, lmax: int) -> Float[np.ndarray, " ell"]:
+    """Beam over noise of Q and U of a band, b_l / sqrt(N_l) [1 / uK_CMB].
+
+    Its inverse square is the noise; where that varies, pixels count by their weights.
+    """
     noise = np.asarray(band.noise)
+    level = noise * np.radians(1 / 60)
     if noise.ndim:
         pixel = healpy.nside2resol(healpy.npix2nside(noise.shape[-1]))
         level = pixel / np.sqrt(np.mean([1 / noise[-2, -2], 1 / noise[-1, -1]]))
-    else:
-        level = float(noise) * np.radians(1 / 60)
-    return level * float(band.band.conversion("uK_RJ", "uK_CMB"))
-
-
-def noise_weights(band: ObservedBand, lmax: int) -> Float[np.ndarray, " ell"]:
-    """Beam over noise of a band, b_l / sqrt(N_l) [1 / uK_CMB]; its inverse square is the noise."""
-    return np.asarray(beam_ratio(band.beam, 0.0, lmax)) / noise_level(band)
+    level = level * float(band.band.conversion("uK_RJ", "uK_CMB"))
+    return np.asarray(beam_ratio(band.beam, 0.0, lmax)) / level
 
 
 def _modes(spectra: MaskedSpectra) -> Float[np.ndarray, " bin"]:
@@ -284,6 +274,30 @@ def band_correlation(
     inside = _inside(spectra, fit, "correlated components")
     coefficients = cross[inside] / np.sqrt(first[inside] * second[inside])
     return float(np.average(coefficients, weights=_modes(spectra)[inside]))
+
+
+def foreground_laws(
+    sky: Sky, spectra: MaskedSpectra, fields: Sequence[str], fit: tuple[int, int]
+) -> dict[str, float]:
+    """Power laws of the components' spectra and the correlation of each pair, by their names.
+
+    Those are the names of `fits.fisher.fiducial`.
+    """
+    maps = {name: sky[name].amplitude for name in sky}
+    auto = {name: band_powers(spectra, values) for name, values in maps.items()}
+    pairs = itertools.combinations(maps, 2)
+    cross = {(a, b): band_powers(spectra, maps[a], maps[b]) for a, b in pairs}
+    found: dict[str, float] = {}
+    for field in fields:
+        row = FIELDS.index(field)
+        for name, D in auto.items():
+            law = fit_law(spectra, D[row], fit, f"{field} of {name!r}")
+            found |= {f"{field}.{name}.{kind}": value for kind, value in law._asdict().items()}
+        for (a, b), D in cross.items():
+            found[f"{field}.{a}.{b}.correlation"] = band_correlation(
+                spectra, D[row], auto[a][row], auto[b][row], fit
+            )
+    return found
 
 
 def equal_r(

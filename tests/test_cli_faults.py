@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import commands
 from fits import app as cli
-from fits.commands import endings
-from fits.commands.run import results_folder
+from fits.commands.run import ERROR_LOG, results_folder
 
 JAXSKY = Path(sys.executable).with_name("jaxsky")
 
@@ -69,8 +69,8 @@ def test_errors_of_libraries_are_sentences(monkeypatch, capsys, tmp_path, fail, 
     code, said = run(monkeypatch, capsys, in_folder(out, fail))
     assert code == 2
     assert words in said
-    assert said.rstrip().endswith(f"Traceback: {out / endings.ERROR_LOG}")
-    assert "Traceback (most recent call last)" in (out / endings.ERROR_LOG).read_text()
+    assert said.rstrip().endswith(f"Traceback: {out / ERROR_LOG}")
+    assert "Traceback (most recent call last)" in (out / ERROR_LOG).read_text()
     code, said = run(monkeypatch, capsys, fail)
     assert code == 2
     assert words in said
@@ -81,10 +81,10 @@ def test_errors_of_libraries_are_sentences(monkeypatch, capsys, tmp_path, fail, 
 
 def test_a_log_is_that_of_the_last_run(monkeypatch, capsys, tmp_path):
     run(monkeypatch, capsys, in_folder(tmp_path, raises(TypeError("x"))))
-    assert (tmp_path / endings.ERROR_LOG).exists()
+    assert (tmp_path / ERROR_LOG).exists()
     with results_folder(tmp_path, resume=False, overwrite=False):
         pass
-    assert not (tmp_path / endings.ERROR_LOG).exists()
+    assert not (tmp_path / ERROR_LOG).exists()
 
 
 @pytest.mark.slow
@@ -170,6 +170,26 @@ def test_ctrl_c_ends_a_command(tmp_path, how):
     assert run.returncode == 130
     assert run.stderr == "Stopped; resume with --resume.\n"
     assert time.monotonic() - began < 50
+
+
+@pytest.mark.parametrize("late", ["write_page", "print_tables", "print_written"])
+def test_ctrl_c_says_whether_all_is_written(monkeypatch, capsys, tmp_path, late):
+    """Wherever the end of the command is, and although typer makes an exit of it."""
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    place, rest = "run", "all results are written"
+    if late == "write_page":
+        place, rest = "paper", "resume with --resume"
+    options = ("--out", tmp_path, "--only", "table 1")
+    with monkeypatch.context() as patched:
+        patched.setattr(f"fits.commands.{place}.{late}", interrupted)
+        assert commands.jaxsky(patched, "paper", *options) == 130
+    said = capsys.readouterr().err
+    assert said.endswith(f"\nStopped; {rest}.\n")
+    assert "Traceback" not in said
+    assert commands.jaxsky(monkeypatch, "paper", *options, "--resume") == 0
 
 
 def test_ctrl_c_before_there_is_a_folder(monkeypatch, capsys):

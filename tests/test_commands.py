@@ -12,8 +12,8 @@ import pytest
 from rich.console import Console
 
 from commands import jaxsky
-from fits.commands import console as terminal
-from fits.commands.page import ResultTable, Section, key_of, write_page
+from fits.commands import report as terminal
+from fits.commands.report import ResultTable, Section, anchor, write_page
 from fits.commands.run import DEFAULTS
 
 
@@ -82,7 +82,7 @@ def test_page(tmp_path):
     assert 'id="results"' in text
     assert '<td class="n">1.53</td>' in text
     assert 'src="a b.png"' in text
-    assert key_of("Figure 1: a") == "figure-1"
+    assert anchor("Figure 1: a") == "figure-1"
 
 
 def test_version(monkeypatch, capsys):

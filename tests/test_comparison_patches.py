@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fits.commands.compare_pictures import plot_patches, plot_template_patches
+from fits.commands.compare import plot_patches, plot_template_patches
 from fits.common import common_maps
 from fits.comparison import _patch_noise, compare_patches, template_patches
 from fits.discs import paper_patches, prepare_patches

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 import commands
-from fits.commands.page import Section
 from fits.commands.paper import NUMBERS, STEPS, Make, labels_of, make_figures
+from fits.commands.report import Section
 from fits.commands.run import DEFAULTS
 from fits.paper import figures_model
-from fits.paper.figures import Impossible, Number, PaperFigure, picture_of
 from fits.paper.figures_model import core_observation, figure_patch, prepared_templates
-from fits.paper.sky import PaperSky
+from fits.paper.sky import Impossible, Number, PaperFigure, PaperSky, picture_of
 from jaxsky.checks import listed
 from jaxsky.harmonics import gaussian_beam, power_spectrum
 from jaxsky.io import read_maps

@@ -8,8 +8,8 @@ mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from fits.plots import color_limit, draw_title, in_formula, label, plain, save
-from fits.posterior_plots import _drawable, plot_chains, plot_marginals, plot_posterior
+from fits.commands.fit import _drawable, plot_marginals, plot_posterior
+from fits.plots import color_limit, draw_title, in_formula, label, plain, plot_chains, save
 from fits.results import FitResult
 from fits.spectral_index import RegionFit
 from fits.writing import with_errors

@@ -1,53 +1,46 @@
-"""`jaxsky compare`: observed maps against the model, from settings to a report."""
+"""`jaxsky compare`: observed maps against the model, from settings to a report and its pictures."""
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-from fits.commands import compare_pictures as pictures
-from fits.commands.page import ResultTable, Row
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+
+from fits import plots
+from fits.commands.report import ResultTable, Row
 from fits.commands.run import Command, Report, Run
 from fits.common import prepared_maps
 from fits.comparison import (
     Comparison,
     PatchComparison,
+    Scatter,
     check_comparison,
     compare,
     compare_patches,
 )
-from fits.full_sky import FIELDS
+from fits.full_sky import FIELDS, BandSpectra
 from fits.inputs import inputs_of
+from fits.patches import PatchFits
 from fits.regions import region_masks
 from fits.writing import probability, with_error
+from jaxsky.harmonics import average_pixels
 from jaxsky.settings import Experiment
 
 #: A comparison with a smaller probability is pointed out.
 UNLIKELY = 0.01
-
-
-def _work(settings: Experiment, command: Run) -> Report:
-    command.steps.step("reading and preparing maps")
-    regions = region_masks(settings, settings.compare.regions)
-    inputs = inputs_of(settings)
-    prepared = prepared_maps(settings, inputs)
-    check_comparison(settings, prepared, regions)
-    command.begin()
-    command.steps.step("realisations")
-    simulations, report = command.out / "simulations.npz", command.steps.advance
-    found = compare(settings, prepared, regions, simulations, report)
-    patches = None
-    if settings.compare.patches is not None:
-        command.steps.step("patches")
-        patches = compare_patches(settings, inputs)
-    return Report(
-        inputs.description,
-        [_table(found)],
-        comparison_warnings(found, settings),
-        _numbers(found, patches),
-        _pictures(found, settings, patches),
-    )
-
-
-PICTURES = ("scatter_*.png", "maps_[QU].png", "spectra.png", "leakage.png", "patches.png")
-COMMAND = Command("compare", _work, ("comparison.json", "simulations.npz", *PICTURES))
+OBSERVED, MODEL, FOREGROUNDS, NOISE = plots.COLORS[1], plots.COLORS[2], plots.COLORS[0], "0.55"
+UNIT = plots.UNITS["uK_RJ"]
+POWER = rf"$D_\ell$ [{UNIT}$^2$]"
+MULTIPOLE = r"multipole $\ell$"
+#: Panels beside each other.
+COLUMNS = 3
+#: Label, C_l of EE and BB, and style.
+Curve = tuple[str, np.ndarray, dict[str, Any]]
+#: Patches in a picture: name, those shown, and what x and y are: a fit, and EE (0) or BB (1).
+Series = tuple[str, np.ndarray, tuple[PatchFits, int], tuple[PatchFits, int]]
 
 
 def _numbers(comparison: Comparison, patches: PatchComparison | None) -> dict[str, Any]:
@@ -57,10 +50,9 @@ def _numbers(comparison: Comparison, patches: PatchComparison | None) -> dict[st
         numbers = s._asdict() | {"slope_pte": s.slope_pte}
         band, region, stokes = (numbers.pop(key) for key in ("band", "region", "stokes"))
         pixels.setdefault(band, {}).setdefault(region, {})[stokes] = numbers
+    derived = ("centers", "chi2_bins", "largest_error")
     spectra = {
-        s.band: s._asdict()
-        | {"centers": s.centers, "chi2_bins": s.chi2_bins, "largest_error": s.largest_error}
-        for s in comparison.spectra
+        s.band: s._asdict() | {key: getattr(s, key) for key in derived} for s in comparison.spectra
     }
     found: dict[str, Any] = {"pixels": pixels, "spectra": spectra}
     if patches is not None:
@@ -130,6 +122,191 @@ def comparison_warnings(comparison: Comparison, settings: Experiment) -> list[st
     return sentences
 
 
+def plot_scatter(
+    path: Path, comparison: Comparison, region: str, bands: Sequence[str], title: str
+) -> None:
+    """Observed against modelled pixels of a region: a row for Q, one for U (the paper's fig. 5)."""
+    names, pixels = list(comparison.prepared.bands), comparison.regions[region]
+    rows, columns = 2 * -(-len(bands) // COLUMNS), min(len(bands), COLUMNS)
+    size = 2.4 * columns, 2.35 * rows + 0.6
+    with plots.draw_panels(path, title, size, rows, columns) as grid:
+        for i, band in enumerate(bands):
+            for s, stokes in enumerate("QU"):
+                axes = grid[2 * (i // COLUMNS) + s, i % COLUMNS]
+                both = (comparison.model, comparison.prepared.data)
+                x, y = (np.asarray(maps[names.index(band), s])[pixels] for maps in both)
+                _draw_scatter(axes, comparison.scatter(band, region, stokes), x, y)
+        for axes in grid[-2:, (len(bands) - 1) % COLUMNS + 1 :].flat:
+            axes.set_visible(False)
+        for axes in grid[:, 0]:
+            axes.set_ylabel(f"observed [{UNIT}]")
+        plots.legend_below(grid[0, 0], 2)
+
+
+def _draw_scatter(axes: Axes, scatter: Scatter, x: np.ndarray, y: np.ndarray) -> None:
+    ends = np.array([f(np.quantile(v, q) for v in (x, y)) for f, q in ((min, 0.001), (max, 0.999))])
+    line = ends + 0.15 * (ends[1] - ends[0]) * np.array([-1, 1])
+    axes.hexbin(x, y, gridsize=45, extent=(*line, *line), bins="log", cmap="Greys", lw=0)
+    axes.plot(line, line, color="k", lw=1.0, label="one to one")
+    axes.plot(line, scatter.slope * line, "--", color=plots.COLORS[1], lw=1.4, label="slope")
+    axes.set(xlim=line, ylim=line, aspect="equal", xlabel=f"model [{UNIT}]")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(mpl.ticker.MaxNLocator(4))
+    axes.set_title(plots.plain(f"{scatter.band}: {scatter.stokes}"))
+    slope = f"slope {with_error(scatter.slope, scatter.error)}"
+    words = f"{slope}\nr = {scatter.correlation:.3f}\nPTE {scatter.pte_text}"
+    axes.text(0.04, 0.96, words, transform=axes.transAxes, va="top", fontsize=7)
+
+
+def plot_model_maps(
+    path: Path, comparison: Comparison, stokes: str, bands: Sequence[str], nside: int, title: str
+) -> None:
+    """Observed maps beside the model, in one scale of colours (the paper's fig. 6).
+
+    A row for each band, two columns for each of `stokes`, "Q", "U" or "QU"; in pixels of `nside`.
+    """
+    names, rows = list(comparison.prepared.bands), []
+    region = "full" if "full" in comparison.regions else next(iter(comparison.regions))
+    weights = jnp.asarray(comparison.prepared.used[None], float)
+    share = np.asarray(average_pixels(weights, nside))[0]
+    # Half of a pixel is used, or half as much as in the fullest where a mask is finer than that.
+    used = share > share.max() / 2
+    for band in bands:
+        observed, model = (
+            np.where(used, average_pixels(maps[names.index(band)], nside), np.nan)
+            for maps in (comparison.prepared.data, comparison.model)
+        )
+        row: list[plots.MapPanel] = []
+        for kind in stokes:
+            s, scatter = "QU".index(kind), comparison.scatter(band, region, kind)
+            limit, slope = plots.color_limit(model[s]), with_error(scatter.slope, scatter.error)
+            head = f"model; slope {slope}, r = {scatter.correlation:.2f} ({region})"
+            row += [
+                plots.MapPanel(plots.plain(words), values[s], UNIT, limit=limit)
+                for words, values in ((f"{band}: {kind} observed", observed), (head, model))
+            ]
+        rows.append(row)
+    plots.plot_maps(path, rows, title)
+
+
+def _draw_curves(axes: Axes, curves: Sequence[Curve], field: int, width: float) -> None:
+    """Spectra of EE (0) or BB (1) as D_l, both axes logarithmic."""
+    for name, spectra, style in curves:
+        axes.plot(*plots.with_powers(spectra[field]), label=name, **{"lw": width, **style})
+    axes.set(xscale="log", yscale="log")
+    plots.round_numbers(axes.xaxis)
+
+
+def plot_full_sky(path: Path, spectra: Sequence[BandSpectra], title: str) -> None:
+    """EE and BB of each band, observed and of the complete model (the paper's figs. 7 and 8)."""
+    size = 7.2, 2.3 * len(spectra) + 0.8
+    with plots.draw_panels(path, title, size, len(spectra), 2, sharex=True) as grid:
+        for row, one in zip(grid, spectra, strict=True):
+            for index, axes in enumerate(row):
+                _draw_spectrum(axes, one, index)
+            row[0].set_ylabel(POWER)
+        for axes in grid[-1]:
+            axes.set_xlabel(MULTIPOLE)
+        plots.legend_below(grid[0, 0])
+
+
+def _draw_spectrum(axes: Axes, spectra: BandSpectra, index: int) -> None:
+    ell, observed = plots.with_powers(spectra.observed[index])
+    _, error = plots.with_powers(spectra.error[index])
+    low = np.maximum(observed - error, 1e-3 * observed)
+    axes.fill_between(ell, low, observed + error, color=OBSERVED, alpha=0.3, lw=0)
+    name = r"observed $\pm\,\Delta C_\ell$"
+    curves: list[Curve] = [
+        (name, spectra.observed, {"color": OBSERVED, "lw": 2.2, "alpha": 0.8}),
+        ("foregrounds + CMB + noise", spectra.complete, {"color": MODEL}),
+        ("foregrounds", spectra.foregrounds, {"color": FOREGROUNDS, "ls": "--"}),
+        ("noise", spectra.noise, {"color": NOISE, "ls": ":"}),
+    ]
+    _draw_curves(axes, curves, index, 1.0)
+    _, foregrounds = plots.with_powers(spectra.foregrounds[index])
+    axes.set_ylim(bottom=0.3 * min(observed.min(), foregrounds.min()))
+    chi2, pte = f"{spectra.chi2[index]:.1f}", probability(spectra.pte[index])
+    tested = rf"$\chi^2$ = {chi2} / {spectra.binned.shape[-1]} bins, PTE {pte}"
+    axes.set_title(f"{plots.plain(spectra.band)}: {FIELDS[index]}, {tested}")
+
+
+def plot_leakage(path: Path, spectra: Sequence[BandSpectra], title: str) -> None:
+    """BB before and after leakage was subtracted, and noise (the paper's fig. 9)."""
+    with plots.draw_panels(path, title, (3.6 * len(spectra), 3.2), 1, len(spectra)) as grid:
+        for axes, one in zip(grid[0], spectra, strict=True):
+            assert one.uncorrected is not None  # as chosen by the caller
+            assert one.pte_uncorrected is not None
+            before, after = (probability(p[1]) for p in (one.pte_uncorrected, one.pte))
+            curves: list[Curve] = [
+                (f"before correction, PTE {before}", one.uncorrected, {"color": plots.COLORS[1]}),
+                (f"after correction, PTE {after}", one.observed, {"color": plots.COLORS[0]}),
+                ("foregrounds", one.foregrounds, {"color": "k", "lw": 0.9, "ls": "--"}),
+                ("noise", one.noise, {"color": plots.COLORS[2], "ls": ":"}),
+            ]
+            _draw_curves(axes, curves, 1, 1.2)
+            axes.set(xlabel=MULTIPOLE, title=plots.plain(f"{one.band}: BB"))
+            axes.legend(frameon=False)
+        grid[0, 0].set_ylabel(POWER)
+
+
+def _draw_patches(axes: Axes, series: Sequence[Series], what: str) -> None:
+    """A or alpha with errors, and the line of equals; the field of BICEP2 is a star."""
+    drawn: list[float] = []
+    for (name, shown, *pair), color in zip(series, plots.COLORS, strict=False):
+        star = np.array([patch == "BICEP2" for patch in pair[0][0].names])
+        x, y = (getattr(fit, what)[:, index] for fit, index in pair)
+        dx, dy = (getattr(fit, f"{what}_error")[:, index] for fit, index in pair)
+        style: Any = {"color": color, "elinewidth": 0.4, "alpha": 0.8, "zorder": 3}
+        for kept, marker, size in ((shown & ~star, "x", 4), (shown & star, "*", 11)):
+            axes.errorbar(x[kept], y[kept], dy[kept], dx[kept], fmt=marker, ms=size, **style)
+        axes.plot([], [], "x", color=color, label=f"{name}: {shown.sum()} of {star.size} patches")
+        drawn += [*x[shown], *y[shown]]
+    line = [*axes.get_xlim(), *axes.get_ylim()]
+    if what == "A":
+        axes.set(xscale="log", yscale="log")
+        plots.round_numbers(axes.xaxis)
+        plots.round_numbers(axes.yaxis)
+        line = [min(drawn) / 1.5, max(drawn) * 1.5] if drawn else line
+    ends = min(line), max(line)
+    axes.plot(ends, ends, color="k", lw=1)
+    axes.set(xlim=ends, ylim=ends, aspect="equal")
+    axes.plot([], [], "k*", ms=9, label="BICEP2")
+
+
+def _plot_patch_pairs(
+    path: Path, series: Sequence[Series], x: str, y: str, heads: Sequence[str], title: str
+) -> None:
+    """A on the left and alpha on the right."""
+    symbols = {"A": rf"$A$ [{UNIT}$^2$]", "alpha": r"$\alpha$"}
+    with plots.draw_panels(path, title, (7.2, 4.0), 1, 2) as panels:
+        for axes, (what, symbol), head in zip(panels[0], symbols.items(), heads, strict=True):
+            _draw_patches(axes, series, what)
+            axes.set(xlabel=f"{symbol}, {x}", ylabel=f"{symbol}, {y}")
+            axes.set_title(head, fontsize=8)
+        plots.legend_below(panels[0, 0])
+
+
+def plot_patches(path: Path, patches: PatchComparison, title: str) -> None:
+    """A and alpha of the patches, model and observed (the paper's fig. 10)."""
+    title = f"{title}\n{patches.band}: patches of 400 square degrees"
+    series: list[Series] = [
+        (name, patches.detected(i), (patches.model, i), (patches.observed, i))
+        for i, name in enumerate(FIELDS)
+    ]
+    found = {"observed / model": patches.ratio, "observed - model": patches.slope_difference}
+    heads = [
+        f"{what}: {', '.join(f'{name} {with_error(*of(i))}' for i, name in enumerate(FIELDS))}"
+        for what, of in found.items()
+    ]
+    _plot_patch_pairs(path, series, "model", "observed", heads, title)
+
+
+def plot_template_patches(path: Path, fit: PatchFits, heads: Sequence[str], title: str) -> None:
+    """A and alpha of the patches of one map, BB against EE, each with its head."""
+    series = [("EE and BB", np.all(fit.detected, axis=1), (fit, 0), (fit, 1))]
+    _plot_patch_pairs(path, series, *FIELDS, heads, f"{title}\npatches of 400 square degrees")
+
+
 def _pictures(
     found: Comparison, settings: Experiment, patches: PatchComparison | None
 ) -> dict[str, tuple[Any, ...]]:
@@ -137,15 +314,42 @@ def _pictures(
     bands, title = list(found.prepared.bands), settings.title
     nside = min(settings.compare.panel_nside, settings.common.nside)
     drawn: dict[str, tuple[Any, ...]] = {
-        f"scatter_{region}.png": (pictures.plot_scatter, found, region, bands, f"{title}\n{region}")
+        f"scatter_{region}.png": (plot_scatter, found, region, bands, f"{title}\n{region}")
         for region in found.regions
     }
     for stokes in "QU":
-        drawn[f"maps_{stokes}.png"] = pictures.plot_model_maps, found, stokes, bands, nside, title
+        drawn[f"maps_{stokes}.png"] = plot_model_maps, found, stokes, bands, nside, title
     if found.spectra:
-        drawn["spectra.png"] = pictures.plot_full_sky, found.spectra, title
+        drawn["spectra.png"] = plot_full_sky, found.spectra, title
     if leaky := [s for s in found.spectra if s.uncorrected is not None]:
-        drawn["leakage.png"] = pictures.plot_leakage, leaky, title
+        drawn["leakage.png"] = plot_leakage, leaky, title
     if patches is not None:
-        drawn["patches.png"] = pictures.plot_patches, patches, title
+        drawn["patches.png"] = plot_patches, patches, title
     return drawn
+
+
+def _work(settings: Experiment, command: Run) -> Report:
+    command.steps.step("reading and preparing maps")
+    regions = region_masks(settings, settings.compare.regions)
+    inputs = inputs_of(settings)
+    prepared = prepared_maps(settings, inputs)
+    check_comparison(settings, prepared, regions)
+    command.begin()
+    command.steps.step("realisations")
+    simulations, report = command.out / "simulations.npz", command.steps.advance
+    found = compare(settings, prepared, regions, simulations, report)
+    patches = None
+    if settings.compare.patches is not None:
+        command.steps.step("patches")
+        patches = compare_patches(settings, inputs)
+    return Report(
+        inputs.description,
+        [_table(found)],
+        comparison_warnings(found, settings),
+        _numbers(found, patches),
+        _pictures(found, settings, patches),
+    )
+
+
+PICTURES = ("scatter_*.png", "maps_[QU].png", "spectra.png", "leakage.png", "patches.png")
+COMMAND = Command("compare", _work, ("comparison.json", "simulations.npz", *PICTURES))

@@ -7,9 +7,8 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 
-from fits.commands.console import console, print_tables
-from fits.commands.endings import interruptible
-from fits.commands.page import ResultTable, Row
+from fits.commands.report import ResultTable, Row, console, print_tables
+from fits.commands.run import if_stopped
 from jaxsky import archive
 from jaxsky.io import InputError
 from jaxsky.io.folders import cache_folder
@@ -89,7 +88,8 @@ def _fetch(
         TransferSpeedColumn(),
         console=console,
     )
-    with interruptible("; fetch it again to resume"), bar as progress:
+    if_stopped("; fetch it again to resume")
+    with bar as progress:
         for product in wanted:
             report = partial(progress.update, progress.add_task(product.name, total=product.size))
             words = f"{product.name}: another process fetches it; waiting."
@@ -99,6 +99,7 @@ def _fetch(
             )
             size = path.stat().st_size
             report(completed=size, total=size)
+    if_stopped("; all files are there")
     console.print(f"In {folder}: {len(wanted)} files.", soft_wrap=True)
 
 

@@ -1,6 +1,6 @@
 """`jaxsky forecast`: foreground B modes against primordial ones, and errors on r and the laws."""
 
-import itertools
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import healpy
@@ -9,41 +9,41 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from fits import tensor_ratio
-from fits.commands.page import ResultTable, Row
+from fits import plots, tensor_ratio
+from fits.commands.report import ResultTable, Row
 from fits.commands.run import Command, Report, Run
 from fits.common import prepare_component
-from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors, foreground_names
+from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors
 from fits.full_sky import FIELDS
-from fits.mixing import unit_sky
-from fits.plots import spread
+from fits.mixing import Mixing, unit_sky
 from fits.pseudo_cl import (
     LEAST_WINDOW,
     PIVOT,
     MaskedSpectra,
-    band_powers,
     bin_edges,
     masked_spectra,
     sky_fraction,
 )
 from fits.regions import apodize, region_mask
+from fits.writing import with_error
 from jaxsky import Sky
 from jaxsky.checks import check_double
 from jaxsky.cmb import camb_spectra, tensor_spectra
 from jaxsky.components import declared
 from jaxsky.experiment import map_nside, read_channel
 from jaxsky.harmonics import Preparation, gaussian_beam
-from jaxsky.inputs import Template, read_sky
+from jaxsky.inputs import read_sky
 from jaxsky.io import degrade_mask
 from jaxsky.observation import ObservedBand
 from jaxsky.progress import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 from jaxsky.sky import unknown_parameter
 
-#: Of the foregrounds' spectra, what may be free.
-KINDS = ("amplitude", "slope", "correlation")
 #: Spectra are taken in so many bands, if the settings name none.
 SHOWN = 5
+#: Primordial spectra, from the largest r on.
+DASHES = ("-", "--", "-.", ":")
+LENSING = "#888888"
 
 
 class ForecastInputs(NamedTuple):
@@ -97,39 +97,32 @@ def forecast_inputs(settings: Experiment) -> ForecastInputs:
     bands = {str(one.name): read_channel(settings, one, pixels) for one in settings.bands}
     if silent := [name for name, band in bands.items() if band.noise is None]:
         raise SettingsError(f"bands.{silent[0]}.noise: is missing.")
-    shown = spec.bands or spread(tuple(bands), SHOWN)
+    shown = spec.bands or plots.spread(tuple(bands), SHOWN)
     fwhm = max(template.fwhm for template in templates.values())
     nside = min(healpy.npix2nside(template.used.size) for template in templates.values())
-    _check_resolution(spec.lmax, nside, fwhm)
+    if spec.lmax > 2 * nside - 1:
+        raise SettingsError(
+            f"forecast.lmax: {spec.lmax} is beyond what templates of nside {nside} resolve, "
+            f"{2 * nside - 1}."
+        )
+    if (window := float(gaussian_beam(fwhm, spec.lmax)[-1])) < LEAST_WINDOW:
+        raise SettingsError(
+            f"forecast.lmax: the templates' beam of {fwhm:g} arcmin leaves {window:.2g} of the "
+            f"amplitude at l = {spec.lmax}; a correction takes {LEAST_WINDOW:g}."
+        )
     used = region_mask(settings, spec.region, nside, coarser=True)
-    for template in templates.values():
+    components = {}
+    for name, template in templates.items():
         used &= degrade_mask(template.used, nside, 1.0)
-    sky = Sky({name: _prepared(template, nside, fwhm) for name, template in templates.items()})
+        components[name] = template.component
+        own = healpy.npix2nside(template.used.size)
+        if own != nside or template.fwhm != fwhm:
+            operator = Preparation.smoothing(own, template.fwhm, nside, fwhm, 2 * nside)
+            components[name] = prepare_component(template.component, operator, template.used)
     mask = apodize(used, spec.apodization)
     if not mask.any():
         raise SettingsError("forecast.region: leaves no pixel.")
-    return ForecastInputs(sky, fwhm, mask, bands, tuple(shown), description)
-
-
-def _check_resolution(lmax: int, nside: int, fwhm: float) -> None:
-    if lmax > 2 * nside - 1:
-        raise SettingsError(
-            f"forecast.lmax: {lmax} is beyond what templates of nside {nside} resolve, "
-            f"{2 * nside - 1}."
-        )
-    if (window := float(gaussian_beam(fwhm, lmax)[lmax])) < LEAST_WINDOW:
-        raise SettingsError(
-            f"forecast.lmax: the templates' beam of {fwhm:g} arcmin leaves {window:.2g} of the "
-            f"amplitude at l = {lmax}; a correction takes {LEAST_WINDOW:g}."
-        )
-
-
-def _prepared(template: Template, nside: int, fwhm: float):
-    own = healpy.npix2nside(template.used.size)
-    if own == nside and template.fwhm == fwhm:
-        return template.component
-    operator = Preparation.smoothing(own, template.fwhm, nside, fwhm, 2 * nside)
-    return prepare_component(template.component, operator, template.used)
+    return ForecastInputs(Sky(components), fwhm, mask, bands, tuple(shown), description)
 
 
 def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
@@ -171,51 +164,25 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
         for name, law in laws.items()
     }
     progress.step("Fisher matrix")
-    model, parameters = _model(settings, inputs, spectra, tensors, lensed)
-    errors, without = _errors(settings, model, parameters)
-    return Forecast(
-        inputs, spectra, powers, laws, equal, tensors, lensed, parameters, errors, without
-    )
-
-
-def _model(
-    settings: Experiment,
-    inputs: ForecastInputs,
-    spectra: MaskedSpectra,
-    tensors: np.ndarray,
-    lensed: np.ndarray,
-) -> tuple[ForecastModel, dict[str, float]]:
-    """The covariance of all bands, with the foregrounds' spectra measured outside the mask."""
-    spec = settings.forecast
-    sky, fields = inputs.sky, tuple(f for f in FIELDS if f in spec.spectra)
-    rows = {field: FIELDS.index(field) for field in fields}
-    maps = {name: sky[name].amplitude for name in sky}
-    auto = {name: band_powers(spectra, values) for name, values in maps.items()}
-    foregrounds: dict[str, float] = {}
-    for field, row in rows.items():
-        for name, D in auto.items():
-            law = tensor_ratio.fit_law(spectra, D[row], spec.fit, f"{field} of {name!r}")
-            foregrounds |= {f"{field}.{name}.{kind}": v for kind, v in law._asdict().items()}
-    for first, second in itertools.combinations(maps, 2):
-        cross = band_powers(spectra, maps[first], maps[second])
-        for field, row in rows.items():
-            foregrounds[f"{field}.{first}.{second}.correlation"] = tensor_ratio.band_correlation(
-                spectra, cross[row], auto[first][row], auto[second][row], spec.fit
-            )
-    ell, lmax = np.arange(spec.lmin, spec.fisher_lmax + 1), spec.fisher_lmax
-    weights = [tensor_ratio.noise_weights(band, lmax)[ell] for band in inputs.bands.values()]
-    cmb_rows = 1 + np.array(list(rows.values()))[:, None]
-    model = ForecastModel.of(
-        unit_sky(sky, mask=inputs.mask),
-        {name: band.band for name, band in inputs.bands.items()},
+    fields = tuple(field for field in FIELDS if field in spec.spectra)
+    ell, rows = np.arange(spec.lmin, spec.fisher_lmax + 1), [1 + FIELDS.index(f) for f in fields]
+    weights = [tensor_ratio.noise_weights(b, spec.fisher_lmax)[ell] for b in inputs.bands.values()]
+    bandpasses = {name: band.band for name, band in inputs.bands.items()}
+    model = ForecastModel(
+        Mixing.of(unit_sky(inputs.sky, mask=inputs.mask), bandpasses, "uK_CMB"),
         jnp.asarray(np.stack(weights, axis=1)),
-        jnp.asarray(tensors[cmb_rows, ell]),
-        jnp.asarray(lensed[cmb_rows, ell]),
+        jnp.asarray(tensors[rows][:, ell]),
+        jnp.asarray(lensed[rows][:, ell]),
         jnp.asarray(ell, float),
         jnp.asarray(sky_fraction(inputs.mask)),
         fields,
     )
-    return model, fiducial(model.sky, foregrounds, settings.cmb.r, settings.cmb.A_lens)
+    foregrounds = tensor_ratio.foreground_laws(inputs.sky, spectra, fields, spec.fit)
+    parameters = fiducial(model.sky, foregrounds, settings.cmb.r, settings.cmb.A_lens)
+    errors, without = _errors(settings, model, parameters)
+    return Forecast(
+        inputs, spectra, powers, laws, equal, tensors, lensed, parameters, errors, without
+    )
 
 
 def _errors(
@@ -223,8 +190,13 @@ def _errors(
 ) -> tuple[Errors, float | None]:
     """Errors of all that is free, and that of r without foregrounds."""
     spec = settings.forecast
-    kinds = [kind for kind in spec.free if kind in KINDS]
-    nuisance = foreground_names(model.sky, model.fields, kinds)
+    nuisance = [
+        name
+        for field in model.fields
+        for kind in spec.free
+        for name in parameters
+        if name.startswith(f"{field}.") and name.endswith(f".{kind}")
+    ]
     spectral = settings.free_in("forecast")
     widths = {n: one.gaussian[1] for n, one in spectral.items() if one.gaussian is not None}
     for name in spec.priors:
@@ -235,13 +207,13 @@ def _errors(
             if name not in parameters:
                 raise unknown_parameter(name, parameters)
     with at_key("forecast"):
-        own = [name for name in spec.free if name not in KINDS]
+        own = [name for name in spec.free if name in parameters]
         free = list(dict.fromkeys((*own, *spectral, *nuisance)))
         errors = fisher_errors(model, parameters, free, widths | spec.priors)
     if "r" not in spec.free:
         return errors, None
     none = {n: 0.0 if n.endswith(".amplitude") else v for n, v in parameters.items()}
-    return errors, fisher_errors(model, none, ["r"]).sigma("r")
+    return errors, fisher_errors(model, none, ["r"]).sigma["r"]
 
 
 def _numbers(found: Forecast, settings: Experiment) -> dict[str, Any]:
@@ -266,7 +238,7 @@ def _numbers(found: Forecast, settings: Experiment) -> dict[str, Any]:
         "parameters": found.parameters,
         "fisher": {
             "free": errors.free,
-            "sigma": {name: errors.sigma(name) for name in errors.free},
+            "sigma": errors.sigma,
             "sigma_all_others_known": errors.known,
             "covariance": errors.covariance,
             "priors": errors.priors,
@@ -274,7 +246,7 @@ def _numbers(found: Forecast, settings: Experiment) -> dict[str, Any]:
     }
     if found.without_foregrounds is not None:
         results["sigma_r"] = {
-            "foregrounds_free": errors.sigma("r"),
+            "foregrounds_free": errors.sigma["r"],
             "all_else_known": errors.known["r"],
             "no_foregrounds": found.without_foregrounds,
         }
@@ -288,7 +260,7 @@ def _tables(found: Forecast) -> list[ResultTable]:
         equal = [f"{r:.3g}" for r in found.equal_r[name].values()]
         bands.append((name, f"{law.amplitude:.3g}", f"{law.slope:.2f}", *equal))
     for name in errors.free:
-        widths = errors.sigma(name), errors.known[name], errors.priors.get(name)
+        widths = errors.sigma[name], errors.known[name], errors.priors.get(name)
         shown = ("" if width is None else f"{width:.2g}" for width in widths)
         numbers.append((name, f"{errors.fiducial[name]:.4g}", *shown))
     if found.without_foregrounds is not None:
@@ -308,7 +280,7 @@ def forecast_warnings(found: Forecast) -> list[str]:
     for name in errors.free:
         component, *field = name.split(".")
         positive = component in sky and declared(type(sky[component]), field[0])["positive"]
-        if positive and errors.sigma(name) > errors.fiducial[name]:
+        if positive and errors.sigma[name] > errors.fiducial[name]:
             sentences.append(
                 f"{name}: the error is larger than the value; the Fisher matrix, good for small "
                 "errors, says only that this is not measured."
@@ -322,9 +294,76 @@ def forecast_warnings(found: Forecast) -> list[str]:
     return sentences
 
 
-def _work(settings: Experiment, command: Run) -> Report:
-    from fits.commands import forecast_pictures as pictures
+def plot_b_modes(path: Path, found: Forecast, settings: Experiment) -> None:
+    """BB of the foregrounds in some bands and their noise, against primordial BB."""
+    lmax = settings.forecast.lmax
+    with plots.draw_panels(path, "", (plots.COLUMN, 3.9)) as panels:
+        axes = panels[0, 0]
+        for (name, powers), color in zip(found.powers.items(), plots.COLORS, strict=False):
+            BB = np.where(powers[1] > 0, powers[1], np.nan)
+            title = plots.plain(f"{name} GHz" if name.isdigit() else name)
+            axes.loglog(found.spectra.centers, BB, color=color, lw=1.8, label=title)
+            noise = tensor_ratio.noise_weights(found.inputs.bands[name], lmax) ** -2
+            axes.loglog(*plots.with_powers(noise), color=color, lw=0.7)
+        axes.loglog(*plots.with_powers(found.lensed[2, : lmax + 1]), color=LENSING, lw=1.2)
+        bottom = 1.0
+        for r, dashes in zip(sorted(settings.forecast.show_r, reverse=True), DASHES, strict=False):
+            ell, primordial = plots.with_powers(r * found.tensors[2, : lmax + 1])
+            axes.loglog(ell, primordial, color="k", ls=dashes, lw=1.1, label=f"$r = {r:g}$")
+            bottom = min(bottom, primordial[: min(100, len(ell))].min())
+        axes.plot([], [], color=LENSING, lw=1.2, label="lensing")
+        axes.plot([], [], color="k", lw=0.7, label="noise (thin)")
+        plots.label_b_modes(axes, 2, lmax, 3)
+        axes.set_ylim(bottom=bottom / 2)
+        plots.round_numbers(axes.xaxis)
 
+
+def plot_errors(path: Path, found: Forecast) -> None:
+    """Values with errors, and how the errors are correlated, without foregrounds' spectra in l."""
+    errors = found.errors
+    laws = [name for name in errors.free if not name.startswith(("EE.", "BB."))]
+    names = laws or errors.free
+    count = len(names)
+    matrix = np.array([[errors.correlation(a, b) for b in names] for a in names])
+    matrix[np.triu_indices(count)] = np.nan
+    height = 0.75 + (plots.COLUMN - 1.9) / max(count, 3) * count
+    with plots.draw_panels(path, "", (plots.COLUMN, height)) as panels:
+        axes = panels[0, 0]
+        axes.imshow(matrix, cmap="RdBu_r", vmin=-1.3, vmax=1.3, aspect="auto")
+        for (row, column), value in np.ndenumerate(matrix):
+            if row > column:
+                text = f"{value:+.2f}".replace("0.", ".").replace("-", "\u2212")
+                text = "0" if abs(value) < 0.005 else text
+                color = "w" if abs(value) > 0.6 else "k"
+                axes.text(column, row, text, ha="center", va="center", fontsize=7, color=color)
+        symbols = [f"${_symbol(name)[0]}$" for name in names]
+        turned: Any = {"rotation": 40, "ha": "right", "rotation_mode": "anchor"}
+        axes.set_xticks(range(count), symbols, fontsize=8, **turned)
+        axes.set_yticks(range(count), [_value(errors, name) for name in names], fontsize=8)
+        axes.tick_params(length=0)
+        axes.spines[:].set_visible(False)
+        axes.set_title("errors of 68 % and their correlation", fontsize=8, loc="right")
+
+
+def _symbol(name: str) -> tuple[str, str]:
+    """TeX for a parameter, and its unit."""
+    symbol = {"r": "r", "A_lens": r"A_{\rm lens}"}.get(name) or plots.label(name)
+    symbol, _, unit = symbol.partition(r"\ [")
+    return symbol, rf"\ {unit.rstrip(']')}" if unit else ""
+
+
+def _value(errors: Errors, name: str) -> str:
+    """A parameter with its value and two digits of its error."""
+    value, sigma = errors.fiducial[name], errors.sigma[name]
+    symbol, unit = _symbol(name)
+    if not value and sigma < 0.01:
+        power = int(np.floor(np.log10(sigma)))
+        return rf"${symbol} = 0 \pm {sigma / 10.0**power:.1f} \times 10^{{{power}}}{unit}$"
+    shown = with_error(value, sigma).replace("\u00b1", r"\pm")
+    return rf"${symbol} = {shown}{unit}$"
+
+
+def _work(settings: Experiment, command: Run) -> Report:
     found = forecast(settings, command.steps)
     command.begin()
     return Report(
@@ -333,10 +372,10 @@ def _work(settings: Experiment, command: Run) -> Report:
         [*forecast_warnings(found), *settings.left_out("forecast")],
         _numbers(found, settings),
         {
-            "bb.png": (pictures.plot_b_modes, found, settings),
-            "fisher.png": (pictures.plot_errors, found),
+            "bb.png": (plot_b_modes, found, settings),
+            "fisher.png": (plot_errors, found),
         },
     )
 
 
-COMMAND = Command("forecast", _work, ("forecast.json", "bb.png", "fisher.png"), resumable=False)
+COMMAND = Command("forecast", _work, ("forecast.json", "bb.png", "fisher.png"))

@@ -8,11 +8,10 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from fits.commands.page import ResultTable, Row, Section, write_page
+from fits.commands.report import ResultTable, Row, Section, write_page
 from fits.commands.run import CIRCUMSTANCES, PAGE, Report, Run
 from fits.paper import figures_data, figures_model
-from fits.paper.figures import TEXTS, Impossible, PaperFigure, picture_of
-from fits.paper.sky import PaperSky
+from fits.paper.sky import TEXTS, Impossible, PaperFigure, PaperSky, picture_of
 from fits.writing import write_log
 from jaxsky.io import write_text
 from jaxsky.programs import forget_programs

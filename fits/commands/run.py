@@ -1,28 +1,57 @@
-"""What all commands do: settings, folder, steps, and the report of what was found.
+"""What all commands do: settings, folder, steps, the report of what was found, and how they end.
 
-A command is a function from its settings to a `Report`; the rest is here, once.
+A command is a function from its settings to a `Report`; the rest is here, once. It ends with an
+error as one sentence, its traceback in a file, or by Ctrl-C within seconds, whatever it is doing.
 """
 
+import _thread
+import atexit
+import dis
 import json
+import os
+import signal
+import socket
 import sys
+import tempfile
+import threading
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fits.commands.console import Steps, console, print_tables, print_written, warn
-from fits.commands.endings import ERROR_LOG, interruptible, keep_traceback
-from fits.commands.page import ResultTable, Section, write_page
+import jaxsky
+from fits.commands.report import (
+    ResultTable,
+    Section,
+    Steps,
+    console,
+    print_tables,
+    print_written,
+    warn,
+    write_page,
+)
 from fits.writing import write_json, write_log
 from jaxsky.io.folders import ALL, Folder, occupied
 from jaxsky.settings import Experiment, load, of_file
 
 #: Steps and their times, and the page that shows the results, in every folder.
 LOG, PAGE = "log.txt", "index.html"
+#: What Ctrl-C says once everything is written.
+WRITTEN = "; all results are written"
 #: When, where and with what a command was run, next to its numbers.
 CIRCUMSTANCES = "log.json"
 #: Experiments that commands have without a file.
 DEFAULTS = Path(__file__).parents[1] / "defaults"
+#: Where the traceback of an error is written, in the folder of the results.
+ERROR_LOG = "error.log"
+#: Longest message of a library that is repeated.
+LONGEST = 500
+#: Ctrl-C is repeated after this time [s], in case a callback has swallowed it; and after so many
+#: repetitions the process ends where it is.
+PATIENCE, REPETITIONS = 1.0, 3
+#: Time for a thread to take notice [s].
+MOMENT = 0.1
 
 
 class Report(NamedTuple):
@@ -77,7 +106,6 @@ class Command(NamedTuple):
     name: str
     work: Callable[[Experiment, Run], Report]
     results: tuple[str, ...] = ()
-    resumable: bool = True
 
 
 def run_command(
@@ -86,12 +114,12 @@ def run_command(
     out: Path,
     values: Sequence[str] | None = None,
     *,
-    resume: bool = False,
+    resume: bool | None = None,
     overwrite: bool = False,
     maps: Path | None = None,
     part: range = ALL,
 ) -> None:
-    """Run a command with what the command line says.
+    """Run a command with what the command line says; `resume` is None if it cannot be resumed.
 
     `part` of the results is made, see `jaxsky.io.folders.occupied`. All of them are replaced, so
     nobody else may be making any then.
@@ -105,7 +133,7 @@ def run_command(
         results_folder(
             out,
             command.results,
-            resume=resume if command.resumable else None,
+            resume=resume,
             overwrite=overwrite,
             part=ALL if overwrite else part,
         ) as folder,
@@ -116,12 +144,11 @@ def run_command(
         from jaxsky.montecarlo import other_sky
 
         mpl.use("Agg")  # pictures go to files
-        running = Run(out, resume, overwrite, command.results, folder, steps, part)
+        running = Run(out, bool(resume), overwrite, command.results, folder, steps, part)
         report = command.work(settings, running)
         report = report._replace(warnings=[*report.warnings, *other_sky(settings)])
-        written = [*_write(settings, report, running), *report.written]
-        if report.page:
-            written.insert(0, _show(out, settings.title, report, written, steps.seconds))
+        written = _write(settings, report, running)
+        if_stopped(WRITTEN)
     if report.description:
         console.print(report.description)
     print_tables(report.tables)
@@ -133,17 +160,28 @@ def run_command(
 
 
 def _write(settings: Experiment, report: Report, command: Run) -> list[Path]:
-    """Write the numbers, a log and the pictures of a report."""
-    if report.numbers is None:
-        return []
-    command.steps.step("drawing")
-    written = [command.out / command.results[0], command.out / CIRCUMSTANCES]
-    said = {"description": report.description, "warnings": report.warnings}
-    write_json(written[0], {**said, **report.numbers})
-    for name, (draw, *drawn) in report.pictures.items():
-        if draw(command.out / name, *drawn) is not False:
-            written.append(command.out / name)
-    write_log(written[1], settings, command.steps.seconds)
+    """Write the numbers, a log, the pictures and the page of a report; all files there are."""
+    out, written = command.out, list[Path]()
+    if report.numbers is not None:
+        command.steps.step("drawing")
+        written = [out / command.results[0], out / CIRCUMSTANCES]
+        said = {"description": report.description, "warnings": report.warnings}
+        write_json(written[0], {**said, **report.numbers})
+        for name, (draw, *drawn) in report.pictures.items():
+            if draw(out / name, *drawn) is not False:
+                written.append(out / name)
+        write_log(written[1], settings, command.steps.seconds)
+    written += report.written
+    if report.page:
+        numbered = enumerate(report.tables, 1)
+        tables = [Section(f"Results {i}", table.caption, table=table) for i, table in numbered]
+        drawn = [path for path in written if path.suffix == ".png"]
+        pictures = [Section(path.stem.replace("_", " "), picture=path.name) for path in drawn]
+        intro = [report.description, *(f"(!) {sentence}" for sentence in report.warnings)]
+        called, seconds = " ".join(["jaxsky", *sys.argv[1:2]]), command.steps.seconds
+        end = f"Written by `{called}` in {seconds:.0f} s,"
+        write_page(out / PAGE, settings.title or "jaxsky", intro, [*tables, *pictures], end)
+        written.insert(0, out / PAGE)
     return written
 
 
@@ -166,8 +204,8 @@ def results_folder(
         raise ValueError("--resume and --overwrite exclude each other.")
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is not a folder; choose another --out.")
-    stopped = interruptible("" if resume is None else "; resume with --resume")
-    with stopped, occupied(out, part) as folder:
+    if_stopped("" if resume is None else "; resume with --resume")
+    with occupied(out, part) as folder:
         if not folder.locked:
             warn(
                 f"{out}: this file system has no locks, so see to it that no other command writes "
@@ -190,12 +228,139 @@ def results_folder(
             raise
 
 
-def _show(out: Path, title: str, report: Report, written: Sequence[Path], seconds: float) -> Path:
-    """Write the page of a command's tables and pictures."""
-    tables = [Section(f"Results {i}", t.caption, table=t) for i, t in enumerate(report.tables, 1)]
-    drawn = [path for path in written if path.suffix == ".png"]
-    pictures = [Section(path.stem.replace("_", " "), picture=path.name) for path in drawn]
-    intro = [report.description, *(f"(!) {sentence}" for sentence in report.warnings)]
-    end = f"Written by `{' '.join(['jaxsky', *sys.argv[1:2]])}` in {seconds:.0f} s,"
-    write_page(out / PAGE, title or "jaxsky", intro, [*tables, *pictures], end)
-    return out / PAGE
+def _raised_in(error: BaseException) -> tuple[str, bool]:
+    """Package in which an error came up, and whether its code has raised it, or what it called."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    if trace is None:
+        return "", False
+    package = str(trace.tb_frame.f_globals.get("__name__", "")).partition(".")[0]
+    return package, trace.tb_frame.f_code.co_code[trace.tb_lasti] == dis.opmap["RAISE_VARARGS"]
+
+
+def _sentence(error: BaseException) -> str | None:
+    """What is wrong with which file, key or argument, if the error says that already."""
+    from fits.results import FitError
+
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}."
+    package, raised = _raised_in(error)
+    kinds = (ValueError, KeyError, OSError, FitError)
+    if not (raised and package in ("jaxsky", "fits") and isinstance(error, kinds)):
+        return None
+    if isinstance(error, KeyError):  # of a dictionary, it is the key alone
+        words = str(error.args[0] if error.args else "")
+        return words if " " in words else None
+    return str(error)
+
+
+def _summary(error: BaseException) -> str:
+    """What a library says, on one line."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    first = lines[0][:LONGEST].rstrip(".") if lines else ""
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in first:
+        return f"There is not enough memory ({first or 'MemoryError'})."
+    kind = f"{type(error).__name__} in {_raised_in(error)[0]}"
+    return f"{kind}: {first}." if first else f"{kind}."
+
+
+def keep_traceback(error: Exception, path: Path) -> None:
+    """Write the traceback of an error to a file, unless its message says enough."""
+    if _sentence(error) is None:
+        text = f"jaxsky {jaxsky.__version__}\n{''.join(traceback.format_exception(error))}"
+        with suppress(OSError):
+            path.write_text(text, encoding="utf-8", errors="replace")
+            error.add_note(str(path))
+
+
+def print_error(error: Exception) -> None:
+    """Print an error as one sentence, and where its traceback is if that may be of use."""
+    if (message := _sentence(error)) is None:
+        notes = getattr(error, "__notes__", [])
+        log = next((note for note in notes if note.endswith(ERROR_LOG)), None)
+        if log is None:
+            log = tempfile.mkstemp(f"-{ERROR_LOG}", "jaxsky-")[1]
+            keep_traceback(error, Path(log))
+        message = f"{_summary(error)} Traceback: {log}"
+    console.print("jaxsky: ", style="red", end="")
+    console.print(message, soft_wrap=True)
+
+
+class _Interrupts:
+    """Whether Ctrl-C was pressed, whether the command has ended by it, and what is said then."""
+
+    def __init__(self) -> None:
+        self.pressed, self.seen, self.words = threading.Event(), threading.Event(), "Stopped."
+
+    def watch(self, reader: socket.socket) -> None:
+        """Wait for Ctrl-C; then see to it that the process ends."""
+        while signal.SIGINT not in (received := reader.recv(64)):
+            if not received:  # the command has ended
+                return
+        self.pressed.set()
+        for _ in range(REPETITIONS):
+            if not self.seen.wait(PATIENCE):
+                _thread.interrupt_main()
+        threading.Event().wait(PATIENCE)  # what remains is the end of the interpreter
+        self.say()
+        console.show_cursor()
+        os._exit(130)
+
+    def say(self) -> None:
+        """Say that the command was stopped, once."""
+        if not self.seen.is_set():
+            self.seen.set()
+            console.print(self.words)
+
+    def caused(self, error: BaseException) -> bool:
+        """Whether an error is Ctrl-C, or what typer or another library has made of it."""
+        if not isinstance(error, Exception):
+            return isinstance(error, KeyboardInterrupt) or getattr(error, "code", 0) == 130
+        return self.pressed.wait(MOMENT)  # the thread may hear of it only now
+
+
+_current = _Interrupts()
+
+
+def if_stopped(words: str) -> None:
+    """Have Ctrl-C say this from now on, behind "Stopped"."""
+    _current.words = f"Stopped{words}."
+
+
+def _unraisable(error: "sys.UnraisableHookArgs") -> None:
+    """Keep the traceback of an interrupt to ourselves that was raised where none can be."""
+    if error.exc_type is not KeyboardInterrupt:
+        sys.__unraisablehook__(error)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Have the process end with exit code 130 within seconds after Ctrl-C.
+
+    An interrupt is an exception in the main thread once that runs Python code, which it does not
+    while it waits for a computation or compiles, and an exception in a callback (of the garbage
+    collector, of JAX) is printed or becomes another one. So a thread hears of the signal, too.
+    Everything on disk is complete at any moment; what is stopped in this way can be resumed.
+    """
+    global _current
+    _current = interrupts = _Interrupts()
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    before, sys.unraisablehook = sys.unraisablehook, _unraisable
+    descriptor = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    threading.Thread(target=interrupts.watch, args=(reader,), daemon=True).start()
+    try:
+        yield
+    except BaseException as error:
+        if not interrupts.caused(error):
+            raise
+        interrupts.say()
+        sys.exit(130)
+    finally:
+        # At the end of the interpreter nothing is left to stop, and nobody to catch an exception.
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
+        if not interrupts.pressed.is_set():
+            signal.set_wakeup_fd(descriptor)
+            sys.unraisablehook = before
+            writer.close()

@@ -1,18 +1,17 @@
-"""`jaxsky separate`, from settings to tables, maps and pictures."""
+"""`jaxsky separate`, from settings to a report: numbers, a table, warnings, maps, pictures."""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fits import plots
 from fits.cleaning import SAMPLED, Separation, separate_data
-from fits.commands import separate_pictures as pictures
-from fits.commands.page import ResultTable, Row
+from fits.commands.report import ResultTable, Row
 from fits.commands.run import Command, Report, Run
-from fits.posterior_plots import plot_chains
 from fits.results import FitError
 from fits.separated_data import separation_data
-from fits.writing import probability, with_error
+from fits.writing import probability, two_digits, with_error
 from jaxsky.inputs import parameter_unit
 from jaxsky.io import write_maps
 from jaxsky.settings import Experiment
@@ -23,6 +22,9 @@ UNLIKELY = 1e-3
 LEAKED = 0.5
 #: Name, unit and values of a column of a map's file.
 Column = tuple[str, str, np.ndarray]
+#: Bands whose residuals are drawn.
+SHOWN = 4
+CLEANED, NOISE, RESIDUAL, LEFT, LENSING, TRUTH = (*plots.COLORS[:4], "0.5", plots.COLORS[3])
 
 
 def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
@@ -150,31 +152,30 @@ def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
     return sentences
 
 
+def _stokes(name: str, unit: str, maps: np.ndarray) -> list[Column]:
+    return [(f"{name}_{s}", unit, values) for s, values in zip("QU", maps[-2:], strict=True)]
+
+
 def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path]:
     """Maps of components, residuals, and parameters that have regions."""
-    mask, in_pixels = np.isfinite(found.maps).all(axis=(0, 1)), found.data.by_pixel
-    components: list[Column] = []
+    components, residuals = list[Column](), list[Column]()
     for name, maps in zip(found.components, found.maps, strict=True):
         unit, head = "uK_CMB" if name == "cmb" else "uK_RJ", name.upper()
-        components += [(f"{head}_{s}", unit, x) for s, x in zip("QU", maps[-2:], strict=True)]
-        if in_pixels:
-            sigma = found.found.sigma(name)[-2:]
-            components += [(f"{head}_SIGMA_{s}", unit, x) for s, x in zip("QU", sigma, strict=True)]
-    if in_pixels:
-        tested = {"CHI2": found.found.chi2, "PROBABILITY": found.found.probability}
-        components += [(name, "", values) for name, values in tested.items()]
-    residuals: list[Column] = [
-        (f"{band}_{stokes}", settings.separate.unit, values)
-        for band, maps in zip(found.data.bands, found.residuals[:, -2:], strict=True)
-        for stokes, values in zip("QU", maps, strict=True)
-    ]
+        components += _stokes(head, unit, maps)
+        if found.data.by_pixel:
+            components += _stokes(f"{head}_SIGMA", unit, found.found.sigma(name))
+    if found.data.by_pixel:
+        components.append(("CHI2", "", found.found.chi2))
+        components.append(("PROBABILITY", "", found.found.probability))
+    for band, maps in zip(found.data.bands, found.residuals, strict=True):
+        residuals += _stokes(band, settings.separate.unit, maps)
     parameters: list[Column] = [
         (name.upper() + end, parameter_unit(name), found.of_pixel(name, values))
         for name in found.fit.free
         if np.ndim(found.fit.best_fit[name])
         for end, values in (("", found.fit.best_fit), ("_SIGMA", found.sigma))
     ]
-    written = []
+    mask, written = np.isfinite(found.maps).all(axis=(0, 1)), []
     for file, columns in zip(MAPS, (components, residuals, parameters), strict=True):
         if columns:
             names, units, values = zip(*columns, strict=True)
@@ -193,13 +194,114 @@ def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path
     return written
 
 
+def plot_components(path: Path, found: Separation, settings: Experiment) -> None:
+    """Q and U of the components, a row for each."""
+    rows = []
+    for name, maps in zip(found.components, found.maps[:, -2:], strict=True):
+        component = found.like.mixing.sky[name]
+        nu_ref = getattr(component, "nu_ref", None)
+        title = "CMB" if name == "cmb" else name
+        title += "" if nu_ref is None else f", {float(nu_ref):g} GHz"
+        rows.append(plots.stokes_panels(title, maps, plots.color_limit(maps), component.unit))
+    plots.plot_maps(path, rows, settings.title)
+
+
+def plot_residuals(path: Path, found: Separation, settings: Experiment) -> None:
+    """Data less components in a few bands, Q beside U."""
+    names, rows, unit = list(found.data.bands), [], settings.separate.unit
+    for name in plots.spread(names, SHOWN):
+        maps = found.residuals[names.index(name), -2:]
+        limit = 3 * float(np.nanstd(maps))
+        rows.append(plots.stokes_panels(f"{name}, data less components", maps, limit, unit, 0.0))
+    plots.plot_maps(path, rows, settings.title)
+
+
+def plot_parameters(path: Path, found: Separation, settings: Experiment) -> bool:
+    """Maps of the parameters that have regions, their errors beside them.
+
+    Returns False, without a picture, if none has.
+    """
+    rows = []
+    for name in found.fit.free:
+        if not np.ndim(found.fit.best_fit[name]):
+            continue
+        value, sigma = (found.of_pixel(name, x) for x in (found.fit.best_fit, found.sigma))
+        middle, symbol = float(np.nanmedian(value)), plots.label(name)
+        half = float(f"{np.nanquantile(sigma, 0.98) / 2:.1g}")
+        head = f"${symbol}$, {len(found.fit.best_fit[name])} regions"
+        limit, center = plots.color_limit(value - middle, 0.98), float(f"{middle:.3g}")
+        error = plots.MapPanel("its standard deviation", sigma, rf"$\sigma({symbol})$", half, half)
+        rows.append([plots.MapPanel(head, value, f"${symbol}$", center, limit), error])
+    if rows:
+        plots.plot_maps(path, rows, settings.title)
+    return bool(rows)
+
+
+def plot_spectra(path: Path, found: Separation, settings: Experiment) -> None:
+    """BB of the cleaned CMB, its noise and residual foregrounds, against the model."""
+    model, edges, ell = found.tensors.model, np.array(found.spectra.edges), found.spectra.centers
+    signal = found.tensors.powers - model.additive
+    error = np.sqrt(np.diagonal(found.tensors.covariance))
+    noise, residual = found.simulated.noise.mean(axis=0), found.simulated.residual.mean(axis=0)
+    curves = [
+        ("lensing", model.lensing, LENSING, "-", 1.4),
+        ("$r = 0.01$", 0.01 * model.tensors, "k", "--", 1.1),
+        ("$r = 0.001$", 0.001 * model.tensors, "k", ":", 1.1),
+        ("noise", noise, NOISE, "-", 1.4),
+        ("residuals, from errors of laws", residual, RESIDUAL, "-", 1.4),
+    ]
+    if found.left is not None:
+        curves.append(("foregrounds left (known)", found.left, LEFT, "-.", 1.4))
+    with plots.draw_panels(path, settings.title, (plots.COLUMN, 4.2), fontsize=8) as panels:
+        axes, seen = panels[0, 0], signal > 0
+        yerr = np.stack([np.minimum(error, 0.99 * np.abs(signal)), error])[:, seen]
+        xerr = np.stack([ell - edges[:-1], edges[1:] - 1 - ell])[:, seen]
+        points: Any = {"fmt": "o", "ms": 3, "lw": 1.0, "label": "cleaned, noise subtracted"}
+        axes.errorbar(ell[seen], signal[seen], yerr, xerr, color=CLEANED, **points)
+        if not seen.all():
+            upper, below = (np.maximum(signal, 0) + 2 * error)[~seen], r"below 0: $2\sigma$"
+            axes.plot(ell[~seen], upper, "v", ms=4, color=CLEANED, label=below)
+        for name, powers, color, dashes, width in curves:
+            positive = np.where(powers > 0, powers, np.nan)
+            axes.plot(ell, positive, dashes, color=color, lw=width, label=name)
+        plots.label_b_modes(axes, edges[0], edges[-1] - 1, 2)
+        lowest = min(x[x > 0].min(initial=np.inf) for x in (residual, found.left) if x is not None)
+        axes.set_ylim(bottom=max(lowest / 3, np.nanmax(model.lensing) * 1e-8))
+
+
+def plot_ratio(path: Path, found: Separation, settings: Experiment) -> None:
+    """The posterior of the tensor-to-scalar ratio, and above it the estimate with its error."""
+    ratio = found.tensors
+    r, sigma, grid, posterior = ratio.r, ratio.sigma, ratio.grid, ratio.posterior
+    with plots.draw_panels(path, settings.title, (plots.COLUMN, 3.2), fontsize=8) as panels:
+        axes, below = panels[0, 0], grid <= ratio.upper_95
+        axes.plot(grid, posterior, color=CLEANED, label=r"posterior, $r \geq 0$")
+        limit = f"95 %: $r < {two_digits(ratio.upper_95)}$"
+        axes.fill_between(
+            grid[below], posterior[below], color=CLEANED, alpha=0.2, lw=0, label=limit
+        )
+        marker: Any = {"fmt": "o", "color": "k", "ms": 3.5, "lw": 1.2, "capsize": 2}
+        axes.errorbar(r, 1.12, xerr=sigma, label=f"estimate {with_error(r, sigma)}", **marker)
+        if (known := (found.data.truth or {}).get("r")) is not None:
+            axes.axvline(known, color=TRUTH, lw=1.6, label="truth")
+        shown = grid[posterior > 2e-3].max()
+        axes.set(
+            xlim=(min(0.0, r - 1.3 * sigma), max(shown, r + 1.5 * sigma)),
+            ylim=(0, 1.25),
+            xlabel="tensor-to-scalar ratio $r$",
+            ylabel="relative probability",
+        )
+        axes.ticklabel_format(axis="x", style="sci", scilimits=(-2, 3), useMathText=True)
+        plots.legend_below(axes, 2, fontsize=7)
+
+
 #: Pictures, each with what draws it; maps; and what a stopped run resumes from.
 PICTURES = {
-    "components.png": pictures.plot_components,
-    "residuals.png": pictures.plot_residuals,
-    "spectra.png": pictures.plot_spectra,
-    "r.png": pictures.plot_ratio,
-    "parameters.png": pictures.plot_parameters,
+    "components.png": plot_components,
+    "residuals.png": plot_residuals,
+    "spectra.png": plot_spectra,
+    "r.png": plot_ratio,
+    "parameters.png": plot_parameters,
 }
 POSTERIOR = "posterior.png"
 MAPS = ("components.fits", "residuals.fits", "parameters.fits")
@@ -216,7 +318,7 @@ def _work(settings: Experiment, command: Run) -> Report:
         raise ValueError(f"The spectral parameters were not found. {error}") from None
     drawn: dict[str, Any] = {name: (plot, found, settings) for name, plot in PICTURES.items()}
     if (chain := found.chain) is not None:
-        drawn[POSTERIOR] = plot_chains, {chain.method: chain}, data.truth, settings.title
+        drawn[POSTERIOR] = plots.plot_chains, {chain.method: chain}, data.truth, settings.title
     return Report(
         data.description,
         [_table(found)],

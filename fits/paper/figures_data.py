@@ -5,12 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fits.commands import compare_pictures as pictures
+from fits.commands import compare as pictures
+from fits.commands.fit import plot_grids
 from fits.common import prepared_maps
 from fits.comparison import Comparison, compare_patches, template_patches
-from fits.paper.figures import TEXTS, Impossible, Number, PaperFigure, described, filled
-from fits.paper.sky import PaperSky
-from fits.posterior_plots import plot_grids
+from fits.paper.sky import TEXTS, Impossible, Number, PaperFigure, PaperSky, filled
 from fits.regions import region_masks, region_words
 from fits.spectral_index import fit_regions, known_truth
 from fits.writing import probability, with_error, with_errors
@@ -65,15 +64,8 @@ def figure_scatter(paper: PaperSky, picture: Path) -> PaperFigure:
         slope = with_error(scatter.slope, scatter.error)
         note = f"r = {scatter.correlation:.3f}, PTE {scatter.pte_text}"
         numbers.append(Number(f"slope, {band}, Q and U", slope, note))
-    return described(
-        "Figure 5",
-        numbers,
-        nside=settings.common.nside,
-        region=region_words(settings, region),
-        beam=_beam(paper),
-        maps=paper.maps_differ,
-        here=_pixels_here(paper),
-    )
+    where, beam = region_words(settings, region), _beam(paper)
+    return paper.described("Figure 5", numbers, here=_pixels_here(paper), region=where, beam=beam)
 
 
 def figure_maps(paper: PaperSky, picture: Path) -> PaperFigure:
@@ -81,8 +73,7 @@ def figure_maps(paper: PaperSky, picture: Path) -> PaperFigure:
     settings, found = paper.settings, paper.comparison
     nside = min(settings.compare.panel_nside, settings.common.nside)
     pictures.plot_model_maps(picture, found, "QU", _chosen(found), nside, settings.title)
-    maps, here = paper.maps_differ, _pixels_here(paper)
-    return described("Figure 6", nside=nside, maps=maps, here=here)
+    return paper.described("Figure 6", nside=nside, here=_pixels_here(paper))
 
 
 def figure_full_sky(experiment: str, paper: PaperSky, picture: Path) -> PaperFigure:
@@ -106,15 +97,9 @@ def figure_full_sky(experiment: str, paper: PaperSky, picture: Path) -> PaperFig
     end = f"they end at l = {lmax} rather than 100" * (lmax != 100)
     cmb = f"r is {r:g} rather than 0.1" * (r != 0.1) if settings.cmb.include else "there is no CMB"
     first = f"the spectra are of maps of nside {nside} rather than 256"
-    return described(
-        label,
-        numbers,
-        texts="Figures 7 and 8",
-        experiment=experiment,
-        lmax=lmax,
-        nsims=settings.compare.nsims,
-        maps=paper.maps_differ,
-        here=_here(paper, first, [s.band for s in spectra], wanted, end, cmb),
+    here = _here(paper, first, [s.band for s in spectra], wanted, end, cmb)
+    return paper.described(
+        label, numbers, texts="Figures 7 and 8", experiment=experiment, here=here
     )
 
 
@@ -129,14 +114,14 @@ def figure_leakage(paper: PaperSky, picture: Path) -> PaperFigure:
         if s.pte_uncorrected is not None:
             before, after = probability(s.pte_uncorrected[1]), probability(s.pte[1])
             numbers.append(Number(f"PTE of BB, {s.band}", f"before {before}, after {after}"))
-    leakage = paper.sky_differs
+    leakage = paper.differs
     if paper.simulated:
         fractions = listed(
             filled(texts["fraction"], percent=100 * fraction, name=name)
             for name, fraction in settings.simulate.leakage.items()
         )
         leakage = filled(texts["simulated"], fractions=fractions)
-    return described("Figure 9", numbers, leakage=leakage)
+    return paper.described("Figure 9", numbers, leakage=leakage)
 
 
 def figure_patches(paper: PaperSky, picture: Path) -> PaperFigure:
@@ -153,7 +138,7 @@ def figure_patches(paper: PaperSky, picture: Path) -> PaperFigure:
             Number(f"A observed / model, {name}", ratio, f"correlation {A:.2f}"),
             Number(f"alpha observed - model, {name}", difference, f"correlation {alpha:.2f}"),
         ]
-    return described("Figure 10", numbers, band=found.band, maps=paper.maps_differ)
+    return paper.described("Figure 10", numbers, band=found.band)
 
 
 def _template_patches(paper: PaperSky, picture: Path) -> PaperFigure:
@@ -166,8 +151,7 @@ def _template_patches(paper: PaperSky, picture: Path) -> PaperFigure:
     heads = f"median BB / EE: {ratio}", f"median of EE, BB: {slopes}"
     pictures.plot_template_patches(picture, found, heads, paper.settings.title)
     numbers = [Number("median A of BB / EE", ratio), Number("median alpha, EE, BB", slopes)]
-    texts, sky = "Figure 10 of the template", paper.sky_differs
-    return described("Figure 10", numbers, texts=texts, sky=sky)
+    return paper.described("Figure 10", numbers, texts="Figure 10 of the template")
 
 
 def figure_probability(paper: PaperSky, picture: Path) -> PaperFigure:
@@ -197,11 +181,6 @@ def figure_probability(paper: PaperSky, picture: Path) -> PaperFigure:
         for region, grid in grids.items()
         for name in grid.free
     ]
-    simulated = TEXTS["Figure 11"]["simulated"]
-    return described(
-        "Figure 11",
-        numbers,
-        bands=listed(bands),
-        region=region_words(settings, "strip"),
-        maps=simulated if paper.simulated else paper.sky_differs,
-    )
+    maps = TEXTS["Figure 11"]["simulated"] if paper.simulated else paper.differs
+    region = region_words(settings, "strip")
+    return paper.described("Figure 11", numbers, bands=listed(bands), region=region, maps=maps)

@@ -3,28 +3,26 @@
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import healpy
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
 
-from fits.commands.forecast import forecast
-from fits.commands.forecast_pictures import plot_b_modes
-from fits.commands.page import ResultTable
-from fits.paper.figures import TEXTS, Impossible, Number, PaperFigure, described, filled
-from fits.paper.sky import NSIDE, PAPER_FWHM, SYMBOLS, PaperSky
-from fits.plots import (
-    COLORS,
-    COLUMN,
-    UNITS,
-    MapPanel,
-    color_limit,
-    draw_panels,
-    draw_patch,
-    draw_spectra,
-    plot_maps,
-    with_powers,
+from fits import plots
+from fits.commands.forecast import forecast, plot_b_modes
+from fits.commands.report import ResultTable
+from fits.paper.sky import (
+    NSIDE,
+    PAPER_FWHM,
+    SYMBOLS,
+    TEXTS,
+    Impossible,
+    Number,
+    PaperFigure,
+    PaperSky,
+    filled,
 )
 from fits.pseudo_cl import PIVOT, sky_fraction
 from fits.regions import region_words, superpixels
@@ -48,7 +46,6 @@ from jaxsky.simulation import observe_bands
 from jaxsky.small_scales import DUST, SYNCHROTRON, Continued
 from jaxsky.templates import correlation, polarization_template, preset, steepening
 
-NAMES = ("synchrotron", "dust")
 #: Blocks of the honest jackknife: pixels of 15 degrees.
 NSIDE_BLOCKS = 4
 #: The paper's ranges of the fits of power laws.
@@ -61,12 +58,7 @@ SIZE_CORE, SIZE = 30.0, 5.0
 BANDS = ("45", "105", "315")
 #: Resolution of the embedded model in a forecast, and the largest multipole.
 NSIDE_FORECAST, LMAX = 128, 250
-
-
-def _row(title: str, Q: Float[ArrayLike, " pix"]) -> list[MapPanel]:
-    """A map of Q [uK_RJ], alone in its row."""
-    Q = np.asarray(Q)
-    return [MapPanel(title, Q, color_limit(Q), UNITS["uK_RJ"])]
+UNIT = plots.UNITS["uK_RJ"]
 
 
 def figure_templates(paper: PaperSky, picture: Path) -> PaperFigure:
@@ -76,9 +68,9 @@ def figure_templates(paper: PaperSky, picture: Path) -> PaperFigure:
         layer = paper.template(name)
         beams[name] = layer.fwhm
         title = f"{name}, $Q$, {float(layer.component.nu_ref):g} GHz"
-        rows.append(_row(title, layer.maps[0]))
-    plot_maps(picture, rows)
-    return described("Figure 1", beams=beams, sky=paper.sky_differs)
+        rows.append([plots.MapPanel(title, np.asarray(layer.maps[0]), UNIT)])
+    plots.plot_maps(picture, rows)
+    return paper.described("Figure 1", beams=beams)
 
 
 def figure_indices(paper: PaperSky, picture: Path) -> PaperFigure:
@@ -88,9 +80,8 @@ def figure_indices(paper: PaperSky, picture: Path) -> PaperFigure:
         index, fwhm, steeper, origin = paper.index(name)
         values = np.asarray(index)
         mean, spread = float(values.mean()), float(values.std())
-        middle, title = round(mean, 2), f"{word}, {fwhm / 60:g}° beam"
-        limit, label = color_limit(values - middle), rf"$\beta_{{\rm {symbol}}}$"
-        rows.append([MapPanel(title, values, limit, label, middle)])
+        title, label = f"{word}, {fwhm / 60:g}° beam", rf"$\beta_{{\rm {symbol}}}$"
+        rows.append([plots.MapPanel(title, values, label, round(mean, 2))])
         origins.append(origin)
         note = "by construction" if steeper is None else ""
         numbers += [
@@ -99,8 +90,8 @@ def figure_indices(paper: PaperSky, picture: Path) -> PaperFigure:
         ]
         if name == "beta_syn":
             numbers.append(_steepening(steeper))
-    plot_maps(picture, rows)
-    return described("Figure 3", numbers, origins=" and ".join(origins))
+    plots.plot_maps(picture, rows)
+    return paper.described("Figure 3", numbers, origins=" and ".join(origins))
 
 
 def _steepening(by: float | None) -> Number:
@@ -118,7 +109,8 @@ def _steepening(by: float | None) -> Number:
 def figure_ame(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 4: Q of AME, and Pearson's correlation with the dust, with jackknife errors."""
     ame, dust, resolution, origin = paper.ame()
-    plot_maps(picture, [_row("AME, $Q$, 23 GHz, 1 % polarized", ame[0])])
+    title = "AME, $Q$, 23 GHz, 1 % polarized"
+    plots.plot_maps(picture, [[plots.MapPanel(title, np.asarray(ame[0]), UNIT)]])
     own, numbers = healpy.npix2nside(ame.shape[-1]), []
     nside = min(NSIDE, own)
     if nside != own:
@@ -130,20 +122,15 @@ def figure_ame(paper: PaperSky, picture: Path) -> PaperFigure:
         note = f"jackknife over pixels of nside {nside}; over blocks of 15° the error is {wide:.2g}"
         what = f"correlation of dust and AME, {stokes}"
         numbers.append(Number(what, with_error(r, error), note))
-    return described(
-        "Figure 4",
-        numbers,
-        sky=paper.sky_differs,
-        origin=origin[:1].upper() + origin[1:],
-        resolution=resolution,
-    )
+    origin = origin[:1].upper() + origin[1:]
+    return paper.described("Figure 4", numbers, origin=origin, resolution=resolution)
 
 
 def figure_spectra(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 2: EE of both templates, of what continues them, and of both together."""
     fwhm, numbers = paper.settings.paper.fwhm, []
-    with draw_panels(picture, "", (COLUMN, 5.2), 2, sharex=True) as panels:
-        for axes, name in zip(panels[:, 0], NAMES, strict=True):
+    with plots.draw_panels(picture, "", (plots.COLUMN, 5.2), 2, sharex=True) as panels:
+        for axes, name in zip(panels[:, 0], RANGES, strict=True):
             layer, continued = paper.template(name), paper.continued(name)
             (alm,), (part,), small = continued.alms, continued.parts, layer.small_scales
             (start, join), lmax = small.EE, lmax_of(alm)
@@ -151,13 +138,14 @@ def figure_spectra(paper: PaperSky, picture: Path) -> PaperFigure:
             law = np.where(np.arange(lmax + 1) < start, np.nan, part.target[0])
             final = np.asarray(power_spectrum(alm[:1])[0] * gaussian_beam(fwhm, lmax) ** 2)
             for label, spectrum, color, lw, ls in (
-                (f"with small scales, {fwhm:g}'", final, COLORS[1], 0.9, "-"),
-                (f"template, {layer.fwhm:g}'", power_spectrum(original)[0], COLORS[2], 1.8, "-"),
-                ("power law, no beam", law, COLORS[0], 1.4, "--"),
+                (f"with small scales, {fwhm:g}'", final, 1, 0.9, "-"),
+                (f"template, {layer.fwhm:g}'", power_spectrum(original)[0], 2, 1.8, "-"),
+                ("power law, no beam", law, 0, 1.4, "--"),
             ):
-                draw_spectra(axes, {label: spectrum}, "uK_RJ", color=color, lw=lw, ls=ls)
+                style: Any = {"color": plots.COLORS[color], "lw": lw, "ls": ls}
+                plots.draw_spectra(axes, {label: spectrum}, "uK_RJ", **style)
             axes.axvline(join, color="0.4", ls=":", lw=1)
-            shown = with_powers(final)[1]
+            shown = plots.with_powers(final)[1]
             axes.set_ylim(shown[-1] * 1e-2, shown.max() * 2)
             axes.set_title(f"{name} $EE$, {float(layer.component.nu_ref):g} GHz")
             axes.legend(frameon=False, loc="lower left", handlelength=1.4)
@@ -169,19 +157,18 @@ def figure_spectra(paper: PaperSky, picture: Path) -> PaperFigure:
                 ours = with_error(float(slope), float(error))
                 numbers.append(Number(f"slope of {name} {kind}", ours, note))
         panels[0, 0].set_xlabel("")
-    sky, ranges = paper.sky_differs, _ranges(paper)
-    return described("Figure 2", numbers, fwhm=fwhm, sky=sky, ranges=ranges)
+    return paper.described("Figure 2", numbers, ranges=_ranges(paper))
 
 
 def _ranges(paper: PaperSky) -> str:
     """What is to be said about the ranges of the fits."""
     texts = TEXTS["Figure 2"]["ranges"]
-    layers, wanted = [paper.template(name) for name in NAMES], paper.settings.paper
+    layers, wanted = [paper.template(name) for name in RANGES], paper.settings.paper
     used = [(one.small_scales.EE, one.small_scales.BB) for one in layers]
     if used != [(tuple(one.EE), tuple(one.BB)) for one in (wanted.synchrotron, wanted.dust)]:
         ends = sorted({layer.nside for layer in layers})
         return filled(texts["clipped"], ends=listed(f"l = {2 * n}" for n in ends))
-    if used == [(RANGES[name].EE, RANGES[name].BB) for name in NAMES]:
+    if used == [(one.EE, one.BB) for one in RANGES.values()]:
         return filled(texts["paper"])
     return filled(texts["model" if paper.embedded else "other"])
 
@@ -201,9 +188,9 @@ def _draw_patches(
     size: float,
 ) -> None:
     """Four square patches of the sky: title, map, limit of the colours and unit of each."""
-    with draw_panels(path, "", (5.4, 4.4), 2, 2) as grid:
+    with plots.draw_panels(path, "", (5.4, 4.4), 2, 2) as grid:
         for axes, (title, (values, limit, unit)) in zip(grid.flat, panels.items(), strict=True):
-            draw_patch(axes, values, center, size, limit, UNITS[unit])
+            plots.draw_patch(axes, values, center, size, limit, plots.UNITS[unit])
             axes.set_title(title)
             axes.label_outer()
 
@@ -218,28 +205,20 @@ def figure_randomised(paper: PaperSky, picture: Path) -> PaperFigure:
         "another realisation": partial(paper.with_small_scales, kind="other small scales"),
         f"steeper by {-TILT:g}": partial(paper.with_small_scales, tilt=TILT),
     }
-
-    original = partial(polarization_template, layer.maps, layer.fwhm, layer.fwhm, nside)
-    panels = {f"template, {layer.fwhm / 60:.2g}°": np.asarray(original()[0], np.float32)}
+    original = polarization_template(layer.maps, layer.fwhm, layer.fwhm, nside)[0]
+    panels = {f"template, {layer.fwhm / 60:.2g}°": np.asarray(original, np.float32)}
+    del original
     for title, make in makers.items():
         (alm,) = make("synchrotron").alms
         beam = gaussian_beam(fwhm, lmax_of(alm))
         panels[title] = np.asarray(synthesis(alm * expand(beam), nside)[0], np.float32)
     template, *rest = [_disc(values, center, SIZE) for values in panels.values()]
     middle = float(template.mean())
-    limit = color_limit(rest[0] - middle, 0.995)
+    limit = plots.color_limit(rest[0] - middle, 0.995)
     shifted = {title: (values - middle, limit, "uK_RJ") for title, values in panels.items()}
     _draw_patches(picture, shifted, center, SIZE)
-    return described(
-        "Figure 14",
-        size=SIZE,
-        center=center,
-        mean=middle,
-        fwhm=fwhm,
-        steeper=-TILT,
-        rms=listed(f"{float((values - template).std()):.2f}" for values in rest),
-        sky=paper.sky_differs,
-    )
+    rms = listed(f"{float((values - template).std()):.2f}" for values in rest)
+    return paper.described("Figure 14", size=SIZE, mean=middle, steeper=-TILT, rms=rms)
 
 
 def forecast_settings(paper: PaperSky) -> Experiment:
@@ -250,7 +229,7 @@ def forecast_settings(paper: PaperSky) -> Experiment:
         embedded = sky.embedded.model_copy(update={"nside": NSIDE_FORECAST})
         sky = sky.model_copy(update={"embedded": embedded})
     if not paper.embedded:
-        lmax = min(LMAX, 2 * min(paper.template(name).nside for name in NAMES) - 8)
+        lmax = min(LMAX, 2 * min(paper.template(name).nside for name in RANGES) - 8)
     fit = (20, min(200, lmax - 10))
     spec = settings.forecast.model_copy(update={"bands": list(BANDS), "lmax": lmax, "fit": fit})
     bands = [BandTable.model_validate(band) for band in band_tables("core")]
@@ -269,16 +248,16 @@ def figure_b_modes(paper: PaperSky, picture: Path) -> PaperFigure:
     except ValueError as reason:
         raise Impossible(str(reason)) from None
     plot_b_modes(picture, found, settings)
-    where, sky = f"l = {PIVOT}", paper.sky_differs
+    differs, where = paper.differs, f"l = {PIVOT}"
     if paper.embedded:
-        sky = filled(TEXTS["Figure 12"]["model"], nside=NSIDE_FORECAST)
+        differs = filled(TEXTS["Figure 12"]["model"], nside=NSIDE_FORECAST)
     numbers = [
         Number(f"r with as much BB at {where}, {name} GHz", f"{equal[where]:.3g}")
         for name, equal in found.equal_r.items()
     ]
     region, percent = settings.forecast.region, 100 * sky_fraction(found.inputs.mask)
     words = region_words(settings, region)
-    return described("Figure 12", numbers, region=words, percent=percent, sky=sky)
+    return paper.described("Figure 12", numbers, region=words, percent=percent, differs=differs)
 
 
 def core_observation(paper: PaperSky) -> Observation:
@@ -322,24 +301,16 @@ def figure_patch(paper: PaperSky, picture: Path) -> PaperFigure:
         Q = {which: np.asarray(values[0]) for which, values in maps.items()}
         inside = {which: _disc(values, center, SIZE_CORE) for which, values in Q.items()}
         numbers.append(_brightest(name, inside))
-        limit, beam = color_limit(inside["total"]), f"{float(channel.beam):g}'"
+        limit, beam = plots.color_limit(inside["total"]), f"{float(channel.beam):g}'"
         panels[f"{name} GHz, {beam}"] = Q["total"], limit, "uK_RJ"
         if name == observation.names[-1]:
             to_cmb = float(channel.band.conversion("uK_RJ", "uK_CMB"))
-            limit = color_limit(inside["cmb"] * to_cmb)
+            limit = plots.color_limit(inside["cmb"] * to_cmb)
             panels = {f"CMB, {beam}": (Q["cmb"] * to_cmb, limit, "uK_CMB"), **panels}
     _draw_patches(picture, panels, center, SIZE_CORE)
     spectra = settings.cmb.spectra
-    return described(
-        "Figure 13",
-        numbers,
-        size=SIZE_CORE,
-        center=center,
-        cmb=f"r = {settings.cmb.r:g}" if spectra is None else f"spectra of {spectra}",
-        sky=paper.sky_differs,
-        fwhm=settings.paper.fwhm,
-        nside=observation.nside,
-    )
+    words = f"r = {settings.cmb.r:g}" if spectra is None else f"spectra of {spectra}"
+    return paper.described("Figure 13", numbers, size=SIZE_CORE, cmb=words, nside=observation.nside)
 
 
 def _brightest(band: str, inside: Mapping[str, Float[np.ndarray, " inside"]]) -> Number:
@@ -362,4 +333,4 @@ def table_core(paper: PaperSky, picture: Path) -> PaperFigure:
         ("Noise [µK_RJ arcmin]", *(f"{band['noise']['level']:.2f}" for band in bands)),
         ("Width [GHz]", *(f"{band['bandpass']['width']:.3g}" for band in bands)),
     ]
-    return described("Table 1", table=ResultTable(header, rows))
+    return paper.described("Table 1", table=ResultTable(header, rows))

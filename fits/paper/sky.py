@@ -1,19 +1,22 @@
-"""The sky of the figures: templates, AME, maps of indices; made when they are needed."""
+"""The sky of the figures: templates, AME, maps of indices, made when needed; and their words."""
 
 import dataclasses
+import re
+import tomllib
+from collections.abc import Sequence
 from functools import cache, cached_property
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import healpy
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fits.commands.report import ResultTable, Section
 from fits.common import prepared_maps
 from fits.comparison import Comparison, compare
 from fits.inputs import Inputs, inputs_of
-from fits.paper.figures import TEXTS, Impossible, filled
 from fits.regions import region_masks
 from jaxsky import AME, Dust, Synchrotron
 from jaxsky.checks import listed
@@ -21,7 +24,6 @@ from jaxsky.cmb import gaussian_fields
 from jaxsky.galaxy import EmbeddedSky
 from jaxsky.harmonics import gaussian_beam, synthesis
 from jaxsky.inputs import (
-    Template,
     default_galaxy,
     embedded_galaxy,
     parameter_map,
@@ -44,6 +46,11 @@ from jaxsky.settings import (
 from jaxsky.small_scales import Continued, SmallScales, continue_templates
 from jaxsky.templates import dust_index, from_pysm_beta, polarization_template, steepening
 
+#: Titles, captions, what differs from the paper, and numbers of its text, by label.
+TEXTS: dict[str, Any] = tomllib.loads(
+    Path(__file__).with_name("paper.toml").read_text(encoding="utf-8")
+)
+WORDS = TEXTS["sky"]
 #: Beams of the paper's templates [arcmin].
 PAPER_FWHM = {"dust": 10.0, "synchrotron": 60.0}
 #: Reference frequency of the AME [GHz], its resolution [arcmin] and nside, and those of its
@@ -62,12 +69,44 @@ SYMBOLS = {"beta_dust": "β_dust", "beta_syn": "β_syn"}
 MEAN = {"beta_dust": 1.53, "beta_syn": 2.9}
 SCATTER = {"beta_dust": 0.04, "beta_syn": 0.1}
 SLOPE = -2.0
-
-WORDS = TEXTS["sky"]
-
 #: Pixels of an index, its resolution [arcmin], by how much it was made steeper (None if it was
 #: drawn), and where it is from, as a part of a sentence.
 Index: TypeAlias = tuple[Float[Array, " pix"], float, float | None, str]
+
+
+class Impossible(ValueError):
+    """A figure that the settings do not allow, and why in one sentence: the others go on."""
+
+
+class Number(NamedTuple):
+    """A number of the paper's text next to ours, and what is to be known about it."""
+
+    what: str
+    ours: str
+    note: str = ""
+    paper: str = ""
+
+
+class PaperFigure(NamedTuple):
+    """A figure or a table, by the paper's number ("Figure 1"), and the seconds that it took.
+
+    The note of its section is on what differs from the paper, whose text gives the numbers.
+    """
+
+    label: str
+    section: Section
+    numbers: tuple[Number, ...] = ()
+    seconds: float = 0.0
+
+
+def filled(text: str, **words: Any) -> str:
+    """A text of `paper.toml` on one line, its words in braces filled in."""
+    return " ".join(text.format_map(words).split())
+
+
+def picture_of(label: str) -> str:
+    """Name of the picture of a figure."""
+    return re.sub(r"\d+", lambda n: f"{int(n[0]):02d}", label.lower().replace(" ", "_")) + ".png"
 
 
 class Layer(NamedTuple):
@@ -128,7 +167,7 @@ class PaperSky:
         return filled(WORDS["files"], files=", ".join(files))
 
     @property
-    def sky_differs(self) -> str:
+    def differs(self) -> str:
         """The part of a line that says what the sky is, for a figure that shows it."""
         embedded = self.settings.sky.embedded
         if self.embedded and embedded is not None:
@@ -142,7 +181,33 @@ class PaperSky:
     @property
     def maps_differ(self) -> str:
         """The same for a figure that shows observed maps."""
-        return filled(WORDS["differs"]["simulated"]) if self.simulated else self.sky_differs
+        return filled(WORDS["differs"]["simulated"]) if self.simulated else self.differs
+
+    def described(
+        self,
+        label: str,
+        numbers: Sequence[Number] = (),
+        *,
+        table: ResultTable | None = None,
+        texts: str | None = None,
+        **words: Any,
+    ) -> PaperFigure:
+        """A figure with the texts of its label, filled in, and what the paper says of its numbers.
+
+        Texts may name these words, tables of the settings, and what this `sky` knows of itself;
+        other `texts` than those of the label are named by their heading in `paper.toml`.
+        """
+        own, words = TEXTS[texts or label], {**dict(self.settings), "sky": self, **words}
+        published, otherwise = own.get("published", {}), own.get("otherwise", "not given")
+        section = Section(
+            f"{label}: {filled(own['title'], **words)}",
+            filled(own["caption"], **words),
+            picture_of(label) if table is None else None,
+            table,
+            f"Differs from the paper: {filled(own['differs'], **words)}",
+        )
+        said = [one._replace(paper=published.get(one.what, otherwise)) for one in numbers]
+        return PaperFigure(label, section, tuple(said))
 
     @cached_property
     def galaxy(self) -> EmbeddedSky:
@@ -170,34 +235,29 @@ class PaperSky:
             )
         return found[0]
 
-    @cached_property
-    def _templates(self) -> dict[str, Template]:
-        names = {law: self._spec(law)[0] for law in PAPER_FWHM}
-        galaxy = None if self.settings.sky.embedded is None else self.galaxy
-        templates, _ = read_sky(self.settings, names=list(names.values()), galaxy=galaxy)
-        return {law: templates[name] for law, name in names.items()}
-
-    def _template(self, name: str) -> Layer:
+    def _template(self, law: str) -> Layer:
         """Q, U of dust or synchrotron at the resolution of the paper's, as far as its map has it.
 
         Ranges of power laws that are beyond the multipoles of the map keep their ratio of ends.
         """
-        own = self._templates[name]
+        name, _ = self._spec(law)
+        galaxy = None if self.settings.sky.embedded is None else self.galaxy
+        own = read_sky(self.settings, names=[name], galaxy=galaxy)[0][name]
         if missing := int(np.sum(~own.used)):
             raise SettingsError(
                 f"sky.{name}: {missing} pixels have no value; the figures of the paper take "
                 "maps of the full sky."
             )
-        fwhm = max(own.fwhm, PAPER_FWHM[name])
+        fwhm = max(own.fwhm, PAPER_FWHM[law])
         nside = healpy.npix2nside(own.used.size)
         maps = polarization_template(own.component.template, own.fwhm, fwhm, nside)
-        numbers = getattr(self.settings.paper, name).model_dump(exclude={"correlated_with"})
+        numbers = getattr(self.settings.paper, law).model_dump(exclude={"correlated_with"})
         last = int(KNOWN * nside)
         for kind in ("EE", "BB"):
             first, end = numbers[kind]
             if end > last:
                 numbers[kind] = max(2, round(first * last / end)), last
-        with at_key(f"paper.{name}"):
+        with at_key(f"paper.{law}"):
             small = SmallScales(**numbers)
         assert isinstance(own.component, Dust | Synchrotron)  # by its law
         return Layer(dataclasses.replace(own.component, amplitude=maps), fwhm, small)

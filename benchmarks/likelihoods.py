@@ -98,7 +98,7 @@ def _grid_at(nside: int, points: int) -> tuple[Row, dict[str, float]]:
     def ours():
         return chi2_on_grid(like, axes)
 
-    chi2_on_grid.clear_cache()
+    jax.clear_caches()
     first = seconds(ours)
     value = float(ours()[points // 3, points // 3])
     error = abs(value / pixels(beta_dust, beta_syn) - 1)

@@ -687,7 +687,7 @@ ALTERNATIVES = {
     "[simulate]": "nside include small_scales_seed leakage",
     "[compare]": "patches",
     "[separate]": "nsteps lmax",
-    "[forecast]": "bands priors",
+    "[forecast]": "bands",
     "[paper]": "ame beta_dust beta_syn",
 }
 

@@ -289,6 +289,17 @@ def test_laws_that_vary_and_coarse_masks(folder):
     )
 
 
+def test_priors_are_in_the_table_free(folder):
+    """Also those of what only a forecast has, which frees it."""
+    own = '"r" = {}\n"A_lens" = { gaussian = [1.0, 0.05] }\n"BB.dust.slope" = { gaussian = [-2.6, 0.01] }'
+    path = written(folder, "priors", "[free]", f"[free]\n{own}")
+    path.write_text(path.read_text().replace("[forecast]", '[forecast]\nfree = ["amplitude"]'))
+    errors = forecast(load(path)).errors
+    assert errors.priors == {"dust.beta_dust": 0.5, "A_lens": 0.05, "BB.dust.slope": 0.01}
+    assert errors.sigma("A_lens") < 0.05
+    assert 0 < errors.sigma("BB.dust.slope") < 0.01 and errors.sigma("r") > 0
+
+
 def test_settings_that_come_along():
     default = load(DEFAULTS / "forecast.toml")
     assert [band.name for band in default.bands] == list(load_instrument("core"))
@@ -327,12 +338,7 @@ def test_settings_that_come_along():
         ("lmax = 60", 'lmax = 60\nbands = ["44"]', "forecast.bands: '44' is none of 40, 100, 300"),
         ("lmax = 60", 'lmax = 60\nfree = ["q"]', "forecast.free.0: input should be 'r', 'A_lens'"),
         ('"synchrotron.beta_syn"', '"q"', "free: Unknown parameter 'q'; known"),
-        ("lmax = 60", 'lmax = 60\npriors = { "dust.T_dust" = 0.5 }',
-         "forecast: The prior of 'dust.T_dust' has no effect"),
-        ("lmax = 60", 'lmax = 60\npriors = { "dust.beta_dust" = 0 }',
-         "forecast.priors.dust.beta_dust"),
-        ("lmax = 60", 'lmax = 60\npriors = { "dust.beta_dust" = 0.1 }',
-         "forecast.priors: the prior of 'dust.beta_dust' is in the table free"),
+        ('"synchrotron.beta_syn"', '"BB.dust.q"', "free: Unknown parameter 'BB.dust.q'; known"),
         ("[free]", "[cmb]\ninclude = false\n[free]", "cmb.include: is false, but a forecast has"),
         ("[free]", '[cmb]\nspectra = "cmb.dat"\n[free]',
          "cmb.spectra: a forecast changes r, which takes spectra of CAMB"),

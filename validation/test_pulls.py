@@ -10,7 +10,7 @@ from fits.optimize import best_fit
 from jaxsky.galaxy import embedded_sky
 from jaxsky.settings import load
 
-SKIES = 200
+SKIES = 500
 KINDS = [("exact", "Q"), ("exact", "U"), ("exact", "QU"), ("diagonal", "QU")]
 
 

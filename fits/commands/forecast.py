@@ -199,9 +199,6 @@ def _errors(
     ]
     spectral = settings.free_in("forecast")
     widths = {n: one.gaussian[1] for n, one in spectral.items() if one.gaussian is not None}
-    for name in spec.priors:
-        if name in widths:
-            raise SettingsError(f"forecast.priors: the prior of {name!r} is in the table free.")
     with at_key("free"):
         for name in spectral:
             if name not in parameters:
@@ -209,8 +206,8 @@ def _errors(
     with at_key("forecast"):
         own = [name for name in spec.free if name in parameters]
         free = list(dict.fromkeys((*own, *spectral, *nuisance)))
-        errors = fisher_errors(model, parameters, free, widths | spec.priors)
-    if "r" not in spec.free:
+        errors = fisher_errors(model, parameters, free, widths)
+    if "r" not in free:
         return errors, None
     none = {n: 0.0 if n.endswith(".amplitude") else v for n, v in parameters.items()}
     return errors, fisher_errors(model, none, ["r"]).sigma["r"]

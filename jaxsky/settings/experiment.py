@@ -158,7 +158,6 @@ class ForecastTable(BinsTable):
     free: Distinct[Literal["r", "A_lens", "amplitude", "slope", "correlation"]] = Field(
         ["r", "amplitude", "slope", "correlation"]
     )
-    priors: dict[str, Positive] = Field(default={})
     spectra: Several[Literal["EE", "BB"]] = Field(["BB"])
     fisher_lmax: int = Field(300, ge=2, le=3000)
 

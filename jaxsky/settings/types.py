@@ -29,7 +29,7 @@ LONGEST = 40
 WORDS = {
     "offset": ("fit",),
     **dict.fromkeys(("gain", "shift", "width", "angle"), ("fit", "separate")),
-    **dict.fromkeys(("r", "A_lens"), ("forecast",)),
+    **dict.fromkeys(("r", "A_lens", "EE", "BB"), ("forecast",)),
 }
 #: What else is called by a name in results and columns.
 RESERVED = ("cmb", "noise", "total", "residual", "center", "embedded", *map(str.lower, WORDS))

@@ -1,4 +1,4 @@
-"""What an experiment file names, brought together as a simulation; refusals with the numbers."""
+"""Build a simulation from an experiment file, and refuse beams and pixels that do not fit."""
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -23,18 +23,18 @@ from jaxsky.settings import BandTable, ColumnKeys, Experiment, SettingsError, at
 from jaxsky.sky import Sky, get_parameters, observe_band, parameter_names
 from jaxsky.small_scales import SmallScales
 
-#: A map resolves beams of so many pixels: there b_l is down to 0.43 at l = 2 nside.
+#: Smallest beam, in pixels, that a map resolves: b_l is then 0.43 at l = 2 nside.
 PIXELS = 1.5
-#: A beam below this lets nothing through that would be seen.
+#: Where a beam's window is below this, nothing of the sky is visible.
 UNSEEN_WINDOW = 1e-8
 
 
 class SimulationInputs(NamedTuple):
-    """What is simulated, ready for `jaxsky.simulate`.
+    """Everything that `jaxsky.simulate` takes.
 
-    `cmb` are spectra TT, EE, BB, TE [uK_CMB^2]; `leakage` is Q and U [uK_RJ] that have leaked from
-    the intensity, by band, with its beam; `truth` the sky's parameters that are numbers, by dotted
-    name; `small_scales_seed` that of small scales which are the same for all realisations.
+    `cmb` holds the spectra TT, EE, BB, TE [uK_CMB^2]; `leakage` is Q and U [uK_RJ] that leak from
+    the intensity into each band, with its beam; `truth` holds the sky's scalar parameters by dotted
+    name; `small_scales_seed` is given if all realisations have the same small scales.
     """
 
     sources: dict[str, Source]
@@ -46,12 +46,12 @@ class SimulationInputs(NamedTuple):
     description: str
 
     def small_scales_key(self, key: Array) -> Array:
-        """Key of the small scales in the realisation of a key."""
+        """Return the key of the small scales, given that of the realisation."""
         seed = self.small_scales_seed
         return key if seed is None else realisation_key(seed)
 
     def observed(self, name: str) -> Observed:
-        """How a band is observed, as its maps are."""
+        """Describe how the maps of a band are observed."""
         channel = self.observation.channels[name]
         beam = channel.map_beam
         noise, spectrum = channel.noise, None
@@ -79,11 +79,12 @@ def simulation_inputs(
     written: bool = True,
     galaxy: EmbeddedSky | None = None,
 ) -> SimulationInputs:
-    """Read what the settings name of some bands, by default all, and check that it can work.
+    """Read the sky and the bands called `names` (default: all), and check that they fit.
 
-    Maps that are `written` have Stokes parameters and precision of the settings, and pixels that
-    resolve all beams; others are Q and U in double precision, to be smoothed. What bands show does
-    not depend on the others. `galaxy` is the embedded model, if it is made already.
+    If `written`, maps have the Stokes parameters and the precision of the settings, and pixels that
+    resolve all beams; otherwise they are Q and U in double precision, to be smoothed later. The map
+    of a band does not depend on which other bands are simulated. `galaxy` is the embedded model, if
+    it has been made already.
     """
     spec = settings.simulate
     stokes, precision = (spec.stokes, spec.precision) if written else ("QU", "double")
@@ -132,7 +133,7 @@ def simulation_inputs(
 
 
 def map_nside(settings: Experiment, templates: Mapping[str, Template]) -> int:
-    """Resolution of simulated maps: what the settings say, or that of the coarsest template."""
+    """Return nside of the simulated maps: the settings', or that of the coarsest template."""
     if settings.simulate.nside is not None:
         return settings.simulate.nside
     if not templates and settings.sky.templates:  # nothing of the sky is simulated
@@ -145,7 +146,7 @@ def map_nside(settings: Experiment, templates: Mapping[str, Template]) -> int:
 
 
 def _width(beam: Array | float) -> float:
-    """FWHM [arcmin] of a Gaussian beam, or of the Gaussian that falls to 1/2 where a table does."""
+    """Return the FWHM [arcmin] of a beam; a table counts as the Gaussian that has its half width."""
     table = np.asarray(beam)
     if not table.ndim:
         return float(table)
@@ -155,7 +156,7 @@ def _width(beam: Array | float) -> float:
 
 
 def _reach(beam: Array | float) -> float:
-    """The last multipole that a beam lets through; a table may fall less fast than a Gaussian."""
+    """Return the last multipole that is visible through a beam."""
     table = np.asarray(beam)
     if table.ndim:
         return float(np.flatnonzero(np.abs(table) > UNSEEN_WINDOW).max())
@@ -214,7 +215,7 @@ def _source(settings: Experiment, name: str, template: Template) -> Source:
 
 
 def _truth(settings: Experiment, sources: Mapping[str, Source], cmb: bool) -> dict[str, float]:
-    """Parameters of what is simulated, by dotted name, and r where it is known."""
+    """Return the scalar parameters of the simulated sky by dotted name, and r where it is known."""
     numbers = {"r": settings.cmb.r} if cmb and settings.cmb.spectra is None else {}
     if not sources:
         return numbers
@@ -226,7 +227,7 @@ def _truth(settings: Experiment, sources: Mapping[str, Source], cmb: bool) -> di
 def read_channel(
     settings: Experiment, spec: BandTable, nside: int, stokes: str = "QU", noisy: bool = True
 ) -> ObservedBand:
-    """How a band observes maps, from what its table says; if `noisy`, with noise [uK_RJ]."""
+    """Read how a band observes the sky from its table; if `noisy`, with its noise [uK_RJ]."""
     folder, where = Path(settings.data_dir), f"bands.{spec.name}"
     band = bandpass_of(folder, spec)
     if (beam := beam_of(folder, spec, 2 * nside)) is None:
@@ -248,7 +249,7 @@ def read_channel(
 
 
 def _noise_unit(spec: BandTable, where: str) -> str:
-    """Unit of the noise of a band whose map, if it has one, is not read."""
+    """Return the unit of a band's noise without reading its map."""
     noise = spec.noise
     assert noise is not None  # as called
     if noise.estimate_above is not None:
@@ -260,7 +261,7 @@ def _noise_unit(spec: BandTable, where: str) -> str:
 
 
 def cmb_spectra(settings: Experiment, lmax: int, r: float | None = None) -> np.ndarray:
-    """TT, EE, BB, TE of the CMB [uK_CMB^2], shape (4, ell); another r is for those of CAMB only."""
+    """Return TT, EE, BB, TE of the CMB [uK_CMB^2], shape (4, ell); `r` overrides the settings."""
     spec = settings.cmb
     if spec.spectra is None:
         with at_key("cmb.cosmology"):
@@ -282,7 +283,7 @@ def _leakage(
     observation: Observation,
     galaxy: EmbeddedSky | None,
 ) -> dict[str, Float[Array, "2 pix"]]:
-    """What leaks from the intensity of the foregrounds into Q and U of some bands [uK_RJ]."""
+    """Return what leaks from the foregrounds' intensity into Q and U of each band [uK_RJ]."""
     fractions = {n: f for n, f in settings.simulate.leakage.items() if n in observation.channels}
     if not any(fractions.values()):
         return {}
@@ -301,10 +302,10 @@ def _leakage(
 
 
 def leak(intensity: Float[Array, " pix"]) -> Float[Array, "2 pix"]:
-    """Q and U of an intensity that is polarized along the meridians of the ecliptic.
+    """Return Q and U of an intensity that is polarized along the meridians of the ecliptic.
 
-    As detectors with different bandpasses see it that turn about the Sun's direction once a
-    minute and always have the same angle to the direction in which they move.
+    This is the pattern of bandpass mismatch: the spacecraft spins once a minute about the direction
+    of the Sun, and its detectors keep a fixed angle to their direction of motion.
     """
     nside = healpy.npix2nside(intensity.size)
     pole = healpy.Rotator(coord=["E", "G"])(np.array([0.0, 0.0, 1.0]))

@@ -1,4 +1,4 @@
-"""The experiment file: its tables, a sentence for each mistake, and the files that it names."""
+"""The experiment file: its tables, error messages, and the files that it names."""
 
 from jaxsky.settings.experiment import CommonTable, Experiment, RadioIndexMap, parse_region
 from jaxsky.settings.files import (

@@ -42,12 +42,12 @@ from jaxsky.settings.types import (
 )
 from jaxsky.small_scales import DUST, SYNCHROTRON
 
-#: Regions that need not be named.
+#: Regions that are predefined.
 REGIONS: dict[str, str | MapFile] = {"strip": "|b| <= 20", "outside": "|b| > 20", "full": "full"}
 
 
 def parse_region(text: str) -> tuple[str, float] | None:
-    """The comparison and the latitude [deg] of "|b| > 20" and its like; None for the full sky."""
+    """Return comparison and latitude [deg] of a region like "|b| > 20"; None for the full sky."""
     if text == "full":
         return None
     match = re.fullmatch(r"\|b\|\s*(<=|<|>=|>)\s*(\d+(?:\.\d*)?)", text.strip())
@@ -72,7 +72,7 @@ Region = Annotated[str, valid(parse_region)] | MaskFile
 
 
 class CommonTable(SettingsTable):
-    """How templates and maps are brought together: for fit, compare, separate and paper."""
+    """The common resolution of templates and maps in fit, compare, separate and paper."""
 
     nside: Nside = 64
     fwhm: float = Field(60.0, ge=0)
@@ -110,7 +110,7 @@ class FitTable(SettingsTable):
 
 
 class BinsTable(SettingsTable):
-    """Spectra in bins of some multipoles: of compare, separate and forecast."""
+    """Binned spectra, of compare, separate and forecast."""
 
     width: int = Field(10, ge=1)
 
@@ -132,7 +132,7 @@ class CompareTable(SimulationsTable):
 
 
 class SeparateTable(SimulationsTable):
-    """How components are separated, and r taken from the cleaned BB."""
+    """How components are separated, and how r is measured from the cleaned BB."""
 
     domain: Literal["pixel", "harmonic"] = "pixel"
     region: Word = "full"
@@ -146,7 +146,7 @@ class SeparateTable(SimulationsTable):
 
 
 class ForecastTable(BinsTable):
-    """Spectra of the foregrounds outside of a mask, and the Fisher matrix."""
+    """Spectra of the foregrounds outside a mask, and the Fisher matrix."""
 
     region: Word = "outside"
     apodization: float = Field(4.0, ge=0, lt=90)
@@ -178,17 +178,17 @@ class IntensityMap(BeamedMap):
 
 
 class RadioIndexMap(BeamedMap):
-    """A map of beta_syn, which is made steeper if it is one at radio frequencies.
+    """A map of beta_syn, to which `steepening` is added if it was measured at radio frequencies.
 
-    By a number, the paper's is 0.13, or as a spectrum says, a file with a table of frequency [GHz]
-    and antenna temperature.
+    It is a number, 0.13 in the paper, or the file of a spectrum: frequency [GHz] and antenna
+    temperature.
     """
 
     steepening: float | FileName = 0.0
 
 
 class PaperTable(SettingsTable):
-    """What only the figures of the paper need."""
+    """Settings that only the figures of the paper need."""
 
     fwhm: Positive = 5.0
     center: Pair[float] = (180.0, 30.0)
@@ -206,9 +206,9 @@ class PaperTable(SettingsTable):
 
 
 class Experiment(SettingsTable):
-    """All settings: a sky, the bands in which it is observed, and what is done with them.
+    """All settings: a sky, the bands in which it is observed, and what the commands do with them.
 
-    `truth` are parameters of the simulated sky where they differ from those that are modelled.
+    `truth` holds parameters of the simulated sky that differ from those of the model.
     """
 
     title: str = ""
@@ -282,17 +282,17 @@ class Experiment(SettingsTable):
         return self
 
     def modelled(self) -> list[str]:
-        """Names of the components that are modelled."""
+        """Return the names of the components in the model."""
         return [n for n in self.sky.components if n in (self.common.components or [n])]
 
     def included(self) -> list[str]:
-        """Names of all that is simulated, "cmb" and "noise" among them."""
+        """Return the names of everything that is simulated, with "cmb" and "noise"."""
         include = self.simulate.include
         everything = [*self.sky.components, *(["cmb"] if self.cmb.include else []), "noise"]
         return [n for n in everything if include is None or n in include]
 
     def free_in(self, command: str) -> dict[str, FreeParameter]:
-        """The free parameters that a command has: those of components, and words of its own."""
+        """Return the free parameters that a command knows: those of components, and its own."""
         return {
             name: one
             for name, one in self.free.items()
@@ -300,7 +300,7 @@ class Experiment(SettingsTable):
         }
 
     def leaks(self) -> list[str]:
-        """Warnings about maps that are known to hold leakage which is not subtracted."""
+        """Return warnings about maps that contain leakage which is not subtracted."""
         return [
             f"bands.{band.name}: {file} holds intensity that has leaked into Q and U through the "
             "bandpasses, and nothing is subtracted; indices fitted to it may be wrong by many "
@@ -312,7 +312,7 @@ class Experiment(SettingsTable):
         ]
 
     def left_out(self, command: str) -> list[str]:
-        """Warnings about what is said of free parameters that a command does not have."""
+        """Return warnings about settings of free parameters that a command ignores."""
         here = self.free_in(command)
         regions = [n for n, one in here.items() if one.regions and command != "separate"]
         uniform = [n for n, one in here.items() if one.uniform and command == "forecast"]
@@ -326,7 +326,7 @@ class Experiment(SettingsTable):
         return [f"{w.format(command)}: {', '.join(names)}." for w, names in parts.items() if names]
 
     def start(self, command: str) -> dict[str, float]:
-        """Start values of the free parameters of a command."""
+        """Return the start values of the free parameters of a command."""
         values = {}
         for name, one in self.free_in(command).items():
             if one.start is None:

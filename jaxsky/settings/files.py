@@ -1,4 +1,4 @@
-"""Maps, masks, bandpasses and noise in files, as any table of settings names them."""
+"""Tables of settings that name maps, masks, bandpasses and noise in files."""
 
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -19,7 +19,7 @@ from jaxsky.units import UNITS
 
 
 class TableKeys(SettingsTable):
-    """Columns of a table in a file, and their unit."""
+    """Columns of a table in one or several files, and their unit."""
 
     file: Files | None = None
     fields: list[str | int] | None = None
@@ -27,19 +27,19 @@ class TableKeys(SettingsTable):
 
     @property
     def files(self) -> list[str]:
-        """Names of the files, however many."""
+        """The names of all files."""
         return [self.file] if isinstance(self.file, str) else self.file or []
 
     @property
     def label(self) -> str:
-        """Names of the files without folders, to be shown."""
+        """The names of the files without folders, for display."""
         return ", ".join(Path(file).name for file in self.files)
 
 
 class ColumnKeys(TableKeys):
-    """Columns of HEALPix maps in a FITS table, or in several with a column each.
+    """Columns of HEALPix maps in one FITS table, or in several with one column each.
 
-    What a header says need not be given; see `jaxsky.io.read_maps`.
+    Keys may be left out where the header has the answer; see `jaxsky.io.read_maps`.
     """
 
     hdu: Hdus | None = None
@@ -50,7 +50,7 @@ class ColumnKeys(TableKeys):
 
 
 class MapKeys(ColumnKeys):
-    """A map where there may be none; its Stokes parameters if names of columns are not certain."""
+    """An optional map, and its Stokes parameters if the column names do not tell them."""
 
     stokes: Stokes | None = None
 
@@ -68,7 +68,7 @@ class MapFile(MapKeys):
 
 
 class BeamedKeys(MapKeys):
-    """A map where there may be none, and the FWHM of its Gaussian beam [arcmin]."""
+    """An optional map, and the FWHM of its Gaussian beam [arcmin]."""
 
     fwhm: float | None = Field(None, ge=0)
 
@@ -103,10 +103,10 @@ def _list(value: Any) -> Any:
 
 
 class NoiseColumns(ColumnKeys):
-    """Columns about the noise, in the file of the map that has it unless they have their own.
+    """Columns that describe the noise, by default in the file of the map itself.
 
-    What else is not given is as in that map. A list alone names the columns. `sigma0` is the noise
-    of one observation: a number, or one for each Stokes parameter.
+    Keys that are not given are those of the map. A plain list names the columns. `sigma0` is the
+    noise of one observation: a number, or one per Stokes parameter.
     """
 
     sigma0: Annotated[list[Positive], Field(max_length=3), BeforeValidator(_list)] | None = None
@@ -118,22 +118,22 @@ class NoiseColumns(ColumnKeys):
 
 
 class NoiseTable(SettingsTable):
-    """Noise of a band or of a template: exactly one of its kinds.
+    """Noise of a band or of a template, given as exactly one of its kinds.
 
-    A level is white noise [unit arcmin]; that of a template is seen through its beam. The others
-    are of a pixel of the map as it is in the file: rms, a number or a map; a covariance; hits, the
-    number of observations; weights, the inverse of Q and U's covariance in units of sigma0, as in
+    `level` is white noise [unit arcmin], which in a template is seen through its beam. The other
+    kinds are per pixel of the map in the file: `rms`, a number or a map; `covariance`; `hits`, the
+    number of observations; `weights`, the inverse covariance of Q and U in units of sigma0, as in
     the second table of WMAP's maps. `unit` is that of level, rms, covariance (squared) and
-    sigma0, by default that of the map, or uK_CMB where there is no map. `plausible` says that noise
-    is meant which is far from the rms of its map; `correlated`, that noise estimated from a map has
-    a spectrum. `shared` says how many times a template has the noise of a band, by name, besides
-    its own: of maps that were made from the same bands.
+    sigma0, by default that of the map, or uK_CMB where there is no map. `plausible` accepts noise
+    that is far from the rms of its map; `correlated` gives noise that is estimated from a map a
+    spectrum. `shared` is the factor with which the noise of a band, by name, is also in a template,
+    because the template was made from that band.
     """
 
     KINDS: ClassVar[tuple[str, ...]] = (
         "level", "rms", "covariance", "hits", "weights", "estimate_above"
     )  # fmt: skip
-    #: Columns that have to be named.
+    #: The columns that have to be named for each kind.
     COLUMNS: ClassVar[dict[str, str]] = {
         "covariance": "QQ, QU, UU or II, IQ, IU, QQ, QU, UU",
         "hits": "N_OBS",

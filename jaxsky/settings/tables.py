@@ -32,15 +32,15 @@ from jaxsky.settings.types import (
 
 #: Release and correction in the names of Planck's files.
 _RELEASE = re.compile(r"_R(\d)\.\d\d")
-#: Maps of LFI's second and third release, and of HFI's second, that are as they were observed: of
-#: the whole mission, years, surveys and half rings, whole or compressed.
+#: Maps of LFI's second and third release, and of HFI's second, without correction for leakage: of
+#: the whole mission, years, surveys and half rings, compressed or not.
 _LEAKY = re.compile(
     r"(LFI_SkyMap_0\d\d|HFI_SkyMap_(?:100|143|217|353)(?=.*_R2))(.*_R[23]\.\d\d.*)", re.IGNORECASE
 )
 
 
 def without_leakage(name: str) -> str | None:
-    """What to take in place of a map that holds leakage, or None if it is not known to."""
+    """Say what to use in place of a map that contains leakage; None if it is not known to."""
     match = _LEAKY.fullmatch(name)
     if match is None or "bpasscorr" in name.lower():
         return None
@@ -56,12 +56,12 @@ def without_leakage(name: str) -> str | None:
     return f'Take {corrected}, or subtract it: leakage = {{ file = "{correction}", {beam} }}'
 
 
-#: Components of the embedded model, named as their laws.
+#: Components of the embedded model, which have the names of their laws.
 EMBEDDED = ("dust", "synchrotron")
 
 
 class EmbeddedTable(SettingsTable):
-    """The embedded model of the Galaxy; its other keys are those of `jaxsky.galaxy.GalaxyModel`."""
+    """The embedded model of the Galaxy; other keys are fields of `jaxsky.galaxy.GalaxyModel`."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, float] = Field(init=False)
@@ -71,7 +71,7 @@ class EmbeddedTable(SettingsTable):
 
     @property
     def numbers(self) -> dict[str, float]:
-        """Numbers of the model that are not as by default."""
+        """The numbers of the model that differ from its defaults."""
         return self.__pydantic_extra__ or {}
 
     @model_validator(mode="after")
@@ -103,11 +103,11 @@ class SmallScalesTable(SettingsTable):
 
 
 class ComponentTable(BeamedKeys):
-    """A component: its law, parameters that are not default, and its map at `nu_ref` [GHz].
+    """A component: its law, parameters that differ from the defaults, its map at `nu_ref` [GHz].
 
-    Maps may take the place of parameters. `angles` names the component along which an intensity
-    is polarized. A component without a map is one of the embedded model, or one that a separation
-    finds by its law alone.
+    A parameter may be a map. `angles` names the component along which an intensity is polarized. A
+    component without a map belongs to the embedded model, or is found by a separation from its law
+    alone.
     """
 
     law: Law | None = None
@@ -137,12 +137,12 @@ class ComponentTable(BeamedKeys):
 
     @property
     def polarized(self) -> bool:
-        """Whether its law, which is known, has any polarization."""
+        """Whether the law, which must be given, is polarized."""
         return component_class(str(self.law)).polarized
 
 
 class SkyTable(SettingsTable):
-    """Components of the sky by name, and the embedded model, whose maps those replace."""
+    """Components of the sky by name, and the embedded model, whose maps they replace."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, ComponentTable] = Field(init=False)
@@ -151,7 +151,7 @@ class SkyTable(SettingsTable):
 
     @property
     def given(self) -> dict[str, ComponentTable]:
-        """The components that have a table."""
+        """The components that have a table of their own."""
         return self.__pydantic_extra__ or {}
 
     @property
@@ -200,7 +200,7 @@ class SkyTable(SettingsTable):
 class CMBTable(SettingsTable):
     """The CMB: from CAMB, or from a file of spectra.
 
-    It is part of what is observed and of what is known about it. `A_lens` multiplies the B modes
+    It is part of the simulated sky and of the covariance in fits. `A_lens` multiplies the B modes
     of lensing.
     """
 
@@ -224,7 +224,7 @@ class CMBTable(SettingsTable):
 
 
 class BandTable(BeamedKeys):
-    """A band: how it observes, and its map; without a map it is simulated."""
+    """A band: how it observes the sky, and its map; a band without a map is simulated."""
 
     name: BandName | None = None
     instrument: str | None = None
@@ -261,7 +261,7 @@ class BandTable(BeamedKeys):
         return self
 
     def _check_release(self, leakage: BeamedMap) -> None:
-        """Refuse leakage of another release than the map, or that is subtracted already."""
+        """Refuse leakage from another release than the map, or that has been subtracted already."""
         for file in self.files:
             if "BPassCorrected" in file:
                 raise ValueError(f"leakage is subtracted from {file} already")
@@ -274,10 +274,9 @@ class BandTable(BeamedKeys):
             )
 
     def bands(self, folder: Path) -> list["BandTable"]:
-        """The bands that this stands for: channels of an instrument, with what is given here.
+        """Return the bands of this entry: channels of an instrument, updated by the keys here.
 
-        Levels of noise of an instrument are in uK_CMB, whatever the unit of a map that is given
-        here.
+        Noise levels of an instrument are in uK_CMB, whatever the unit of a map that is given here.
         """
         if self.instrument is None:
             return [self]
@@ -302,7 +301,7 @@ class BandTable(BeamedKeys):
 
 
 class RegionsTable(MapKeys):
-    """Where a parameter has values of its own: exactly one of these, or the file of a map."""
+    """Regions with their own value of a parameter: exactly one of these, or the file of a map."""
 
     nside: Nside | None = None
     latitudes: list[float] | None = Field(None, min_length=1)
@@ -318,9 +317,9 @@ class RegionsTable(MapKeys):
 
 
 class FreeParameter(SettingsTable):
-    """A free parameter: where to start, its prior, and its regions if it has several values.
+    """A free parameter: its start value, its prior, and its regions if it has several values.
 
-    Without a start it is the middle of the prior.
+    The default start is the middle of the prior.
     """
 
     start: float | None = None
@@ -344,6 +343,6 @@ class FreeParameter(SettingsTable):
         return self
 
     def numbers(self) -> list[float]:
-        """All values that it names, for a check of their sign."""
+        """Return all values that it contains, to check their sign."""
         said = (self.start, self.gaussian and self.gaussian[0], self.uniform and self.uniform[1])
         return [number for number in said if number is not None]

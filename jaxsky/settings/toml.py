@@ -1,4 +1,4 @@
-"""Settings from TOML files and the command line, and the files that they name."""
+"""Read settings from TOML files and the command line, and find the files that they name."""
 
 import json
 import os
@@ -25,7 +25,7 @@ PACKAGES = "jaxsky jax numpy healpy ducc0 jaxbind camb optimistix emcee blackjax
 
 @contextmanager
 def at_key(name: str) -> Iterator[None]:
-    """Have an error of the numerics name the key of the value that led to it."""
+    """Add the key of a setting to errors that its value causes in the numerical code."""
     try:
         yield
     except (InputError, SettingsError):
@@ -39,7 +39,7 @@ def at_key(name: str) -> Iterator[None]:
 
 @contextmanager
 def of_file(path: Path) -> Iterator[None]:
-    """Have errors about settings name their file."""
+    """Add the path of the settings file to errors about settings."""
     try:
         yield
     except SettingsError as error:
@@ -49,7 +49,7 @@ def of_file(path: Path) -> Iterator[None]:
 
 
 def _assigned(assignment: str) -> tuple[list[str], Any]:
-    """The key and the value of `key=value`, where the value is TOML, or text as it is."""
+    """Split `key=value` into key and value; a value that is not TOML is plain text."""
     key, equals, value = assignment.partition("=")
     text = f"{key} = {json.dumps(value.strip(), ensure_ascii=False)}"
     for line in (assignment, text) if equals else ():
@@ -70,7 +70,7 @@ def _assigned(assignment: str) -> tuple[list[str], Any]:
 
 
 def _replaced(raw: Any, path: Sequence[str], value: Any) -> Any:
-    """Tables with one key replaced; a number is the place in a list."""
+    """Return the tables with the value at `path` replaced; a number in it is an index of a list."""
     if not path:
         return value
     key, *rest = path
@@ -84,10 +84,10 @@ def _replaced(raw: Any, path: Sequence[str], value: Any) -> Any:
 
 
 def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
-    """An experiment from a TOML file, with `data_dir` as an absolute path.
+    """Read an experiment from a TOML file; its `data_dir` becomes an absolute path.
 
-    Assignments are `key=value` with a dotted key, such as "common.nside=32", "bands.0.fwhm=30" or
-    "free.'dust.beta_dust'.start=1.5", in place of what the file says; a table is replaced whole.
+    Assignments `key=value` with a dotted key, such as "common.nside=32", "bands.0.fwhm=30" or
+    "free.'dust.beta_dust'.start=1.5", override the file; a table is replaced as a whole.
     """
     try:
         raw = tomllib.loads(path.read_text())
@@ -158,7 +158,7 @@ def find_file(folder: Path, name: str) -> Path:
 
 
 def _missing(path: Path, cache: Path | None) -> str:
-    """Why a file is not there, and how it comes."""
+    """Say that a file is missing, and how to get it."""
     from jaxsky.archive import catalogue, product_sets  # slow to import, and seldom needed
 
     said = "no such file" if path.parent.is_dir() else "no such file, nor folder"
@@ -174,7 +174,7 @@ def _missing(path: Path, cache: Path | None) -> str:
 
 
 def found_files(settings: Experiment) -> dict[str, str]:
-    """The files that settings name and that are there: name -> path."""
+    """Return the existing files that the settings name: name -> path."""
     found = {}
     for name in named_files(settings):
         try:
@@ -185,7 +185,7 @@ def found_files(settings: Experiment) -> dict[str, str]:
 
 
 def circumstances(settings: Experiment) -> dict[str, Any]:
-    """When, where, how, with which versions and from which files results are made."""
+    """Record date, command, machine, versions and input files of a run."""
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": sys.argv,
@@ -197,7 +197,7 @@ def circumstances(settings: Experiment) -> dict[str, Any]:
 
 
 def named_files(value: Any) -> Iterator[str]:
-    """All names of files among the values of settings."""
+    """Yield every file name among the values of the settings."""
     if isinstance(value, NamedFile):
         yield value
     elif isinstance(value, BaseModel | dict):

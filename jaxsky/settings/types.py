@@ -1,4 +1,4 @@
-"""Types of values in settings, and checks of values; ValueError with the words after the key."""
+"""Types of the values in settings, and checks that raise ValueError with a sentence about them."""
 
 import math
 import re
@@ -25,22 +25,22 @@ T = TypeVar("T")
 
 #: Names are parts of file names and of columns in FITS files.
 LONGEST = 40
-#: First parts of free parameters that are no components, and the commands that have them.
+#: First parts of free parameters that do not name a component, and the commands that know them.
 WORDS = {
     "offset": ("fit",),
     **dict.fromkeys(("gain", "shift", "width", "angle"), ("fit", "separate")),
     **dict.fromkeys(("r", "A_lens", "EE", "BB"), ("forecast",)),
 }
-#: What else is called by a name in results and columns.
+#: Names with a meaning of their own in results and columns.
 RESERVED = ("cmb", "noise", "total", "residual", "center", "embedded", *map(str.lower, WORDS))
 
 
 class SettingsError(ValueError):
-    """Settings that cannot work, as one sentence that names the file and the key."""
+    """An error in the settings, as one sentence that names the file and the key."""
 
 
 class MistakeAt(ValueError):
-    """A mistake at a key inside of the table that is checked."""
+    """An error at a key inside the table that is being checked."""
 
     def __init__(self, key: str, mistake: str | ValueError) -> None:
         self.key, self.words = key, str(mistake)
@@ -50,9 +50,9 @@ class MistakeAt(ValueError):
 
 
 class SettingsTable(BaseModel):
-    """A table of settings: its fields are the keys, and no others, with values of their types.
+    """A table of settings: its fields are the allowed keys, with values of their types.
 
-    A number in quotes, a switch where a number is meant and an empty word are mistakes.
+    A number in quotes, a boolean in place of a number and an empty string are errors.
     """
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
@@ -65,7 +65,7 @@ class SettingsTable(BaseModel):
         return value
 
     def changed(self, keys: Iterable[str]) -> list[str]:
-        """Those of some keys that are not as by default; others may be from a log."""
+        """Return those of `keys` whose value is not the default (logs contain defaults, too)."""
         fields = type(self).model_fields
         return [key for key in keys if getattr(self, key) != fields[key].default]
 
@@ -79,7 +79,7 @@ class SettingsTable(BaseModel):
 
 
 class NamedFile(str):
-    """The name of a file, told from other text; see `find_file`."""
+    """The name of a file, as opposed to other text; see `find_file`."""
 
     __slots__ = ()
 
@@ -96,7 +96,7 @@ def _distinct(values: list[Any]) -> None:
 
 
 def valid(check: Callable[[Any], object]) -> AfterValidator:
-    """Values of a type for which a check raises nothing."""
+    """Make a validator of a function that raises ValueError for a bad value."""
 
     def kept(value: Any) -> Any:
         check(value)
@@ -141,7 +141,7 @@ RegionName = Annotated[str, valid(check_name)]
 
 
 def _key(raw: Any, place: Sequence[str | int], missing: bool) -> str:
-    """The dotted key of a mistake; its place also names types, which are no keys."""
+    """Return the dotted key of an error; pydantic's location also contains types, dropped here."""
     keys = []
     for i, step in enumerate(place):
         if isinstance(raw, dict) and step in raw:
@@ -158,7 +158,10 @@ def _key(raw: Any, place: Sequence[str | int], missing: bool) -> str:
 def mistakes(
     raw: Any, error: ValidationError, options: Mapping[str, str] = MappingProxyType({})
 ) -> str:
-    """A sentence about what is wrong with tables, with the keys; options add to those of a key."""
+    """Return a sentence about all errors in the tables, with their keys.
+
+    `options` adds a remark to the errors of a key.
+    """
     wrong: dict[str, list[str]] = {}
     types: dict[str, str] = {}
     for found in error.errors():
@@ -183,7 +186,7 @@ def mistakes(
             value = "" if ", not " in what else f", not {reprlib.repr(found['input'])}"
             what = f"{what[0].lower()}{what[1:]}{value}"
         wrong.setdefault(where, []).append(what)
-    # Of a value that may be of several types, those that it is not matter only if it is none.
+    # Where a value may have one of several types, a mismatch matters only if all of them fail.
     places = [*wrong, *types]
     for where, what in types.items():
         if where not in wrong and not any(place.startswith(f"{where}.") for place in places):
@@ -206,7 +209,7 @@ def check_names(kind: str, names: Iterable[str]) -> None:
 
 
 def check_reference(law: str, nu_ref: float | None) -> None:
-    """Raise ValueError for a reference frequency that is not in GHz, or that a law has not."""
+    """Raise ValueError for a reference frequency that is not in GHz, or if the law has none."""
     if nu_ref is None:
         return
     known = declared(component_class(law), "nu_ref")
@@ -220,7 +223,7 @@ def check_reference(law: str, nu_ref: float | None) -> None:
 
 
 def check_signs(values: Mapping[str, Any], table: str = "") -> None:
-    """Raise ValueError for indices beta_syn in the sign of T ~ nu^beta, by their dotted names."""
+    """Raise ValueError for a beta_syn with the sign of T ~ nu^beta; names are dotted."""
     for name, value in values.items():
         if name.split(".")[-1] != "beta_syn":
             continue

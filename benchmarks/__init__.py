@@ -1,4 +1,4 @@
-"""Benchmarks: each work beside a peer that does the same in the same process.
+"""Benchmarks: each task next to a peer that does the same in the same process.
 
 `python -m benchmarks` prints one table of ratios with their targets; `--list` names the
 benchmarks, `--only NAME` runs one, `--quick` runs all on small maps, without verdicts, and

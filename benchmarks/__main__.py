@@ -51,7 +51,7 @@ LONG = ("planck", "nside-2048", "separation-pixels", "commands")
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser("python -m benchmarks", description="Times beside peers.")
+    parser = argparse.ArgumentParser("python -m benchmarks", description="Times against peers.")
     parser.add_argument("--list", action="store_true", help="name the benchmarks and stop")
     parser.add_argument("--only", choices=BENCHMARKS, help="run one", metavar="NAME")
     parser.add_argument("--quick", action="store_true", help="small maps, no verdicts")

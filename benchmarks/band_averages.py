@@ -1,4 +1,4 @@
-"""Band averages of dust with maps of its spectral parameters, beside PySM 3."""
+"""Band averages of dust with maps of its spectral parameters, next to PySM 3."""
 
 import jax
 import jax.numpy as jnp
@@ -131,7 +131,7 @@ def _beside_copy(nside: int, rounds: int) -> Row:
 
 
 def beta_map(quick: bool) -> list[Row]:
-    """A map of the index, beside PySM 3 and a plain copy."""
+    """A map of the index, next to PySM 3 and a plain copy."""
     nside = 32 if quick else 512
     return [
         _beside_pysm(nside, False, 200, 2 if quick else 5),
@@ -140,7 +140,7 @@ def beta_map(quick: bool) -> list[Row]:
 
 
 def beta_and_T_maps(quick: bool) -> list[Row]:
-    """Maps of index and temperature, beside PySM 3."""
+    """Maps of index and temperature, next to PySM 3."""
     return [_beside_pysm(32 if quick else 512, True, 40, 2 if quick else 3)]
 
 
@@ -186,7 +186,7 @@ def growth(quick: bool) -> list[Row]:
 
 
 def compilation(quick: bool) -> list[Row]:
-    """The first call, which compiles, beside later ones."""
+    """The first call, which compiles, next to later ones."""
     nside = 32 if quick else 512
     sky, band = _sky(nside), _band()
 

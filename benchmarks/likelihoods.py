@@ -1,4 +1,4 @@
-"""Likelihoods on a grid and in chains, beside a sum over pixels in numpy and emcee by itself."""
+"""Likelihoods on a grid and in chains, next to a sum over pixels in numpy and emcee by itself."""
 
 import itertools
 import tempfile

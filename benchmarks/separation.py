@@ -1,4 +1,4 @@
-"""Component separation: likelihoods beside FURAX, fits from cold starts, simulations, samples.
+"""Component separation: likelihoods next to FURAX, fits from cold starts, simulations, samples.
 
 FGBuster is not on PyPI, so it is left out.
 """

@@ -1,4 +1,4 @@
-"""Simulated observations beside PySM 3 and healpy: the command, transforms, long runs."""
+"""Simulated observations next to PySM 3 and healpy: the command, transforms, long runs."""
 
 import sys
 import tempfile
@@ -279,7 +279,7 @@ def _error(values: np.ndarray, exact: np.ndarray) -> float:
 
 
 def smoothing(quick: bool) -> list[Row]:
-    """Smoothing a map of polarization, beside healpy."""
+    """Smoothing a map of polarization, next to healpy."""
     nside = 64 if quick else 512
     maps, alm = _band_limited(nside)
     lmax, zero = 2 * nside, np.zeros(maps.shape[-1])
@@ -315,7 +315,7 @@ def smoothing(quick: bool) -> list[Row]:
 
 
 def transform(quick: bool) -> list[Row]:
-    """Analysis of a band-limited map, beside healpy with its three iterations."""
+    """Analysis of a band-limited map, next to healpy with its three iterations."""
     nside = 64 if quick else 512
     maps, alm = _band_limited(nside)
     lmax, zero = 2 * nside, np.zeros(maps.shape[-1])

@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from fits.compress import gram, square_root
 from fits.mixing import Mixing, named_bands, unit_sky
@@ -136,7 +136,7 @@ class PixelLikelihood(SkyLikelihood):
         return jnp.asarray(self.whitening) @ products.ravel()
 
 
-def _check_maps(sky: Sky, bands: Mapping[str, Any], data: Array, sigma: Array) -> None:
+def _check_shapes(sky: Sky, bands: Mapping[str, Any], data: Array, sigma: Array) -> None:
     shape = (len(bands), *sky.shape)
     form = f"(band, stokes, pix) = {shape}"
     check_shape("data", data, data.shape == shape, f"have shape {form}")
@@ -145,17 +145,21 @@ def _check_maps(sky: Sky, bands: Mapping[str, Any], data: Array, sigma: Array) -
     except ValueError:
         broadcasts = False
     check_shape("sigma", sigma, broadcasts, f"broadcast to {form}")
-    values, errors = np.asarray(data), np.asarray(sigma)
-    if bad := int(np.sum(~(errors > 0))):
-        raise ValueError(f"Argument `sigma` has {bad} of {errors.size} values that are not > 0.")
-    used = np.isfinite(np.broadcast_to(errors, shape))
-    if bad := int(np.sum(used & (~np.isfinite(values) | (values < UNSEEN)))):
+
+
+def _checked_weights(data: Array, sigma: Array) -> tuple[Array, Int[np.ndarray, "band stokes"]]:
+    """Return 1/sigma^2 of all data, and how many are not masked per band and Stokes parameter."""
+    weights, used, wrong, unseen = _weights(data, sigma)
+    if wrong:
+        raise ValueError(f"Argument `sigma` has {wrong} of {sigma.size} values that are not > 0.")
+    if unseen:
         raise ValueError(
-            f"Argument `data` has {bad} values that are not finite (or UNSEEN) in pixels that are "
-            "used; mask them with an infinite `sigma`."
+            f"Argument `data` has {unseen} values that are not finite (or UNSEEN) in pixels that "
+            "are used; mask them with an infinite `sigma`."
         )
-    if not bool(used.any()):
+    if not used.any():
         raise ValueError("No pixel is left: the mask, or an infinite `sigma`, covers the map.")
+    return weights, np.asarray(used)
 
 
 def likelihood(
@@ -206,7 +210,8 @@ def likelihood(
     check_double("fits")
     bands = named_bands(bands)
     data, sigma = as_array("data", data), as_array("sigma", sigma)
-    _check_maps(sky, bands, data, sigma)
+    _check_shapes(sky, bands, data, sigma)
+    weights, counts = _checked_weights(data, sigma)
     labels = "QU" if len(data[0]) == 2 else "IQU"
     stokes = labels if stokes is None else stokes
     if not stokes or set(stokes) - set(labels):
@@ -220,7 +225,6 @@ def likelihood(
         if name[-1] not in stokes if name in offsets else stokes == "I":
             raise ValueError(f"Parameter {name!r} has no effect on Stokes {stokes}.")
     sky = mixing.laws({n: value for n, value in params.items() if not n.endswith(OFFSET)})
-    weights = _weights(data, sigma)
     if pixelwise or any(leaf.ndim == 1 for leaf in jax.tree.leaves(sky)):
         mixing = dataclasses.replace(mixing, sky=sky)
         like = SkyLikelihood(params, 0, mixing, labels, bool(angles))
@@ -236,7 +240,7 @@ def likelihood(
     if angles:
         templates = jnp.concatenate([templates, _swapped(templates)])
     products = np.asarray(gram(data, templates, weights))
-    values = int(np.sum(np.asarray(weights)[:, keep] > 0))
+    values = int(counts[:, keep].sum())
     like = TemplateLikelihood(
         params, jnp.asarray(values), mixing, labels, bool(angles), jnp.zeros((0, 0))
     )
@@ -277,8 +281,11 @@ def _swapped(maps: Float[Array, "*maps stokes x"]) -> Float[Array, "*maps stokes
 
 @jax.jit
 def _weights(data, sigma):
-    """1/sigma^2 of all data."""
-    return jnp.broadcast_to(1 / sigma**2, data.shape)
+    """1/sigma^2 of all data; counts of those that are used, of bad sigma, and of bad data."""
+    weights = jnp.broadcast_to(1 / sigma**2, data.shape)
+    used = weights > 0
+    unseen = used & (~jnp.isfinite(data) | (data < UNSEEN))
+    return weights, used.sum(axis=-1), jnp.sum(~(sigma > 0)), unseen.sum()
 
 
 @jax.jit

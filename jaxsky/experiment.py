@@ -146,7 +146,7 @@ def map_nside(settings: Experiment, templates: Mapping[str, Template]) -> int:
 
 
 def _width(beam: Array | float) -> float:
-    """Return the FWHM [arcmin] of a beam; a table counts as the Gaussian that has its half width."""
+    """Return the FWHM [arcmin] of a beam; a table counts as the Gaussian of its half width."""
     table = np.asarray(beam)
     if not table.ndim:
         return float(table)

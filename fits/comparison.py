@@ -5,6 +5,7 @@ from the model maps may be by chance is seen in simulated noise and CMB. And on 
 in the paper's figure 10: their power laws against those of the model.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -260,30 +261,28 @@ def compare_pixels(
     floor = 1 / (1 + len(simulated.chi2))
     pte = floor * (1 + (simulated.chi2 >= found).sum(axis=0))
     squares = simulated.squares.mean(axis=0)
-    rows = []
-    for b, band in enumerate(prepared.bands):
-        for r, (region, pixels) in enumerate(regions.items()):
-            observed, modelled = (np.asarray(m[b])[:, pixels] for m in (prepared.data, model))
-            for s, stokes in enumerate(STOKES):
-                pick = slice(None) if stokes == "QU" else slice(s, s + 1)
-                x, y = modelled[pick].ravel(), observed[pick].ravel()
-                rows.append(
-                    Scatter(
-                        band,
-                        region,
-                        stokes,
-                        x.size,
-                        float(slopes[b, r, s]),
-                        float(errors[b, r, s]),
-                        float(np.corrcoef(x, y)[0, 1]),
-                        float(np.sqrt(np.mean((y - x) ** 2))),
-                        math.sqrt(float(squares[b, r, s]) / x.size),
-                        float(found[b, r, s]),
-                        float(pte[b, r, s]),
-                        floor,
-                    )
-                )
-    return rows
+    names = itertools.product(prepared.bands, regions, STOKES)
+    scatters = []
+    for (band, region, stokes), at in zip(names, np.ndindex(slopes.shape), strict=True):
+        both = (np.asarray(maps[at[0]])[:, regions[region]] for maps in (model, prepared.data))
+        x, y = (maps[["QU".index(s) for s in stokes]].ravel() for maps in both)
+        scatters.append(
+            Scatter(
+                band,
+                region,
+                stokes,
+                x.size,
+                float(slopes[at]),
+                float(errors[at]),
+                float(np.corrcoef(x, y)[0, 1]),
+                float(np.sqrt(np.mean((y - x) ** 2))),
+                math.sqrt(float(squares[at]) / x.size),
+                float(found[at]),
+                float(pte[at]),
+                floor,
+            )
+        )
+    return scatters
 
 
 class PatchComparison(NamedTuple):

@@ -239,35 +239,30 @@ def _raised_in(error: BaseException) -> tuple[str, bool]:
     return package, trace.tb_frame.f_code.co_code[trace.tb_lasti] == dis.opmap["RAISE_VARARGS"]
 
 
-def _sentence(error: BaseException) -> str | None:
-    """What is wrong with which file, key or argument, if the error says that already."""
+def _sentence(error: BaseException) -> tuple[str, bool]:
+    """What is wrong, on one line; and whether an error says itself which file, key or argument."""
     from fits.results import FitError
 
     if isinstance(error, OSError) and error.filename and error.strerror:
-        return f"{error.filename}: {error.strerror}."
+        return f"{error.filename}: {error.strerror}.", True
     package, raised = _raised_in(error)
     kinds = (ValueError, KeyError, OSError, FitError)
-    if not (raised and package in ("jaxsky", "fits") and isinstance(error, kinds)):
-        return None
-    if isinstance(error, KeyError):  # of a dictionary, it is the key alone
-        words = str(error.args[0] if error.args else "")
-        return words if " " in words else None
-    return str(error)
-
-
-def _summary(error: BaseException) -> str:
-    """What a library says, on one line."""
+    if raised and package in ("jaxsky", "fits") and isinstance(error, kinds):
+        # Of a dictionary, it is the key alone.
+        words = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+        if " " in words or not isinstance(error, KeyError):
+            return words, True
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     first = lines[0][:LONGEST].rstrip(".") if lines else ""
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in first:
-        return f"There is not enough memory ({first or 'MemoryError'})."
-    kind = f"{type(error).__name__} in {_raised_in(error)[0]}"
-    return f"{kind}: {first}." if first else f"{kind}."
+        return f"There is not enough memory ({first or 'MemoryError'}).", False
+    kind = f"{type(error).__name__} in {package}"
+    return (f"{kind}: {first}." if first else f"{kind}."), False
 
 
 def keep_traceback(error: Exception, path: Path) -> None:
     """Write the traceback of an error to a file, unless its message says enough."""
-    if _sentence(error) is None:
+    if not _sentence(error)[1]:
         text = f"jaxsky {jaxsky.__version__}\n{''.join(traceback.format_exception(error))}"
         with suppress(OSError):
             path.write_text(text, encoding="utf-8", errors="replace")
@@ -276,13 +271,14 @@ def keep_traceback(error: Exception, path: Path) -> None:
 
 def print_error(error: Exception) -> None:
     """Print an error as one sentence, and where its traceback is if that may be of use."""
-    if (message := _sentence(error)) is None:
+    message, enough = _sentence(error)
+    if not enough:
         notes = getattr(error, "__notes__", [])
         log = next((note for note in notes if note.endswith(ERROR_LOG)), None)
         if log is None:
             log = tempfile.mkstemp(f"-{ERROR_LOG}", "jaxsky-")[1]
             keep_traceback(error, Path(log))
-        message = f"{_summary(error)} Traceback: {log}"
+        message = f"{message} Traceback: {log}"
     console.print("jaxsky: ", style="red", end="")
     console.print(message, soft_wrap=True)
 

@@ -38,7 +38,8 @@ from jaxsky.noise import pixel_covariance
 from jaxsky.progress import QUIET
 from jaxsky.settings import Experiment, SettingsError
 
-STOKES = ("Q", "U", "QU")
+#: What is compared, and which of Q and U counts in it.
+STOKES, COUNTED = ("Q", "U", "QU"), np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
 #: A slope and a correlation take a few pixels.
 LEAST_PIXELS = 10
 
@@ -220,8 +221,7 @@ def _sums_of_squares(
     maps: Float[Array, "band stokes pix"], regions: Bool[Array, "region pix"]
 ) -> Float[Array, "band region 3"]:
     """Sum over the pixels of each region of the squares of Q, of U and of both."""
-    single = jnp.einsum("bsp,rp->brs", maps**2, regions.astype(maps.dtype))
-    return jnp.concatenate([single, single.sum(axis=-1, keepdims=True)], axis=-1)
+    return jnp.einsum("bsp,rp,ts->brt", maps**2, regions.astype(maps.dtype), COUNTED)
 
 
 def _slopes(
@@ -233,18 +233,13 @@ def _slopes(
     the model m: m^T W C W m / (m^T W m)^2.
     """
     weighted = jnp.where(jnp.isfinite(prepared.sigma), model / prepared.sigma**2, 0.0)
-    # A row for each region and Stokes parameter, zero in the other one.
-    rows = jnp.einsum("bsp,rp,st->brtsp", weighted, inside.astype(model.dtype), jnp.eye(2))
-    bands, regions = rows.shape[:2]
-    flat = rows.reshape(bands, 2 * regions, 2, -1)
-    total = prepared.fluctuations.covariance(flat).reshape(bands, regions, 2, bands, regions, 2)
-    own = jnp.einsum("brsbrt->brst", total)
-    norm = jnp.einsum("brtsp,bsp->brt", rows, model)
-    product = jnp.einsum("brtsp,bsp->brt", rows, prepared.data)
-    slopes = jnp.concatenate([product / norm, (product.sum(-1) / norm.sum(-1))[..., None]], axis=-1)
-    variance = jnp.einsum("brss->brs", own) / norm**2
-    both = own.sum(axis=(-2, -1)) / norm.sum(axis=-1) ** 2
-    return np.asarray(slopes), np.sqrt(np.concatenate([variance, both[..., None]], axis=-1))
+    # A row for each region, of Q, of U and of both.
+    rows = jnp.einsum("bsp,rp,ts->brtsp", weighted, inside.astype(model.dtype), COUNTED)
+    shape = rows.shape[:3]
+    total = prepared.fluctuations.covariance(rows.reshape(shape[0], -1, *rows.shape[3:]))
+    variance = np.einsum("brtbrt->brt", total.reshape(*shape, *shape))
+    norm, product = (np.einsum("brtsp,bsp->brt", rows, maps) for maps in (model, prepared.data))
+    return product / norm, np.sqrt(variance) / norm
 
 
 def compare_pixels(

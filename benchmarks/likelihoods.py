@@ -20,7 +20,7 @@ from fits.priors import Uniform
 from fits.sampling import sample
 from fits.template_likelihood import likelihood
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe
-from jaxsky.constants import H_OVER_K
+from jaxsky.sed import H_OVER_K
 
 NU_DUST, NU_SYNCHROTRON, T_DUST = 353.0, 30.0, 21.0
 START = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1}

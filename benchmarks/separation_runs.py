@@ -21,7 +21,7 @@ from fits.optimize import best_fit
 from fits.profile_likelihood import spectral_likelihood
 from fits.regions import superpixels
 from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe, observe_components
-from jaxsky.instrument import band_tables, load_instrument
+from jaxsky.observation import band_tables, load_instrument
 
 NAMES = ("dust.T_dust", "dust.beta_dust", "synchrotron.beta_syn")
 TRUTH = dict(zip(NAMES, (20.0, 1.54, 3.0), strict=True))
@@ -53,7 +53,7 @@ class Experiment(NamedTuple):
 
 
 def litebird(nside: int) -> Experiment:
-    """The instrument as `jaxsky.instrument` has it: top hats of 51 samples, white noise."""
+    """The instrument as `jaxsky.observation` has it: top hats of 51 samples, white noise."""
     levels = [band["noise"]["level"] for band in band_tables("litebird")]
     pixel = np.degrees(np.sqrt(4 * np.pi / (12 * nside**2))) * 60
     sigma = np.array(levels) / pixel

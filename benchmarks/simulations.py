@@ -28,8 +28,8 @@ from jaxsky.harmonics import (
     smooth,
     synthesis,
 )
-from jaxsky.instrument import load_instrument
 from jaxsky.io import read_maps, write_maps
+from jaxsky.observation import load_instrument
 
 JAXSKY = str(Path(sys.executable).with_name("jaxsky"))
 #: Multipoles whose power of CMB and noise is compared, in a map of 1 degree.

@@ -5,8 +5,7 @@ What users need is imported from here (`__all__`); each name when it is first as
 
 from typing import TYPE_CHECKING
 
-import jaxsky.bare  # before all else
-from jaxsky.exports import exported
+from jaxsky.public import exported  # before all else
 
 if TYPE_CHECKING:
     from fits.commands.forecast import forecast

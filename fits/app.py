@@ -18,7 +18,7 @@ import jaxsky
 from fits.commands.data import data_commands
 from fits.commands.report import print_written
 from fits.commands.run import DEFAULTS, Command, interruptible, print_error, run_command
-from jaxsky.io.folders import cache_folder
+from jaxsky.io.files import cache_folder
 from jaxsky.programs import keep_programs
 
 #: Parameters of glibc's mallopt: M_ARENA_MAX, M_MMAP_THRESHOLD.

@@ -38,8 +38,8 @@ from jaxsky.checks import Numeric, check_double
 from jaxsky.cmb import realisation, tensor_spectra
 from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import expand, gaussian_beam, synthesis
-from jaxsky.keys import stream
-from jaxsky.progress import QUIET, Progress
+from jaxsky.noise import stream
+from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 
 #: Walkers of emcee, if they are enough.

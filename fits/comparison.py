@@ -33,9 +33,8 @@ from jaxsky.harmonics import (
     pixel_window,
     power_spectrum,
 )
-from jaxsky.keys import realisation_key, stream
-from jaxsky.noise import pixel_covariance
-from jaxsky.progress import QUIET
+from jaxsky.noise import pixel_covariance, realisation_key, stream
+from jaxsky.programs import QUIET
 from jaxsky.settings import Experiment, SettingsError
 
 #: What is compared, and which of Q and U counts in it.

@@ -24,8 +24,7 @@ from jaxsky.harmonics import (
     map_variance,
     synthesis,
 )
-from jaxsky.keys import stream
-from jaxsky.noise import draw, pixel_covariance, white_alm
+from jaxsky.noise import draw, pixel_covariance, stream, white_alm
 
 #: Pixels whose products are added up at once; few enough to stay in cache.
 CHUNK = 1 << 16

@@ -30,13 +30,12 @@ from jaxsky.inputs import (
     uK_RJ_per,
 )
 from jaxsky.io import MissingFileError
-from jaxsky.io.observations import Observed, read_observed
-from jaxsky.keys import realisation_key
-from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum
+from jaxsky.montecarlo import Observed, observed_band, read_observed
+from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum, realisation_key
 from jaxsky.noise_inputs import read_noise
-from jaxsky.observation import Observation, ObservedBand, harmonic_sources
+from jaxsky.observation import Observation, ObservedBand
 from jaxsky.settings import BandTable, Experiment, MapFile, SettingsError, at_key, find_file
-from jaxsky.simulation import observe_bands
+from jaxsky.simulation import harmonic_sources, observe_bands
 
 
 class Leakage(NamedTuple):
@@ -153,7 +152,7 @@ def _simulated(
     used = np.ones(healpy.nside2npix(observation.nside), bool)
     bands = {}
     for name, maps in observe_bands(key, sky, observation, setup.cmb):
-        observed, total = setup.observed(name), maps["total"]
+        observed, total = observed_band(setup, name), maps["total"]
         noise, correlated = _noise_of(observed, observation.nside, f"bands.{name}.noise")
         if (leakage := _leakage_of(observed, used)) is not None:
             total = total + leakage.maps

@@ -20,8 +20,8 @@ from jaxtyping import Array
 
 from jaxsky.checks import check_seed
 from jaxsky.io import InputError, whole
-from jaxsky.keys import realisation_key, stream
-from jaxsky.progress import QUIET
+from jaxsky.noise import realisation_key, stream
+from jaxsky.programs import QUIET
 
 #: Files are written after so many seconds, and when a run is stopped.
 SAVED_EVERY = 10.0

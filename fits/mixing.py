@@ -18,11 +18,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsky import Bandpass, Sky, parameter_names, set_parameters
-from jaxsky.bandpass import Samples, average, stack_bands
+from jaxsky.bandpass import Samples, average, parse_unit, stack_bands
 from jaxsky.checks import Numeric
 from jaxsky.interpolation import band_seds, choose_nodes
 from jaxsky.sed import cmb_derivative
-from jaxsky.units import parse_unit
 
 #: parameter of a band -> its value if not given
 NOMINAL = {"shift": 0.0, "width": 1.0, "gain": 1.0, "angle": 0.0}

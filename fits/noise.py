@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxsky.bare import refuse_unit, takes_quantities
 from jaxsky.checks import Numeric
+from jaxsky.public import refuse_unit, takes_quantities
 
 #: Pixels per pass.
 CHUNK = 1 << 15

@@ -28,9 +28,9 @@ from fits.noise import Noise, as_noise, bare
 from fits.posterior import Likelihood
 from fits.regions import Cells, check_labels, intersections
 from jaxsky import Bandpass, Component, Sky, get_parameters
+from jaxsky.bandpass import parse_unit
 from jaxsky.checks import Numeric, as_array, check_double, check_finite, check_shape
 from jaxsky.sky import check_parameter, unknown_parameter
-from jaxsky.units import parse_unit
 
 #: Pixels that are treated at once.
 PASS = 4096

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fits.writing import with_error
-from jaxsky.checks import Numeric
-from jaxsky.printed import Summary, as_html, as_text
+from jaxsky.checks import Numeric, Summary, as_html, as_text
 
 if TYPE_CHECKING:
     from getdist import MCSamples

@@ -24,7 +24,7 @@ from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.checks import Numeric, as_array, check_finite, check_shape
 from jaxsky.components import component_class
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
-from jaxsky.instrument import Instrument
+from jaxsky.observation import Instrument
 
 
 class ComponentMaps(NamedTuple):

@@ -26,7 +26,7 @@ from fits.results import FitResult
 from fits.sampling import sample
 from fits.template_likelihood import SkyLikelihood, TemplateLikelihood
 from jaxsky import observe_components, parameter_names, set_parameters
-from jaxsky.progress import QUIET, Progress
+from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 
 #: A band in which each template has less than this part of its weight has none.

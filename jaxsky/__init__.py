@@ -6,8 +6,7 @@ What users need is imported from here (`__all__`); each name when it is first as
 
 from typing import TYPE_CHECKING
 
-import jaxsky.bare  # before all else
-from jaxsky.exports import exported
+from jaxsky.public import exported  # before all else
 
 if TYPE_CHECKING:
     from jaxsky.archive import fetch
@@ -16,7 +15,6 @@ if TYPE_CHECKING:
     from jaxsky.components import AME, CMB, Component, Dust, FreeFree, Synchrotron
     from jaxsky.galaxy import embedded_sky
     from jaxsky.harmonics import smooth
-    from jaxsky.instrument import load_instrument
     from jaxsky.io import (
         read_bandpass,
         read_beam,
@@ -25,7 +23,7 @@ if TYPE_CHECKING:
         read_spectra,
         write_maps,
     )
-    from jaxsky.observation import Observation, ObservedBand, Source
+    from jaxsky.observation import Observation, ObservedBand, Source, load_instrument
     from jaxsky.simulation import simulate
     from jaxsky.sky import (
         Sky,

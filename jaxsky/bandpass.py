@@ -1,8 +1,12 @@
-"""Bandpasses: weights over frequency, their conventions, and the average of a spectrum."""
+"""Bandpasses: weights over frequency, the average of a spectrum, and brightness units.
+
+Units are named by strings such as "uK_CMB", "mK_RJ", "MJy/sr", which are static. Inside the package
+everything is uK_RJ.
+"""
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,10 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxsky.checks import Numeric, as_array, check_finite, check_positive, is_concrete
-from jaxsky.printed import Printed, shown
+from jaxsky.checks import (
+    Numeric,
+    Printed,
+    as_array,
+    check_finite,
+    check_positive,
+    is_concrete,
+    shown,
+)
 from jaxsky.sed import cmb_derivative
-from jaxsky.units import band_conversion, parse_unit
 
 #: convention -> factor that turns its weights into weights on antenna temperature
 CONVENTIONS: dict[str, Callable[[Array], Array]] = {
@@ -130,7 +140,7 @@ class Bandpass(Printed, eqx.Module):
     def conversion(
         self, source: str, target: str, nu_ref: Numeric | None = None
     ) -> Float[Array, ""]:
-        """Factor between brightness units in this band; see `jaxsky.units.band_conversion`.
+        """Factor between brightness units in this band; see `band_conversion`.
 
         MJy/sr needs `nu_ref`, the frequency at which it is quoted [GHz], and is refused without:
         the published factors are for nominal frequencies, and the center differs by percents.
@@ -204,3 +214,62 @@ def average(sed: Callable[[Array], Array], band: Bandpass | Samples) -> Float[Ar
 
     first = band.quadrature[0] * sed(band.nu[0])
     return jax.lax.scan(add, first, (band.nu[1:], band.quadrature[1:]))[0]
+
+
+# Brightness units.
+
+#: Brightness of 1 K_RJ at 1 GHz, 2 k nu^2 / c^2 [MJy/sr].
+MJYSR_PER_K_RJ_AT_1GHZ: Final = 2 * 1.380649e-23 * 1e18 / 299792458.0**2 * 1e20
+
+_PREFIXES = {"": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9}
+#: name -> (size in the unit of its kind, kind)
+UNITS: dict[str, tuple[float, str]] = {
+    f"{prefix}{kind}": (size, kind)
+    for kind in ("K_RJ", "K_CMB")
+    for prefix, size in _PREFIXES.items()
+} | {"MJy/sr": (1.0, "MJy/sr"), "kJy/sr": (1e-3, "MJy/sr"), "Jy/sr": (1e-6, "MJy/sr")}
+
+
+def parse_unit(unit: str) -> tuple[float, str]:
+    """Size and kind ("K_RJ", "K_CMB" or "MJy/sr") of a unit's name."""
+    try:
+        return UNITS[unit]
+    except KeyError:
+        raise ValueError(f"Unknown unit {unit!r}; known units are {', '.join(UNITS)}.") from None
+
+
+def conversion(source: str, target: str, nu: Numeric) -> Float[Array, "..."]:
+    """Factor from one brightness unit to another at a frequency [GHz]."""
+    nu = jnp.asarray(nu)
+    return band_conversion(source, target, nu[..., None], jnp.ones(1, nu.dtype), nu)
+
+
+@partial(jax.jit, static_argnames=("source", "target"))
+def band_conversion(
+    source: str,
+    target: str,
+    nu: Float[Array, "... sample"],
+    weights: Float[Array, " sample"],
+    nu_ref: Numeric,
+) -> Float[Array, "..."]:
+    """Factor from one brightness unit to another over a band.
+
+    A band reports the weighted mean of the antenna temperature, so 1 K_CMB reads sum w g(nu)
+    K_RJ, g being `cmb_derivative`. A value in MJy/sr is that at `nu_ref` [GHz] of a spectrum
+    I ~ 1/nu (the IRAS convention, which Planck HFI follows: Planck 2013 results IX). The weights
+    are those on antenna temperature, with sum 1 (`Bandpass.quadrature`).
+    """
+    (source_size, source_kind), (target_size, target_kind) = parse_unit(source), parse_unit(target)
+    scale = source_size / target_size
+    if source_kind == target_kind:
+        return jnp.asarray(scale)
+
+    def K_RJ_per(kind: str) -> Any:
+        if kind == "K_RJ":
+            return 1.0
+        if kind == "K_CMB":
+            return jnp.sum(weights * cmb_derivative(nu), axis=-1)
+        falling = jnp.asarray(nu_ref)[..., None] / nu
+        return jnp.sum(weights * falling / (MJYSR_PER_K_RJ_AT_1GHZ * nu**2), axis=-1)
+
+    return scale * K_RJ_per(source_kind) / K_RJ_per(target_kind)

@@ -1,14 +1,15 @@
-"""Types and checks of arguments, at construction and at the border: one sentence an error."""
+"""Values: their types and checks, one sentence an error, and how they print."""
 
-from collections.abc import Iterable
-from typing import TypeAlias
+import html
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsky.bare import refuse_unit, takes_quantities
+from jaxsky.public import refuse_unit, takes_quantities
 
 #: What the spectral laws take: numbers or arrays that broadcast.
 Numeric: TypeAlias = float | Array | np.ndarray
@@ -100,3 +101,49 @@ def check_double(what: str) -> None:
         raise RuntimeError(
             f"{what} needs double precision; call jax.config.update('jax_enable_x64', True) first."
         )
+
+
+#: A heading, and rows of equally many cells.
+Summary = tuple[str, Sequence[Sequence[str]]]
+
+
+class Printed:
+    """Base class of what has a `summary`; in notebooks it is a table."""
+
+    def summary(self) -> Summary:
+        """The heading, and rows of cells."""
+        raise TypeError(f"{type(self).__name__} must define `summary`.")
+
+    def __str__(self) -> str:
+        return as_text(self.summary())
+
+    def _repr_html_(self) -> str:
+        return as_html(self.summary())
+
+
+def as_text(summary: Summary) -> str:
+    """Lines of a terminal."""
+    heading, rows = summary
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+    return "\n".join([heading, *(f"  {line}" for line in lines)])
+
+
+def as_html(summary: Summary) -> str:
+    """A table of a notebook."""
+    heading, rows = summary
+    cells = ["".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows]
+    body = "".join(f"<tr>{row}</tr>" for row in cells)
+    return f"<b>{html.escape(heading)}</b><table>{body}</table>"
+
+
+def shown(value: Any, unit: str = "") -> str:
+    """A number, the range of a map or several numbers, with their unit."""
+    if isinstance(value, tuple):
+        return ", ".join(shown(one, unit) for one in value)
+    if not is_concrete(value):
+        return f"unknown while JAX traces, shape {np.shape(value)}"
+    if np.ndim(value):
+        low, middle, high = np.percentile(value, [0, 50, 100])
+        return f"map from {shown(low)} to {shown(high, unit)}, median {middle:.5g}"
+    return f"{float(value):.5g} {unit}".rstrip()

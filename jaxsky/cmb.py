@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsky.harmonics import expand
-from jaxsky.keys import normal
-from jaxsky.noise import cholesky
+from jaxsky.noise import cholesky, normal
 
 #: Planck 2018 results VI, TT,TE,EE+lowE+lensing; arguments of `camb.set_params`.
 PLANCK_2018 = {
@@ -115,7 +114,7 @@ def _tensors(end, **cosmology):
 
 def _spectra(which: str, end: int, **arguments: Any) -> Float[np.ndarray, "4 ell"]:
     """What CAMB computes up to l = end for arguments of `camb.set_params`, once and for all."""
-    from jaxsky.io.folders import kept  # the border is slow to import, as CAMB is
+    from jaxsky.io.files import kept  # the border is slow to import, as CAMB is
 
     def computed() -> np.ndarray:
         import camb

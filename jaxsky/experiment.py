@@ -11,12 +11,11 @@ from jaxtyping import Array, Float
 
 from jaxsky.cmb import camb_spectra
 from jaxsky.galaxy import EmbeddedSky
-from jaxsky.harmonics import beam_ratio, gaussian_beam, resample
+from jaxsky.harmonics import gaussian_beam, resample
 from jaxsky.inputs import Template, bandpass_of, beam_of, read_sky, set_parameters_of
 from jaxsky.io import read_spectra
 from jaxsky.io.maps import tangents
-from jaxsky.io.observations import Observed
-from jaxsky.keys import realisation_key
+from jaxsky.noise import realisation_key
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import DTYPES, Observation, ObservedBand, Source
 from jaxsky.settings import BandTable, ColumnKeys, Experiment, SettingsError, at_key, find_file
@@ -49,27 +48,6 @@ class SimulationInputs(NamedTuple):
         """Return the key of the small scales, given that of the realisation."""
         seed = self.small_scales_seed
         return key if seed is None else realisation_key(seed)
-
-    def observed(self, name: str) -> Observed:
-        """Describe how the maps of a band are observed."""
-        channel = self.observation.channels[name]
-        beam = channel.map_beam
-        noise, spectrum = channel.noise, None
-        if noise is not None and channel.target is not None:
-            if not jnp.ndim(noise):
-                lmax = self.observation.lmax
-                window = np.asarray(beam_ratio(beam, channel.beam, lmax, f"band {name!r}"))
-                spectrum = (float(noise) * np.radians(1 / 60) * window) ** 2
-                spectrum[:2] = 0.0
-            noise = None
-        return Observed(
-            channel.band,
-            jnp.asarray(beam) if jnp.ndim(beam) else float(beam),
-            noise if noise is None or jnp.ndim(noise) else float(noise),
-            spectrum,
-            None if name not in self.leakage else np.asarray(self.leakage[name]),
-            self.truth,
-        )
 
 
 def simulation_inputs(

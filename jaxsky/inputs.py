@@ -18,7 +18,7 @@ from jaxsky.components import AME, Component, component_class, parameter_declara
 from jaxsky.galaxy import EmbeddedSky, GalaxyModel, embedded_sky
 from jaxsky.io import Maps, read_bandpass, read_beam, read_maps, unit_factor
 from jaxsky.io.columns import sentinels
-from jaxsky.io.folders import kept
+from jaxsky.io.files import kept
 from jaxsky.settings import (
     BandTable,
     ComponentTable,
@@ -31,11 +31,6 @@ from jaxsky.settings import (
     find_file,
 )
 from jaxsky.sky import Sky, set_parameters
-
-
-def parameter_unit(name: str) -> str:
-    """Unit of a spectral parameter by its name, dotted or not; "" for a pure number."""
-    return parameter_declaration(name.split(".")[-1]).get("unit", "")
 
 
 def parameter_map(
@@ -52,19 +47,17 @@ def parameter_map(
     `of` says whose nside it must have; if it is `stated` which values are missing, zeros are data.
     """
     values, used = one_column(found, nside, where, of), np.asarray(found.mask)
-    unit = parameter_unit(name)
-    if found.unit != unit:
-        try:
-            values = values * float(unit_factor(found.unit, unit))
-        except ValueError:
-            raise SettingsError(
-                f"{where}: {name} is {f'in {unit}' if unit else 'a pure number'}, but column "
-                f"{found.names[0]} is in {found.unit or 'no unit'}."
-            ) from None
+    declared = parameter_declaration(name)
+    unit = declared.get("unit", "")
+    try:
+        values = values * unit_factor(found.unit, unit)
+    except ValueError:
+        raise SettingsError(
+            f"{where}: {name} is {f'in {unit}' if unit else 'a pure number'}, but column "
+            f"{found.names[0]} is in {found.unit or 'no unit'}."
+        ) from None
     known = values[used]
-    zero = parameter_declaration(name).get("zero", True)
-    marks = [] if stated or zero else sentinels(known, zero=True)
-    if marks:
+    if marks := [] if stated or declared.get("zero", True) else sentinels(known, zero=True):
         raise SettingsError(
             f"{where}: column {found.names[0]} is {marks[0][0]:g} in {marks[0][1]} pixels, far "
             "from its other values; give `missing`, the numbers that mark pixels without a value, "

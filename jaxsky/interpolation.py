@@ -54,14 +54,6 @@ def _coefficients(values: Float[Array, "..."]) -> Float[Array, "..."]:
     return values
 
 
-def _polynomials(n: int, point: Float[Array, "..."]) -> Float[Array, "n ..."]:
-    """The first n Chebyshev polynomials at points in [-1, 1]."""
-    rows = [jnp.ones_like(point), point]
-    for _ in range(n - 2):
-        rows.append(2 * point * rows[-1] - rows[-2])
-    return jnp.stack(rows[:n])
-
-
 def _evaluate(coefs: Float[Array, "..."], *points: Float[Array, " pix"]) -> Float[Array, " pix"]:
     """The series at points in [-1, 1]^d (one array a dimension), by Clenshaw's recurrence.
 
@@ -286,7 +278,10 @@ def band_seds(
     def pixel(points):
         product = coefs
         for n, point in zip(nodes.counts[::-1], points[::-1], strict=True):
-            product = product @ _polynomials(n, point)
+            polynomials = [jnp.ones_like(point), point]
+            for _ in range(n - 2):
+                polynomials.append(2 * point * polynomials[-1] - polynomials[-2])
+            product = product @ jnp.stack(polynomials[:n])
         return product
 
     def interpolated():

@@ -1,21 +1,56 @@
-"""White noise of maps: draws, of a level or of a covariance of each pixel, and estimates.
+"""Random numbers and their keys; white noise of maps: draws, covariances and estimates.
 
-Noise stays what it was written as until pixels are needed: a uniform level [u arcmin], u being the
-unit of the maps, or the covariance of the Stokes parameters in each pixel [u^2].
+A key comes from the seed, the number of a realisation, a kind and a name. Noise stays what it was
+written as until pixels are needed: a uniform level [u arcmin], u being the unit of the maps, or the
+covariance of the Stokes parameters in each pixel [u^2].
 """
 
 import math
-from functools import partial
+import zlib
+from functools import partial, reduce
+from typing import Any
 
 import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxsky.checks import Numeric, as_array, check_finite
+from jaxsky.checks import Numeric, as_array, check_finite, check_seed, check_shape, is_concrete
 from jaxsky.harmonics import analysis, children, expand, power_spectrum
-from jaxsky.keys import stokes_noise
+
+#: Pixels that are checked at once.
+PIECE = 1 << 20
+#: Columns of a covariance by their number, in the order of Planck's maps.
+COVARIANCE_COLUMNS: dict[int, tuple[str, ...]] = {
+    3: ("QQ", "QU", "UU"),
+    6: ("II", "IQ", "IU", "QQ", "QU", "UU"),
+}
+
+
+def realisation_key(seed: int, index: int = 0) -> Array:
+    """The key of a sky, from nothing but the seed and its number; number 0 is what is observed."""
+    check_seed("seed", seed)
+    check_seed("index", index)
+    return jax.random.fold_in(jax.random.key(seed), index)
+
+
+def stream(key: Array, kind: str, name: str = "") -> Array:
+    """The key of one kind of random numbers: the same whatever else is drawn, and in any order."""
+    return jax.random.fold_in(key, zlib.crc32(f"{kind} {name}".encode()))
+
+
+@partial(jax.jit, static_argnames=("shape", "dtype"))
+def normal(key: Array, shape: tuple[int, ...], dtype: Any) -> Float[Array, "..."]:
+    """Normal numbers, which are the same in any precision, but for rounding."""
+    return jax.random.normal(key, shape, jnp.result_type(float)).astype(dtype)
+
+
+@partial(jax.jit, static_argnames=("stokes", "size", "dtype"))
+def stokes_noise(key: Array, stokes: int, size: int, dtype: Any) -> Float[Array, "stokes size"]:
+    """White noise of I, or Q and U, or I, Q and U, of which Q and U are the same in both."""
+    white = normal(key, (stokes, size), dtype)
+    return jnp.roll(white, 1, axis=0) if stokes == 3 else white
 
 
 @partial(jax.jit, static_argnames=("nside", "stokes"))
@@ -176,3 +211,92 @@ def fit_knee(
         raise ValueError("The spectrum of the noise could not be fitted.")
     white, knee, slope = np.exp(np.asarray(solution.value))
     return float(level * white), float(knee), float(slope)
+
+
+def rms_covariance(rms: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:
+    """Covariance of each pixel from maps of the rms, without correlations."""
+    rms = as_array("rms", rms)
+    check_shape("rms", rms, rms.ndim == 2, "have shape (stokes, pix)")
+    check_finite("rms", rms)
+    if is_concrete(rms) and (bad := int(jnp.sum(rms < 0))):
+        raise ValueError(f"Argument `rms` has {bad} of {rms.size} values that are negative.")
+    return _diagonal(rms**2)
+
+
+def hits_covariance(
+    sigma0: ArrayLike, hits: Float[Array, " pix"], stokes: int = 2
+) -> Float[Array, "stokes stokes pix"]:
+    """Covariance of each pixel from the number of observations, sigma_0^2 / hits.
+
+    The noise of one observation, sigma_0, is a number or one for each Stokes parameter; those of
+    WMAP's polarization differ a little from those of its intensity.
+    """
+    sigma0, hits = _each(sigma0, stokes), as_array("hits", hits)
+    check_shape("hits", hits, hits.ndim == 1, "have shape (pix,)")
+    check_finite("hits", hits)
+    if is_concrete(hits) and (bad := int(jnp.sum(hits <= 0))):
+        raise ValueError(f"Argument `hits` is not positive in {bad} of {hits.size} pixels.")
+    return _diagonal(sigma0[:, None] ** 2 / hits)
+
+
+def weights_covariance(
+    sigma0: ArrayLike, weights: Float[Array, "3 pix"]
+) -> Float[Array, "2 2 pix"]:
+    """Covariance of Q and U in each pixel from weights QQ, QU, UU: sigma_0^2 times their inverse.
+
+    WMAP's maps have such weights, which like numbers of observations grow with time (Jarosik et
+    al. 2011). A pixel whose weights have no inverse gets no finite covariance.
+    """
+    sigma0, weights = _each(sigma0, 2), as_array("weights", weights)
+    check_shape("weights", weights, weights.shape[:-1] == (3,), "have shape (3, pix)")
+    QQ, QU, UU = weights
+    inverse = jnp.stack([jnp.stack([UU, -QU]), jnp.stack([-QU, QQ])]) / (QQ * UU - QU**2)
+    return jnp.outer(sigma0, sigma0)[..., None] * inverse
+
+
+def _each(sigma0: ArrayLike, stokes: int) -> Float[Array, " stokes"]:
+    """The noise of one observation in each Stokes parameter."""
+    sigma0 = as_array("sigma0", sigma0)
+    good = sigma0.shape in ((), (stokes,))
+    check_shape("sigma0", sigma0, good, f"be a number or have shape ({stokes},)")
+    check_finite("sigma0", sigma0)
+    return jnp.broadcast_to(sigma0, (stokes,))
+
+
+def _diagonal(variance: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:
+    return jnp.eye(len(variance), dtype=variance.dtype)[..., None] * variance
+
+
+def covariance_from_columns(
+    columns: Float[Array, "column pix"],
+) -> Float[Array, "stokes stokes pix"]:
+    """Covariance of each pixel from its elements in `COVARIANCE_COLUMNS`, in that order."""
+    columns = as_array("columns", columns)
+    good = columns.ndim == 2 and len(columns) in COVARIANCE_COLUMNS
+    check_shape("columns", columns, good, "have shape (3, pix) or (6, pix)")
+    rows = dict(zip(COVARIANCE_COLUMNS[len(columns)], columns, strict=True))
+    stokes = "QU" if len(columns) == 3 else "IQU"
+    return jnp.stack([jnp.stack([rows[min(a + b, b + a)] for b in stokes]) for a in stokes])
+
+
+@jax.jit
+def _number_indefinite(covariance: Float[Array, "stokes stokes pix"]) -> Int[Array, ""]:
+    """The number of pixels whose covariance is not positive definite."""
+    # A root of a negative number is NaN, and NaN is not positive; each pixel is read once.
+    pivots = [row[s] for s, row in enumerate(cholesky(covariance.astype(float)))]
+    return jnp.sum(~reduce(jnp.logical_and, [(p > 0) & jnp.isfinite(p) for p in pivots]))
+
+
+def check_covariance(name: str, covariance: Float[Array, "stokes stokes pix"]) -> None:
+    """Raise ValueError if the covariance of a pixel is not positive definite; says of how many.
+
+    Only the lower triangle is looked at, as in `draw`. Traced arrays pass.
+    """
+    good = covariance.ndim == 3 and covariance.shape[0] == covariance.shape[1]
+    check_shape(name, covariance, good, "have shape (stokes, stokes, pix)")
+    if not is_concrete(covariance):
+        return
+    npix = covariance.shape[-1]
+    pieces = (covariance[..., start : start + PIECE] for start in range(0, npix, PIECE))
+    if bad := sum(int(_number_indefinite(piece)) for piece in pieces):
+        raise ValueError(f"Argument `{name}` is not positive definite in {bad} of {npix} pixels.")

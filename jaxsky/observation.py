@@ -1,44 +1,24 @@
-"""What is observed, and how: components with their beams, bands with theirs, pixels.
+"""What is observed, and how: components and bands with their beams, pixels, instruments."""
 
-Components are brought into harmonic space once, ready to be seen in any band: templates get their
-small scales; a component whose law is the same everywhere is transformed once for all bands, one
-whose parameters are maps a few times (`interpolation.choose_terms`).
-"""
-
-import math
-from collections.abc import Mapping
-from functools import partial
-from typing import NamedTuple
+import tomllib
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
 
 import equinox as eqx
-import healpy
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from jaxsky.bandpass import Bandpass, Samples, average, stack_bands
-from jaxsky.checks import is_concrete
+from jaxsky.bandpass import Bandpass
+from jaxsky.checks import Printed, shown
 from jaxsky.components import Component
-from jaxsky.harmonics import (
-    analysis,
-    expand,
-    gaussian_beam,
-    low_multipoles,
-    resample,
-    synthesis,
-)
-from jaxsky.interpolation import Terms, choose_terms, term, term_weights
-from jaxsky.keys import stream
-from jaxsky.printed import Printed, shown
-from jaxsky.small_scales import SmallScales, continue_templates
+from jaxsky.small_scales import SmallScales
 
 #: Types of numbers by the name of their precision.
 DTYPES: dict[str, type[np.floating]] = {"double": np.float64, "single": np.float32}
-#: Error of the varying laws, relative to the maps of a band.
-TOLERANCE = 1e-7
-#: Most Jacobi steps of an analysis; below nside 128, where the quadrature is worse, one more.
-STEPS = 2
 
 
 class Source(eqx.Module):
@@ -145,195 +125,8 @@ class Observation(eqx.Module):
         return tuple(self.channels[name].band for name in self.names)
 
 
-class HarmonicSource(NamedTuple):
-    """A component in harmonic space, ready to be seen in any band.
-
-    Coefficients are those of the template times each term of its law, with its beam, `fwhm`
-    [arcmin]; `weights` are those of the terms in each band. Where bands are averaged one by one
-    there are no weights, but the law, with parameters at the resolution of the observation, and the
-    template. At `repaired` multipoles the matrix of correlated small scales was repaired.
-    """
-
-    alms: tuple[Float[Array, "stokes alm"], ...]
-    weights: tuple[Float[Array, " term"], ...] | None
-    component: Component | None
-    template: Float[Array, "stokes pix"] | None
-    fwhm: Float[Array, ""] | float
-    repaired: Int[Array, ""] | int = 0
-
-
-def _continued(
-    key: Array, sources: Mapping[str, Source], observation: Observation
-) -> dict[str, tuple[Float[Array, "2 alm"], Int[Array, ""]]]:
-    """Coefficients of the sources that have small scales, without beam, and how many repaired."""
-    leaders = {
-        name: source.correlated_with or name
-        for name, source in sources.items()
-        if source.small_scales is not None
-    }
-    result = {}
-    for leader in sorted(set(leaders.values())):
-        group = [leader, *sorted(n for n, first in leaders.items() if first == leader != n)]
-        members = [sources[name] for name in group]
-        try:
-            continued = continue_templates(
-                stream(key, "small scales", leader),
-                [source.component.template.astype(float) for source in members],
-                [source.fwhm for source in members],
-                [source.small_scales for source in members if source.small_scales is not None],
-                observation.nside,
-                observation.lmax,
-            )
-        except ValueError as error:
-            raise ValueError(f"Small scales of {', '.join(group)}: {error}") from None
-        for name, alm in zip(group, continued.alms, strict=True):
-            result[name] = alm, continued.repaired
-    return result
-
-
-def _at(component: Component, nside: int) -> Component:
-    """A component whose parameters that are maps have the resolution of the observation."""
-
-    def bring(leaf):
-        if leaf.ndim != 1 or leaf.shape[-1] == healpy.nside2npix(nside):
-            return leaf
-        lmax = 2 * min(nside, healpy.npix2nside(leaf.shape[-1]))
-        return resample(leaf[None], jnp.ones(lmax + 1, leaf.dtype), nside)[0]
-
-    return jax.tree.map(bring, component)
-
-
-def _law(component: Component) -> Component:
-    """A component without the pixels of its template."""
-    return jax.tree.map(
-        lambda leaf: np.zeros((len(leaf), 0), leaf.dtype) if leaf.ndim == 2 else leaf, component
-    )
-
-
-def plan_terms(
-    sources: Mapping[str, Source], observation: Observation, tolerance: float = TOLERANCE
-) -> dict[str, Terms | None]:
-    """Terms of each source for `harmonic_sources`, chosen from values that are not being traced.
-
-    The tolerance is the error of varying laws relative to the maps of a band.
-    """
-    # Terms are for the ranges of the maps as they are used.
-    components = {n: _at(source.component, observation.nside) for n, source in sources.items()}
-    if any(leaf.ndim == 1 for leaf in jax.tree.leaves(components)):
-        importance = _importance(components, stack_bands(observation.bands))
-    else:
-        importance = dict.fromkeys(components)
-    return {
-        name: choose_terms(component, observation.bands, importance[name], tolerance)
-        for name, component in components.items()
-    }
-
-
-@jax.jit
-def _importance(
-    components: dict[str, Component], samples: Samples
-) -> dict[str, Float[Array, " band"]]:
-    """The rms of each template relative to all that is seen in each band.
-
-    By its law in each band at the mean of its parameters.
-    """
-    rms, levels = {}, {}
-    for name, component in components.items():
-        middle = jax.tree.map(lambda x: x.mean() if x.ndim == 1 else x, component)
-        rms[name] = jnp.sqrt(jnp.mean(component.template**2))
-        levels[name] = rms[name] * jax.vmap(partial(average, middle.sed))(samples)
-    total = jnp.sqrt(sum(level**2 for level in levels.values()))
-    return {name: value / total for name, value in rms.items()}
-
-
-def _iterations(size: float, nside: int, beam: Array | float) -> int:
-    """Jacobi steps for a term that adds so much to the maps, for an error below `TOLERANCE`.
-
-    Without steps a spectrum like that of the Galaxy is wrong by some 3e-5 of the map at nside
-    256 and a beam of 2 pixels, in proportion to the pixel, and to what the beam leaves of the
-    multipoles where the quadrature is bad. Each step gains at least a factor of 20.
-    """
-    pixels = float(beam) / healpy.nside2resol(nside, arcmin=True) if is_concrete(beam) else 0.0
-    error = 3e-5 * (256 / nside) * (2 / max(pixels, 1.0)) ** 2 * size
-    needed = math.ceil(math.log(max(error / TOLERANCE, 1.0)) / math.log(20))
-    return min(needed, STEPS + (nside < 128))
-
-
-def harmonic_sources(
-    key: Array,
-    sources: Mapping[str, Source],
-    observation: Observation,
-    terms: Mapping[str, Terms | None] | None = None,
-    *,
-    release: bool = False,
-) -> dict[str, HarmonicSource]:
-    """Sources with their small scales, which the key is for, in harmonic space.
-
-    Terms are those of `plan_terms`, by default made here; None for a source averages its bands one
-    by one, as is necessary where its parameters that are maps are being traced. `release` takes
-    each source out of `sources`, a dict, when it has served, to free its memory.
-    """
-    _check_sources(sources, observation)
-    terms = plan_terms(sources, observation) if terms is None else terms
-    lmax, nside, dtype = observation.lmax, observation.nside, observation.dtype
-    continued = _continued(key, sources, observation)
-    result = {}
-    for name in list(sources):
-        chosen, component = terms[name], _law(_at(sources[name].component, nside))
-        repaired: Array | int = 0
-        fwhm = sources[name].fwhm
-        if name in continued:
-            (alm, repaired), fwhm = continued[name], 0.0
-        else:
-            alm = _low_multipoles(sources[name].component.template.astype(dtype), observation)
-        alm = alm.astype(dtype)
-        if release:
-            assert isinstance(sources, dict)
-            del sources[name]
-        if chosen is not None and not chosen.counts:
-            weights = term_weights(component, observation.bands, chosen)
-            result[name] = HarmonicSource((alm,), weights, None, None, fwhm, repaired)
-            continue
-        if name in continued:
-            fwhm = observation.finest
-            alm = alm * expand(gaussian_beam(fwhm, lmax).astype(dtype))
-        template = synthesis(alm, nside)
-        if chosen is None:
-            result[name] = HarmonicSource((), None, component, template, fwhm, repaired)
-            continue
-        alms = []
-        for i, size in enumerate(chosen.sizes):
-            steps = _iterations(size, nside, observation.finest)
-            alms.append(_term_alm(template, component, chosen.coefs(i), lmax, steps))
-            if is_concrete(alms[-1]):
-                # JAX would make the maps of all terms ahead of their analysis.
-                alms[-1].block_until_ready()
-        weights = term_weights(component, observation.bands, chosen)
-        result[name] = HarmonicSource(tuple(alms), weights, None, None, fwhm, repaired)
-    return result
-
-
-def _low_multipoles(
-    template: Float[Array, "stokes pix"], observation: Observation
-) -> Float[Array, "stokes alm"]:
-    """Coefficients of a template, with the steps that its pixels need at the beam observed."""
-    steps = _iterations(1.0, healpy.npix2nside(template.shape[-1]), observation.finest)
-    return low_multipoles(template, observation.lmax, steps)
-
-
-@partial(jax.jit, static_argnames=("lmax", "steps"))
-def _term_alm(
-    template: Float[Array, "stokes pix"],
-    component: Component,
-    coefs: Float[Array, "..."],
-    lmax: int,
-    steps: int,
-) -> Float[Array, "stokes alm"]:
-    """Coefficients of a template times a term of the law; in one program the product is no map."""
-    return analysis(template * term(component, coefs).astype(template.dtype), lmax, steps)
-
-
-def _check_sources(sources: Mapping[str, Source], observation: Observation) -> None:
+def check_sources(sources: Mapping[str, Source], observation: Observation) -> None:
+    """Raise ValueError unless an experiment can observe components together."""
     for name, source in sources.items():
         rows, wanted = len(source.component.template), observation.stokes
         if rows != len(wanted):
@@ -358,3 +151,101 @@ def _check_sources(sources: Mapping[str, Source], observation: Observation) -> N
                 "both need to be components with small scales, and the second one must not be "
                 "correlated with yet another."
             )
+
+
+class Instrument(Printed, dict[str, ObservedBand]):
+    """Channels by name, which print as a table."""
+
+    def __init__(self, title: str, channels: Mapping[str, ObservedBand]) -> None:
+        super().__init__(channels)
+        self.title = title
+
+    def bands(self) -> dict[str, Bandpass]:
+        """The bandpasses by name."""
+        return {name: channel.band for name, channel in self.items()}
+
+    def summary(self):
+        table = [dict(channel.summary()[1]) for channel in self.values()]
+        rows = [(name, *row.values()) for name, row in zip(self, table, strict=True)]
+        return f"Instrument {self.title}", [("channel", *table[0]), *rows]
+
+
+@cache
+def _presets() -> dict[str, dict[str, Any]]:
+    return tomllib.loads((files("jaxsky") / "instruments.toml").read_text())
+
+
+def load_instrument(
+    name: str,
+    channels: Sequence[str] | None = None,
+    *,
+    target: Array | float | None = None,
+    samples: int = 51,
+) -> Instrument:
+    """The channels of an instrument by name, as `Observation` takes them.
+
+    Each has a top-hat band, a Gaussian beam and white noise of Q and U [uK_RJ arcmin], with the
+    figures of `instruments.toml`, where the source of every one is given.
+
+    Parameters
+    ----------
+    name : "planck", "wmap", "core" or "litebird"
+    channels : names of those that are wanted, in this order; by default all
+    target : common beam of the maps [arcmin]; None leaves each its own
+    samples : of each band; see `Bandpass.top_hat`
+
+    Raises
+    ------
+    KeyError
+        If a name is unknown; lists the known ones.
+    TypeError
+        If `channels` is a string.
+
+    Examples
+    --------
+    >>> planck = load_instrument("planck", ["353", "30"])
+    >>> list(planck), f"{planck['353'].band.center:.1f}"
+    (['353', '30'], '361.3')
+    """
+    if name not in _presets():
+        raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(_presets())}.")
+    if isinstance(channels, str):
+        raise TypeError(
+            f"Argument `channels` must be a list of names, not the string {channels!r}."
+        )
+    found = {}
+    for table in band_tables(name, channels):
+        band = Bandpass.top_hat(**table["bandpass"], samples=samples)
+        noise = table["noise"]
+        level = noise["level"] * band.conversion(noise.get("unit", "uK_CMB"), "uK_RJ")
+        found[table["name"]] = ObservedBand(band, jnp.asarray(table["fwhm"]), target, level)
+    return Instrument(_presets()[name]["title"], found)
+
+
+def band_tables(
+    name: str, channels: Sequence[str] | None = None, folder: Path = Path()
+) -> list[dict[str, Any]]:
+    """Bands of an instrument, all or some, as tables of an experiment file.
+
+    Its name is that of a preset, or of a file with a list `bands`, relative to `folder`.
+    """
+    presets, path = _presets(), folder / name
+    if name in presets:
+        bands = presets[name]["bands"]
+    elif path.is_file():
+        try:
+            bands = tomllib.loads(path.read_text())["bands"]
+            names = [str(band["name"]) for band in bands]
+            if not names or len(set(names)) < len(names):
+                raise ValueError(", ".join(names) or "there are none")
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+            raise ValueError(
+                f"{path}: is no TOML file with a list of bands that have different names ({error})"
+            ) from None
+    else:
+        raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(presets)}, or a file.")
+    known = {str(band["name"]): band for band in bands}
+    for channel in channels or ():
+        if channel not in known:
+            raise KeyError(f"{name} has no channel {channel!r}; it has {', '.join(known)}.")
+    return [known[channel] for channel in channels or known]

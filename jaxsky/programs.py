@@ -1,4 +1,4 @@
-"""Compiled programs, kept on disk from one process to the next by JAX's own cache.
+"""Long work: its compiled programs, kept on disk by JAX's own cache, and what it says of itself.
 
 Compilation takes longer than most commands compute. Programs with a transform are not kept, see
 `jaxsky.harmonics.transforms`.
@@ -18,6 +18,20 @@ import jax
 import jaxlib
 from jax._src import compilation_cache, lru_cache
 
+
+class Progress:
+    """Told what is being done and how far it is; this one keeps it to itself."""
+
+    def step(self, message: str) -> None:
+        """Begin a step; the one before it is done."""
+
+    def advance(self, done: int, of: int) -> None:
+        """Say how much of the step is done."""
+
+
+QUIET = Progress()
+
+
 #: Most that is kept [bytes], and how many kinds of processor and versions of JAX it is kept for.
 LARGEST, KINDS = 2**30, 4
 
@@ -36,20 +50,15 @@ class _Cache(lru_cache.LRUCache):
                 part.unlink(missing_ok=True)
 
 
-def _processor() -> str:
-    """What the processor can do: a program for one may not run on another."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return f"{platform.machine()} {platform.processor()}"
-    return "\n".join(
-        dict.fromkeys(x for x in lines if x.startswith(("flags", "Features", "model")))
-    )
-
-
 def program_folder(folder: Path) -> Path:
     """The folder for programs of this version of JAX and this processor, within another one."""
-    kind = hashlib.sha256(_processor().encode()).hexdigest()[:12]
+    # What the processor can do: a program for one may not run on another.
+    processor = f"{platform.machine()} {platform.processor()}"
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        said = [line for line in lines if line.startswith(("flags", "Features", "model"))]
+        processor = "\n".join(dict.fromkeys(said))
+    kind = hashlib.sha256(processor.encode()).hexdigest()[:12]
     return folder / f"{jax.__version__}-{jaxlib.__version__}-{kind}"
 
 

@@ -6,12 +6,19 @@ other, all are differentiable, and none is treated specially at any value. Frequ
 GHz, temperatures in K. "The paper" is Hervias-Caimapo, Bonaldi & Brown (2016, MNRAS 462, 2063).
 """
 
+from typing import Final
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsky.checks import Numeric
-from jaxsky.constants import H_OVER_K, T_CMB
+
+#: h/k [K/GHz], CODATA 2018 (both exact in the SI).
+H_OVER_K: Final = 6.62607015e-34 / 1.380649e-23 * 1e9
+
+#: CMB temperature [K], Fixsen (2009), the value of the paper. `astropy` has 2.7255.
+T_CMB: Final = 2.72548
 
 
 def _log_body(nu, beta_dust, T_dust, nu_pivot):

@@ -9,10 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.bandpass import Bandpass
-from jaxsky.checks import as_array
+from jaxsky.checks import Printed, as_array
 from jaxsky.components import Component, check_value, declared
 from jaxsky.interpolation import Nodes, band_sed, choose_nodes
-from jaxsky.printed import Printed
 
 
 class Sky(Printed, eqx.Module):
@@ -116,21 +115,16 @@ def _emission(
     return maps
 
 
-@partial(jax.jit, static_argnames="plan")
-def _observe_components(sky, bands, plan):
-    return {
-        name: jnp.stack(_emission(component, bands, nodes))
+@partial(jax.jit, static_argnames=("plan", "apart"))
+def _observe(sky, bands, plan, apart):
+    """The maps of all components together, or of each by itself."""
+    emissions = {
+        name: _emission(component, bands, nodes)
         for (name, component), nodes in zip(sky.components.items(), plan, strict=True)
     }
-
-
-@partial(jax.jit, static_argnames="plan")
-def _observe(sky, bands, plan):
-    emissions = [
-        _emission(component, bands, nodes)
-        for component, nodes in zip(sky.components.values(), plan, strict=True)
-    ]
-    return jnp.stack([sum(maps) for maps in zip(*emissions, strict=True)])
+    if apart:
+        return {name: jnp.stack(maps) for name, maps in emissions.items()}
+    return jnp.stack([sum(maps) for maps in zip(*emissions.values(), strict=True)])
 
 
 def observe(
@@ -162,7 +156,7 @@ def observe(
         If `bands` does not hold at least one Bandpass, and nothing else.
     """
     bands = _check_bands(bands)
-    return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance))
+    return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance), False)
 
 
 def observe_band(
@@ -181,7 +175,7 @@ def observe_components(
 ) -> dict[str, Float[Array, "band stokes pix"]]:
     """Each component by itself, as `observe` sees it [uK_RJ]."""
     bands = _check_bands(bands)
-    return _observe_components(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance))
+    return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance), True)
 
 
 # Parameters by name. A sky is a tree of arrays, so the names are read off the tree: the component,

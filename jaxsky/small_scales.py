@@ -40,7 +40,7 @@ from jaxsky.harmonics import (
     shortened,
     synthesis,
 )
-from jaxsky.harmonics.windows import NEGLIGIBLE
+from jaxsky.harmonics.resolution import NEGLIGIBLE
 
 
 class SmallScales(eqx.Module):
@@ -193,22 +193,6 @@ def modulation(maps: Float[Array, "2 pix"], fwhm: ArrayLike, nside: int) -> Floa
     return resample(intensity[None], window, nside)[0] / intensity.mean()
 
 
-def _correlations(
-    alms: Float[Array, "field alm"], ranges: Sequence[tuple[int, int]]
-) -> Float[Array, "field field"]:
-    """Correlation coefficients of coefficients over the multipoles in all ranges."""
-    lmin, lmax = max(r[0] for r in ranges), min(r[1] for r in ranges)
-    if lmin > lmax:
-        raise ValueError(
-            f"Correlated small scales need ranges that overlap, but they are {list(ranges)}."
-        )
-    ell = jnp.arange(lmax_of(alms) + 1)
-    inside = expand(jnp.where((ell >= lmin) & (ell <= lmax), 1.0, 0.0))
-    products = (alms * inside) @ alms.T
-    scale = jnp.sqrt(jnp.diagonal(products))
-    return products / (scale[:, None] * scale)
-
-
 def _correlated_parts(
     alms: Float[Array, "field alm"],
     parts: Sequence[Extrapolation],
@@ -224,10 +208,17 @@ def _correlated_parts(
     Of `alms`, the coefficients that stay, without their beams, with the spectra in `parts` and one
     range of fit a field. Returns those parts, and the spectra of what is missing, to be drawn.
     """
+    lmin, lmax = max(r[0] for r in ranges), min(r[1] for r in ranges)
+    if lmin > lmax:
+        raise ValueError(
+            f"Correlated small scales need ranges that overlap, but they are {list(ranges)}."
+        )
     law = jnp.concatenate([part.target for part in parts])
     n, ell = len(alms), jnp.arange(law.shape[-1])
     beyond = ell > jnp.array([[join] for _, join in ranges])
-    rho = _correlations(alms, ranges)[..., None]
+    products = (alms * expand(jnp.where((ell >= lmin) & (ell <= lmax), 1.0, 0.0))) @ alms.T
+    scale = jnp.sqrt(jnp.diagonal(products))
+    rho = (products / (scale[:, None] * scale))[..., None]
     kept = jax.vmap(lambda one: jax.vmap(lambda other: power_spectrum(one, other))(alms))(alms)
     power = jnp.einsum("iil->il", kept)
     auto = jnp.where(beyond, law, power)

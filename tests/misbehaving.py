@@ -14,7 +14,7 @@ import time
 import numpy as np
 from astropy.io import fits as pyfits
 
-from jaxsky.archive import Product
+from jaxsky.products import Product
 
 NAME = "map.fits"
 OLD, NEW = '"1"', '"2"'

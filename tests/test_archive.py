@@ -6,18 +6,11 @@ import pytest
 
 from commands import jaxsky
 from fits.commands.run import DEFAULTS
-from jaxsky.archive import (
-    ProductSet,
-    catalogue,
-    fetch,
-    find,
-    product_sets,
-    total_size,
-    verify,
-)
+from jaxsky.archive import fetch
+from jaxsky.bandpass import parse_unit
 from jaxsky.io import InputError
+from jaxsky.products import ProductSet, catalogue, find, product_sets, total_size, verify
 from jaxsky.settings import load, named_files
-from jaxsky.units import parse_unit
 from misbehaving import CONTENT, NAME, SHA, Handler, fits_bytes, product, serving
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -158,10 +151,10 @@ def served(server, monkeypatch, tmp_path):
     wanted = product(f"{server}/good/{NAME}", hash=SHA, size=len(CONTENT))
     second = wanted._replace(name="second.fits", addresses=(f"{server}/good/second.fits",))
     known = {NAME: wanted, "second.fits": second}
-    monkeypatch.setattr("jaxsky.archive.products.catalogue", lambda: known)
+    monkeypatch.setattr("jaxsky.products.catalogue", lambda: known)
     sets = {"both": ProductSet("An analysis", (NAME, "second.fits"))}
-    for module in ("products", ""):
-        monkeypatch.setattr(f"jaxsky.archive.{module}".rstrip(".") + ".product_sets", lambda: sets)
+    for module in ("jaxsky.products", "fits.commands.data"):
+        monkeypatch.setattr(f"{module}.product_sets", lambda: sets)
     monkeypatch.setenv("JAXSKY_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 

@@ -113,7 +113,12 @@ def test_files_of_one_field_must_agree(tmp_path):
         ),
         ({"POLCCONV": "IAU"}, "uK_CMB", {}, "unit of column U is uK_CMB, but .* is K_CMB"),
         ({"POLCCONV": "IAU"}, "K_CMB", {"hdu": [1, 1, 1]}, "`path` must be one, or as many as"),
-        ({"POLCCONV": "IAU"}, "K_CMB", {"fields": ["Q", "U", "V"]}, "or one of each, not 3"),
+        (
+            {"POLCCONV": "IAU"},
+            "K_CMB",
+            {"fields": ["Q", "U", "V"]},
+            "as many as the other names, 2, but is 3",
+        ),
         ({"POLCCONV": "IAU"}, "K_CMB", {"stokes": "IQU"}, "names 3 columns, but 2 are read, Q, U"),
         ({"POLCCONV": "IAU"}, "K_CMB", {"stokes": "UQ"}, "says U of column Q, whose name says Q"),
         ({"POLCCONV": "IAU"}, "K_CMB", {"stokes": "QV"}, "must name I, Q, U or pairs.*is 'QV'"),

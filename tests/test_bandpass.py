@@ -8,8 +8,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxsky import Bandpass, sed
-from jaxsky.bandpass import CONVENTIONS, average, stack_bands
-from jaxsky.units import conversion
+from jaxsky.bandpass import CONVENTIONS, average, conversion, stack_bands
 
 NU = np.linspace(60.0, 80.0, 81)
 

@@ -40,7 +40,7 @@ def in_folder(out, function):
 
 
 def test_sentences_of_our_own_have_no_traceback(monkeypatch, capsys):
-    from jaxsky.units import conversion
+    from jaxsky.bandpass import conversion
 
     code, said = run(monkeypatch, capsys, lambda: conversion("furlong", "uK_RJ", 30.0))
     assert code == 2

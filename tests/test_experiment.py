@@ -19,8 +19,8 @@ from jaxsky.experiment import simulation_inputs
 from jaxsky.galaxy import GalaxyModel
 from jaxsky.harmonics import alm_ell, expand, gaussian_beam, synthesis
 from jaxsky.io import read_maps, write_maps
-from jaxsky.io.folders import occupied
-from jaxsky.keys import realisation_key
+from jaxsky.io.files import occupied
+from jaxsky.noise import realisation_key
 from jaxsky.settings import load
 from jaxsky.simulation import simulate
 

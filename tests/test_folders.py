@@ -20,7 +20,7 @@ import pytest
 from commands import jaxsky, said
 from fits.kept import KeptChain, fingerprint, kept_realisations
 from jaxsky.io import InputError, whole, write_maps, write_text
-from jaxsky.io.folders import ALL, Owner, alone, occupied
+from jaxsky.io.files import ALL, Owner, alone, occupied
 
 COMMANDS = ("fit", "compare", "separate", "simulate", "forecast", "paper")
 
@@ -66,7 +66,7 @@ def test_a_lock_ends_with_its_process(tmp_path):
     """Also if it is killed; what it left is removed, and nothing of a living one."""
     out = tmp_path / "deep" / "out"
     code = (
-        "import sys, time; from pathlib import Path; from jaxsky.io.folders import occupied\n"
+        "import sys, time; from pathlib import Path; from jaxsky.io.files import occupied\n"
         "with occupied(Path(sys.argv[1])): print(flush=True); time.sleep(100)"
     )
     holding = [sys.executable, "-c", code, str(out)]

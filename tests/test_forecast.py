@@ -14,9 +14,8 @@ from fits.fisher import ForecastModel, fiducial, fisher_errors
 from fits.mixing import Mixing, unit_sky
 from fits.tensor_ratio import noise_weights
 from jaxsky import AME, Bandpass, Dust, Sky, Synchrotron, observe
-from jaxsky.instrument import load_instrument
 from jaxsky.noise import uniform_covariance
-from jaxsky.observation import ObservedBand
+from jaxsky.observation import ObservedBand, load_instrument
 from jaxsky.sky import set_parameters
 from systems import spread
 

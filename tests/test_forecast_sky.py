@@ -16,8 +16,8 @@ from fits.regions import apodize
 from fits.tensor_ratio import BandLaw, band_correlation, equal_r, fit_law, foreground_powers
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe_band
 from jaxsky.harmonics import alm_ell, gaussian_beam, power_spectrum, synthesis
-from jaxsky.instrument import load_instrument
 from jaxsky.io import write_maps
+from jaxsky.observation import load_instrument
 from jaxsky.settings import load
 
 NSIDE, LMAX = 32, 64

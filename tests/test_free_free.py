@@ -194,7 +194,7 @@ def test_a_class_of_ones_own_is_fitted(folder, monkeypatch, reference):
 
 
 def test_a_law_has_one_class():
-    with pytest.raises(ValueError, match=re.escape("'dust' is that of jaxsky.components.dust:")):
+    with pytest.raises(ValueError, match=re.escape("'dust' is that of jaxsky.components.laws:")):
 
         class Another(Component, law="dust"):
             """Takes the name of jaxsky's."""

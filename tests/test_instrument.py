@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxsky.instrument import band_tables, load_instrument
+from jaxsky.observation import band_tables, load_instrument
 
 
 @pytest.mark.parametrize("name", ["planck", "wmap", "core", "litebird"])

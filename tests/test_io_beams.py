@@ -6,8 +6,8 @@ import pytest
 from astropy.io import fits as pyfits
 
 from jaxsky.harmonics import gaussian_beam
-from jaxsky.instrument import load_instrument
 from jaxsky.io import read_beam
+from jaxsky.observation import load_instrument
 from refusals import refused
 
 LMAX = 40

@@ -12,9 +12,9 @@ from fits.paper.sky import PaperSky
 from fits.regions import region_masks
 from fits.separated_data import separation_data
 from fits.writing import write_log
-from jaxsky.archive import cache_folder
 from jaxsky.experiment import simulation_inputs
 from jaxsky.io import InputError, write_maps
+from jaxsky.io.files import cache_folder
 from jaxsky.settings import Experiment, MapFile, SettingsError, find_file, found_files, load
 from settings_fuzz import changed_at, written
 

@@ -9,7 +9,6 @@ from astropy import units as u
 from jax.test_util import check_grads
 
 from jaxsky import noise
-from jaxsky import noise_inputs as read
 from jaxsky.harmonics import alm_ell, analysis, synthesis
 
 KEY = jax.random.key(1)
@@ -106,8 +105,8 @@ def test_gradient_in_the_noise_level():
     for function, arguments in [
         (lambda n: noise.draw(KEY, noise.uniform_covariance(n, 1)), (50.0,)),
         (lambda n: noise.uniform_alm(KEY, n, 4), (50.0,)),
-        (lambda s, h: noise.draw(KEY, read.hits_covariance(s, h)), (1.5, hits)),
-        (lambda r: noise.draw(KEY, read.rms_covariance(r)), (rms,)),
+        (lambda s, h: noise.draw(KEY, noise.hits_covariance(s, h)), (1.5, hits)),
+        (lambda r: noise.draw(KEY, noise.rms_covariance(r)), (rms,)),
     ]:
         check_grads(jax.jit(function), arguments, order=1, rtol=1e-5)
 
@@ -121,10 +120,10 @@ def test_single_precision(covariance):
     draws = jax.vmap(noise.draw, (0, None))(keys, single)
     deviation = (sample_covariance(draws) - covariance) / errors(covariance, 4000)
     assert np.abs(deviation).max() < 5
-    read.check_covariance("covariance", single)
-    assert read.rms_covariance(jnp.abs(single[0])).dtype == jnp.float32
-    assert read.hits_covariance(jnp.float32(2), single[0, 0]).dtype == jnp.float32
-    assert read.covariance_from_columns(single[0]).dtype == jnp.float32
+    noise.check_covariance("covariance", single)
+    assert noise.rms_covariance(jnp.abs(single[0])).dtype == jnp.float32
+    assert noise.hits_covariance(jnp.float32(2), single[0, 0]).dtype == jnp.float32
+    assert noise.covariance_from_columns(single[0]).dtype == jnp.float32
     assert noise.uniform_alm(KEY, jnp.float32(60), 8).dtype == jnp.float32
 
 
@@ -166,40 +165,34 @@ def test_rms_and_hits():
     rms = rng.uniform(1, 3, (3, 20))
     expected = np.zeros((3, 3, 20))
     expected[[0, 1, 2], [0, 1, 2]] = rms**2
-    np.testing.assert_allclose(read.rms_covariance(rms), expected, rtol=1e-14)
+    np.testing.assert_allclose(noise.rms_covariance(rms), expected, rtol=1e-14)
     hits = rng.integers(1, 500, 20)
     np.testing.assert_allclose(
-        read.hits_covariance(1.4, hits), np.eye(2)[..., None] * 1.4**2 / hits, rtol=1e-14
+        noise.hits_covariance(1.4, hits), np.eye(2)[..., None] * 1.4**2 / hits, rtol=1e-14
     )
     sigma0 = np.array([1.43, 1.44, 1.45])
     expected[[0, 1, 2], [0, 1, 2]] = sigma0[:, None] ** 2 / hits
-    np.testing.assert_allclose(read.hits_covariance(sigma0, hits, 3), expected, rtol=1e-14)
+    np.testing.assert_allclose(noise.hits_covariance(sigma0, hits, 3), expected, rtol=1e-14)
 
 
 def test_columns(covariance):
     I, Q, U = covariance  # noqa: E741
     planck = jnp.stack([I[0], I[1], I[2], Q[1], Q[2], U[2]])
-    np.testing.assert_array_equal(read.covariance_from_columns(planck), covariance)
-    np.testing.assert_array_equal(read.covariance_from_columns(planck[3:]), covariance[1:, 1:])
-    names = ["UU_COV", "QQ_COV", "TQ", "II", "UT", "qu_cov"]
-    shuffled = jnp.stack([U[2], Q[1], I[1], I[0], I[2], Q[2]])
-    np.testing.assert_array_equal(read.covariance_from_columns(shuffled, names), covariance)
-    names = ["UU", "UQ", "QQ"]
-    shuffled = jnp.stack([U[2], Q[2], Q[1]])
-    np.testing.assert_array_equal(read.covariance_from_columns(shuffled, names), covariance[1:, 1:])
+    np.testing.assert_array_equal(noise.covariance_from_columns(planck), covariance)
+    np.testing.assert_array_equal(noise.covariance_from_columns(planck[3:]), covariance[1:, 1:])
 
 
 def test_covariances_that_cannot_be(covariance):
-    read.check_covariance("covariance", covariance)
+    noise.check_covariance("covariance", covariance)
     # More correlated than possible; of no variance; not a number.
     bad = covariance.at[2, 1, 3].set(2 * jnp.sqrt(covariance[1, 1, 3] * covariance[2, 2, 3]))
     bad = bad.at[:, :, 7].set(0).at[0, 0, 9].set(jnp.nan).at[0, 0, 11].multiply(-1)
     with pytest.raises(ValueError, match="`noise` is not positive definite in 4 of 40 pixels"):
-        read.check_covariance("noise", bad)
+        noise.check_covariance("noise", bad)
     with pytest.raises(ValueError, match=r"`noise` must have shape \(stokes, stokes, pix\), but"):
-        read.check_covariance("noise", covariance[:2])
+        noise.check_covariance("noise", covariance[:2])
     # Being traced, it has no values to look at.
-    jax.jit(lambda c: read.check_covariance("noise", c))(bad)
+    jax.jit(lambda c: noise.check_covariance("noise", c))(bad)
 
 
 def test_bad_arguments():
@@ -208,25 +201,22 @@ def test_bad_arguments():
     gone = np.array([np.nan, healpy.UNSEEN, *ones[2:]])
     united = np.ones((2, 12)) * u.K
     for function, arguments, words in [
-        (read.rms_covariance, (ones,),
+        (noise.rms_covariance, (ones,),
          r"`rms` must have shape \(stokes, pix\), but has shape \(12,"),
-        (read.rms_covariance, ([gone, ones],), "`rms` has 2 of 24 values that are not finite"),
-        (read.rms_covariance, ([holes, ones],), "`rms` has 1 of 24 values that are negative"),
-        (read.rms_covariance, (united,), "`rms` carries the unit K"),
-        (read.hits_covariance, (1.0, holes), "`hits` is not positive in 2 of 12 pixels"),
-        (read.hits_covariance, (1.0, gone), "`hits` has 2 of 12 values that are not finite"),
-        (read.hits_covariance, (1.0, [ones]), r"`hits` must have shape \(pix,\), but has shape"),
-        (read.hits_covariance, (np.nan, ones), "`sigma0` has 1 of 1 values that are not finite"),
-        (read.hits_covariance, ([1.0], ones), r"`sigma0` must be a number or have shape \(2,\)"),
-        (read.hits_covariance, (united[0, 0], ones), "`sigma0` carries the unit K"),
-        (read.hits_covariance, (1.0, united[0]), "`hits` carries the unit K"),
-        (read.covariance_from_columns, (np.ones((4, 12)),),
+        (noise.rms_covariance, ([gone, ones],), "`rms` has 2 of 24 values that are not finite"),
+        (noise.rms_covariance, ([holes, ones],), "`rms` has 1 of 24 values that are negative"),
+        (noise.rms_covariance, (united,), "`rms` carries the unit K"),
+        (noise.hits_covariance, (1.0, holes), "`hits` is not positive in 2 of 12 pixels"),
+        (noise.hits_covariance, (1.0, gone), "`hits` has 2 of 12 values that are not finite"),
+        (noise.hits_covariance, (1.0, [ones]), r"`hits` must have shape \(pix,\), but has shape"),
+        (noise.hits_covariance, (np.nan, ones), "`sigma0` has 1 of 1 values that are not finite"),
+        (noise.hits_covariance, ([1.0], ones), r"`sigma0` must be a number or have shape \(2,\)"),
+        (noise.hits_covariance, (united[0, 0], ones), "`sigma0` carries the unit K"),
+        (noise.hits_covariance, (1.0, united[0]), "`hits` carries the unit K"),
+        (noise.covariance_from_columns, (np.ones((4, 12)),),
          r"\(3, pix\) or \(6, pix\), but has shape .4, 12"),
-        (read.covariance_from_columns, (ones[:3],), r"or \(6, pix\), but has shape \(3,\)"),
-        (read.covariance_from_columns, (np.ones((3, 12)), ["II", "QQ", "UU"]),
-         "`names` must be QQ, QU, UU in any order, but is II, QQ, UU"),
-        (read.covariance_from_columns, (np.ones((3, 12)), ["QQ", "QU"]), "but is QQ, QU"),
-        (read.covariance_from_columns, (united[[0, 1, 1]],), "`columns` carries the unit K"),
+        (noise.covariance_from_columns, (ones[:3],), r"or \(6, pix\), but has shape \(3,\)"),
+        (noise.covariance_from_columns, (united[[0, 1, 1]],), "`columns` carries the unit K"),
         (noise.uniform_alm, (KEY, 1.0, 4, 4), "`stokes` must be 1, 2 or 3, not 4"),
         (noise.uniform_alm, (KEY, united[0, 0], 4), "`noise` carries the unit K"),
     ]:  # fmt: skip

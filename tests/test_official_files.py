@@ -12,7 +12,7 @@ from jaxsky.experiment import leak
 from jaxsky.harmonics import gaussian_beam, resample, synthesis
 from jaxsky.inputs import read
 from jaxsky.io import InputError
-from jaxsky.noise_inputs import weights_covariance
+from jaxsky.noise import weights_covariance
 from jaxsky.settings import Experiment, MapFile, SettingsError
 from mapfiles import NSIDE, table, write
 

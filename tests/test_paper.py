@@ -19,8 +19,9 @@ from fits.paper.sky import Impossible, Number, PaperFigure, PaperSky, picture_of
 from jaxsky.checks import listed
 from jaxsky.harmonics import gaussian_beam, power_spectrum
 from jaxsky.io import read_maps
-from jaxsky.observation import Source, harmonic_sources
+from jaxsky.observation import Source
 from jaxsky.settings import Experiment, load
+from jaxsky.simulation import harmonic_sources
 from jaxsky.small_scales import fit_power_law
 
 LABELS = [*(f"Figure {n}" for n in (1, 2, 3, 4, 13)), "Table 1", "Figure 14"]

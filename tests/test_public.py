@@ -22,8 +22,7 @@ from jaxsky import Bandpass, Sky, Synchrotron, observe, set_parameters
 from jaxsky.checks import as_array
 from jaxsky.harmonics import smooth
 from jaxsky.io import Maps, unit_factor
-from jaxsky.keys import realisation_key
-from jaxsky.noise import estimate_variance
+from jaxsky.noise import estimate_variance, realisation_key
 from jaxsky.settings import CommonTable
 
 #: Annotations of arguments that may be numbers, or hold some.

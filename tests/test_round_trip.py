@@ -16,8 +16,7 @@ from jaxsky import Bandpass
 from jaxsky.experiment import cmb_spectra, simulation_inputs
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.io import InputError, write_maps
-from jaxsky.io.observations import Observed, observed_tables, read_observed
-from jaxsky.montecarlo import run
+from jaxsky.montecarlo import Observed, observed_tables, read_observed, run
 from jaxsky.settings import SettingsError, load
 
 NSIDE, NPIX = 16, 12 * 16**2

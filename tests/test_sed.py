@@ -10,7 +10,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxsky import sed
-from jaxsky.constants import H_OVER_K, T_CMB
+from jaxsky.sed import H_OVER_K, T_CMB
 
 LAWS = {
     "power_law": (sed.power_law, {"beta_syn": 3.1, "nu_ref": 30.0}),

@@ -22,7 +22,7 @@ from fits.tensor_ratio import fit_tensors
 from jaxsky.cmb import camb_spectra, realisation
 from jaxsky.harmonics import expand, gaussian_beam, lmax_of, power_spectrum, synthesis
 from jaxsky.io import InputError
-from jaxsky.progress import Progress
+from jaxsky.programs import Progress
 from jaxsky.settings import Experiment, SettingsError, load
 
 NSIDE, FWHM = 16, 360.0

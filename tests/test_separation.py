@@ -28,7 +28,7 @@ from jaxsky import (
     observe,
     set_parameters,
 )
-from jaxsky.constants import H_OVER_K, T_CMB
+from jaxsky.sed import H_OVER_K, T_CMB
 
 NPIX = 48
 CENTERS = [23.0, 35.0, 60.0, 95.0, 145.0, 220.0, 280.0, 353.0]

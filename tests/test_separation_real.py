@@ -18,8 +18,8 @@ from fits.separated_maps import component_maps
 from fits.tensor_ratio import fit_tensors, power_model
 from jaxsky import CMB, Dust, Sky, Synchrotron, observe
 from jaxsky.cmb import camb_spectra, tensor_spectra
-from jaxsky.instrument import load_instrument
 from jaxsky.io import read_maps
+from jaxsky.observation import load_instrument
 
 pytestmark = pytest.mark.slow
 

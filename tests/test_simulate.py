@@ -21,9 +21,9 @@ from jaxsky.harmonics import (
     smooth,
     synthesis,
 )
-from jaxsky.keys import stream
-from jaxsky.observation import Observation, ObservedBand, Source, harmonic_sources, plan_terms
-from jaxsky.simulation import observe_bands, simulate
+from jaxsky.noise import stream
+from jaxsky.observation import Observation, ObservedBand, Source
+from jaxsky.simulation import harmonic_sources, observe_bands, plan_terms, simulate
 from jaxsky.small_scales import SmallScales
 
 NSIDE = 8

@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 import requests
 
-from jaxsky.archive import DownloadError, Product, download, fetch
+from jaxsky import archive
+from jaxsky.archive import fetch
 from jaxsky.io import InputError
+from jaxsky.products import DownloadError, Product
 from misbehaving import (
     CONTENT,
     CUT,
@@ -106,7 +108,7 @@ def test_wrong_answers(server, tmp_path, kind, words, changes):
     [("cut", CUT), ("reset", CUT), ("chunked_cut", CUT), ("stalled", 100), ("whole", CUT)],
 )
 def test_transfers_that_end_early(server, tmp_path, monkeypatch, kind, size):
-    monkeypatch.setattr(download, "TIMEOUT", (0.5, 0.5))
+    monkeypatch.setattr(archive, "TIMEOUT", (0.5, 0.5))
     said = refused(product(f"{server}/{kind}/{NAME}"), tmp_path)
     assert f"ended early, after {size} bytes; fetch it again to resume." in said
     assert (tmp_path / f"{NAME}.part").read_bytes() == CONTENT[:size]
@@ -207,12 +209,12 @@ def test_https_is_not_left():
     ):
         answer.headers["Location"] = there
         if leaves:
-            with pytest.raises(download.RefusedError, match=r"sends on to .*, which is not https"):
-                download._stay_safe(answer)
+            with pytest.raises(archive.RefusedError, match=r"sends on to .*, which is not https"):
+                archive._stay_safe(answer)
         else:
-            download._stay_safe(answer)
+            archive._stay_safe(answer)
     answer.url, answer.headers["Location"] = "http://archive.org/a.fits", "http://b.org/a.fits"
-    download._stay_safe(answer)
+    archive._stay_safe(answer)
 
 
 @pytest.mark.parametrize("mirror", ["file:///data", "/data", "ftp://a.org", "archive.org", ""])
@@ -341,7 +343,7 @@ def test_a_disk_that_is_full_while_a_file_comes(server, tmp_path, monkeypatch):
     part = tmp_path / f"{NAME}.part"
     part.symlink_to("/dev/full")
     with monkeypatch.context() as patch:
-        patch.setattr(download, "discard", lambda part: None)
+        patch.setattr(archive, "discard", lambda part: None)
         with pytest.raises(DownloadError, match=f"{tmp_path}: the disk is full; make room"):
             fetch(product(f"{server}/good/{NAME}"), tmp_path)
     assert fetch(product(f"{server}/good/{NAME}"), tmp_path).read_bytes() == CONTENT

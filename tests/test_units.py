@@ -9,8 +9,8 @@ from astropy import cosmology
 from jax.test_util import check_grads
 
 from jaxsky import Bandpass
-from jaxsky.constants import T_CMB
-from jaxsky.units import UNITS, conversion, parse_unit
+from jaxsky.bandpass import UNITS, conversion, parse_unit
+from jaxsky.sed import T_CMB
 
 NU = np.array([0.4, 30.0, 143.0, 353.0, 857.0, 3000.0])
 

@@ -30,7 +30,7 @@ def test_wheel_imports_from_an_empty_environment(tmp_path):
     paths = os.pathsep.join([str(site), sysconfig.get_paths()["purelib"]])
     code = (
         "import jaxsky, fits; from fits.commands.run import DEFAULTS;"
-        "from jaxsky.instrument import load_instrument; from jaxsky.settings import load;"
+        "from jaxsky.observation import load_instrument; from jaxsky.settings import load;"
         f"assert all(p.__file__.startswith({str(site)!r}) for p in (jaxsky, fits));"
         "assert 'fit' in [load(path) and path.stem for path in DEFAULTS.glob('*.toml')];"
         "load_instrument('litebird')"

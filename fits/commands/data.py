@@ -9,9 +9,10 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, Trans
 
 from fits.commands.report import ResultTable, Row, console, print_tables
 from fits.commands.run import if_stopped
-from jaxsky import archive
+from jaxsky.archive import fetch
 from jaxsky.io import InputError
-from jaxsky.io.folders import cache_folder
+from jaxsky.io.files import cache_folder
+from jaxsky.products import find, product_sets, total_size, verify
 
 data_commands = typer.Typer(
     help="Official data products: what there is, download, and checks.", no_args_is_help=True
@@ -39,22 +40,22 @@ Folder = Annotated[
 def _list(folder: Folder, products: Words = None) -> None:
     """Name the products and sets of them, and say which are there."""
     rows, group = list[Row](), None
-    for product in archive.find(products or []):
+    for product in find(products or []):
         if product.group != group:
             group = product.group
             rows += [(), (group, product.title)]
         path = folder / product.name
         here = path.is_file()
         known = product._replace(size=path.stat().st_size) if here else product
-        size = archive.total_size([known]) if known.size or known.about else ""
+        size = total_size([known]) if known.size or known.about else ""
         nside, kept = str(product.nside or ""), "yes" if here else ""
         rows.append((product.name, product.what, nside, product.unit or "", size, kept))
     if not products:
         rows += [(), ("sets", "files of an analysis")]
-        for name, found in archive.product_sets().items():
-            members = archive.find([name])
+        for name, found in product_sets().items():
+            members = find([name])
             held = f"{sum((folder / p.name).is_file() for p in members)} of {len(members)}"
-            rows.append((name, found.title, "", "", archive.total_size(members), held))
+            rows.append((name, found.title, "", "", total_size(members), held))
     header = ("file", "what", "nside", "unit", "size", "here")
     table = ResultTable(header, rows, f"Kept in {folder}", words=6)
     print_tables([table], width=None if console.is_terminal else 200)
@@ -78,9 +79,9 @@ def _fetch(
     ] = False,
 ) -> None:
     """Download products, unless they are there; what was cut is resumed."""
-    wanted = archive.find(products)
+    wanted = find(products)
     if len(wanted) > 1:
-        console.print(f"{len(wanted)} files, {archive.total_size(wanted)}.")
+        console.print(f"{len(wanted)} files, {total_size(wanted)}.")
     bar = Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -94,7 +95,7 @@ def _fetch(
             report = partial(progress.update, progress.add_task(product.name, total=product.size))
             words = f"{product.name}: another process fetches it; waiting."
             waiting = partial(console.print, words)
-            path = archive.fetch(
+            path = fetch(
                 product, folder, mirror=mirror, accept=accept, report=report, waiting=waiting
             )
             size = path.stat().st_size
@@ -106,13 +107,13 @@ def _fetch(
 @data_commands.command("verify")
 def _verify(folder: Folder, products: Words = None) -> None:
     """Check files that are there: size, hash, columns, units, and that they are complete."""
-    wanted = archive.find(products or [])
+    wanted = find(products or [])
     if not products:
         wanted = [product for product in wanted if (folder / product.name).exists()]
     wrong = 0
     for product in wanted:
         try:
-            console.print(f"{product.name}: {archive.verify(product, folder)}", soft_wrap=True)
+            console.print(f"{product.name}: {verify(product, folder)}", soft_wrap=True)
         except InputError as error:
             wrong += 1
             console.print(str(error), style="red", soft_wrap=True)

@@ -35,7 +35,7 @@ from jaxsky.harmonics import Preparation, gaussian_beam
 from jaxsky.inputs import read_sky
 from jaxsky.io import degrade_mask
 from jaxsky.observation import ObservedBand
-from jaxsky.progress import QUIET, Progress
+from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 from jaxsky.sky import unknown_parameter
 

@@ -14,8 +14,7 @@ from fits.paper import figures_data, figures_model
 from fits.paper.sky import TEXTS, Impossible, PaperFigure, PaperSky, picture_of
 from fits.writing import write_log
 from jaxsky.io import write_text
-from jaxsky.programs import forget_programs
-from jaxsky.progress import QUIET, Progress
+from jaxsky.programs import QUIET, Progress, forget_programs
 from jaxsky.settings import Experiment
 
 #: File of the settings and the figures that are made with them, from which a stopped run resumes.

@@ -15,7 +15,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 import jaxsky
-from jaxsky import progress
+from jaxsky import programs
 from jaxsky.io import write_text
 
 #: Everything is printed as it is: names, titles and paths may have brackets and colons.
@@ -98,7 +98,7 @@ def print_written(paths: Sequence[Path]) -> None:
     console.print("Written: " + ", ".join(map(str, paths)), soft_wrap=True)
 
 
-class Steps(progress.Progress):
+class Steps(programs.Progress):
     """The steps of a command: a line that moves on a terminal, elsewhere a line for each.
 
     With `keep`, they are in a file as well. A step that takes longer than two seconds leaves its

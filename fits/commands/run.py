@@ -32,7 +32,7 @@ from fits.commands.report import (
     write_page,
 )
 from fits.writing import write_json, write_log
-from jaxsky.io.folders import ALL, Folder, occupied
+from jaxsky.io.files import ALL, Folder, occupied
 from jaxsky.settings import Experiment, load, of_file
 
 #: Steps and their times, and the page that shows the results, in every folder.
@@ -121,7 +121,7 @@ def run_command(
 ) -> None:
     """Run a command with what the command line says; `resume` is None if it cannot be resumed.
 
-    `part` of the results is made, see `jaxsky.io.folders.occupied`. All of them are replaced, so
+    `part` of the results is made, see `jaxsky.io.files.occupied`. All of them are replaced, so
     nobody else may be making any then.
     """
     path, values = settings_file or DEFAULTS / f"{command.name}.toml", list(values or ())
@@ -198,7 +198,7 @@ def results_folder(
 
     It is made if it is not there, and removed again if nothing was written. What `results` says is
     kept, replaced, or refused if it is to be neither; `resume` is None for commands that cannot be
-    resumed. `part` of the results is made, see `jaxsky.io.folders.occupied`.
+    resumed. `part` of the results is made, see `jaxsky.io.files.occupied`.
     """
     if resume and overwrite:
         raise ValueError("--resume and --overwrite exclude each other.")

@@ -12,7 +12,7 @@ from fits.commands.run import Command, Report, Run
 from fits.results import FitError
 from fits.separated_data import separation_data
 from fits.writing import probability, two_digits, with_error
-from jaxsky.inputs import parameter_unit
+from jaxsky.components import parameter_declaration
 from jaxsky.io import write_maps
 from jaxsky.settings import Experiment
 
@@ -170,7 +170,11 @@ def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path
     for band, maps in zip(found.data.bands, found.residuals, strict=True):
         residuals += _stokes(band, settings.separate.unit, maps)
     parameters: list[Column] = [
-        (name.upper() + end, parameter_unit(name), found.of_pixel(name, values))
+        (
+            name.upper() + end,
+            parameter_declaration(name).get("unit", ""),
+            found.of_pixel(name, values),
+        )
         for name in found.fit.free
         if np.ndim(found.fit.best_fit[name])
         for end, values in (("", found.fit.best_fit), ("_SIGMA", found.sigma))

@@ -30,19 +30,11 @@ from fits.writing import with_error
 from jaxsky.checks import listed
 from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import analysis, expand, gaussian_beam, lmax_of, power_spectrum, synthesis
-from jaxsky.instrument import band_tables, load_instrument
 from jaxsky.interpolation import term_weights
 from jaxsky.io import InputError
-from jaxsky.observation import (
-    HarmonicSource,
-    Observation,
-    ObservedBand,
-    Source,
-    harmonic_sources,
-    plan_terms,
-)
+from jaxsky.observation import Observation, ObservedBand, Source, band_tables, load_instrument
 from jaxsky.settings import BandTable, Experiment
-from jaxsky.simulation import observe_bands
+from jaxsky.simulation import HarmonicSource, harmonic_sources, observe_bands, plan_terms
 from jaxsky.small_scales import DUST, SYNCHROTRON, Continued
 from jaxsky.templates import correlation, polarization_template, preset, steepening
 

@@ -32,8 +32,8 @@ from jaxsky.inputs import (
     uK_RJ_per,
 )
 from jaxsky.io import InputError
-from jaxsky.io.text import read_text
-from jaxsky.keys import realisation_key, stream
+from jaxsky.io.curves import read_text
+from jaxsky.noise import realisation_key, stream
 from jaxsky.settings import (
     BeamedMap,
     ComponentTable,

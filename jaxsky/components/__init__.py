@@ -1,4 +1,4 @@
-"""Components of the sky: template maps times a spectral law, a file for each.
+"""Components of the sky: template maps times a spectral law, one class each.
 
 A component is its parameters. Each spectral parameter is a number or a map of shape (pix,); the
 law is written once, for a frequency, in `sed`, and everything else (band averages, gradients,
@@ -9,7 +9,6 @@ this folder are imported, so that a new one is complete as it is.
 import importlib
 import pkgutil
 
-from jaxsky.components.ame import AME
 from jaxsky.components.base import (
     Component,
     check_value,
@@ -20,10 +19,14 @@ from jaxsky.components.base import (
     reference,
     template,
 )
-from jaxsky.components.cmb import CMB
-from jaxsky.components.dust import Dust
-from jaxsky.components.free_free import FreeFree
-from jaxsky.components.synchrotron import Synchrotron
+from jaxsky.components.laws import (
+    AME,
+    CMB,
+    Dust,
+    FreeFree,
+    Synchrotron,
+    amplitude_from_emission_measure,
+)
 
 for _module in pkgutil.iter_modules(__path__):
     _found = importlib.import_module(f"{__name__}.{_module.name}")

@@ -11,8 +11,15 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxsky.checks import as_array, check_finite, check_positive, check_shape, is_concrete
-from jaxsky.printed import Printed, shown, shown_maps
+from jaxsky.checks import (
+    Printed,
+    as_array,
+    check_finite,
+    check_positive,
+    check_shape,
+    is_concrete,
+    shown,
+)
 
 #: Components by the name of their law, or module and class, from the moment a class is defined.
 _LAWS: dict[str, type["Component"]] = {}
@@ -138,7 +145,12 @@ class Component(Printed, eqx.Module):
         return self.amplitude
 
     def summary(self):
-        rows = [("amplitude", shown_maps(self.amplitude, self.unit))]
+        stokes, npix = self.amplitude.shape
+        maps = f"{'I, Q, U' if stokes == 3 else 'Q, U'} in {npix} pixels"
+        if is_concrete(self.amplitude):
+            rms = np.sqrt(np.mean(np.square(self.amplitude[-2:])))
+            maps = f"{maps}, rms {rms:.4g} {self.unit}"
+        rows = [("amplitude", maps)]
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if "positive" in field.metadata and value is not None:
@@ -195,9 +207,9 @@ def declared(component: type[Component], field: str) -> Mapping[str, Any]:
     return next((f.metadata for f in dataclasses.fields(component) if f.name == field), {})
 
 
-def parameter_declaration(field: str) -> Mapping[str, Any]:
-    """What the first law with a parameter of this name declares about it; nothing if none has."""
-    found = (declared(component, field) for component in _LAWS.values())
+def parameter_declaration(name: str) -> Mapping[str, Any]:
+    """What the first law with a parameter of this name, dotted or not, declares about it."""
+    found = (declared(component, name.split(".")[-1]) for component in _LAWS.values())
     return next((metadata for metadata in found if "symbol" in metadata), {})
 
 

@@ -11,9 +11,9 @@ from astropy.io import fits as pyfits
 from jaxtyping import Float
 
 from jaxsky.bandpass import CONVENTIONS, Bandpass
+from jaxsky.io.curves import TextTable, read_text
 from jaxsky.io.files import UnfitError, in_file, is_fits
 from jaxsky.io.tables import open_fits, select_hdu
-from jaxsky.io.text import TextTable, read_text
 
 #: astropy's name of a unit -> how it is spelt; wavenumbers and wavelengths are converted.
 _UNITS = {
@@ -89,7 +89,7 @@ def _to_GHz(samples: Float[np.ndarray, "2 sample"], unit: str) -> Float[np.ndarr
 
 
 #: Frequencies [GHz] and weights of a table.
-Samples: TypeAlias = tuple[np.ndarray, np.ndarray]
+Curve: TypeAlias = tuple[np.ndarray, np.ndarray]
 
 #: Unit of a RIMO's WAVENUMBER -> convention. The LFI column holds frequencies, and its weights act
 #: on antenna temperature; those of HFI act on power.
@@ -105,7 +105,7 @@ _NO_WEIGHT = 1e-6
 _WIDEST = 8
 
 
-def _checked(nu: np.ndarray, weights: np.ndarray) -> Samples:
+def _checked(nu: np.ndarray, weights: np.ndarray) -> Curve:
     """The samples at positive frequencies [GHz]; raises InputError if they are no bandpass."""
     if bad := int(np.sum(~np.isfinite(nu) | ~np.isfinite(weights))):
         raise UnfitError(f"{bad} of {nu.size} samples of the bandpass are not finite.")
@@ -125,15 +125,7 @@ def _checked(nu: np.ndarray, weights: np.ndarray) -> Samples:
     return nu, weights
 
 
-def _merged(nu: np.ndarray, weights: np.ndarray) -> Samples:
-    """Neighbours that share a frequency, as single precision makes some do, as their mean."""
-    first = np.concatenate([[True], np.diff(nu) != 0])
-    starts = np.flatnonzero(first)
-    counts = np.diff(np.append(starts, nu.size))
-    return nu[starts], np.add.reduceat(weights, starts) / counts
-
-
-def _rimo_samples(hdus: pyfits.HDUList, name: str) -> tuple[Samples, str]:
+def _rimo_samples(hdus: pyfits.HDUList, name: str) -> tuple[Curve, str]:
     tables = [select_hdu(hdus, i) for i, h in enumerate(hdus) if h.name == name]
     names = tables[0].columns.names
     for column in ("WAVENUMBER", "TRANSMISSION"):
@@ -146,7 +138,11 @@ def _rimo_samples(hdus: pyfits.HDUList, name: str) -> tuple[Samples, str]:
     if unit not in _RIMO:
         known = " or ".join(_RIMO)
         raise UnfitError(f"HDU {name!r}: WAVENUMBER has the unit {unit!r}, not {known}.")
-    return _checked(*_merged(*_to_GHz(data[0], unit))), _RIMO[unit]
+    nu, weights = _to_GHz(data[0], unit)
+    # Neighbours that share a frequency, as single precision makes some do, count as their mean.
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(nu) != 0]))
+    counts = np.diff(np.append(starts, nu.size))
+    return _checked(nu[starts], np.add.reduceat(weights, starts) / counts), _RIMO[unit]
 
 
 def _rimo_names(
@@ -177,24 +173,19 @@ def _rimo_names(
     return [single[detector] for detector in asked_for]
 
 
-def _mean(tables: Sequence[Samples]) -> Samples:
-    """Mean of several detectors, each normalised to unit integral, on all their frequencies."""
-    if len(tables) == 1:
-        return tables[0]
-    grid = np.unique(np.concatenate([nu for nu, _ in tables]))
-    curves = [np.interp(grid, nu, w / np.trapezoid(w, nu), left=0.0, right=0.0) for nu, w in tables]
-    return grid, np.mean(curves, axis=0)
-
-
-def _read_rimo(
-    path: Path, band: str | None, detectors: Sequence[str] | None
-) -> tuple[Samples, str]:
+def _read_rimo(path: Path, band: str | None, detectors: Sequence[str] | None) -> tuple[Curve, str]:
     with open_fits(path) as hdus:
         known = list(dict.fromkeys(h.name for h in hdus if h.name.startswith("BANDPASS_")))
         if not known:
             raise UnfitError("no HDU is named BANDPASS_...; not an instrument model.")
         found = [_rimo_samples(hdus, name) for name in _rimo_names(known, band, detectors)]
-    return _mean([samples for samples, _ in found]), found[0][1]
+    if len(found) == 1:
+        return found[0]
+    # The mean of several detectors, each normalised to unit integral, on all their frequencies.
+    tables = [samples for samples, _ in found]
+    grid = np.unique(np.concatenate([nu for nu, _ in tables]))
+    curves = [np.interp(grid, nu, w / np.trapezoid(w, nu), left=0.0, right=0.0) for nu, w in tables]
+    return (grid, np.mean(curves, axis=0)), found[0][1]
 
 
 def _columns(table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
@@ -226,7 +217,7 @@ def _columns(table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
 
 def _read_text(
     table: TextTable, fields: Sequence[int | str] | None, given: str | None
-) -> tuple[Samples, str]:
+) -> tuple[Curve, str]:
     """Frequencies and weights of a table, and the convention, which IPAC tables have, or ""."""
     columns = _columns(table, fields)
     samples = table.numbers(columns).T
@@ -260,7 +251,7 @@ def read_bandpass(
       over CO lines are used like the others.
     * IPAC tables (WMAP), with the frequency's unit from their header: convention "power".
     * Text with two columns, frequency and weight, separated by blanks, commas or semicolons
-      (`jaxsky.io.text.read_text`). Their unit is the one that the header states ("nu [MHz]",
+      (`jaxsky.io.curves.read_text`). Their unit is the one that the header states ("nu [MHz]",
       "nu_GHz"), else GHz, provided that the middle of the band is then within 1 and 3000 GHz.
       Such a file does not say its convention, so it has to be given.
 

@@ -17,10 +17,10 @@ import healpy
 import numpy as np
 from jaxtyping import Float
 
+from jaxsky.bandpass import UNITS
 from jaxsky.io.files import InputError, UnfitError
 from jaxsky.io.quantities import is_ambiguous, unit_name
 from jaxsky.io.tables import PIXELS, HealpixTable, equals, open_table
-from jaxsky.units import UNITS
 
 _LETTERS = {"I": "I", "T": "I", "Q": "Q", "U": "U"}
 _RUNS = ("FULL", "HM1", "HM2", "HR1", "HR2", "YR1", "YR2", "Y1", "Y2")
@@ -143,16 +143,13 @@ def _marks(rest: np.ndarray, extreme: float, count: int, usual: bool) -> np.ndar
     near = others.min() if extreme < others.min() else others.max()
     far = abs(near - extreme) > abs(np.median(others) - near)
     often = max(REPEATED, 1 + MORE_OFTEN * int(np.count_nonzero(others == near)))
-    is_mark = far and (usual or abs(extreme) >= HUGE or (count >= often and _is_continuous(others)))
+    # Most values of a map are there once, unlike labels, steps and rings.
+    some = others[:: max(1, others.size // 1000)]
+    repeated = count >= often and np.unique(some).size > some.size / 2
+    is_mark = far and (usual or abs(extreme) >= HUGE or repeated)
     if usual and count > 1 and not is_mark:
         is_mark = not np.array_equal(others, np.round(others))
     return others if is_mark else None
-
-
-def _is_continuous(values: np.ndarray) -> bool:
-    """True if most values are there once, unlike labels, steps and rings."""
-    some = values[:: max(1, values.size // 1000)]
-    return np.unique(some).size > some.size / 2
 
 
 class Column(NamedTuple):
@@ -191,12 +188,10 @@ def default_fields(table: HealpixTable, argument: str = "fields") -> list[int]:
 
     What follows after "_" or "-" does not count: good enough to choose by, but no evidence.
     """
-
-    def kind(name: str) -> str | None:
-        beginning = re.match(r"[IQU](?=[_-])", name.upper())
-        return beginning[0] if stokes_of(name) is None and beginning else stokes_of(name)
-
-    kinds = [kind(name) for name in table.names]
+    kinds = [stokes_of(name) for name in table.names]
+    for i, name in enumerate(table.names):
+        if kinds[i] is None and (beginning := re.match(r"[IQU](?=[_-])", name.upper())):
+            kinds[i] = beginning[0]
     if found := [kinds.index(letter) for letter in "IQU" if letter in kinds]:
         return found
     columns = [i for i, name in enumerate(table.names) if name.upper() not in PIXELS]
@@ -232,24 +227,19 @@ def _several(value: Any) -> list[Any]:
 
 def _split(path: Any, hdu: Any, fields: Any) -> list[tuple[Path, Any, list[Any] | None]]:
     """File, HDU and columns of each table, from arguments that may be lists."""
-    paths, hdus = _several(path), _several(hdu)
-    number = max(len(paths), len(hdus))
-    for name, given in {"path": paths, "hdu": hdus}.items():
-        if len(given) not in (1, number) or not given:
-            said = f"must be one, or as many as the other names, {number}, but is {len(given)}"
-            raise InputError(f"Argument `{name}` {said}.")
     wanted = None if fields is None else _several(fields)
-    if wanted is not None and not wanted:
-        raise InputError(f"{paths[0]}: argument `fields` is empty.")
-    if number == 1:
-        return [(Path(paths[0]), hdus[0], wanted)]
-    if wanted is not None and len(wanted) not in (1, number):
-        raise InputError(
-            f"Argument `fields` must name one column of all {number} tables, or one of each, "
-            f"not {len(wanted)}."
-        )
-    columns = [None] * number if wanted is None else [[one] for one in wanted]
-    each = (one * (number // len(one)) for one in (paths, hdus, columns))
+    given: dict[str, list[Any]] = {"path": _several(path), "hdu": _several(hdu)}
+    number = max(map(len, given.values()))
+    if number > 1:
+        given["fields"] = [None] if wanted is None else [[one] for one in wanted]
+    for name, entries in given.items():
+        if len(entries) not in (1, number):
+            said = f"must be one, or as many as the other names, {number}, but is {len(entries)}"
+            raise InputError(f"Argument `{name}` {said}.")
+    if wanted == []:
+        raise InputError(f"{given['path'][0]}: argument `fields` is empty.")
+    given.setdefault("fields", [wanted])
+    each = (entries * (number // len(entries)) for entries in given.values())
     return [(Path(p), h, c) for p, h, c in zip(*each, strict=True)]
 
 
@@ -293,6 +283,42 @@ def read_columns(
                 f"{first.name} in {first.where} is {one}; {hint}."
             )
     return [first, *others]
+
+
+def column_stokes(
+    columns: Sequence[Column], given: str | Sequence[str] | None
+) -> tuple[str | None, ...]:
+    """The Stokes parameter of each column, where it has to be known."""
+    first, names = columns[0], [column.name for column in columns]
+    # healpy calls any map T or TEMPERATURE that is alone in its file.
+    doubtful = ("T", "TEMPERATURE") if len(names) > 1 or given is not None else ()
+    certain = [None if c.alone and c.name in doubtful else stokes_of(c.name) for c in columns]
+    if given is None:
+        if None in certain and (first.coordinates != "G" or first.polarization == "IAU"):
+            galactic = first.coordinates == "G"
+            why = "has the IAU sign of U" if galactic else "is not in Galactic coordinates"
+            raise InputError(
+                f"{first.where}: the file {why}, and the name of column "
+                f"{names[certain.index(None)]} does not say which Stokes parameter it holds; give "
+                f'`stokes`, such as "QU" or "I", one letter for each of {", ".join(names)}.'
+            )
+        return tuple(certain)
+    stated = [""] * len(names) if given == "" else parse_stokes(given)
+    if len(stated) != len(names):
+        raise InputError(
+            f"{first.where}: argument `stokes` names {len(stated)} columns, but {len(names)} "
+            f"are read, {', '.join(names)}."
+        )
+    for column, one, found in zip(columns, stated, certain, strict=True):
+        if not one or found is None:
+            continue
+        # Any may be a spread, or have no Stokes parameter.
+        if not (found in ("I", "") if one == "I" else one in (found, found * 2)):
+            raise InputError(
+                f"{column.where}: argument `stokes` says {one} of column {column.name}, whose "
+                f"name says {found or 'that it has no Stokes parameter'}."
+            )
+    return tuple(stated)
 
 
 def mark_missing(columns: Sequence[Column], missing: Any, zeros_are_data: bool) -> None:

@@ -1,10 +1,24 @@
-"""Files: what is wrong with those that are read, and how others are written whole."""
+"""Files: what is wrong with those that are read, how others are written whole, and folders.
 
+One process works in a folder of results, or several, each on a part of its own.
+"""
+
+import errno
+import hashlib
 import os
+import socket
 import stat
-from collections.abc import Callable, Iterator
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from datetime import datetime
 from pathlib import Path
+from typing import NamedTuple
+
+import filelock
+import numpy as np
+import platformdirs
 
 
 class InputError(ValueError):
@@ -106,3 +120,223 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file whole."""
     with whole(path) as beside:
         beside.write_text(text)
+
+
+#: Locked for moments only, while it is seen who works in a folder.
+GATE = ".lock"
+#: How the name of a file begins that a process keeps locked as long as it works in a folder.
+OWNER = ".running"
+#: The part of a process that shares its folder with no other.
+ALL = range(sys.maxsize)
+#: How a file system says that it has no locks.
+NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EPROTONOSUPPORT}
+
+
+def cache_folder() -> Path:
+    """What can be had again is kept here: $JAXSKY_CACHE, or the platform's folder for caches."""
+    given = os.environ.get("JAXSKY_CACHE")
+    return Path(given or platformdirs.user_cache_path("jaxsky")).expanduser().absolute()
+
+
+def kept(
+    kind: str, mark: object, shape: tuple[int, ...], make: Callable[[], np.ndarray]
+) -> np.ndarray:
+    """An array that takes long to make, from a folder of the cache if it was made before.
+
+    `mark` is all that it depends on; it is made if it is not there, damaged or of another shape.
+    """
+    name = hashlib.sha256(repr(mark).encode()).hexdigest()
+    path = cache_folder() / kind / f"{name}.npy"
+    with suppress(OSError, ValueError, EOFError):
+        found = np.load(path)
+        if found.shape == shape:
+            return found
+    made = make()
+    with suppress(OSError):  # it can be had again
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole(path) as beside, beside.open("wb") as file:
+            np.save(file, made)
+    return made
+
+
+class Owner(NamedTuple):
+    """A process that works in a folder, as the name of its file says; started in ns."""
+
+    pid: int
+    started: int
+    first: int
+    stop: int
+    host: str
+
+    @property
+    def name(self) -> str:
+        """Name of its file."""
+        return "-".join((OWNER, *map(str, self)))
+
+    @classmethod
+    def named(cls, name: str) -> "Owner":
+        """The process with this name of a file."""
+        _, pid, started, first, stop, host = name.split("-", 5)
+        return cls(int(pid), int(started), int(first), int(stop), host)
+
+    def __str__(self) -> str:
+        """Process and start time."""
+        when = datetime.fromtimestamp(self.started / 1e9).isoformat(" ", "seconds")
+        where = "" if self.host == socket.gethostname() else f" on {self.host}"
+        return f"process {self.pid}{where}, started {when}"
+
+
+def _lock(path: Path) -> filelock.BaseFileLock:
+    # The operating system releases it when a process dies; filelock's other kind would stay.
+    return filelock.FileLock(path, timeout=0, fallback_to_soft=False)
+
+
+def _acquire(lock: filelock.BaseFileLock, timeout: float = 0) -> bool:
+    """Lock a file; False if the file system has no locks."""
+    try:
+        lock.acquire(timeout)
+        return True
+    except OSError as error:
+        if error.errno in NO_LOCKS:
+            return False
+        raise
+
+
+@contextmanager
+def locked(
+    path: Path, timeout: float = -1, waiting: Callable[[], None] = lambda: None
+) -> Iterator[bool]:
+    """Hold a lock; False where the file system has none.
+
+    `timeout` is in seconds, -1 for ever; `waiting` is called if another process has the lock.
+    """
+    lock = _lock(path)
+    try:
+        held = _acquire(lock)
+    except filelock.Timeout:
+        waiting()
+        held = _acquire(lock, timeout)
+    try:
+        yield held
+    finally:
+        lock.release()
+
+
+@contextmanager
+def alone(out: Path) -> Iterator[bool]:
+    """Whoever is in here is alone with the list of a folder's processes; for moments only.
+
+    False where the file system has no locks.
+    """
+    with locked(out / GATE, 60) as held:
+        try:
+            yield held
+        finally:
+            if held and not any(out.glob(f"{OWNER}-*")):
+                (out / GATE).unlink(missing_ok=True)
+
+
+def _owners(out: Path) -> Iterator[Owner]:
+    """Who works in a folder; files of processes that have died are removed."""
+    for path in out.glob(f"{OWNER}-*"):
+        lock = _lock(path)
+        try:
+            lock.acquire()
+        except filelock.Timeout:
+            yield Owner.named(path.name)
+        else:
+            path.unlink(missing_ok=True)
+            lock.release()
+
+
+class Folder:
+    """A folder in which this process works on a part of the results; see `occupied`."""
+
+    def __init__(self, path: Path, part: range) -> None:
+        self.path, self.locked = path, False
+        me, now, host = os.getpid(), time.time_ns(), socket.gethostname()
+        self._owner = Owner(me, now, part.start, part.stop, host)
+
+    @property
+    def _place(self) -> Path:
+        return self.path / self._owner.name
+
+    @contextmanager
+    def owned(self) -> Iterator[None]:
+        """Work in the folder, unless another process works on the same part."""
+        me, lock = self._owner, _lock(self._place)
+        with alone(self.path) as locked:
+            for other in _owners(self.path) if locked else ():
+                if other.first < me.stop and me.first < other.stop:
+                    raise ValueError(
+                        f"{self.path}: is being written to by another command ({other}); wait "
+                        "for its end, or choose another --out."
+                    )
+            self.locked = locked and _acquire(lock)
+            self._place.touch()
+        guards.append(self.check)
+        try:
+            yield
+        except (OSError, ValueError):
+            self.check()  # the reason of all errors, if there is none any more
+            raise
+        finally:
+            guards.remove(self.check)
+            with suppress(OSError):
+                self.check()
+                with alone(self.path):
+                    self._place.unlink()
+            lock.release()
+
+    def check(self) -> None:
+        """Raise FileNotFoundError if the folder was removed, or is another one now."""
+        if not self._place.exists():
+            raise FileNotFoundError(
+                f"{self.path}: was removed while the command worked in it; the rest of its "
+                "results is not written."
+            )
+
+    def narrow(self, part: range) -> None:
+        """Go on with a smaller part only."""
+        with alone(self.path):
+            before = self._place
+            self._owner = self._owner._replace(first=part.start, stop=part.stop)
+            before.rename(self._place)
+
+    def remove(self, patterns: Sequence[str]) -> None:
+        """Remove files by patterns of their names."""
+        self.check()
+        for pattern in patterns:
+            for path in self.path.glob(pattern):
+                path.unlink(missing_ok=True)
+
+    def clean(self) -> None:
+        """Remove incomplete files of processes that have died."""
+        with alone(self.path) as locked:
+            if not locked:
+                return
+            living = {str(other.pid) for other in _owners(self.path) if other != self._owner}
+            for path in (*self.path.glob(f"{PARTIAL}*"), *self.path.glob(f"*/{PARTIAL}*")):
+                if path.name.split("-")[1] not in living:
+                    path.unlink(missing_ok=True)
+
+
+@contextmanager
+def occupied(out: Path, part: range = ALL) -> Iterator[Folder]:
+    """Work in a folder, which is made if it is not there, and left as it was if that fails.
+
+    Processes share it only if the parts of the results that they make differ.
+    """
+    missing = [folder for folder in (out, *out.parents) if not folder.exists()]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(f"{out}: cannot be made ({error.strerror}); choose another --out.") from error
+    folder = Folder(out, part)
+    try:
+        with folder.owned():
+            yield folder
+    finally:
+        for made in missing:
+            with suppress(OSError):
+                made.rmdir()  # unless there is something in it

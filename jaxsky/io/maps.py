@@ -1,5 +1,6 @@
-"""HEALPix maps in FITS files: read into the package's conventions, written in full."""
+"""HEALPix maps and masks: read into the package's conventions, maps written in full."""
 
+import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,11 +12,12 @@ from astropy.io import fits as pyfits
 from jaxtyping import Bool, Float
 
 from jaxsky.bandpass import Bandpass
-from jaxsky.bare import takes_quantities
-from jaxsky.checks import Numeric
-from jaxsky.io.columns import Column, mark_missing, parse_stokes, read_columns, stokes_of
-from jaxsky.io.files import InputError, whole
+from jaxsky.checks import Numeric, check_shape
+from jaxsky.io.columns import column_stokes, default_fields, mark_missing, read_columns
+from jaxsky.io.files import InputError, UnfitError, check_file, in_file, whole
 from jaxsky.io.quantities import unit_factor, unit_name
+from jaxsky.io.tables import equals, in_ring, open_table, spelled
+from jaxsky.public import takes_quantities
 
 
 def _blocks(where: str, names: Sequence[str], kinds: Sequence[str | None]) -> list[list[int]]:
@@ -76,7 +78,7 @@ def _interpolated(block: np.ndarray, rotator: healpy.Rotator) -> np.ndarray:
 def _to_galactic(
     maps: Float[np.ndarray, "field pix"],
     mask: Bool[np.ndarray, " pix"],
-    rows_together: Sequence[list[int]],
+    blocks: Sequence[list[int]],
     coordinates: str,
 ) -> tuple[Float[np.ndarray, "field pix"], Bool[np.ndarray, " pix"]]:
     """Maps turned to Galactic coordinates, Q and U as the spin-2 field they are.
@@ -87,9 +89,7 @@ def _to_galactic(
     """
     rotator = healpy.Rotator(coord=[coordinates, "G"])
     turn = _turned if mask.all() else _interpolated
-    turned = np.zeros_like(maps)
-    for rows in rows_together:
-        turned[rows] = turn(maps[rows], rotator)
+    turned = np.concatenate([turn(maps[rows], rotator) for rows in blocks])
     if not mask.all():
         mask = _interpolated(mask[None].astype(float), rotator)[0] > 1 - 1e-9
         turned[:, ~mask] = 0
@@ -123,47 +123,6 @@ class Maps:
         """The maps in another unit; `at` and `nu_ref` as in `unit_factor`."""
         factor = unit_factor(self.unit, unit, at, nu_ref)
         return replace(self, maps=self.maps * factor, unit=unit_name(unit))
-
-
-def _agree(stated: str, certain: str | None) -> bool:
-    """True if a column may be what is stated; any may be a spread, or have no Stokes parameter."""
-    if not stated or certain is None:
-        return True
-    return certain in (stated, "") if stated == "I" else stated in (certain, certain * 2)
-
-
-def _kinds(columns: Sequence[Column], given: str | Sequence[str] | None) -> list[str | None]:
-    """The Stokes parameter of each column, where it has to be known."""
-    first, names = columns[0], [column.name for column in columns]
-    # healpy calls any map T or TEMPERATURE that is alone in its file.
-    doubtful = ("T", "TEMPERATURE") if len(names) > 1 or given is not None else ()
-    certain = [
-        None if column.alone and column.name in doubtful else stokes_of(column.name)
-        for column in columns
-    ]
-    if given is not None:
-        stated = [""] * len(names) if isinstance(given, str) and not given else parse_stokes(given)
-        if len(stated) != len(names):
-            raise InputError(
-                f"{first.where}: argument `stokes` names {len(stated)} columns, but {len(names)} "
-                f"are read, {', '.join(names)}."
-            )
-        for column, one, found in zip(columns, stated, certain, strict=True):
-            if not _agree(one, found):
-                raise InputError(
-                    f"{column.where}: argument `stokes` says {one} of column {column.name}, whose "
-                    f"name says {found or 'that it has no Stokes parameter'}."
-                )
-        return list(stated)
-    if None in certain and (first.coordinates != "G" or first.polarization == "IAU"):
-        galactic = first.coordinates == "G"
-        why = "has the IAU sign of U" if galactic else "is not in Galactic coordinates"
-        raise InputError(
-            f"{first.where}: the file {why}, and the name of column "
-            f"{names[certain.index(None)]} does not say which Stokes parameter it holds; give "
-            f'`stokes`, such as "QU" or "I", one letter for each of {", ".join(names)}.'
-        )
-    return certain
 
 
 def read_maps(
@@ -231,8 +190,8 @@ def read_maps(
     first, where, names = columns[0], columns[0].where, tuple(column.name for column in columns)
     if nside not in (None, first.nside):
         raise InputError(f"{where}: nside is {first.nside}, but {nside} is expected.")
-    kinds = _kinds(columns, stokes)
-    rows = None if first.coordinates == "G" else _blocks(where, names, kinds)
+    kinds = column_stokes(columns, stokes)
+    blocks = None if first.coordinates == "G" else _blocks(where, names, kinds)
     mark_missing(columns, missing, zeros_are_data)
     maps = np.empty((len(names), first.values.size))
     for row in range(len(names)):
@@ -243,27 +202,9 @@ def read_maps(
     maps[:, ~mask] = 0
     if first.polarization == "IAU":
         maps *= np.array([[(-1.0) ** (kind or "").count("U")] for kind in kinds])
-    if rows is not None:
-        maps, mask = _to_galactic(maps, mask, rows, first.coordinates)
-    return Maps(maps, mask, first.unit, names, tuple(kinds))
-
-
-def _check_written(
-    maps: np.ndarray, names: Sequence[str], units: Sequence[str], mask: np.ndarray | None
-) -> None:
-    if maps.ndim != 2 or not healpy.isnpixok(maps.shape[-1]):
-        wanted = "(field, pix) with 12 nside^2 pixels"
-        raise ValueError(f"Argument `maps` must have shape {wanted}, but has shape {maps.shape}.")
-    for name, values in {"names": names, "unit": units}.items():
-        if len(values) != len(maps):
-            raise ValueError(f"Argument `{name}` has {len(values)} entries for {len(maps)} maps.")
-    if mask is not None and mask.shape != maps.shape[-1:]:
-        pix = maps.shape[-1:]
-        raise ValueError(f"Argument `mask` must have shape {pix}, but has shape {mask.shape}.")
-    used = maps if mask is None else maps[:, mask]
-    if bad := int(np.sum(~np.isfinite(used))):
-        counted = f"{bad} of {used.size} values that are not finite"
-        raise ValueError(f"Argument `maps` has {counted}; leave pixels out with `mask`.")
+    if blocks is not None:
+        maps, mask = _to_galactic(maps, mask, blocks, first.coordinates)
+    return Maps(maps, mask, first.unit, names, kinds)
 
 
 def write_maps(
@@ -306,7 +247,18 @@ def write_maps(
     names = [names] if isinstance(names, str) else list(names)
     units = [unit_name(x) for x in ([unit] * len(maps) if isinstance(unit, str) else unit)]
     mask = None if mask is None else np.asarray(mask, dtype=bool)
-    _check_written(maps, names, units, mask)
+    npix = maps.shape[-1]
+    good = maps.ndim == 2 and healpy.isnpixok(npix)
+    check_shape("maps", maps, good, "have shape (field, pix) with 12 nside^2 pixels")
+    for name, values in {"names": names, "unit": units}.items():
+        if len(values) != len(maps):
+            raise ValueError(f"Argument `{name}` has {len(values)} entries for {len(maps)} maps.")
+    if mask is not None:
+        check_shape("mask", mask, mask.shape == (npix,), f"have shape ({npix},)")
+    used = maps if mask is None else maps[:, mask]
+    if bad := int(np.sum(~np.isfinite(used))):
+        counted = f"{bad} of {used.size} values that are not finite"
+        raise ValueError(f"Argument `maps` has {counted}; leave pixels out with `mask`.")
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path}: file exists, and `overwrite` is not set.")
     if not path.parent.is_dir():
@@ -322,9 +274,9 @@ def write_maps(
     required = {
         "PIXTYPE": ("HEALPIX", "HEALPIX pixelisation"),
         "ORDERING": ("RING", "pixel ordering"),
-        "NSIDE": (healpy.npix2nside(maps.shape[-1]), "resolution"),
+        "NSIDE": (healpy.npix2nside(npix), "resolution"),
         "FIRSTPIX": (0, "first pixel"),
-        "LASTPIX": (maps.shape[-1] - 1, "last pixel"),
+        "LASTPIX": (npix - 1, "last pixel"),
         "INDXSCHM": ("IMPLICIT", "indexing"),
         "OBJECT": ("FULLSKY", "sky coverage"),
         "COORDSYS": ("G", "Galactic coordinates"),
@@ -338,3 +290,109 @@ def write_maps(
     table.header.update(required)
     with whole(path) as beside:
         pyfits.HDUList([pyfits.PrimaryHDU(), table, *tables]).writeto(beside, overwrite=True)
+
+
+def _read_npz(path: Path, field: str | int | None, ordering: str | None) -> np.ndarray:
+    """The values of a mask in an archive, in RING order."""
+    order = spelled("ordering", ordering or "RING")
+    check_file(path)
+    try:
+        with np.load(path) as archive:
+            known = list(archive)
+            name = known[0] if field is None and len(known) == 1 else field
+            if name not in known:
+                what = "give `field`, of several" if field is None else f"no mask {field!r}"
+                raise UnfitError(f"{what}; it has {', '.join(known)}.")
+            found = np.squeeze(archive[name])
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise UnfitError(f"not a readable .npz archive ({error}).") from error
+    if found.dtype.kind not in "biuf" or found.ndim != 1:
+        raise UnfitError(f"{name} is no mask, but has type {found.dtype} and shape {found.shape}.")
+    if not healpy.isnpixok(found.size):
+        raise UnfitError(f"not a HEALPix mask, {found.size} is not 12 nside^2 pixels.")
+    values = found.astype(np.float64)
+    values[~np.isfinite(values) | equals(values, healpy.UNSEEN, 1e-5)] = np.nan
+    return in_ring(values, order)
+
+
+def read_mask(
+    path: str | Path,
+    *,
+    field: str | int | None = None,
+    hdu: int | str = 1,
+    nside: int | None = None,
+    ordering: str | None = None,
+) -> Bool[np.ndarray, " pix"]:
+    """A mask from a FITS file or an .npz archive.
+
+    Pixels without a value are not used: those that a partial map does not list, UNSEEN, NaN,
+    BAD_DATA and TNULL of the header.
+
+    Parameters
+    ----------
+    path : FITS file or .npz archive
+    field : column of the table or array of the archive, for example "GAL040"; may be left out
+        where there is only one, or an I column (the WMAP masks)
+    hdu : number or name of the FITS table
+    nside : resolution that is expected
+    ordering : "RING" or "NESTED" where the header does not say; an archive is RING unless it is
+        given. A FITS mask without coordinates is taken to be Galactic.
+
+    Returns
+    -------
+    True in used pixels; RING, Galactic, shape (pix,).
+
+    Raises
+    ------
+    InputError
+        If the file has no such mask, or it has values other than 0 and 1 (read an apodized mask
+        with `read_maps`), the wrong nside, or leaves no pixel.
+    """
+    path = Path(path)
+    frame, others = "G", []
+    with in_file(path):
+        if path.suffix == ".npz":
+            values = _read_npz(path, field, ordering)
+        else:
+            with open_table(path, hdu) as table:
+                column = default_fields(table, "field")[0] if field is None else table.index(field)
+                order = table.state("ordering", ordering)
+                frame = table.state("coordinates", None, "G")
+                values = table.values(column, order, logical=True)
+                others = [name for name in table.names if name != table.names[column]]
+        found = healpy.npix2nside(values.size)
+        if nside not in (None, found):
+            raise UnfitError(f"nside is {found}, but {nside} is expected.")
+        odd = values[np.isfinite(values) & (values != 0) & (values != 1)]
+        if odd.size:
+            listed = ", ".join(f"{value:.6g}" for value in np.unique(odd)[:3])
+            raise UnfitError(
+                f"a mask has values 0 and 1, but {odd.size} of {values.size} pixels have others, "
+                f"such as {listed}."
+            )
+        mask = values == 1
+        if not mask.any():
+            hint = f"; give `field` out of {', '.join(others)}" if field is None and others else ""
+            raise UnfitError(f"the mask leaves no pixel{hint}.")
+    if frame == "G":
+        return mask
+    # As it is at the pixel centers of the Galactic frame.
+    directions = healpy.pix2ang(found, np.arange(mask.size))
+    return mask[healpy.ang2pix(found, *healpy.Rotator(coord=["G", frame])(*directions))]
+
+
+def degrade_mask(
+    mask: Bool[np.ndarray, " pix"], nside: int, threshold: float = 0.5
+) -> Bool[np.ndarray, " pix"]:
+    """A mask in RING order at lower resolution: pixels of which at least a fraction is used."""
+    found = healpy.npix2nside(np.size(mask))
+    if not healpy.isnsideok(found, nest=True):
+        raise ValueError(f"Argument `mask` must have nside 1, 2, 4, ..., but has nside {found}.")
+    if not healpy.isnsideok(nside, nest=True) or nside > found:
+        raise ValueError(
+            f"Argument `nside` must be a power of 2 up to that of the mask, {found}, not {nside}."
+        )
+    if not 0 < threshold <= 1:
+        raise ValueError(f"Argument `threshold` must be within (0, 1], but is {threshold}.")
+    # The means of 0 and 1 over powers of 4 are exact, so a threshold of 1 keeps full pixels.
+    return healpy.ud_grade(np.asarray(mask, dtype=float), nside) >= threshold

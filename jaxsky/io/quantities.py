@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 from astropy import units as u
 
-from jaxsky.bandpass import Bandpass
-from jaxsky.bare import takes_quantities
+from jaxsky.bandpass import UNITS, Bandpass, conversion
 from jaxsky.checks import Numeric
-from jaxsky.units import UNITS, conversion
+from jaxsky.public import takes_quantities
 
 _DIMENSIONLESS = {"", "1", "none", "n/a", "na", "unitless", "dimensionless", "index", "ratio"}
 _DIMENSIONLESS |= {"count", "counts", "ct", "hit", "hits", "n_obs", "samples", "number"}
@@ -28,8 +27,8 @@ _JANSKY = re.compile(
 def unit_name(text: str) -> str:
     """The package's name for a unit as FITS headers and astropy spell it ("mK,thermodynamic").
 
-    A name of `jaxsky.units`, with "^2" for a square; "" for a pure number; "K", "mK", "uK" or
-    "nK" where the text does not say whether antenna or thermodynamic; else astropy's name.
+    A name of `jaxsky.bandpass.UNITS`, with "^2" for a square; "" for a pure number; "K", "mK",
+    "uK" or "nK" where the text does not say whether antenna or thermodynamic; else astropy's name.
     """
     if text.strip().lower() in _DIMENSIONLESS:
         return ""
@@ -70,11 +69,6 @@ def unit_factor(
         that of `Bandpass.conversion`
     nu_ref : frequency at which a band's MJy/sr is quoted [GHz], needed for that unit
 
-    Raises
-    ------
-    ValueError
-        If a unit is unknown, they do not convert, or `at` is missing.
-
     Examples
     --------
     >>> round(unit_factor("K_CMB^2", "uK_RJ^2", at=100.0) / 1e12, 4)
@@ -82,12 +76,11 @@ def unit_factor(
     """
     names = unit_name(source), unit_name(target)
     first, second = (name.removesuffix("^2") for name in names)
-    powers = {1 + name.endswith("^2") for name in names}
+    power, other = (1 + name.endswith("^2") for name in names)
     hint = "; say K_CMB or K_RJ" if is_ambiguous(first) and second in UNITS else ""
     refusal = ValueError(f"Unit {source!r} does not convert to {target!r}{hint}.")
-    if len(powers) > 1 or (first in UNITS) != (second in UNITS):
+    if power != other or (first in UNITS) != (second in UNITS):
         raise refusal
-    power = powers.pop()
     if first not in UNITS:
         try:
             return u.Unit(first).to(u.Unit(second)) ** power
@@ -115,26 +108,11 @@ def from_quantity(
     at: Numeric | Bandpass | u.Quantity | None = None,
     nu_ref: float | None = None,
 ) -> np.ndarray:
-    """An astropy Quantity as a bare array in a unit of the package.
+    """An astropy Quantity as a bare array in a unit of the package, in double precision.
 
-    Units are taken by name, so those of `pysm3.units` (uK_RJ, K_CMB) work as well as astropy's.
-
-    Parameters
-    ----------
-    quantity : number or array with a unit
-    unit : unit of the result: "uK_RJ", "K_CMB", "MJy/sr", "GHz", "arcmin", "K", ...
-    at, nu_ref : see `unit_factor`
-
-    Returns
-    -------
-    Array of float64.
-
-    Raises
-    ------
-    TypeError
-        If the quantity has no unit.
-    ValueError
-        If the units do not convert, or `at` is missing.
+    The unit of the result is "uK_RJ", "K_CMB", "MJy/sr", "GHz", "arcmin", "K", ...; for `at` and
+    `nu_ref` see `unit_factor`. Units are taken by name, so those of `pysm3.units` (uK_RJ, K_CMB)
+    work as well as astropy's.
 
     Examples
     --------

@@ -5,6 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
+from jaxsky.bandpass import UNITS
 from jaxsky.settings.types import (
     Files,
     Hdus,
@@ -15,7 +16,6 @@ from jaxsky.settings.types import (
     Stokes,
     Word,
 )
-from jaxsky.units import UNITS
 
 
 class TableKeys(SettingsTable):

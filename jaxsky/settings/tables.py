@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from jaxsky.components import AME, component_class, declared
 from jaxsky.galaxy import GalaxyModel
-from jaxsky.instrument import band_tables
+from jaxsky.observation import band_tables
 from jaxsky.settings.files import BandpassSpec, BeamedKeys, BeamedMap, MapFile, MapKeys, NoiseTable
 from jaxsky.settings.types import (
     RESERVED,

@@ -16,7 +16,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from jaxsky.io import InputError, MissingFileError, check_file
-from jaxsky.io.folders import cache_folder
+from jaxsky.io.files import cache_folder
 from jaxsky.settings.experiment import Experiment
 from jaxsky.settings.types import NamedFile, SettingsError, mistakes
 
@@ -159,7 +159,7 @@ def find_file(folder: Path, name: str) -> Path:
 
 def _missing(path: Path, cache: Path | None) -> str:
     """Say that a file is missing, and how to get it."""
-    from jaxsky.archive import catalogue, product_sets  # slow to import, and seldom needed
+    from jaxsky.products import catalogue, product_sets  # slow to import, and seldom needed
 
     said = "no such file" if path.parent.is_dir() else "no such file, nor folder"
     if cache is not None:

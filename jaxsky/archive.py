@@ -14,7 +14,9 @@ from urllib.parse import urljoin, urlsplit
 import requests
 import urllib3
 
-from jaxsky.archive.products import (
+from jaxsky.io import InputError
+from jaxsky.io.files import cache_folder, locked
+from jaxsky.products import (
     DownloadError,
     Product,
     check_product,
@@ -23,8 +25,6 @@ from jaxsky.archive.products import (
     recorded,
     remember,
 )
-from jaxsky.io import InputError
-from jaxsky.io.folders import cache_folder, locked
 
 #: Seconds to wait for a connection, and for more bytes.
 TIMEOUT = (10.0, 60.0)

@@ -1,9 +1,10 @@
-"""Functions of the multipole in files: power spectra, and windows of beams."""
+"""Curves in files: tables of numbers as text, power spectra, and windows of beams."""
 
+import codecs
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -11,11 +12,144 @@ from jaxtyping import Float
 from jaxsky.io.files import UnfitError, in_file, is_fits
 from jaxsky.io.quantities import unit_factor, unit_name
 from jaxsky.io.tables import TABLES, open_fits, select_hdu
-from jaxsky.io.text import read_text
+
+COMMENTS = ("#", ";", "%", "!", "\\", "|", "//", "*")
+_TRAILING = re.compile(r"\s(?:[#!%\\]|//).*")
+_NUMBER = re.compile(
+    r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:[ed][+-]?\d+)?|nan|inf|infinity)", re.I | re.ASCII
+)
+#: What to do about decimal commas.
+_WRITE = "write decimal points, or semicolons between the columns"
+#: A field that begins as a number does, if not as a word.
+_DAMAGED = re.compile(r"[\"'(\[+-]*\.?\d")
+
+
+class TextRow(NamedTuple):
+    """A line of a table: its number in the file, its text and its fields."""
+
+    line: int
+    text: str
+    cells: list[str]
+
+
+def _words(line: str) -> list[str]:
+    return re.split(r"[\s,;|]+", line.strip(" ,;|"))
+
+
+class TextTable(NamedTuple):
+    """Lines of a text file: comments and names of columns, the bars of an IPAC header, rows."""
+
+    path: Path
+    header: list[str]
+    bars: list[str]
+    rows: list[TextRow]
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return len(self.rows[0].cells)
+
+    def words(self) -> list[list[str]]:
+        """The lines above the rows, split into words."""
+        return [_words(line) for line in [*self.bars, *self.header]]
+
+    def names(self) -> list[str]:
+        """Names of the columns: those of the last line of the header with so many words."""
+        lines = [re.sub(r"[(\[].*?[)\]]", "", line) for line in [*self.bars[:1], *self.header]]
+        named = (words for words in map(_words, reversed(lines)) if len(words) == self.width)
+        return next(named, [])
+
+    def numbers(self, columns: Sequence[int] | None = None) -> Float[np.ndarray, "row column"]:
+        """The numbers of some columns; without, of all, of which each row must have as many."""
+        table = []
+        for line, text, cells in self.rows:
+            wanted = range(len(cells)) if columns is None else columns
+            values = [_number(cells[c]) if c < len(cells) else None for c in wanted]
+            with in_file(f"{self.path}, line {line}"):
+                if None in values:
+                    raise UnfitError(f"not a row of numbers: {text!r}.")
+                if columns is None and len(values) != self.width:
+                    raise UnfitError(f"{len(values)} numbers, but {self.width} in the lines above.")
+            table.append(values)
+        return np.array(table, np.float64)
+
+
+def _number(cell: str) -> float | None:
+    """The value of a field, exponents of Fortran (1.0D+01) included; None if it is no number."""
+    if not _NUMBER.fullmatch(cell):
+        return None
+    word = cell.lower()
+    return float(word if "n" in word else word.replace("d", "e"))
+
+
+def _cells(text: str) -> list[str]:
+    """Fields between semicolons, commas or blanks; a comma may be decimal in the first."""
+    if ";" in text:
+        return [cell.strip().replace(",", ".") for cell in text.strip(" ;").split(";")]
+    words = [word.strip(",") for word in text.split()]
+    for word in words if len(words) > 1 else ():
+        if "," in word and all(_number(part) is not None for part in word.split(",")):
+            raise UnfitError(f"{word!r} is two numbers or one with a decimal comma; {_WRITE}.")
+    return [cell for cell in re.split(r"[\s,]+", text) if cell]
+
+
+def read_text(path: Path) -> TextTable:
+    r"""The lines of a text table; UTF-8, or UTF-16 with its mark.
+
+    Comments start with # ; % ! \ | // or *. Columns are separated by blanks, commas or semicolons.
+    A line before the first row is a header if none of its fields is a number, and they do not all
+    begin with a digit.
+    """
+    table, content = TextTable(path, [], [], []), path.read_bytes()
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    with in_file(path):
+        try:
+            decoded = content.decode("utf-16" if wide else "utf-8-sig")
+        except UnicodeDecodeError:
+            raise UnfitError("neither a FITS file nor a text table.") from None
+        if "\0" in decoded:
+            raise UnfitError("neither a FITS file nor a text table, for it has NUL bytes.")
+        for line, text in enumerate(map(str.strip, decoded.splitlines()), start=1):
+            if text:
+                with in_file(f"{path}, line {line}"):
+                    _add_line(table, line, text)
+        if not table.rows:
+            raise UnfitError("no line has numbers.")
+        _check_commas(table.rows)
+    return table
+
+
+def _add_line(table: TextTable, line: int, text: str) -> None:
+    """Put a line of the file where it belongs."""
+    if text.startswith("|") and table.rows:
+        raise UnfitError(f"a header among the rows: {text!r}.")
+    if text.startswith("|"):
+        table.bars.append(text)
+    elif text.startswith(COMMENTS):
+        if not table.rows:
+            table.header.append(text.lstrip("".join(COMMENTS)).strip())
+    else:
+        cells = _cells(_TRAILING.sub("", text))
+        if table.rows or any(_number(cell) is not None for cell in cells):
+            table.rows.append(TextRow(line, text, cells))
+        elif all(_DAMAGED.match(cell) for cell in cells):
+            raise UnfitError(f"not a row of numbers: {text!r}.")
+        else:
+            table.header.append(text)
+
+
+def _check_commas(rows: list[TextRow]) -> None:
+    """Refuse rows such as 30,5,2,0: two numbers with decimal commas, or four."""
+    cells = [cell for row in rows for cell in row.cells]
+    halves = all(len(row.cells) % 2 == 0 and len(row.cells) > 2 for row in rows)
+    commas = all(len(row.text.split()) == 1 and "," in row.text for row in rows)
+    if halves and commas and all(cell.lstrip("+-").isdigit() for cell in cells):
+        raise UnfitError(
+            f"line {rows[0].line}: {rows[0].text!r} may have decimal commas; {_WRITE}."
+        )
+
 
 SPECTRA = ("TT", "EE", "BB", "TE")
-#: Multipoles of the rows of a table, and C_l of TT, EE, BB, TE [uK_CMB^2].
-Spectra: TypeAlias = tuple[Float[np.ndarray, " row"], Float[np.ndarray, "4 row"]]
 #: First columns of text files, by format.
 _ORDERS = {"planck": ("L", "TT", "TE", "EE", "BB"), "camb": ("L", "TT", "EE", "BB", "TE")}
 #: Names of columns, upper case -> the package's: HEALPix (IDL, Fortran, healpy), HEALPix C++.
@@ -96,16 +230,6 @@ def _text_order(
     return _ORDERS[format]
 
 
-def _spectra_of_text(path: Path, format: str | None) -> Spectra:
-    text = read_text(path)
-    table = text.numbers()
-    names = _text_order(path.name, text.words(), text.width, format)
-    at, *columns = _located(names, ("L", *SPECTRA))
-    ell = table[:, at]
-    factor = np.where(ell > 0, 2 * np.pi / np.maximum(ell * (ell + 1), 1), 0)
-    return ell, table[:, columns].T * factor
-
-
 def _fits_factor(name: str, found: str | None, given: str | None) -> float:
     """Factor to uK_CMB^2 from the unit of a column or the argument that stands in for it."""
     stated = None if (found or "").lower() in ("", "unknown") else found
@@ -126,7 +250,10 @@ def _fits_factor(name: str, found: str | None, given: str | None) -> float:
     return factors[0]
 
 
-def _spectra_of_fits(path: Path, unit: str | None) -> Spectra:
+def _spectra_of_fits(
+    path: Path, unit: str | None
+) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, "4 row"]]:
+    """Multipoles of the rows of a table, and C_l of TT, EE, BB, TE [uK_CMB^2]."""
     with open_fits(path) as hdus:
         table = select_hdu(hdus, 1, TABLES)
         if stated := _D_ELL.search(repr(table.header)):
@@ -142,18 +269,6 @@ def _spectra_of_fits(path: Path, unit: str | None) -> Spectra:
 
 def _first(bad: np.ndarray) -> str:
     return f"{bad.sum()} multipoles, the first l = {np.argmax(bad)}"
-
-
-def _check(spectra: Float[np.ndarray, "4 ell"]) -> None:
-    """Raise InputError if the spectra are not those of a Gaussian field."""
-    for name, values in zip(SPECTRA, spectra, strict=True):
-        bad = ~np.isfinite(values) | ((values < 0) & (name != "TE"))
-        if bad.any():
-            kind = "finite" if name == "TE" else "finite and not negative"
-            raise UnfitError(f"{name} must be {kind}, but is not at {_first(bad)}.")
-    TT, EE, _, TE = spectra
-    if np.any(bad := np.abs(TE) > np.sqrt(TT * EE) * _ROUNDING):
-        raise UnfitError(f"|TE| exceeds sqrt(TT EE) at {_first(bad)}.")
 
 
 def read_spectra(
@@ -197,9 +312,22 @@ def read_spectra(
         else:
             if unit is not None:
                 raise UnfitError("argument `unit` is for FITS files, text is in uK^2.")
-            ell, values = _spectra_of_text(path, format)
+            text = read_text(path)
+            table = text.numbers()
+            names = _text_order(path.name, text.words(), text.width, format)
+            at, *columns = _located(names, ("L", *SPECTRA))
+            ell = table[:, at]
+            factor = np.where(ell > 0, 2 * np.pi / np.maximum(ell * (ell + 1), 1), 0)
+            values = table[:, columns].T * factor
         spectra = _up_to(ell, values, lmax, 2)
-        _check(spectra)
+        for name, row in zip(SPECTRA, spectra, strict=True):
+            bad = ~np.isfinite(row) | ((row < 0) & (name != "TE"))
+            if bad.any():
+                kind = "finite" if name == "TE" else "finite and not negative"
+                raise UnfitError(f"{name} must be {kind}, but is not at {_first(bad)}.")
+        TT, EE, _, TE = spectra
+        if np.any(bad := np.abs(TE) > np.sqrt(TT * EE) * _ROUNDING):
+            raise UnfitError(f"|TE| exceeds sqrt(TT EE) at {_first(bad)}.")
     return spectra
 
 
@@ -228,7 +356,7 @@ def read_beam(path: str | Path, lmax: int, *, hdu: int | str = 1) -> Float[np.nd
 
     The table must hold b_l, by which a_lm are multiplied, not its square.
 
-    * Text with columns l and b_l (`jaxsky.io.text.read_text`), IPAC tables as of WMAP among it;
+    * Text with columns l and b_l (`read_text`), IPAC tables as of WMAP among it;
       further columns are ignored.
     * FITS tables from l = 0 on, of HEALPix or Planck: the first column named TEMPERATURE,
       INTENSITY, T, NOMINAL or BL, so of a file with several that of the temperature.

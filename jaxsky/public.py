@@ -1,11 +1,14 @@
-"""Public functions take bare numbers: what carries a unit is refused by the argument's name.
+"""What users see: names that are imported when they are asked for, and take bare numbers.
 
 JAX and numpy drop the unit of an astropy quantity without a word. Importing this module, as the
 two packages do before all else, has every function and method whose name has no underscore
-checked, in the manner of beartype and jaxtyping; so none can be forgotten.
+checked, in the manner of beartype and jaxtyping: what carries a unit is refused by the argument's
+name, and no function can be forgotten.
 """
 
+import ast
 import functools
+import importlib
 import inspect
 import sys
 from collections.abc import Callable
@@ -23,11 +26,29 @@ PACKAGES = ("jaxsky", "fits")
 PLAIN = frozenset({bool, int, float, str, type(None), np.ndarray, np.float64, np.int64})
 
 
-def _unit(value: object) -> object:
-    """The unit of a number or an array of astropy, unyt or pint; None for all else."""
-    unit = getattr(value, "unit", getattr(value, "units", None))
-    numeric = any(hasattr(value, name) for name in ("__array__", "value", "magnitude"))
-    return unit if numeric else None
+def exported(package: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
+    """`__all__`, `__getattr__` and `__dir__` of a package, as its block for type checkers says.
+
+    The imports under `if TYPE_CHECKING:`, which Python passes over, are made one name at a time.
+    """
+    module: Any = sys.modules[package]
+    tree = ast.parse(module.__spec__.loader.get_source(package))
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    places = {
+        alias.name: line.module
+        for line in block.body
+        if isinstance(line, ast.ImportFrom)
+        for alias in line.names
+    }
+
+    def get(name: str) -> Any:
+        if name not in places:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        value = getattr(importlib.import_module(str(places[name])), name)
+        setattr(module, name, value)
+        return value
+
+    return sorted(places), get, lambda: sorted({*vars(module), *places})
 
 
 def refuse_unit(name: str, value: object) -> None:
@@ -39,13 +60,15 @@ def refuse_unit(name: str, value: object) -> None:
             refuse_unit(str(key), entry)
     elif isinstance(value, list | tuple):
         for entry in value:
-            if type(entry) not in PLAIN:
-                refuse_unit(name, entry)
-    elif (unit := _unit(value)) is not None:
-        raise TypeError(
-            f"Argument `{name}` carries the unit {unit}; jaxsky takes bare arrays. "
-            "Convert it first, for example with jaxsky.from_quantity."
-        )
+            refuse_unit(name, entry)
+    # A number or an array of astropy, unyt or pint.
+    elif any(hasattr(value, word) for word in ("__array__", "value", "magnitude")):
+        unit = getattr(value, "unit", getattr(value, "units", None))
+        if unit is not None:
+            raise TypeError(
+                f"Argument `{name}` carries the unit {unit}; jaxsky takes bare arrays. "
+                "Convert it first, for example with jaxsky.io.from_quantity."
+            )
 
 
 def takes_quantities(function: F) -> F:

@@ -15,8 +15,7 @@ from astropy.io import fits as pyfits
 from rich.filesize import decimal
 
 from jaxsky.io import InputError, read_spectra
-from jaxsky.io.files import UnfitError
-from jaxsky.io.folders import locked
+from jaxsky.io.files import UnfitError, locked
 from jaxsky.io.quantities import unit_name
 from jaxsky.io.tables import HealpixTable, open_fits, open_table
 
@@ -52,7 +51,7 @@ class ProductSet(NamedTuple):
 
 @cache
 def _table() -> dict[str, Any]:
-    return tomllib.loads((files("jaxsky.archive") / "products.toml").read_text())
+    return tomllib.loads((files("jaxsky") / "products.toml").read_text())
 
 
 @cache
@@ -141,15 +140,15 @@ def recorded(product: Product, folder: Path) -> Product:
     return product._replace(hash=known, size=product.size if known == product.hash else None)
 
 
-def file_hash(path: Path, like: str) -> str:
+def _hash_like(other: str, path: Path) -> str:
     """The hash of a file by the algorithm of another hash."""
-    algorithm = like.partition(":")[0]
+    algorithm = other.partition(":")[0]
     return f"{algorithm}:{pooch.file_hash(str(path), alg=algorithm)}"
 
 
 def remember(product: Product, folder: Path, path: Path) -> None:
     """Record the hash of the file that came for a product."""
-    found = file_hash(path, product.hash or "sha256:")
+    found = _hash_like(product.hash or "sha256:", path)
     with locked(folder / f".{CHECKSUMS}.lock"):
         known = checksums(folder) | {product.name: found}
         new = folder / f".{CHECKSUMS}.new"
@@ -176,7 +175,7 @@ def check_product(product: Product, path: Path, hint: str = "") -> list[str]:
         raise InputError(f"{path}: has {size} bytes, but should have {product.size}{hint}.")
     if product.hash is None:
         return structure
-    if (found := file_hash(path, product.hash)) != product.hash:
+    if (found := _hash_like(product.hash, path)) != product.hash:
         raise InputError(f"{path}: has the hash {found}, but should have {product.hash}{hint}.")
     return ["hash", *structure]
 
@@ -191,7 +190,13 @@ def _check_structure(product: Product, path: Path) -> list[str]:
         if not start.startswith((b"SIMPLE", b"\x1f\x8b")):
             raise InputError(f"{path}: is no FITS file, it begins with {shown!r}.")
         with open_fits(path) as hdus:
-            _check_whole(hdus)
+            # At the last byte of each table or image astropy notices a cut.
+            for hdu in hdus:
+                if isinstance(hdu, pyfits.BinTableHDU):
+                    if len(hdu.columns):
+                        hdu.data[-1:]
+                elif hdu.is_image and hdu.shape:
+                    hdu.section[-1:]
         if product.nside is None:
             return ["complete"]
         with open_table(path, 1) as table:
@@ -206,16 +211,6 @@ def _check_structure(product: Product, path: Path) -> list[str]:
             if file.read() != b"\n":
                 raise InputError(f"{path}: ends in the middle of a line.")
     return ["complete"]
-
-
-def _check_whole(hdus: pyfits.HDUList) -> None:
-    """Read the last byte of each table or image, at which astropy notices a cut."""
-    for hdu in hdus:
-        if isinstance(hdu, pyfits.BinTableHDU):
-            if len(hdu.columns):
-                hdu.data[-1:]
-        elif hdu.is_image and hdu.shape:
-            hdu.section[-1:]
 
 
 def _check_maps(table: HealpixTable, product: Product) -> None:

@@ -1,0 +1,232 @@
+"""The components that come with the package."""
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxsky import sed
+from jaxsky.checks import Numeric, Parameter, as_array, check_shape, is_concrete
+from jaxsky.components.base import Component, parameter, reference, template
+from jaxsky.sed import T_CMB
+
+
+class Dust(Component, law="dust"):
+    """Thermal dust: one modified black body, or a sum of them given as tuples.
+
+    Parameters
+    ----------
+    amplitude : template at nu_ref [uK_RJ], shape (stokes, pix)
+    beta_dust, T_dust : index and temperature [K], or a tuple of them with one entry a body;
+        the paper's baseline 1.53 and 21 K
+    E_dust : tuple of relative amplitudes, only for several bodies (`sed.modified_blackbodies`)
+    nu_ref : reference frequency [GHz]
+    nu_pivot : pivot of the emissivities [GHz], only for several bodies; default 3000
+
+    Raises
+    ------
+    ValueError
+        For tuples of different lengths, E_dust or nu_pivot with a single body, and what
+        `Component` refuses.
+
+    Examples
+    --------
+    >>> import jax.numpy as jnp
+    >>> maps = jnp.ones((2, 12))
+    >>> Dust(maps, beta_dust=(1.67, 2.70), T_dust=(9.4, 16.2), E_dust=(0.49, 1.0)).bodies
+    2
+    """
+
+    amplitude: Float[Array, "stokes pix"] = template()
+    beta_dust: Parameter | tuple[Parameter, ...] = parameter(
+        1.53, symbol=r"\beta_{\rm dust}", zero=False
+    )
+    T_dust: Parameter | tuple[Parameter, ...] = parameter(
+        21.0, positive=True, symbol=r"T_{\rm dust}", unit="K", zero=False
+    )
+    E_dust: tuple[Parameter, ...] | None = parameter(None, symbol=r"E_{\rm dust}")
+    nu_ref: Parameter = reference(353.0, within=(1.0, 2e4))
+    nu_pivot: Parameter | None = parameter(
+        None, positive=True, symbol=r"\nu_{\rm pivot}", unit="GHz"
+    )
+
+    def __post_init__(self) -> None:
+        if isinstance(self.beta_dust, tuple) and self.nu_pivot is None:
+            self.nu_pivot = 3000.0
+
+    def __check_init__(self) -> None:
+        if not isinstance(self.beta_dust, tuple):
+            for name in ("E_dust", "nu_pivot"):
+                if getattr(self, name) is not None:
+                    raise ValueError(
+                        f"Argument `{name}` has no effect with a single body; give `beta_dust`, "
+                        "`T_dust` and `E_dust` as tuples for several."
+                    )
+        bodies = (self.beta_dust, self.T_dust, self.E_dust)
+        lengths = [len(v) if isinstance(v, tuple) else None for v in bodies]
+        if len(set(lengths)) > 1 or lengths[0] == 0:
+            raise ValueError(
+                "Arguments `beta_dust`, `T_dust` and `E_dust` must be tuples with one entry a "
+                f"body, but have lengths {lengths}."
+            )
+
+    @property
+    def bodies(self) -> int:
+        """Number of modified black bodies."""
+        return len(self.E_dust) if self.E_dust is not None else 1
+
+    def sed(self, nu):
+        if self.E_dust is None:
+            return sed.modified_blackbody(nu, self.beta_dust, self.T_dust, self.nu_ref)
+        return sed.modified_blackbodies(
+            nu, self.beta_dust, self.T_dust, self.E_dust, self.nu_ref, self.nu_pivot
+        )
+
+
+class Synchrotron(Component, law="synchrotron"):
+    """Synchrotron: a power law, or one with curvature (`sed.curved_power_law`).
+
+    Parameters
+    ----------
+    amplitude : template at nu_ref [uK_RJ], shape (stokes, pix)
+    beta_syn : spectral index, T ~ nu^-beta_syn; the paper's baseline 3.10
+    curvature : C of the paper, 0 for a pure power law
+    nu_piv : pivot frequency of the curvature [GHz]
+    nu_ref : reference frequency [GHz]
+    """
+
+    amplitude: Float[Array, "stokes pix"] = template()
+    beta_syn: Parameter = parameter(
+        3.10,
+        within=(0.0, 10.0),
+        symbol=r"\beta_{\rm syn}",
+        zero=False,
+        hint="T ~ nu^-beta_syn, so jaxsky.templates.from_pysm_beta makes 3.1 of an index of -3.1",
+    )
+    curvature: Parameter = parameter(0.0, symbol="C")
+    nu_piv: Parameter = parameter(23.0, positive=True, symbol=r"\nu_{\rm piv}", unit="GHz")
+    nu_ref: Parameter = reference(30.0, within=(0.01, 1e3))
+
+    def sed(self, nu):
+        return sed.curved_power_law(nu, self.beta_syn, self.curvature, self.nu_piv, self.nu_ref)
+
+
+class AME(Component, law="ame"):
+    """Anomalous microwave emission with the log-parabola law (`sed.ame_log_parabola`).
+
+    Parameters
+    ----------
+    amplitude : template at nu_ref [uK_RJ], shape (stokes, pix), its Q and U for a polarization
+        fraction of 1; `from_dust_angles` makes one
+    polarization_fraction : what Q and U are multiplied by; 1 for maps that are measured Q and U
+    m60, nu_max : slope at 60 GHz and peak frequency in flux [GHz] (below 60)
+    nu_ref : reference frequency [GHz]
+    """
+
+    amplitude: Float[Array, "stokes pix"] = template()
+    polarization_fraction: Parameter = parameter(1.0, symbol=r"f_{\rm p}")
+    m60: Parameter = parameter(4.0, symbol="m_{60}")
+    nu_max: Parameter = parameter(19.0, positive=True, symbol=r"\nu_{\rm max}", unit="GHz")
+    nu_ref: Parameter = reference(23.0, within=(0.01, 1e3))
+
+    def __check_init__(self) -> None:
+        nu_max = as_array("nu_max", self.nu_max)
+        if is_concrete(nu_max) and not bool(jnp.all(nu_max < 60)):
+            raise ValueError(f"Argument `nu_max` must be below 60 GHz, but is {nu_max.max():g}.")
+
+    @classmethod
+    def from_dust_angles(
+        cls,
+        intensity: ArrayLike,
+        dust: ArrayLike,
+        polarization_fraction: Parameter = 0.01,
+        **parameters: Any,
+    ) -> "AME":
+        """AME that is polarized along the dust: Q, U = f T (cos, sin)(2 chi), the paper's eq. 5.
+
+        Parameters
+        ----------
+        intensity : AME intensity [uK_RJ], shape (pix,)
+        dust : dust polarization Q, U or I, Q, U in any unit, shape (stokes, pix); the result
+            has the same Stokes parameters. Where the dust is not polarized, nor is the AME.
+        polarization_fraction : f, the paper's 1 %
+        **parameters : further parameters of `AME`
+        """
+        intensity, dust = as_array("intensity", intensity), as_array("dust", dust)
+        form = f"have shape {dust.shape[1:]} like a map of `dust`"
+        check_shape("intensity", intensity, intensity.shape == dust.shape[1:], form)
+        Q, U = dust[-2:]
+        P = jnp.hypot(Q, U)
+        polarized = intensity * dust[-2:] / jnp.where(P > 0, P, 1.0)
+        amplitude = polarized if len(dust) == 2 else jnp.concatenate([intensity[None], polarized])
+        return cls(amplitude, polarization_fraction, **parameters)
+
+    @property
+    def template(self):
+        polarized = self.amplitude[-2:] * self.polarization_fraction
+        return jnp.concatenate([self.amplitude[:-2], polarized])
+
+    def sed(self, nu):
+        return sed.ame_log_parabola(nu, self.m60, self.nu_max, self.nu_ref)
+
+
+def _emissivity(nu: Numeric, T_e: Numeric) -> Float[Array, "..."]:
+    """nu^-2 T_e^-1/2 times the Gaunt factor of Draine (2011), eq. 10.9, with nu in units of GHz."""
+    falling = jnp.exp(5.960 - jnp.sqrt(3) / jnp.pi * jnp.log(nu * (T_e / 1e4) ** -1.5))
+    return jnp.log(falling + jnp.e) / (jnp.sqrt(T_e) * nu**2)
+
+
+@jax.jit
+def amplitude_from_emission_measure(
+    EM: Numeric, T_e: Numeric, nu_ref: Numeric
+) -> Float[Array, "..."]:
+    """Antenna temperature of optically thin free-free emission [uK_RJ] from its emission measure.
+
+    0.05468 T_e^-3/2 nu^-2 EM g_ff is the optical depth of Draine (2011), with nu in GHz and EM in
+    cm^-6 pc; times T_e it is the temperature (Planck 2015 results X, table 4, to first order in
+    the depth).
+    """
+    return jnp.asarray(1e6 * 0.05468 * EM * _emissivity(nu_ref, T_e))
+
+
+class FreeFree(Component, law="free_free"):
+    """Free-free emission, optically thin, with the Gaunt factor of Draine (2011), eq. 10.9.
+
+    (nu/nu_ref)^-2 g_ff(nu, T_e) / g_ff(nu_ref, T_e), with
+    g_ff = ln{exp[5.960 - sqrt(3)/pi ln(nu/GHz (T_e/10^4 K)^-3/2)] + e}. It is not polarized.
+
+    Parameters
+    ----------
+    amplitude : template at nu_ref [uK_RJ], I, Q, U with nothing in Q and U, shape (3, pix);
+        `amplitude_from_emission_measure` makes the one of I
+    T_e : electron temperature [K]
+    nu_ref : reference frequency [GHz]
+    """
+
+    polarized: ClassVar[bool] = False
+
+    amplitude: Float[Array, "stokes pix"] = template()
+    T_e: Parameter = parameter(7000.0, positive=True, symbol=r"T_{\rm e}", unit="K", zero=False)
+    nu_ref: Parameter = reference(30.0, within=(0.01, 1e3))
+
+    def sed(self, nu):
+        return _emissivity(nu, self.T_e) / _emissivity(self.nu_ref, self.T_e)
+
+
+class CMB(Component, law="cmb"):
+    """The CMB anisotropies: the derivative of a black body (`sed.cmb_derivative`).
+
+    Parameters
+    ----------
+    amplitude : map in thermodynamic temperature [uK_CMB], shape (stokes, pix)
+    T_cmb : temperature of the monopole [K]
+    """
+
+    unit: ClassVar[str] = "uK_CMB"
+
+    amplitude: Float[Array, "stokes pix"] = template()
+    T_cmb: Parameter = parameter(T_CMB, positive=True, symbol=r"T_{\rm CMB}", unit="K", zero=False)
+
+    def sed(self, nu):
+        return sed.cmb_derivative(nu, self.T_cmb)

@@ -29,7 +29,7 @@ from benchmarks.separation_runs import (
 )
 from benchmarks.table import Row, time_text
 from benchmarks.timing import Usage, interleave, seconds, usage
-from fits.priors import Uniform
+from fits.posterior import Uniform
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.sampling import sample
 from jaxsky import Bandpass, observe

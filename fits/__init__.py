@@ -10,19 +10,18 @@ from jaxsky.public import exported  # before all else
 if TYPE_CHECKING:
     from fits.commands.forecast import forecast
     from fits.comparison import compare
+    from fits.compress import as_noise
     from fits.fisher import fisher_errors
-    from fits.grid import grid_fit
     from fits.multipoles import harmonic_coefficients, harmonic_likelihood
-    from fits.noise import as_noise
     from fits.optimize import Newton, best_fit
-    from fits.posterior import chi2, fisher_matrix
-    from fits.priors import Gaussian, Uniform
+    from fits.posterior import Gaussian, Uniform, chi2, fisher_matrix
     from fits.profile_likelihood import spectral_likelihood
     from fits.pseudo_cl import band_powers, bin_edges, masked_spectra
     from fits.regions import apodize, clusters, superpixels
-    from fits.results import FitError, FitResult
+    from fits.results import Convergence, FitError, FitResult
     from fits.sampling import sample
     from fits.separated_maps import component_maps, harmonic_component_maps, separate
+    from fits.spectral_index import grid_fit
     from fits.template_likelihood import likelihood
     from fits.tensor_ratio import fit_tensors, power_model
 

@@ -18,8 +18,7 @@ from jaxtyping import Array, Float
 
 from fits.kept import KeptChain, fingerprint, kept_realisations
 from fits.optimize import best_fit
-from fits.posterior import Likelihood, Posterior, value_and_gradient
-from fits.priors import Gaussian, Prior, priors_of
+from fits.posterior import Gaussian, Likelihood, Posterior, Prior, priors_of, value_and_gradient
 from fits.profile_likelihood import SpectralLikelihood
 from fits.pseudo_cl import (
     LEAST_WINDOW,
@@ -29,7 +28,7 @@ from fits.pseudo_cl import (
     masked_spectra,
     mean_spectrum,
 )
-from fits.results import FitResult, misfit
+from fits.results import Convergence, FitResult
 from fits.sampling import sample
 from fits.separated_data import FullSkyData, PixelData
 from fits.systems import Factor
@@ -187,13 +186,13 @@ def separate_data(
         like = data.likelihood(data.observed)
     fit = best_fit(like, priors=priors, throw=False)
     # What no law describes is separated nevertheless, and said.
-    fit.checked(throw=fit.message != misfit(fit.chi2, fit.dof))
+    fit.checked(throw=fit.converged is not Convergence.misfit)
     response = Response(like, fit.best_fit, priors)
     progress.step("components")
     best = like.named(jnp.asarray(response.theta))
     found = data.components(like, best, data.observed)
     maps = data.maps(found, like, best, data.observed)
-    amplitude = maps if data.in_pixels else found.amplitude
+    amplitude = found.amplitude if data.exact else maps
     row = found.components.index("cmb")
 
     progress.step("simulations")

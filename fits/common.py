@@ -1,28 +1,209 @@
-"""Templates, maps and their noise at a common resolution, where they can be compared."""
+"""Templates, maps and their noise at a common resolution, where they can be compared.
 
-from collections.abc import Mapping, Sequence
+There the noise of a band is a linear operator applied to white noise, and the CMB is synthesised
+from independent coefficients, one set for all bands. The inner products of rows with the data
+therefore have a covariance that follows exactly from a few transposed transforms of the rows; no
+simulation, no matrix over pixels.
+"""
+
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 from jaxtyping import Array, Bool, Float
 
-from fits.fluctuations import Fluctuations
-from fits.inputs import Inputs
-from fits.kept import fingerprint
+from fits.compress import Noise, as_noise, chunks
+from fits.inputs import Inputs, prepare_component
+from fits.kept import remembered
+from fits.regions import common_holes
 from fits.template_likelihood import CovarianceOf, SkyLikelihood, likelihood
-from fits.template_noise import TemplateErrors
+from fits.template_noise import TemplateErrors, template_errors
 from jaxsky import Bandpass, Sky, observe
 from jaxsky.checks import Numeric
-from jaxsky.components import Component
-from jaxsky.harmonics import Preparation, beam_ratio, gaussian_beam, pixel_window
-from jaxsky.noise import pixel_covariance
+from jaxsky.cmb import realisation
+from jaxsky.harmonics import (
+    Preparation,
+    adjoint_synthesis,
+    alm_ell,
+    average_pixels,
+    beam_ratio,
+    expand,
+    gaussian_beam,
+    map_variance,
+    pixel_window,
+    synthesis,
+)
+from jaxsky.noise import draw, pixel_covariance, stream, white_alm
 from jaxsky.settings import Experiment, at_key
 
 #: A pixel is used if no more than this fraction of what was smoothed or averaged was missing.
 MISSING = 0.01
+#: Pixels whose products are added up at once; few enough to stay in cache.
+CHUNK = 1 << 16
+
+
+class MapNoise(NamedTuple):
+    """Noise of Q and U of a map, which the preparation brings to the common resolution.
+
+    `noise` is that of its own pixels, a level [uK_RJ arcmin] or the covariance of Q and U in each
+    [uK_RJ^2]; `correlated` C_l of noise that is correlated between pixels, the same for E and B, in
+    the prepared map [uK_RJ^2], None where there is none.
+    """
+
+    preparation: Preparation
+    noise: Numeric
+    correlated: Float[Array, " ell"] | None
+
+    def covariance(self, rows: Float[Array, "row stokes pix"]) -> Float[np.ndarray, "row row"]:
+        """Covariance of the inner products of rows with the prepared noise.
+
+        The rows at the resolution of the noise are kept in its precision.
+        """
+        count = len(rows)
+        block = np.zeros((count, count))
+        if np.ndim(self.noise) or self.noise:
+            noise = pixel_covariance(self.noise, self.preparation.nside_in)
+            before = [
+                np.asarray(self.preparation.transpose(row).astype(noise.dtype).block_until_ready())
+                for row in rows
+            ]
+            covariance = np.asarray(noise)
+            for cut in chunks(covariance.shape[-1], CHUNK):
+                maps = np.array([row[:, cut] for row in before], dtype=float)
+                seen = np.einsum("stp,jtp->jsp", covariance[..., cut].astype(float), maps)
+                block += maps.reshape(count, -1) @ seen.reshape(count, -1).T
+            block = (block + block.T) / 2
+        if self.correlated is None:
+            return block
+        modes = np.asarray(_modes(rows, np.stack([self.correlated] * 2)))
+        return block + modes @ modes.T
+
+    def alm(self, key: Array, name: str) -> Float[Array, "2 alm"]:
+        """Coefficients E and B of a realisation of smoothed noise, by the name of the map."""
+        window = self.preparation.window
+        assert window is not None  # there is a common beam
+        white = white_alm(stream(key, "noise", name), self.noise, window.size - 1) * expand(window)
+        return white if self.correlated is None else white + self._correlated_alm(key, name)
+
+    def _correlated_alm(self, key: Array, name: str) -> Float[Array, "2 alm"]:
+        spectrum = jnp.asarray(self.correlated)
+        white = jax.random.normal(stream(key, "correlated", name), (2, spectrum.size**2))
+        return white * expand(jnp.sqrt(spectrum))
+
+    def realisation(self, key: Array, name: str) -> Float[Array, "stokes pix"]:
+        """Noise at the common resolution [uK_RJ]; its random numbers come from the name."""
+        nside = self.preparation.nside
+        if self.preparation.window is not None:
+            return synthesis(self.alm(key, name), nside)
+        pixels = jnp.asarray(pixel_covariance(self.noise, self.preparation.nside_in), float)
+        total = average_pixels(draw(stream(key, "noise", name), pixels), nside)
+        if self.correlated is None:
+            return total
+        return total + synthesis(self._correlated_alm(key, name), nside)
+
+    def variance(self) -> Float[np.ndarray, "stokes pix"]:
+        """Variance in each pixel of the prepared map [uK_RJ^2]; see `Fluctuations.sigma`."""
+        if np.ndim(self.noise):
+            pixels = jnp.asarray(self.noise)
+            total = np.asarray(self.preparation.variance([pixels[s, s] for s in range(2)]))
+        else:
+            shape = (2, healpy.nside2npix(self.preparation.nside))
+            total = np.full(shape, self.preparation.uniform_variance(float(self.noise)))
+        return total if self.correlated is None else total + map_variance(self.correlated)
+
+
+class Fluctuations(eqx.Module):
+    """What Q, U maps in several bands hold besides the model: noise and CMB.
+
+    Parameters
+    ----------
+    preparations, noise, correlated : of each band; see `MapNoise`
+    cmb_spectra : C_l of EE and BB [uK_CMB^2], shape (2, ell); None without CMB
+    cmb_windows : beam and pixel window of the prepared maps of each band, shape (band, ell)
+    cmb_factors : uK_RJ per uK_CMB in each band, shape (band,)
+    names : of the bands; the random numbers of each come from its name
+    """
+
+    preparations: tuple[Preparation, ...]
+    noise: tuple[Numeric, ...]
+    correlated: tuple[Float[Array, " ell"] | None, ...]
+    cmb_spectra: Float[Array, "stokes ell"] | None
+    cmb_windows: Float[Array, "band ell"] | None
+    cmb_factors: Float[Array, " band"]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def noises(self) -> dict[str, MapNoise]:
+        """The noise of each band by name."""
+        each = map(MapNoise, self.preparations, self.noise, self.correlated)
+        return dict(zip(self.names, each, strict=True))
+
+    # Not one program: XLA would hold the maps of all rows and bands at once.
+    def covariance(
+        self, rows: Float[Array, "band row stokes pix"]
+    ) -> Float[np.ndarray, "bandrow bandrow"]:
+        """Covariance of the inner products of rows with the fluctuations of each band."""
+        blocks = [one.covariance(own) for one, own in zip(self.noises.values(), rows, strict=True)]
+        total = scipy.linalg.block_diag(*blocks)
+        if self.cmb_spectra is None or self.cmb_windows is None:
+            return total
+        spectra = np.asarray(self.cmb_spectra)
+        bands = zip(self.cmb_factors, self.cmb_windows, rows, strict=True)
+        modes = np.concatenate(
+            [
+                np.asarray(factor) * _modes(own, spectra * np.asarray(window) ** 2)
+                for factor, window, own in bands
+            ]
+        )
+        return total + modes @ modes.T
+
+    # Not one program: in that XLA draws the normals anew for each row.
+    def noise_realisation(self, key: Array) -> Float[Array, "band stokes pix"]:
+        """Noise of all bands at the common resolution [uK_RJ]."""
+        return jnp.stack([noise.realisation(key, name) for name, noise in self.noises.items()])
+
+    @eqx.filter_jit
+    def cmb_realisation(self, key: Array) -> Float[Array, "band stokes pix"]:
+        """The CMB in all bands at the common resolution [uK_RJ]; zero without CMB."""
+        nside = self.preparations[0].nside
+        if self.cmb_spectra is None or self.cmb_windows is None:
+            return jnp.zeros((len(self.preparations), 2, healpy.nside2npix(nside)))
+        EE, BB = self.cmb_spectra
+        zero = jnp.zeros_like(EE)
+        alm = realisation(stream(key, "cmb"), jnp.stack([zero, EE, BB, zero]))
+        seen = self.cmb_factors[:, None] * self.cmb_windows
+        return jnp.stack([synthesis(alm * expand(window), nside) for window in seen])
+
+    def cmb_power(self) -> Float[np.ndarray, "band 2 ell"]:
+        """Mean spectra EE and BB of the CMB in the maps of each band [uK_RJ^2]."""
+        if self.cmb_spectra is None or self.cmb_windows is None:
+            return np.zeros((len(self.preparations), 2, 1))
+        seen = np.asarray(self.cmb_factors)[:, None] * np.asarray(self.cmb_windows)
+        return seen[:, None] ** 2 * np.asarray(self.cmb_spectra)
+
+    def sigma(self) -> Float[Array, "band stokes pix"]:
+        """Standard deviation of the noise in each pixel of the prepared maps [uK_RJ].
+
+        NaN where it cannot be had: next to steps of the noise by more than a factor of some
+        hundred, where the smoothed map of variances rings below zero.
+        """
+        total = np.stack([noise.variance() for noise in self.noises.values()])
+        return jnp.asarray(np.sqrt(np.where(total > 0, total, np.nan)))
+
+
+@jax.jit
+def _modes(
+    rows: Float[Array, "row stokes pix"], spectra: Float[Array, "stokes ell"]
+) -> Float[Array, "row mode"]:
+    """Rows as seen by independent modes of unit variance that have the spectra of E and B."""
+    lmax = spectra.shape[-1] - 1
+    root = jnp.sqrt(spectra)[:, alm_ell(lmax)]
+    return jnp.stack([(root * adjoint_synthesis(row, lmax)).ravel() for row in rows])
 
 
 class CommonMaps(NamedTuple):
@@ -83,16 +264,12 @@ class CommonMaps(NamedTuple):
             template_errors=self.template_errors,
         )
 
-    def noise_shares(self, region: Bool[np.ndarray, " pix"], stokes: str) -> dict[str, float]:
-        """Part of the weighted power of each template that is its noise."""
-        assert self.sky is not None
-        assert self.template_errors is not None  # as called
-        keep = np.array([s in stokes for s in "QU"])
-        inside = self.used & region & np.isfinite(self.sigma) & keep[:, None]
-        weights = np.where(inside, 1 / np.asarray(self.sigma) ** 2, 0.0)
-        templates = np.stack([c.amplitude for c in self.sky.components.values()])
-        shares = self.template_errors.shares(np.where(self.used, templates, 0.0), weights)
-        return dict(zip(self.sky, shares.tolist(), strict=True))
+    def pixel_noise(
+        self, used: Bool[np.ndarray, " pix"], factors: Float[np.ndarray, " band"]
+    ) -> Noise:
+        """Noise as spectral likelihoods take it, in units of which uK_RJ has `factors`."""
+        sigma = np.asarray(self.sigma) * factors[:, None, None]
+        return as_noise(np.where(used, sigma, np.inf), sigma.shape)
 
 
 def prepared_maps(settings: Experiment, inputs: Inputs) -> CommonMaps:
@@ -127,7 +304,7 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         else Preparation.averaging(nsides[what], nside, what)
         for what, (_, own) in given.items()
     }
-    holes = _common_holes([used for used, _ in given.values()]) if fwhm else {}
+    holes = common_holes([used for used, _ in given.values()]) if fwhm else {}
     kept = {what: holes.get(own) for what, own in nsides.items()}
 
     used = np.ones(healpy.nside2npix(nside), bool)
@@ -159,11 +336,29 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         (brought(f"band {name!r}", band.maps) - leakage.get(name, 0.0)).block_until_ready()
         for name, band in inputs.bands.items()
     ]
-    fluctuations = _fluctuations(
-        inputs, [operators[w] for w in bands], [kept[w] for w in bands], fwhm, lmax
-    )
+    # Averaged pixels hold multipoles beyond those they resolve.
+    reach = lmax if fwhm else 4 * nside
+
+    def noise_of(what: str, noise: Numeric, spectrum: Float[Array, " ell"] | None) -> MapNoise:
+        """Noise of the pixels that are kept, and C_l of what is correlated between them."""
+        operator, own = operators[what], kept[what]
+        if own is not None:
+            noise = pixel_covariance(noise, operator.nside_in) * own
+        if spectrum is not None:
+            spectrum = spectrum[: reach + 1] * window_of(operator, reach) ** 2
+        return MapNoise(operator, noise, spectrum)
+
+    noises = [noise_of(what, band.noise, band.correlated) for what, band in bands.items()]
+    each, cmb = zip(*noises, strict=True), _cmb(inputs, nside, fwhm, reach)
+    preparations, noise, correlated = each
+    fluctuations = Fluctuations(preparations, noise, correlated, *cmb, tuple(inputs.bands))
     sigma = fluctuations.sigma()
     known = np.asarray(jnp.isfinite(sigma).all(axis=(0, 1)))
+    own_noise = {
+        name: noise_of(f"template {name!r}", one.noise, one.correlated)
+        for name, one in inputs.template_noise.items()
+        if one.own
+    }
     return CommonMaps(
         Sky(sky) if sky else None,
         {name: band.bandpass for name, band in inputs.bands.items()},
@@ -173,166 +368,28 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         fluctuations,
         leakage,
         nsides,
-        _remembered(fluctuations.covariance),
-        _template_errors(inputs, operators, kept, fluctuations, lmax if fwhm else 4 * nside),
+        remembered(fluctuations.covariance),
+        template_errors(list(sky), inputs.template_noise, own_noise, fluctuations.noises),
     )
 
 
-def _fluctuations(
-    inputs: Inputs,
-    operators: Sequence[Preparation],
-    kept: Sequence[np.ndarray | None],
-    fwhm: float,
-    lmax: int,
-) -> Fluctuations:
-    """Noise and CMB of the bands at the common resolution.
-
-    Parameters
-    ----------
-    inputs : the bands
-    operators, kept : of each band, and the pixels of it that are not holes; None if there are none
-    fwhm, lmax : common beam [arcmin], 0 for averages of pixels, and largest multipole
-    """
+def _cmb(
+    inputs: Inputs, nside: int, fwhm: float, lmax: int
+) -> tuple[Array | None, Array | None, Array]:
+    """What `Fluctuations` have of the CMB."""
     bands = inputs.bands.values()
     factors = jnp.stack([band.bandpass.conversion("uK_CMB", "uK_RJ") for band in bands])
-    nside = operators[0].nside
-    if not fwhm:  # averaged pixels hold multipoles beyond those they resolve
-        lmax = 4 * nside
-    spectra = windows = None
-    if inputs.cmb is not None:
-        windows = jnp.stack([beam_ratio(fwhm or band.beam, 0.0, lmax) for band in bands])
-        if not fwhm:
-            windows = windows * pixel_window(nside, lmax)
-        spectra = jnp.asarray(inputs.cmb(lmax)[1:3])
-    noise = tuple(
-        _without_holes(band.noise, op, own)
-        for op, band, own in zip(operators, bands, kept, strict=True)
-    )
-    correlated = tuple(
-        prepared_spectrum(band.correlated, op, lmax)
-        for op, band in zip(operators, bands, strict=True)
-    )
-    return Fluctuations(
-        tuple(operators),
-        noise,
-        correlated,
-        spectra,
-        windows,
-        factors,
-        tuple(inputs.bands),
-    )
+    if inputs.cmb is None:
+        return None, None, factors
+    windows = jnp.stack([beam_ratio(fwhm or band.beam, 0.0, lmax) for band in bands])
+    if not fwhm:
+        windows = windows * pixel_window(nside, lmax)
+    return jnp.asarray(inputs.cmb(lmax)[1:3]), windows, factors
 
 
-def _without_holes(noise: Numeric, operator: Preparation, kept: np.ndarray | None) -> Numeric:
-    """Noise of the pixels that are kept."""
-    return noise if kept is None else pixel_covariance(noise, operator.nside_in) * kept
-
-
-def _template_errors(
-    inputs: Inputs,
-    operators: Mapping[str, Preparation],
-    kept: Mapping[str, np.ndarray | None],
-    fluctuations: Fluctuations,
-    lmax: int,
-) -> TemplateErrors | None:
-    """Noise of the templates at the common resolution; None where there is none."""
-    noises, names = inputs.template_noise, list(inputs.templates)
-    own = [name for name, one in noises.items() if one.own]
-    bands = [b for b in fluctuations.names if any(b in one.shared for one in noises.values())]
-    if not own and not bands:
-        return None
-    preparations = [operators[f"template {name!r}"] for name in own]
-    noise = [
-        _without_holes(noises[name].noise, op, kept[f"template {name!r}"])
-        for name, op in zip(own, preparations, strict=True)
-    ]
-    spectra = [
-        prepared_spectrum(noises[name].correlated, op, lmax)
-        for name, op in zip(own, preparations, strict=True)
-    ]
-    which = list(map(fluctuations.names.index, bands))
-    sources = Fluctuations(
-        (*preparations, *(fluctuations.preparations[b] for b in which)),
-        (*noise, *(fluctuations.noise[b] for b in which)),
-        (*spectra, *(fluctuations.correlated[b] for b in which)),
-        None,
-        None,
-        jnp.ones(len(own) + len(bands)),
-        (*own, *bands),
-    )
-    shared = [noises[n].shared if n in noises else {} for n in names]
-    parts = [
-        [float(n == name) for name in own] + [one.get(band, 0.0) for band in bands]
-        for n, one in zip(names, shared, strict=True)
-    ]
-    of_band = [[0.0] * len(own) + [float(b == name) for b in bands] for name in fluctuations.names]
-    variance = jnp.nan_to_num(sources.sigma() ** 2)
-    covariance_of = _remembered(sources.covariance)
-    return TemplateErrors(covariance_of, np.array(parts), np.array(of_band), variance)
-
-
-def prepare_component(
-    component: Component, preparation: Preparation, kept: Bool[np.ndarray, " pix"] | None = None
-) -> Component:
-    """A component with its amplitude, and parameters that are maps, at the common resolution.
-
-    Parameters
-    ----------
-    component, preparation : what is prepared, and how
-    kept : pixels of the amplitude that are not set to zero; default all
-    """
-
-    def brought(leaf):
-        if leaf.ndim not in (1, 2):
-            return leaf
-        values = jnp.atleast_2d(jnp.asarray(leaf, float))
-        if leaf.ndim == 2:
-            values = values if kept is None else values * kept
-        prepared = preparation(values).block_until_ready()
-        return prepared if leaf.ndim == 2 else prepared[0]
-
-    return jax.tree.map(brought, component)
-
-
-def _remembered(covariance_of: CovarianceOf) -> CovarianceOf:
-    """A covariance that is made once for rows that come again, as for each choice of Stokes."""
-    last: dict[str, Float[np.ndarray, "row row"]] = {}
-
-    def remembered(rows: Float[Array, "band row stokes pix"]) -> Float[np.ndarray, "row row"]:
-        mark = fingerprint(rows)
-        if mark not in last:
-            last.clear()
-            last[mark] = covariance_of(rows)
-        return last[mark]
-
-    return remembered
-
-
-def _common_holes(maps: Sequence[Bool[np.ndarray, " pix"]]) -> dict[int, np.ndarray]:
-    """Pixels that no map misses, at each nside of the maps; empty if none misses any.
-
-    Smoothing spreads what surrounds a hole into it and the hole into what surrounds it, so all
-    maps, templates and data, get the same holes.
-    """
-    if all(used.all() for used in maps):
-        return {}
-    nsides = {healpy.npix2nside(used.size) for used in maps}
-    return {
-        nside: np.logical_and.reduce(
-            [healpy.ud_grade(u.astype(float), nside) > 0.999 for u in maps]
-        )
-        for nside in nsides
-    }
-
-
-def prepared_spectrum(
-    spectrum: Float[Array, " ell"] | None, preparation: Preparation, lmax: int
-) -> Float[Array, " ell"] | None:
-    """Spectrum of a prepared map, from that before."""
-    if spectrum is None:
-        return None
-    window = preparation.window
-    if window is None:
-        pixels = pixel_window(preparation.nside, lmax) / pixel_window(preparation.nside_in, lmax)
-        window = jnp.asarray(pixels)
-    return spectrum[: lmax + 1] * window[: lmax + 1] ** 2
+def window_of(preparation: Preparation, lmax: int) -> Float[Array, " ell"]:
+    """What a preparation multiplies the multipoles of a map with."""
+    if preparation.window is not None:
+        return preparation.window[: lmax + 1]
+    pixels = pixel_window(preparation.nside, lmax) / pixel_window(preparation.nside_in, lmax)
+    return jnp.asarray(pixels)

@@ -1,8 +1,8 @@
 """Observed maps against the model of foregrounds, CMB and noise: the paper's section 4.
 
 Pixel by pixel: the slope of the observed maps against the model, with an honest error. How far
-from the model maps may be by chance is seen in simulated noise and CMB. And on small patches, as
-in the paper's figure 10: their power laws against those of the model.
+from the model maps may be by chance is seen in simulated noise and CMB. Spectra EE and BB of the
+full sky likewise, against those of the complete model.
 """
 
 import itertools
@@ -11,29 +11,25 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 from jaxtyping import Array, Bool, Float
 
-from fits.common import CommonMaps, common_maps, prepared_spectrum
-from fits.discs import EDGES, PreparedPatches, paper_patches, prepare_patches
-from fits.full_sky import LMIN, BandSpectra, compare_spectra, polarization_alms
-from fits.inputs import Band, Inputs
+from fits.common import CommonMaps
 from fits.kept import fingerprint, kept_realisations
-from fits.patches import PatchFits, fit_patches
-from fits.pseudo_cl import bin_edges
-from fits.writing import probability
-from jaxsky.harmonics import (
-    average_pixels,
-    beam_ratio,
-    gaussian_beam,
-    pixel_window,
-    power_spectrum,
+from fits.pseudo_cl import (
+    EDGES,
+    LMIN,
+    bin_centers,
+    bin_edges,
+    cosmic_error,
+    hotelling,
+    polarization_alms,
 )
-from jaxsky.noise import pixel_covariance, realisation_key, stream
+from fits.results import probability
+from jaxsky.harmonics import power_spectrum
 from jaxsky.programs import QUIET
 from jaxsky.settings import Experiment, SettingsError
 
@@ -90,6 +86,49 @@ class Scatter(NamedTuple):
     def slope_pte(self) -> float:
         """Probability of a slope as far from 1 in either direction."""
         return float(2 * scipy.stats.norm.sf(abs(self.slope - 1) / self.error))
+
+
+class BandSpectra(NamedTuple):
+    """EE and BB of one band; C_l in uK_RJ^2 at all multipoles, D_l in bins.
+
+    `uncorrected` is the observed map's before leakage was subtracted, or None, and so with its bins
+    and probability. `complete` is the model's foregrounds and one realisation of CMB and noise,
+    `noise` the mean of realisations, the paper's N_l, and `error` its Delta C_l, sqrt(2 / (2l+1))
+    (C_l^CMB + N_l). `mean` and `std` are those of realisations of the complete model, among which
+    chi2 and its probability are those of the observed bins (`hotelling`), for EE and BB.
+    """
+
+    band: str
+    observed: Float[np.ndarray, "2 ell"]
+    uncorrected: Float[np.ndarray, "2 ell"] | None
+    foregrounds: Float[np.ndarray, "2 ell"]
+    complete: Float[np.ndarray, "2 ell"]
+    noise: Float[np.ndarray, "2 ell"]
+    cmb: Float[np.ndarray, "2 ell"]
+    error: Float[np.ndarray, "2 ell"]
+    edges: tuple[int, ...]
+    binned: Float[np.ndarray, "2 bin"]
+    binned_uncorrected: Float[np.ndarray, "2 bin"] | None
+    mean: Float[np.ndarray, "2 bin"]
+    std: Float[np.ndarray, "2 bin"]
+    chi2: Float[np.ndarray, " 2"]
+    pte: Float[np.ndarray, " 2"]
+    pte_uncorrected: Float[np.ndarray, " 2"] | None
+
+    @property
+    def centers(self) -> Float[np.ndarray, " bin"]:
+        """Middle multipole of each bin."""
+        return bin_centers(self.edges)
+
+    @property
+    def chi2_bins(self) -> Float[np.ndarray, "2 bin"]:
+        """((observed - mean) / std)^2 in each bin."""
+        return ((self.binned - self.mean) / self.std) ** 2
+
+    @property
+    def largest_error(self) -> Float[np.ndarray, " 2"]:
+        """Largest of the paper's errors as a fraction of the observed spectrum."""
+        return (self.error[:, LMIN:] / self.observed[:, LMIN:]).max(axis=-1)
 
 
 class Comparison(NamedTuple):
@@ -188,7 +227,7 @@ def compare(
     scatters = compare_pixels(prepared, model, used, simulated)
     spectra = []
     if prepared.used.all():
-        spectra = compare_spectra(prepared, model, simulated.spectra, simulated.noise, how.width)
+        spectra = compare_spectra(prepared, model, simulated, how.width)
     return Comparison(prepared, model, used, scatters, spectra)
 
 
@@ -279,105 +318,75 @@ def compare_pixels(
     return scatters
 
 
-class PatchComparison(NamedTuple):
-    """A and alpha of the patches in one band.
+def compare_spectra(
+    prepared: CommonMaps,
+    model: Float[Array, "band stokes pix"],
+    simulated: ComparisonRealisations,
+    width: int,
+) -> list[BandSpectra]:
+    """Spectra of the observed maps against those of the complete model.
 
-    Fits to the map, and to the model: foregrounds with a realisation of CMB and noise. `overlap` is
-    the fraction of modes that patches have in common.
+    They are those of the full sky, which the paper takes: no mode of E shows as B there. `width`
+    counts the multipoles in a bin.
     """
-
-    band: str
-    observed: PatchFits
-    model: PatchFits
-    overlap: Float[np.ndarray, "patch patch"]
-
-    def detected(self, index: int) -> np.ndarray:
-        """Patches that show EE (0) or BB (1) in both."""
-        return self.observed.detected[:, index] & self.model.detected[:, index]
-
-    def ratio(self, index: int) -> tuple[float, float]:
-        """Mean logarithm of A observed over A of the model, as a factor, and its error.
-
-        The error is that of the scatter over the patches that show EE (0) or BB (1), with what
-        these have in common.
-        """
-        both = self.detected(index)
-        logs = np.log(self.observed.A[both, index] / self.model.A[both, index])
-        mean, error = self._mean(logs, both)
-        return float(np.exp(mean)), float(np.exp(mean)) * error
-
-    def _mean(self, values: np.ndarray, patches: np.ndarray) -> tuple[float, float]:
-        """Mean over patches, and its error; NaN for less than two."""
-        if (count := len(values)) < 2:
-            return float("nan"), float("nan")
-        shared = self.overlap[np.ix_(patches, patches)].sum() / count
-        return float(values.mean()), float(values.std(ddof=1) * np.sqrt(shared / count))
-
-    def slope_difference(self, index: int) -> tuple[float, float]:
-        """Mean of alpha observed less alpha of the model, and its error, over the same patches."""
-        both = self.detected(index)
-        difference = (self.observed.alpha - self.model.alpha)[both, index]
-        return self._mean(difference, both)
-
-    def correlation(self, index: int) -> tuple[float, float]:
-        """Pearson's coefficient of log A and of alpha between map and model."""
-        both = self.detected(index)
-        if both.sum() < 3:
-            return float("nan"), float("nan")
-        pairs = (
-            np.log([self.observed.A[both, index], self.model.A[both, index]]),
-            [self.observed.alpha[both, index], self.model.alpha[both, index]],
+    if missing := int(np.sum(~prepared.used)):
+        raise ValueError(
+            f"Spectra of the full sky need all pixels, but {missing} of {prepared.used.size} have "
+            "no value."
         )
-        A, alpha = (float(np.corrcoef(*pair)[0, 1]) for pair in pairs)
-        return A, alpha
+    lmax = simulated.spectra.shape[-1] - 1
+    edges = bin_edges(LMIN, lmax, width)
+    observed = np.asarray(power_spectrum(polarization_alms(prepared.data, lmax)))
+    foregrounds = np.asarray(power_spectrum(polarization_alms(model, lmax)))
+    noise = simulated.noise.mean(axis=0)
+    cmb = np.zeros_like(noise)
+    theory = prepared.fluctuations.cmb_power()[..., : lmax + 1]
+    cmb[..., : theory.shape[-1]] = theory
+    error = np.asarray(cosmic_error(jnp.asarray(cmb + noise)))
+    results = []
+    for b, band in enumerate(prepared.bands):
+        sims = _binned(simulated.spectra[:, b], edges)
+        before = binned_before = pte_before = None
+        if band in prepared.leakage:
+            maps = prepared.data[b] + prepared.leakage[band]
+            before = np.asarray(power_spectrum(polarization_alms(maps[None], lmax)))[0]
+            binned_before = _binned(before, edges)
+            _, pte_before = _tested(binned_before, sims)
+        binned = _binned(observed[b], edges)
+        chi2, pte = _tested(binned, sims)
+        results.append(
+            BandSpectra(
+                band,
+                observed[b],
+                before,
+                foregrounds[b],
+                simulated.spectra[0, b],
+                noise[b],
+                cmb[b],
+                error[b],
+                edges,
+                binned,
+                binned_before,
+                sims.mean(axis=0),
+                sims.std(axis=0, ddof=1),
+                chi2,
+                pte,
+                pte_before,
+            )
+        )
+    return results
 
 
-def _patch_noise(
-    band: Band, prepared: CommonMaps, patches: PreparedPatches
-) -> Float[np.ndarray, "patch 2 ell"]:
-    """Spectrum of the noise in the prepared maps, on each patch that of its own pixels."""
-    (preparation,), lmax = prepared.fluctuations.preparations, patches.spectra[0].lmax
-    covariance = pixel_covariance(band.noise, preparation.nside_in)
-    variance = average_pixels(jnp.stack([covariance[0, 0], covariance[1, 1]]), preparation.nside)
-    weights = np.stack([one.mask**2 for one in patches.spectra])
-    # Q and U turn into each other on a patch, and E and B have the mean of both.
-    mean = np.asarray(variance).mean(axis=0) @ weights.T / weights.sum(axis=1)
-    white = mean * healpy.nside2pixarea(preparation.nside_in)
-    total = white[:, None] * np.asarray(prepared_spectrum(jnp.ones(lmax + 1), preparation, lmax))
-    if (correlated := prepared.fluctuations.correlated[0]) is not None:
-        total[:, : correlated.size] += np.asarray(correlated)[: lmax + 1]
-    return np.repeat(total[:, None], 2, axis=1)
+def _binned(spectra: Float[np.ndarray, "... ell"], edges: tuple[int, ...]) -> np.ndarray:
+    """Mean D_l = l (l+1) C_l / 2 pi of each bin."""
+    ell = np.arange(spectra.shape[-1])
+    scaled = ell * (ell + 1) / (2 * np.pi) * spectra
+    means = [scaled[..., a:b].mean(axis=-1) for a, b in itertools.pairwise(edges)]
+    return np.stack(means, axis=-1)
 
 
-def compare_patches(settings: Experiment, inputs: Inputs) -> PatchComparison:
-    """The paper's 48 discs and the field of BICEP2, in the band that the settings name."""
-    name, nside = str(settings.compare.patches), settings.compare.patches_nside
-    fwhm = settings.common.fwhm
-    band = inputs.bands[name]
-    prepared = common_maps(inputs._replace(bands={name: band}), nside, fwhm)
-    window = beam_ratio(fwhm or band.beam, 0.0, 2 * nside)
-    if not fwhm:  # averages of pixels, with the beam of the map
-        window = window * pixel_window(nside, 2 * nside)
-    patches = prepare_patches(paper_patches(nside), np.asarray(window))
-    # Correlations of the powers of a field that has all scales alike, 1 for a patch itself.
-    squares = np.stack([one.mask**2 for one in patches.spectra])
-    squares /= np.linalg.norm(squares, axis=1, keepdims=True)
-    noise = _patch_noise(band, prepared, patches)
-    # Realisations of their own, unlike those of what is observed.
-    key = stream(realisation_key(settings.seed), "patches")
-    model = prepared.model()[0]
-    fluctuations = prepared.fluctuations
-    model = model + fluctuations.noise_realisation(key)[0] + fluctuations.cmb_realisation(key)[0]
-    return PatchComparison(
-        name,
-        fit_patches(prepared.data[0], patches, noise=noise),
-        fit_patches(model, patches, noise=noise),
-        squares @ squares.T,
-    )
-
-
-def template_patches(maps: Float[Array, "2 pix"], fwhm: float) -> PatchFits:
-    """The same patches in Q and U of a template, at its own beam, taken to be without noise."""
-    nside = healpy.npix2nside(maps.shape[-1])
-    patches = prepare_patches(paper_patches(nside), np.asarray(gaussian_beam(fwhm, 2 * nside)))
-    return fit_patches(maps, patches)
+def _tested(
+    binned: Float[np.ndarray, "2 bin"], simulated: Float[np.ndarray, "sim 2 bin"]
+) -> Float[np.ndarray, "2 2"]:
+    """chi^2 of EE and BB among simulations, and the probabilities to exceed them."""
+    return np.array([hotelling(binned[i], simulated[:, i]) for i in (0, 1)]).T

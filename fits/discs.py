@@ -1,14 +1,22 @@
-"""The paper's small patches of the sky: discs at high latitude, and the field of BICEP2."""
+"""The paper's small patches of the sky: discs at high latitude, and the field of BICEP2.
 
-from collections.abc import Mapping, Sequence
+Their power laws, observed against those of the model, are the paper's figure 10.
+"""
+
 from typing import NamedTuple
 
 import healpy
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from fits.pseudo_cl import MaskedSpectra, masked_spectra
-from jaxsky.harmonics import gaussian_beam, smooth
+from fits.common import CommonMaps, common_maps, window_of
+from fits.inputs import Band, Inputs
+from fits.patches import PatchFits, fit_patches
+from fits.pseudo_cl import PreparedPatches, prepare_patches
+from jaxsky.harmonics import average_pixels, beam_ratio, gaussian_beam, pixel_window, smooth
+from jaxsky.noise import pixel_covariance, realisation_key, stream
+from jaxsky.settings import Experiment
 
 #: Radius of the paper's discs: 400 square degrees.
 RADIUS = 11.3
@@ -16,10 +24,6 @@ RADIUS = 11.3
 APODIZATION = 2.0
 #: The field of BICEP2 and Keck: right ascension within +-50 deg, declination -65 to -50 deg.
 BICEP2 = (50.0, -65.0, -50.0)
-#: The paper's multipoles, 40 to 100, in four bins.
-EDGES = (40, 55, 70, 85, 101)
-#: Matrices of coupling that agree to this belong to the same mask, turned.
-SAME = 2e-3
 
 
 def disc_centers(nside: int = 4, latitude: float = 45.0) -> Float[np.ndarray, "2 disc"]:
@@ -93,59 +97,105 @@ def paper_patches(nside: int) -> dict[str, Float[np.ndarray, " pix"]]:
     return discs | {"BICEP2": bicep2_mask(nside)}
 
 
-class PreparedPatches(NamedTuple):
-    """Patches with all that does not depend on the maps; from `prepare_patches`.
+class PatchComparison(NamedTuple):
+    """A and alpha of the patches in one band.
 
-    `shapes` is the first patch with the same mask but for its place, and `window` is b_l of the
-    maps.
+    Fits to the map, and to the model: foregrounds with a realisation of CMB and noise. `overlap` is
+    the fraction of modes that patches have in common.
     """
 
-    names: tuple[str, ...]
-    spectra: tuple[MaskedSpectra, ...]
-    shapes: tuple[int, ...]
-    window: Float[np.ndarray, " ell"]
+    band: str
+    observed: PatchFits
+    model: PatchFits
+    overlap: Float[np.ndarray, "patch patch"]
 
+    def detected(self, index: int) -> np.ndarray:
+        """Patches that show EE (0) or BB (1) in both."""
+        return self.observed.detected[:, index] & self.model.detected[:, index]
 
-def prepare_patches(
-    patches: Mapping[str, Float[np.ndarray, " pix"]],
-    window: Float[np.ndarray, " ell"],
-    *,
-    edges: Sequence[int] = EDGES,
-    lmax: int | None = None,
-    pure: bool = False,
-) -> PreparedPatches:
-    """Patches with all that does not depend on the maps, for any number of them.
+    def ratio(self, index: int) -> tuple[float, float]:
+        """Mean logarithm of A observed over A of the model, as a factor, and its error.
 
-    Parameters
-    ----------
-    patches : weight of each pixel by the name of the patch, for example `paper_patches(nside)`
-    window : window b_l of the maps (beam and pixels)
-    edges : first multipole of each bin, and the one after the last; three bins at least
-    lmax : see `masked_spectra`
-    pure : purify B, which makes its errors on the paper's discs 20 to 40 % smaller; of patches
-        that are no discs the errors that are returned for B are then up to a third too small
+        The error is that of the scatter over the patches that show EE (0) or BB (1), with what
+        these have in common.
+        """
+        both = self.detected(index)
+        logs = np.log(self.observed.A[both, index] / self.model.A[both, index])
+        mean, error = self._mean(logs, both)
+        return float(np.exp(mean)), float(np.exp(mean)) * error
 
-    Raises
-    ------
-    ValueError
-        For fewer than three bins, no patches, and what `masked_spectra` refuses, with the patch.
-    """
-    if len(edges) < 4:
-        raise ValueError(
-            f"Argument `edges` must give three bins at least, for two parameters, not {edges}."
+    def _mean(self, values: np.ndarray, patches: np.ndarray) -> tuple[float, float]:
+        """Mean over patches, and its error; NaN for less than two."""
+        if (count := len(values)) < 2:
+            return float("nan"), float("nan")
+        shared = self.overlap[np.ix_(patches, patches)].sum() / count
+        return float(values.mean()), float(values.std(ddof=1) * np.sqrt(shared / count))
+
+    def slope_difference(self, index: int) -> tuple[float, float]:
+        """Mean of alpha observed less alpha of the model, and its error, over the same patches."""
+        both = self.detected(index)
+        difference = (self.observed.alpha - self.model.alpha)[both, index]
+        return self._mean(difference, both)
+
+    def correlation(self, index: int) -> tuple[float, float]:
+        """Pearson's coefficient of log A and of alpha between map and model."""
+        both = self.detected(index)
+        if both.sum() < 3:
+            return float("nan"), float("nan")
+        pairs = (
+            np.log([self.observed.A[both, index], self.model.A[both, index]]),
+            [self.observed.alpha[both, index], self.model.alpha[both, index]],
         )
-    spectra: list[MaskedSpectra] = []
-    shapes: list[int] = []
-    if not patches:
-        raise ValueError("Argument `patches` has no patch in it.")
-    for i, (name, mask) in enumerate(patches.items()):
-        try:
-            one = masked_spectra(mask, edges, lmax=lmax, window=window, pure=pure)
-        except ValueError as error:
-            raise ValueError(f"Patch {name}: {error}") from error
-        close = SAME * np.abs(one.mixing).max()
-        same = (j for j in set(shapes) if np.allclose(spectra[j].mixing, one.mixing, 0, close))
-        shapes.append(next(same, i))
-        spectra.append(one)
-    window = np.asarray(window, float)[: spectra[0].lmax + 1]
-    return PreparedPatches(tuple(patches), tuple(spectra), tuple(shapes), window)
+        A, alpha = (float(np.corrcoef(*pair)[0, 1]) for pair in pairs)
+        return A, alpha
+
+
+def _patch_noise(
+    band: Band, prepared: CommonMaps, patches: PreparedPatches
+) -> Float[np.ndarray, "patch 2 ell"]:
+    """Spectrum of the noise in the prepared maps, on each patch that of its own pixels."""
+    (preparation,), lmax = prepared.fluctuations.preparations, patches.spectra[0].lmax
+    covariance = pixel_covariance(band.noise, preparation.nside_in)
+    variance = average_pixels(jnp.stack([covariance[0, 0], covariance[1, 1]]), preparation.nside)
+    weights = np.stack([one.mask**2 for one in patches.spectra])
+    # Q and U turn into each other on a patch, and E and B have the mean of both.
+    mean = np.asarray(variance).mean(axis=0) @ weights.T / weights.sum(axis=1)
+    white = mean * healpy.nside2pixarea(preparation.nside_in)
+    total = white[:, None] * np.asarray(window_of(preparation, lmax)) ** 2
+    if (correlated := prepared.fluctuations.correlated[0]) is not None:
+        total[:, : correlated.size] += np.asarray(correlated)[: lmax + 1]
+    return np.repeat(total[:, None], 2, axis=1)
+
+
+def compare_patches(settings: Experiment, inputs: Inputs) -> PatchComparison:
+    """The paper's 48 discs and the field of BICEP2, in the band that the settings name."""
+    name, nside = str(settings.compare.patches), settings.compare.patches_nside
+    fwhm = settings.common.fwhm
+    band = inputs.bands[name]
+    prepared = common_maps(inputs._replace(bands={name: band}), nside, fwhm)
+    window = beam_ratio(fwhm or band.beam, 0.0, 2 * nside)
+    if not fwhm:  # averages of pixels, with the beam of the map
+        window = window * pixel_window(nside, 2 * nside)
+    patches = prepare_patches(paper_patches(nside), np.asarray(window))
+    # Correlations of the powers of a field that has all scales alike, 1 for a patch itself.
+    squares = np.stack([one.mask**2 for one in patches.spectra])
+    squares /= np.linalg.norm(squares, axis=1, keepdims=True)
+    noise = _patch_noise(band, prepared, patches)
+    # Realisations of their own, unlike those of what is observed.
+    key = stream(realisation_key(settings.seed), "patches")
+    model = prepared.model()[0]
+    fluctuations = prepared.fluctuations
+    model = model + fluctuations.noise_realisation(key)[0] + fluctuations.cmb_realisation(key)[0]
+    return PatchComparison(
+        name,
+        fit_patches(prepared.data[0], patches, noise=noise),
+        fit_patches(model, patches, noise=noise),
+        squares @ squares.T,
+    )
+
+
+def template_patches(maps: Float[Array, "2 pix"], fwhm: float) -> PatchFits:
+    """The same patches in Q and U of a template, at its own beam, taken to be without noise."""
+    nside = healpy.npix2nside(maps.shape[-1])
+    patches = prepare_patches(paper_patches(nside), np.asarray(gaussian_beam(fwhm, 2 * nside)))
+    return fit_patches(maps, patches)

@@ -7,6 +7,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import healpy
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -17,6 +18,7 @@ from jaxsky.checks import Numeric
 from jaxsky.components import component_class
 from jaxsky.experiment import SimulationInputs, cmb_spectra, simulation_inputs
 from jaxsky.galaxy import EmbeddedSky
+from jaxsky.harmonics import Preparation
 from jaxsky.inputs import (
     Template,
     bandpass_of,
@@ -119,28 +121,17 @@ def inputs_of(
         bands = {str(s.name): (bands | made)[str(s.name)] for s in settings.bands}
         truths.append(setup.truth)
         description = setup.description
+    laws = settings.sky.components
+    noises = {n: read_template_noise(folder, n, laws[n], template) for n, template in sky.items()}
     return Inputs(
         sky,
         bands,
         partial(cmb_spectra, settings) if settings.cmb.include else None,
         dict(truths[0]) if truths[0] and all(t == truths[0] for t in truths) else None,
         description,
-        _template_noise(folder, settings, sky),
+        {name: noise for name, noise in noises.items() if noise is not None},
         alone,
     )
-
-
-def _template_noise(
-    folder: Path, settings: Experiment, sky: Mapping[str, Template]
-) -> dict[str, TemplateNoise]:
-    noise = {}
-    for name, template in sky.items():
-        spec = settings.sky.components[name]
-        if spec.noise is not None:
-            noise[name] = read_template_noise(folder, name, spec, template)
-        elif spec.file is None:
-            noise[name] = TemplateNoise()  # the embedded maps are exact
-    return noise
 
 
 def _simulated(
@@ -279,6 +270,29 @@ def _estimated_noise(noise, maps, used):
     white, knee, slope = fit_knee(maps, quiet, 2 * nside)
     excess = knee_spectrum(white, knee, slope, 4 * nside) - white
     return float(np.degrees(np.sqrt(white)) * 60), excess.at[:2].set(0.0)
+
+
+def prepare_component(
+    component: Component, preparation: Preparation, kept: Bool[np.ndarray, " pix"] | None = None
+) -> Component:
+    """A component with its amplitude, and parameters that are maps, at the common resolution.
+
+    Parameters
+    ----------
+    component, preparation : what is prepared, and how
+    kept : pixels of the amplitude that are not set to zero; default all
+    """
+
+    def brought(leaf):
+        if leaf.ndim not in (1, 2):
+            return leaf
+        values = jnp.atleast_2d(jnp.asarray(leaf, float))
+        if leaf.ndim == 2:
+            values = values if kept is None else values * kept
+        prepared = preparation(values).block_until_ready()
+        return prepared if leaf.ndim == 2 else prepared[0]
+
+    return jax.tree.map(brought, component)
 
 
 def modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:

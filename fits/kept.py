@@ -45,6 +45,20 @@ def fingerprint(tree: Any) -> str:
     return digest.hexdigest()
 
 
+def remembered(function: Callable[[Array], np.ndarray]) -> Callable[[Array], np.ndarray]:
+    """A function whose last result is kept for an array that comes again."""
+    last: dict[str, np.ndarray] = {}
+
+    def found(rows: Array) -> np.ndarray:
+        mark = fingerprint(rows)
+        if mark not in last:
+            last.clear()
+            last[mark] = function(rows)
+        return last[mark]
+
+    return found
+
+
 class KeptChain(emcee.backends.Backend):
     """A chain of emcee in memory, written to its file every few seconds.
 
@@ -105,12 +119,22 @@ def kept_realisations(
     done = [] if there is None else [list(row) for row in zip(*there, strict=True)]
     held, saved = len(done), time.monotonic()
 
+    def one(number: int) -> list[np.ndarray]:
+        key = stream(realisation_key(seed, number), "realisation")  # unlike what is observed
+        return [np.asarray(x) for x in make(key)]
+
+    def made(numbers: range) -> Iterator[list[np.ndarray]]:
+        """In order, by as many threads as there are processors."""
+        yield from map(one, numbers[:1])  # alone, so that each program is compiled once
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            yield from pool.map(one, numbers[1:])
+
     def stacked() -> list[np.ndarray]:
         return list(map(np.stack, zip(*done, strict=True)))
 
     try:
         report(held, count)
-        for result in _made(make, seed, range(held, count)):
+        for result in made(range(held, count)):
             done.append(result)
             report(len(done), count)
             if path is not None and time.monotonic() - saved > SAVED_EVERY:
@@ -120,20 +144,6 @@ def kept_realisations(
         if path is not None and len(done) > held:
             _save(path, mark, dict(zip(names, stacked(), strict=True)))
     return kind._make(array[:count] for array in stacked())
-
-
-def _made(
-    make: Callable[[Array], Sequence[Array | np.ndarray]], seed: int, numbers: range
-) -> Iterator[list[np.ndarray]]:
-    """Realisations in order, made by as many threads as there are processors."""
-
-    def one(number: int) -> list[np.ndarray]:
-        key = stream(realisation_key(seed, number), "realisation")  # unlike what is observed
-        return [np.asarray(x) for x in make(key)]
-
-    yield from map(one, numbers[:1])  # alone, so that each program is compiled once
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        yield from pool.map(one, numbers[1:])
 
 
 def _save(path: Path, mark: str, arrays: Mapping[str, np.ndarray]) -> None:

@@ -20,11 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.amplitudes import Pixels
-from fits.compress import Layout
+from fits.common import CommonMaps, window_of
+from fits.compress import Layout, bare
 from fits.mixing import named_bands, spectral_names
-from fits.noise import bare
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
+from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.checks import UNSEEN, Numeric, check_double, check_finite
 from jaxsky.harmonics import (
@@ -32,6 +32,7 @@ from jaxsky.harmonics import (
     gaussian_beam,
     lmax_of,
     low_multipoles,
+    map_variance,
     resize,
 )
 
@@ -328,3 +329,23 @@ def harmonic_likelihood(
         block_cell=jnp.zeros(len(pixels[0].data), int),
         values=int(values.sum()),
     )
+
+
+def masked_noise(
+    prepared: CommonMaps, mask: Float[np.ndarray, " pix"], factors: Float[np.ndarray, " band"]
+) -> Float[np.ndarray, "band 2 ell"]:
+    """N_l of masked maps: white as the beam of each band leaves it, and what is correlated.
+
+    The unit is that of which uK_RJ has `factors`.
+    """
+    noises = prepared.fluctuations.noises.values()
+    lmax = 2 * min(healpy.npix2nside(mask.size), *(n.preparation.nside_in for n in noises))
+    area, spectra = np.mean(mask**2), np.zeros((len(noises), 2, lmax + 1))
+    sigma = np.where(mask > 0, prepared.sigma, 0.0) * factors[:, None, None] * mask
+    for i, noise in enumerate(noises):
+        shape, correlated = np.asarray(window_of(noise.preparation, lmax)) ** 2, np.zeros(lmax + 1)
+        if noise.correlated is not None:
+            correlated = np.asarray(noise.correlated[: lmax + 1]) * factors[i] ** 2
+        white = np.mean(sigma[i] ** 2) - map_variance(correlated) * area
+        spectra[i] = white / map_variance(shape) * shape + correlated * area
+    return spectra

@@ -19,9 +19,8 @@ import optimistix as optx
 import scipy.sparse
 from jaxtyping import Float
 
-from fits.posterior import Likelihood, Matrix, Posterior
-from fits.priors import Gaussian, Prior
-from fits.results import FitResult, help_by_prior
+from fits.posterior import Gaussian, Likelihood, Matrix, Posterior, Prior
+from fits.results import Convergence, FitResult, help_by_prior
 from fits.systems import Factor, degenerate, variances
 from jaxsky.checks import Numeric
 
@@ -51,10 +50,10 @@ class Newton(NamedTuple):
     last: float = 1e-5
 
     def minimise(
-        self, posterior: Posterior, max_steps: int | None = None
+        self, posterior: Posterior, max_steps: int = NEWTON_STEPS
     ) -> tuple[Float[np.ndarray, " par"], int]:
         """The optimum within bounds, and the number of steps to it."""
-        theta, max_steps = posterior.start, NEWTON_STEPS if max_steps is None else max_steps
+        theta = posterior.start
         value, gradient = posterior.value(theta)
         damping, reach = 1e-4, posterior.reach()
         for step in range(max_steps):
@@ -226,10 +225,12 @@ def best_fit(
         solver = Newton()
     elif solver is None:
         solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)
+    if max_steps is None:
+        max_steps = NEWTON_STEPS if isinstance(solver, Newton) else MAX_STEPS
     if isinstance(solver, Newton):
         theta, steps = solver.minimise(posterior, max_steps)
     else:
-        theta, steps = _searched(posterior, solver, MAX_STEPS if max_steps is None else max_steps)
+        theta, steps = _searched(posterior, solver, max_steps)
 
     # From here on, nothing depends on how the optimum was found.
     edges = posterior.edges(theta)
@@ -243,7 +244,10 @@ def best_fit(
     covariance, sigma = _errors(posterior, matrix, factor, spread, keep, not unknown)
     slope = posterior.value(theta)[1][keep]
     distance = float(np.sqrt(slope @ factor.solve(slope))) if factor.positive else np.inf
-    message = _message(posterior, theta, steps, distance, unknown, slope, matrix, keep)
+    close = REACHED * float(np.sqrt(max(len(keep), 1)))
+    far = np.zeros(len(theta), bool)
+    far[keep] = ~(np.abs(slope) <= close * np.sqrt(np.abs(matrix.diagonal())))
+    converged, message = _ended(posterior, theta, steps, max_steps, distance, close, unknown, far)
     dense = isinstance(matrix, np.ndarray)
     values, errors = posterior.named(theta), posterior.named(sigma)
     result = FitResult(
@@ -255,7 +259,7 @@ def best_fit(
         covariance=covariance,
         chi2=2 * float(found.value.sum()),
         dof=like.dof(int(posterior.present.sum())),
-        converged=message == "converged",
+        converged=converged,
         message=message,
         details={
             "solver": type(solver).__name__,
@@ -301,20 +305,20 @@ def _errors(
     return covariance, np.sqrt(np.diagonal(covariance))
 
 
-def _message(
+def _ended(
     posterior: Posterior,
     theta: np.ndarray,
     steps: int,
+    max_steps: int,
     distance: float,
+    close: float,
     unknown: list[str],
-    slope: np.ndarray,
-    matrix: Matrix,
-    keep: np.ndarray,
-) -> str:
-    """How a search ended, the gravest first; "converged" if all is well.
+    far: np.ndarray,
+) -> tuple[Convergence, str]:
+    """How a search ended, and in words; the gravest first.
 
-    Slope and matrix are the derivatives of -log posterior in the parameters to keep: those that
-    are not at an edge of their prior.
+    An optimum is reached within `close` of it. `unknown` are labels of degenerate parameters, and
+    `far` those that are not at an optimum, nor at an edge of their prior.
     """
 
     def which(bad: np.ndarray) -> str:
@@ -322,28 +326,29 @@ def _message(
         return f"{posterior.where(bad)}; {help_by_prior(names)}."
 
     if (wrong := posterior.present & ~np.isfinite(theta)).any():
-        return f"The search left the finite numbers within {steps} steps: {which(wrong)}"
+        message = f"The search left the finite numbers within {steps} steps: {which(wrong)}"
+        return Convergence.not_finite, message
     edges = posterior.edges(theta)
     if edges.any():
         first = int(np.argmax(edges))
         name, low, high = posterior.names[first], posterior.low[first], posterior.high[first]
         near = low if theta[first] - low < high - theta[first] else high
         own = edges & (posterior.owner == posterior.owner[first])
-        return (
+        return Convergence.at_edge, (
             f"The best fit of {name!r} lies at the edge {near:g} of its uniform prior "
             f"{low:g} ... {high:g}{which(own).removeprefix(name)}"
         )
-    close = REACHED * np.sqrt(max(len(keep), 1))
-    far = np.zeros(len(theta), bool)
-    far[keep] = ~(np.abs(slope) <= close * np.sqrt(np.abs(matrix.diagonal())))
     if unknown and not far.any():
         open_ = np.isin(posterior.labels, unknown)
-        return f"The data do not determine {posterior.where(open_)}: parameters are degenerate" + (
-            which(open_).removeprefix(posterior.where(open_))
+        where = posterior.where(open_)
+        return Convergence.undetermined, (
+            f"The data do not determine {where}: parameters are degenerate"
+            f"{which(open_).removeprefix(where)}"
         )
     if not unknown and distance < close:
-        return "converged"
+        return Convergence.converged, "converged"
     off = "and not at an optimum" if unknown else f"{distance:.2g} sigma from the optimum"
     still = steps and np.allclose(theta, posterior.start, rtol=1e-12, atol=0.0)
     ended = "did not leave its start" if still else f"stopped after {steps} steps"
-    return f"The search {ended}, {off}{f': {which(far)}' if far.any() else '.'}"
+    message = f"The search {ended}, {off}{f': {which(far)}' if far.any() else '.'}"
+    return Convergence.stalled if steps < max_steps else Convergence.max_steps, message

@@ -20,9 +20,8 @@ import optimistix as optx
 import scipy.stats
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from fits.discs import PreparedPatches
-from fits.power_covariance import covariance_terms
-from fits.pseudo_cl import PIVOT, band_powers, mean_spectrum
+from fits.pseudo_cl import PIVOT, PreparedPatches, band_powers, mean_spectrum
+from fits.tensor_ratio import covariance_terms
 from jaxsky.checks import check_shape
 
 #: The root of the variance of a power never falls below this part of what it is expected to be:
@@ -59,16 +58,6 @@ class PatchFits(NamedTuple):
     errors: Float[np.ndarray, "patch 2 bin"]
     centers: Float[np.ndarray, " bin"]
 
-    @property
-    def A_error(self) -> Float[np.ndarray, "patch 2"]:
-        """Standard deviation of the amplitude."""
-        return np.sqrt(self.covariance[..., 0, 0])
-
-    @property
-    def alpha_error(self) -> Float[np.ndarray, "patch 2"]:
-        """Standard deviation of the slope."""
-        return np.sqrt(self.covariance[..., 1, 1])
-
 
 def fit_patches(
     maps: Float[Array, "2 pix"],
@@ -98,13 +87,6 @@ def fit_patches(
     slope : mean and standard deviation of the Gaussian prior of alpha. It is wide, and there to
         bound alpha where noise leaves nothing to see; alpha = 0.1 off where the truth is 1 off and
         its error is 1
-
-    Raises
-    ------
-    ValueError
-        For maps of another size than the masks or with values that are not finite within, noise
-        of another shape, negative, or too short, a prior without width, and patches without any
-        power.
     """
     maps = _checked("maps", maps, patches)
     other = None if other is None else _checked("other", other, patches)

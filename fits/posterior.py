@@ -1,4 +1,4 @@
-"""A likelihood as a function of a vector of parameters, and its posterior, with derivatives.
+"""Priors, and likelihoods with them as functions of a vector of parameters, with derivatives.
 
 Parameters are numbers, or arrays with a value for each region. A cell, an intersection of regions,
 depends on a few of them only, so its second derivatives are a small matrix; those of all
@@ -6,7 +6,7 @@ parameters are put together from them. A likelihood without regions is a single 
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -16,15 +16,98 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
-from fits.amplitudes import Derivatives
-from fits.priors import Gaussian, Prior, Uniform, check_priors
-from fits.systems import assembled
+from fits.systems import Derivatives, assembled
 from jaxsky.checks import Numeric, as_array
+from jaxsky.settings import Experiment
 
 #: Dense, or sparse for many parameters.
 Matrix: TypeAlias = np.ndarray | scipy.sparse.csc_matrix
 #: A value this close to the edge of a uniform prior, in units of its width, is at the edge.
 EDGE = 1e-4
+
+
+class Prior(eqx.Module):
+    """Base class of priors on a parameter."""
+
+    def log_density(self, value: Numeric) -> Array:
+        """Log-density up to a constant; -inf outside the range."""
+        raise TypeError(f"{type(self).__name__} must define `log_density`.")
+
+
+class Uniform(Prior):
+    """Constant density in low <= value <= high.
+
+    Raises
+    ------
+    ValueError
+        If low is not below high.
+
+    Examples
+    --------
+    >>> float(Uniform(1.0, 2.0).log_density(1.5))
+    0.0
+    """
+
+    low: float
+    high: float
+
+    def __init__(self, low: float, high: float) -> None:
+        self.low, self.high = float(low), float(high)
+        if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
+            raise ValueError(f"A uniform prior needs finite low < high, not {low} and {high}.")
+
+    def log_density(self, value):
+        return jnp.where((value >= self.low) & (value <= self.high), 0.0, -jnp.inf)
+
+
+class Gaussian(Prior):
+    """Gaussian density with a mean and a standard deviation.
+
+    Raises
+    ------
+    ValueError
+        If the mean is not finite, or sigma not positive.
+
+    Examples
+    --------
+    >>> float(Gaussian(1.0, 0.5).log_density(2.0))
+    -2.0
+    """
+
+    mean: float
+    sigma: float
+
+    def __init__(self, mean: float, sigma: float) -> None:
+        self.mean, self.sigma = float(mean), float(sigma)
+        if not (np.isfinite([self.mean, self.sigma]).all() and self.sigma > 0):
+            raise ValueError(
+                f"A Gaussian prior needs a finite mean and positive sigma, not {mean} and {sigma}."
+            )
+
+    def log_density(self, value):
+        return -0.5 * ((value - self.mean) / self.sigma) ** 2
+
+
+def priors_of(settings: Experiment, command: str) -> dict[str, Prior]:
+    """Priors of the free parameters of a command that have one."""
+    priors: dict[str, Prior] = {}
+    for name, one in settings.free_in(command).items():
+        if one.uniform:
+            priors[name] = Uniform(*one.uniform)
+        elif one.gaussian:
+            priors[name] = Gaussian(*one.gaussian)
+    return priors
+
+
+def check_priors(priors: Mapping[str, Prior] | None, free: Iterable[str]) -> dict[str, Prior]:
+    """The priors, once each is known to belong to a free parameter."""
+    free = list(free)
+    for name in priors or {}:
+        if name not in free:
+            raise KeyError(
+                f"There is a prior for {name!r}, which is not free; free are {', '.join(free)}."
+            )
+    return dict(priors or {})
 
 
 class Likelihood(eqx.Module):

@@ -20,13 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from fits import amplitudes
-from fits.amplitudes import Pixels
-from fits.compress import Layout, compressed, gathered, layouts, used_pixels
+from fits import systems
+from fits.compress import Layout, Noise, as_noise, bare, compressed, gathered, layouts, used_pixels
 from fits.mixing import Mixing, named_bands, spectral_names, unit_sky
-from fits.noise import Noise, as_noise, bare
 from fits.posterior import Likelihood
 from fits.regions import Cells, check_labels, intersections
+from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.bandpass import parse_unit
 from jaxsky.checks import Numeric, as_array, check_double, check_finite, check_shape
@@ -120,10 +119,10 @@ class SpectralLikelihood(Likelihood):
 
     def total(self, local: Float[Array, "cell free"]) -> Float[Array, ""]:
         """-2 ln L for parameters of each cell."""
-        parts = self._mapped(amplitudes.least_chi2, self.matrices(local))
+        parts = self._mapped(systems.least_chi2, self.matrices(local))
         return sum((jnp.sum(part) for part in parts), jnp.zeros(()))
 
-    def derivatives(self, local: Float[Array, "cell free"]) -> amplitudes.Derivatives:
+    def derivatives(self, local: Float[Array, "cell free"]) -> systems.Derivatives:
         """-ln L of each cell, and its derivatives in the parameters of the cell."""
         units = jnp.eye(local.shape[1])
 
@@ -137,7 +136,7 @@ class SpectralLikelihood(Likelihood):
         along = partial(slope, first, local)
         (matrices, one), (_, two) = jax.vmap(along, out_axes=(None, 1))(units)
         every = tuple(zip(matrices, one, two, strict=True))
-        parts = self._mapped(lambda m, own: amplitudes.derivatives(m[0], m[1], m[2], own), every)
+        parts = self._mapped(lambda m, own: systems.derivatives(m[0], m[1], m[2], own), every)
         summed = []
         for part in parts:
             cells = self._cell_of_block(len(part.value))
@@ -147,7 +146,7 @@ class SpectralLikelihood(Likelihood):
         return jax.tree.map(lambda *rows: sum(rows), *summed)
 
     def residuals(self, params):
-        parts = self._mapped(amplitudes.residuals, self.matrices(self.flat(params)[self.index]))
+        parts = self._mapped(systems.residuals, self.matrices(self.flat(params)[self.index]))
         return jnp.concatenate([part.ravel() for part in parts])
 
 
@@ -206,7 +205,7 @@ def spectral_likelihood(
     bands : the bands by name, or as a list
     data : observed maps, shape (band, stokes, pix) with Stokes Q, U or I, Q, U
     noise : standard deviations or covariances in the unit of the data; see
-        `fits.noise.as_noise`
+        `fits.compress.as_noise`
     start : start values of the free parameters by name: of the laws ("dust.beta_dust"), or of
         bands ("shift.<band>", "width.<band>", "gain.<band>", "angle.<band>"; see
         `fits.mixing`)
@@ -320,13 +319,14 @@ def _index(values: Mapping[str, Array], cells: Cells) -> Array:
 
 
 @jax.jit
-def _start_matrices(like):
-    return like.matrices(like.flat({})[like.index])[0]
+def matrices_at(like: SpectralLikelihood, params: Mapping[str, Array]) -> tuple[Array, ...]:
+    """Mixing matrices (cell, row, unknown) for parameters by name, for each of `layout`."""
+    return like.matrices(like.flat(params)[like.index])
 
 
 def _check_matrices(like: SpectralLikelihood) -> np.ndarray:
     """The matrices at the start values; ValueError if two components have the same law there."""
-    given = np.asarray(_start_matrices(like))
+    given = np.asarray(matrices_at(like, {})[0])
     matrix = given / np.linalg.norm(given, axis=1, keepdims=True)
     if not np.isfinite(matrix).all():
         raise ValueError("The laws are not finite at the start values.")

@@ -60,6 +60,23 @@ def region_mask(
     return np.asarray(inside)
 
 
+def common_holes(maps: Sequence[Bool[np.ndarray, " pix"]]) -> dict[int, np.ndarray]:
+    """Pixels that no map misses, at each nside of the maps; empty if none misses any.
+
+    Smoothing spreads what surrounds a hole into it and the hole into what surrounds it, so all
+    maps, templates and data, get the same holes.
+    """
+    if all(used.all() for used in maps):
+        return {}
+    nsides = {healpy.npix2nside(used.size) for used in maps}
+    return {
+        nside: np.logical_and.reduce(
+            [healpy.ud_grade(u.astype(float), nside) > 0.999 for u in maps]
+        )
+        for nside in nsides
+    }
+
+
 def region_words(settings: Experiment, name: str) -> str:
     """What a region is, after the word "in" of a sentence."""
     region = settings.regions[name]
@@ -116,11 +133,6 @@ def superpixels(nside_map: int, nside: int) -> Int[np.ndarray, " pix"]:
 
 def latitude_bands(nside_map: int, edges: Sequence[float]) -> Int[np.ndarray, " pix"]:
     """Labels by absolute Galactic latitude: 0 below the first edge [deg], 1 below the second, ...
-
-    Raises
-    ------
-    ValueError
-        If the edges do not increase between 0 and 90 degrees.
 
     Examples
     --------

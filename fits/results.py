@@ -1,13 +1,17 @@
-"""What fits return, as values: numbers by parameter name, and how good they are."""
+"""What fits return: numbers by name, and how good they are; and how results are written."""
 
+import json
 from collections.abc import Callable, Mapping
+from enum import Enum
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from fits.writing import with_error
 from jaxsky.checks import Numeric, Summary, as_html, as_text
+from jaxsky.io import write_text
+from jaxsky.settings import Experiment, circumstances
 
 if TYPE_CHECKING:
     from getdist import MCSamples
@@ -39,6 +43,25 @@ def help_by_prior(names: tuple[str, ...]) -> str:
     return f"a Gaussian prior on {' or '.join(names)} (mean, standard deviation) would help"
 
 
+class Convergence(Enum):
+    """How a fit ended, as a sentence; true exactly if its numbers can be relied on."""
+
+    converged = "The fit converged."
+    max_steps = "The search made all its steps without reaching an optimum."
+    stalled = "The search ended away from an optimum, before its last step."
+    not_finite = "The search left the finite numbers."
+    at_edge = "The best fit lies at the edge of a uniform prior."
+    undetermined = "Data and priors do not determine all parameters."
+    unmixed = "Chains are too short, or do not agree."
+    misfit = "An optimum was reached, but chi2 is that of no fit."
+
+    def __bool__(self) -> bool:
+        return self is Convergence.converged
+
+    def __str__(self) -> str:
+        return str(self.value)
+
+
 class FitError(RuntimeError):
     """A fit that did not reach what its numbers need; carries the result as `.result`."""
 
@@ -62,7 +85,7 @@ class FitResult(NamedTuple):
     chi2 : smallest value of -2 log L, priors left out; for the exact likelihood that of the
         template amplitudes
     dof : number of data with weight less that of amplitudes and free parameters
-    converged, message : whether the numbers can be relied on, and in words
+    converged, message : how it ended, true if the numbers can be relied on, and in words
     details : what only this method has
     """
 
@@ -74,7 +97,7 @@ class FitResult(NamedTuple):
     covariance: Float[np.ndarray, "par par"] | None
     chi2: float
     dof: int
-    converged: bool
+    converged: Convergence
     message: str
     details: dict[str, Any]
 
@@ -136,7 +159,7 @@ class FitResult(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """All numbers but the details by name, for files."""
-        numbers = self._asdict()
+        numbers = self._asdict() | {"converged": bool(self.converged)}
         del numbers["details"]
         return {"free": self.free} | numbers
 
@@ -178,7 +201,7 @@ class FitResult(NamedTuple):
         maps, never do. chi^2 and dof are of the data, or of what the likelihood compares, for
         `misfit`.
         """
-        failures = [] if self.converged else [self.message]
+        ended, failures = self.converged, [] if self.converged else [self.message]
         for name, value in self.best_fit.items():
             limit = LOST * np.maximum(np.abs(start[name]), 1.0)
             lost = np.asarray((np.abs(value) > limit) | (np.asarray(self.sigma[name]) > limit))
@@ -189,16 +212,78 @@ class FitResult(NamedTuple):
             if not lost.ndim:
                 where = f": from {start[name]:g} it went to {value:.3g} +- {self.sigma[name]:.2g}"
             failures.append(f"The data do not constrain {name!r}{where}; {help_by_prior((name,))}.")
+            ended = Convergence.undetermined
         # Where nothing was found, there is no chi^2 either.
         wrong = misfit(chi2, dof, expected) if np.isfinite(chi2) or self.converged else None
         if wrong and wrong not in self.message:
             failures.insert(0, wrong)
+            ended = ended if failures[1:] else Convergence.misfit
         if not failures:
             return self
-        return self._replace(converged=False, message=" ".join(failures))
+        return self._replace(converged=ended, message=" ".join(failures))
 
     def checked(self, throw: bool) -> "FitResult":
         """Itself, if it converged or need not have."""
         if throw and not self.converged:
             raise FitError(self.message, self)
         return self
+
+
+def _digits(size: float) -> int:
+    """Digits behind the point with which a positive number has two in all; 4 for others."""
+    usable = np.isfinite(size) and size > 0
+    return max(0, 1 - int(np.floor(np.log10(size)))) if usable else 4
+
+
+def two_digits(value: float) -> str:
+    """A number in two significant digits, without an exponent."""
+    return f"{value:.{_digits(value)}f}"
+
+
+def with_error(value: float, error: float) -> str:
+    """A value with its standard error, both to two digits of the error."""
+    digits = _digits(error)
+    return f"{value:.{digits}f} \u00b1 {error:.{digits}f}"
+
+
+def with_errors(best: float, low: float, high: float) -> str:
+    """A value with its interval as differences, to two digits of the smaller one.
+
+    Without an interval the value alone, and nothing where there is no value.
+    """
+    if not np.isfinite([low, high]).all():
+        return f"{best:.4f}" if np.isfinite(best) else ""
+    digits = _digits(min(abs(high - best), abs(best - low)))
+    return f"{best:.{digits}f} {low - best:+.{digits}f} {high - best:+.{digits}f}"
+
+
+def probability(value: float) -> str:
+    """A probability in two digits, or its order of magnitude."""
+    if value < 1e-99:
+        return "<1e-99"
+    return f"{value:.2f}" if value >= 0.01 else f"{value:.0e}"
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists, and numbers that are not finite as None: what JSON has."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, Convergence):
+        return bool(value)
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def write_json(path: Path, results: dict[str, Any]) -> None:
+    """Results of a run; arrays become lists, and what is not finite null."""
+    write_text(path, json.dumps(_plain(results), indent=2, allow_nan=False) + "\n")
+
+
+def write_log(path: Path, settings: Experiment, seconds: float) -> None:
+    """When, where, how long, with which versions, settings and files a run was made."""
+    said = settings.model_dump(mode="json", exclude_none=True)
+    log = {**circumstances(settings), "seconds": round(seconds, 2), "settings": said}
+    write_text(path, json.dumps(log, indent=2) + "\n")

@@ -22,9 +22,8 @@ from rich.progress import Progress as Bar
 
 from fits.kept import KeptChain
 from fits.optimize import best_fit
-from fits.posterior import Likelihood, Posterior
-from fits.priors import Prior
-from fits.results import FitResult
+from fits.posterior import Likelihood, Posterior, Prior
+from fits.results import Convergence, FitResult
 from fits.unbounded import Unbounded, unbounded_posterior
 from jaxsky.checks import Numeric, check_seed
 
@@ -108,7 +107,7 @@ def _ensemble(
     enough = len(chain) >= ENOUGH * worst
     message = f"{len(chain)} steps are {len(chain) / worst:.0f} autocorrelation times ({worst:.0f})"
     return {
-        "converged": enough,
+        "converged": Convergence.converged if enough else Convergence.unmixed,
         "message": message + ("" if enough else f", of which at least {ENOUGH} are needed") + ".",
         "chain": chain,
         "log_prob": sampler.get_log_prob(),
@@ -235,7 +234,7 @@ def _no_u_turn(
     with np.errstate(divide="ignore"):
         tau = nsteps * nchains / effective
     return {
-        "converged": not failed,
+        "converged": Convergence.unmixed if failed else Convergence.converged,
         "message": message + (f"; needed are {', '.join(failed)}." if failed else "."),
         "chain": course["chain"],
         "log_prob": course["log_prob"],
@@ -347,7 +346,7 @@ def sample(
             interval_68={name: (value, value) for name, value in nothing.items()},
             labels=labels,
             covariance=np.full((len(labels), len(labels)), np.nan),
-            converged=False,
+            converged=Convergence.undetermined,
             message=f"Data and priors do not determine {shown}: there is nothing to draw from.",
             details={},
         ).checked(throw)

@@ -1,6 +1,6 @@
 """The data of a separation, from an experiment: pixels at a common resolution, or multipoles.
 
-Both have the same methods, so that a separation does not ask which one it has.
+All have the same methods, so that a separation does not ask which one it has.
 """
 
 from collections.abc import Mapping
@@ -12,12 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fits.common import prepared_maps
-from fits.fluctuations import Fluctuations, noise_alm
+from fits.common import Fluctuations, MapNoise, prepared_maps
+from fits.compress import Noise
 from fits.inputs import Inputs, inputs_of, modelled_laws
 from fits.mixing import nominal
-from fits.multipoles import harmonic_coefficients, harmonic_likelihood
-from fits.noise import Noise, as_noise
+from fits.multipoles import harmonic_coefficients, harmonic_likelihood, masked_noise
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.regions import apodize, parameter_labels, region_mask
 from fits.separated_maps import (
@@ -28,20 +27,13 @@ from fits.separated_maps import (
 )
 from jaxsky import Bandpass, Sky
 from jaxsky.checks import Numeric
-from jaxsky.harmonics import (
-    expand,
-    gaussian_beam,
-    lmax_of,
-    low_multipoles,
-    map_variance,
-    synthesis,
-)
+from jaxsky.harmonics import Preparation, expand, gaussian_beam, lmax_of, low_multipoles, synthesis
 from jaxsky.settings import Experiment, SettingsError
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Data:
-    """What both kinds have: the laws and bands, start values by name, and the data in `unit`.
+    """What all have: the laws and bands, start values by name, and the data in `unit`.
 
     `used` are the pixels that the results are of, and `mask` the weight of each in spectra, 0 to 1,
     its edges smooth. Of a simulation `foregrounds` are those alone, like the data, and `truth` its
@@ -59,10 +51,9 @@ class _Data:
     truth: dict[str, float] | None
     description: str
 
-    #: Whether the likelihood knows all correlations of the noise, whether data are maps, and
-    #: whether these are separated pixel by pixel.
+    #: Whether data are multipoles of the full sky, all of whose noise the likelihood knows, and
+    #: whether they are maps that are separated pixel by pixel.
     exact: ClassVar[bool] = False
-    in_pixels: ClassVar[bool] = True
     by_pixel: ClassVar[bool] = True
 
 
@@ -109,86 +100,78 @@ class PixelData(_Data):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MaskedSkyData(PixelData):
-    """Maps on part of the sky that are separated multipole by multipole, all at one beam.
+class _Multipoles(_Data):
+    """What is separated multipole by multipole, into maps of `nside` and `fwhm` [arcmin].
 
-    All bands have the same beam and mask, so the coefficients of the masked maps are those of the
-    masked components, mixed by the laws: what a mask mixes, E and B among it, it mixes alike in
-    all. `spectra` is N_l of the noise in them [unit^2 sr], which is what the beam of each band
-    leaves. The mask correlates multipoles, so errors come from simulations.
+    `spectra` is N_l of the noise in what is observed [unit^2 sr], `fwhms` are its beams [arcmin].
     """
 
     by_pixel: ClassVar[bool] = False
     spectra: Float[np.ndarray, "band stokes ell"]
+    fwhms: Float[np.ndarray, " band"]
+    nside: int
     fwhm: float
 
-    def likelihood(self, data: Float[np.ndarray, "band stokes pix"]) -> SpectralLikelihood:
+    def alm(self, data: Numeric) -> Float[np.ndarray, "_ stokes alm"]:
+        """Coefficients of data."""
+        return np.asarray(data)
+
+    def likelihood(self, data: Float[np.ndarray, "band stokes _"]) -> SpectralLikelihood:
         """The likelihood of data."""
-        alm, beams = self._alm(data), np.full(len(data), self.fwhm)
+        alm, given = self.alm(data), (self.sky, self.bands)
         return harmonic_likelihood(
-            self.sky, self.bands, alm, self.spectra, self.start, beams=beams, unit=self.unit
+            *given, alm, self.spectra, self.start, beams=self.fwhms, unit=self.unit
         )
 
     def components(self, like: SpectralLikelihood, params: Mapping, data, **options):
         """Amplitudes of the components with all that is known of them."""
-        alm, beams = self._alm(data), np.full(len(data), self.fwhm)
-        return harmonic_component_maps(like, params, alm, self.spectra, beams=beams, **options)
+        alm = self.alm(data)
+        return harmonic_component_maps(like, params, alm, self.spectra, beams=self.fwhms, **options)
 
     def maps(self, found: HarmonicMaps, like: SpectralLikelihood, params: Mapping, data):
+        """Amplitudes as maps."""
+        return found.maps(self.nside, self.fwhm)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskedSkyData(_Multipoles, PixelData):
+    """Maps on part of the sky that are separated multipole by multipole, all at one beam.
+
+    All bands have the same beam and mask, so the coefficients of the masked maps are those of the
+    masked components, mixed by the laws: what a mask mixes, E and B among it, it mixes alike in
+    all. The mask correlates multipoles, so errors come from simulations.
+    """
+
+    def alm(self, data):
+        """Coefficients of maps times the mask."""
+        seen, lmax = np.where(self.mask > 0, data, 0.0) * self.mask, self.spectra.shape[-1] - 1
+        return np.stack([np.asarray(low_multipoles(jnp.asarray(rows), lmax)) for rows in seen])
+
+    def maps(self, found, like, params, data):
         """Amplitudes as maps; NaN where masked.
 
         Those of pixels, plus what multipoles find beyond: the same of all components, so that only
         the noise is another, and nothing of the sky is lost at the last multipole.
         """
-        maps = component_maps(like, params, data, self.noise, covariance=False).amplitude
-        nside = healpy.npix2nside(self.mask.size)
-        known = np.stack([np.asarray(synthesis(jnp.asarray(a), nside)) for a in self._alm(maps)])
+        maps = PixelData.components(self, like, params, data, covariance=False).amplitude
+        pixels = [np.asarray(synthesis(jnp.asarray(a), self.nside)) for a in self.alm(maps)]
         weight = np.where(self.used, self.mask, np.nan)
-        return maps + (found.maps(nside, self.fwhm) - known) / weight
-
-    def _alm(self, maps: Numeric) -> Float[np.ndarray, "_ stokes alm"]:
-        return _masked_alm(maps, self.mask, self.spectra.shape[-1] - 1)
+        return maps + (super().maps(found, like, params, data) - np.stack(pixels)) / weight
 
 
 @dataclass(frozen=True, kw_only=True)
-class FullSkyData(_Data):
+class FullSkyData(_Multipoles):
     """Multipoles of the full sky, each band with its own beam; the likelihood is exact.
 
-    `fwhms` are those of the bands [arcmin], and `noise` is N_l of the maps as observed [unit^2 sr].
-    To draw it there is the `white` noise of each band, a level [unit arcmin] or the covariance of Q
-    and U in each of its own pixels [unit^2], and the part of N_l that is `correlated` between
-    pixels. Maps of components have `nside` and `fwhm` [arcmin].
+    `noises` are those of the bands as observed, in `unit`, to be drawn.
     """
 
     exact: ClassVar[bool] = True
-    in_pixels: ClassVar[bool] = False
-    by_pixel: ClassVar[bool] = False
-    fwhms: Float[np.ndarray, " band"]
-    noise: Float[np.ndarray, "band stokes ell"]
-    white: tuple[Numeric, ...]
-    correlated: Float[np.ndarray, "band ell"]
-    nside: int
-    fwhm: float
-
-    def likelihood(self, data: Float[np.ndarray, "band stokes alm"]) -> SpectralLikelihood:
-        """The likelihood of data."""
-        return harmonic_likelihood(
-            self.sky, self.bands, data, self.noise, self.start, beams=self.fwhms, unit=self.unit
-        )
+    noises: dict[str, MapNoise]
 
     def noise_realisation(self, key: Array) -> Float[np.ndarray, "band stokes alm"]:
         """Noise like that of the data."""
-        window = jnp.ones(self.noise.shape[-1])
-        noises = zip(self.bands, self.white, jnp.asarray(self.correlated), strict=True)
-        return np.stack([noise_alm(key, *band, window) for band in noises])
-
-    def components(self, like: SpectralLikelihood, params: Mapping, data, **options):
-        """Amplitudes of the components with all that is known of them."""
-        return harmonic_component_maps(like, params, data, self.noise, beams=self.fwhms, **options)
-
-    def maps(self, found: HarmonicMaps, like: SpectralLikelihood, params: Mapping, data):
-        """Amplitudes as maps."""
-        return found.maps(self.nside, self.fwhm)
+        return np.stack([noise.alm(key, name) for name, noise in self.noises.items()])
 
     def residuals(self, like: SpectralLikelihood, params: Mapping, amplitude):
         """Maps (band, stokes, pix) of the data less the components, each with its own beam."""
@@ -199,14 +182,6 @@ class FullSkyData(_Data):
         """What components show in the bands, with their beams."""
         windows = jnp.stack([gaussian_beam(f, lmax_of(amplitude)) for f in self.fwhms])
         return emission_maps(like, params, amplitude) * np.asarray(expand(windows))[:, None]
-
-
-def _masked_alm(
-    maps: Numeric, mask: Float[np.ndarray, " pix"], lmax: int
-) -> Float[np.ndarray, "_ stokes alm"]:
-    """Coefficients of maps times the mask."""
-    seen = np.where(mask > 0, maps, 0.0) * mask
-    return np.stack([np.asarray(low_multipoles(jnp.asarray(rows), lmax)) for rows in seen])
 
 
 def separation_data(settings: Experiment) -> PixelData | FullSkyData:
@@ -268,56 +243,39 @@ def _pixel_data(
     shared: dict[str, Any],
 ) -> PixelData:
     """Maps at the common resolution; `factors` are the unit of the data per uK_RJ."""
-    prepared = prepared_maps(settings, inputs)
+    prepared, common = prepared_maps(settings, inputs), settings.common
     used = prepared.used & inside
     _check_some(used)
-    mask, sigma = _mask(settings, used), np.asarray(prepared.sigma) * factors[:, None, None]
+    mask, fluctuations = _mask(settings, used), prepared.fluctuations
 
     def scaled(maps):
         return np.where(used, np.asarray(maps) * factors[:, None, None], 0.0)
 
-    alone, fluctuations = None, prepared.fluctuations
+    alone = None
     if inputs.foregrounds is not None:
         pairs = zip(fluctuations.preparations, inputs.foregrounds.values(), strict=True)
         alone = scaled(jnp.stack([operator(maps) for operator, maps in pairs]))
+    by_pixel = settings.separate.domain == "pixel"
+    left = used if by_pixel else mask > 0
     shared |= {
+        "used": left,
         "mask": mask,
         "observed": scaled(prepared.data),
         "foregrounds": alone,
         "labels": parameter_labels(settings, used),
+        "noise": prepared.pixel_noise(left, factors),
         "fluctuations": fluctuations,
         "factors": factors,
     }
-    if settings.separate.domain == "harmonic":
-        used = mask > 0
-    noise = as_noise(np.where(used, sigma, np.inf), sigma.shape)
-    if settings.separate.domain == "pixel":
-        return PixelData(**shared, used=used, noise=noise)
-    spectra = _masked_noise(fluctuations, np.where(used, sigma, 0.0), factors, mask)
+    if by_pixel:
+        return PixelData(**shared)
     return MaskedSkyData(
-        **shared, used=used, noise=noise, spectra=spectra, fwhm=settings.common.fwhm
+        **shared,
+        spectra=masked_noise(prepared, mask, factors),
+        fwhms=np.full(len(factors), common.fwhm),
+        nside=common.nside,
+        fwhm=common.fwhm,
     )
-
-
-def _masked_noise(
-    fluctuations: Fluctuations,
-    sigma: Float[np.ndarray, "band stokes pix"],
-    factors: Float[np.ndarray, " band"],
-    mask: Float[np.ndarray, " pix"],
-) -> Float[np.ndarray, "band stokes ell"]:
-    """N_l of masked noise: white as the beam of each band leaves it, and what is correlated."""
-    preparations = fluctuations.preparations
-    lmax = 2 * min(op.nside_in for op in preparations)
-    lmax, area = min(lmax, 2 * healpy.npix2nside(mask.size)), np.mean(mask**2)
-    spectra = np.zeros((len(sigma), 2, lmax + 1))
-    for i, (op, spectrum) in enumerate(zip(preparations, fluctuations.correlated, strict=True)):
-        assert op.window is not None  # there is a common beam
-        shape, correlated = np.asarray(op.window[: lmax + 1]) ** 2, np.zeros(lmax + 1)
-        if spectrum is not None:
-            correlated = np.asarray(spectrum[: lmax + 1]) * factors[i] ** 2
-        white = np.mean((sigma[i] * mask) ** 2) - map_variance(correlated) * area
-        spectra[i] = white / map_variance(shape) * shape + correlated * area
-    return spectra
 
 
 def _full_sky_data(
@@ -342,19 +300,21 @@ def _full_sky_data(
             )
     nsides = [healpy.npix2nside(band.used.size) for band in bands.values()]
     lmax = 2 * min(common.nside, *nsides)
-    white: list[Numeric] = []
-    correlated = np.zeros((len(nsides), lmax + 1))
-    noise = np.zeros((len(nsides), 1, lmax + 1))
-    for i, (band, factor) in enumerate(zip(bands.values(), factors, strict=True)):
-        if np.ndim(band.noise):
-            white.append(jnp.asarray(band.noise) * factor**2)
-            level = jnp.diagonal(white[i]).mean() * healpy.nside2pixarea(nsides[i])
+    spectra, noises = np.zeros((len(nsides), 2, lmax + 1)), {}
+    for i, (name, band) in enumerate(bands.items()):
+        size, noise, correlated = factors[i], band.noise, None
+        if np.ndim(noise):
+            noise = jnp.asarray(noise) * size**2
+            level = jnp.diagonal(noise).mean() * healpy.nside2pixarea(nsides[i])
         else:
-            white.append(band.noise * factor)
-            level = (white[i] * np.radians(1 / 60)) ** 2
+            noise = noise * size
+            level = (noise * np.radians(1 / 60)) ** 2
+        spectra[i] = level
         if band.correlated is not None:
-            correlated[i] = band.correlated[: lmax + 1] * factor**2
-        noise[i] = level + correlated[i]
+            correlated = band.correlated[: lmax + 1] * size**2
+            spectra[i] += correlated
+        as_observed = Preparation(jnp.ones(lmax + 1), nsides[i], common.nside)
+        noises[name] = MapNoise(as_observed, noise, correlated)
 
     def coefficients(maps):
         scaled = [np.asarray(m) * f for m, f in zip(maps, factors, strict=True)]
@@ -368,9 +328,8 @@ def _full_sky_data(
         observed=coefficients([band.maps for band in bands.values()]),
         foregrounds=None if alone is None else coefficients(alone.values()),
         fwhms=np.array([float(band.beam) for band in bands.values()]),
-        noise=np.broadcast_to(noise, (len(nsides), 2, lmax + 1)),
-        white=tuple(white),
-        correlated=correlated,
+        spectra=spectra,
+        noises=noises,
         nside=common.nside,
         fwhm=common.fwhm,
     )

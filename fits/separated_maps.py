@@ -11,15 +11,14 @@ import numpy as np
 import scipy.special
 from jaxtyping import ArrayLike, Float
 
-from fits import amplitudes
-from fits.amplitudes import Pixels
-from fits.compress import Layout, used_pixels
+from fits import systems
+from fits.compress import Noise, as_noise, bare, chunks, pixel_rows, used_pixels
 from fits.mixing import spectral_names
 from fits.multipoles import check_alm, multipoles_of
-from fits.noise import Noise, as_noise, bare, chunks
 from fits.optimize import best_fit
-from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
+from fits.profile_likelihood import SpectralLikelihood, matrices_at, spectral_likelihood
 from fits.results import FitResult
+from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.checks import Numeric, as_array, check_finite, check_shape
 from jaxsky.components import component_class
@@ -64,11 +63,6 @@ class ComponentMaps(NamedTuple):
         return sigma / np.sqrt(self.alone[self.components.index(name)])
 
 
-@jax.jit
-def _matrices(like, params):
-    return like.matrices(like.flat(params)[like.index])
-
-
 @partial(jax.jit, static_argnames="errors")
 def _separated(matrix, pixels, errors):
     """Amplitudes and chi^2, with a matrix for all pixels or for each.
@@ -77,11 +71,11 @@ def _separated(matrix, pixels, errors):
     """
 
     def separated(m, p):
-        found = amplitudes.explained(m, p)
+        found = systems.explained(m, p)
         if not errors:
             return found
-        single = [amplitudes.inverse_gram(column[:, None], p)[:, 0, 0] for column in m.T]
-        return *found, amplitudes.inverse_gram(m, p), jnp.stack(single, axis=1)
+        single = [systems.inverse_gram(column[:, None], p)[:, 0, 0] for column in m.T]
+        return *found, systems.inverse_gram(m, p), jnp.stack(single, axis=1)
 
     if len(matrix) == 1:
         return separated(matrix[0], pixels)
@@ -91,38 +85,13 @@ def _separated(matrix, pixels, errors):
     return jax.tree.map(lambda x: jnp.moveaxis(x[..., 0], 0, -1), results)
 
 
-def _pixels(
-    layout: Layout, noise: Noise, used: np.ndarray, part: slice, data: np.ndarray
-) -> Pixels:
-    """Data and weights of some pixels; masked ones are zero and have unit weight."""
-    mask, weights = used[part], noise.weights(part)
-    if weights.shape[-1] > 1 or not mask.all():
-        weights = np.where(mask, weights, 1.0)
-    weights = weights.swapaxes(0, 1)
-    values = np.where(mask & (weights > 0), np.asarray(data[..., part], float), 0.0)
-    cross = noise.cross(part) if layout.joint else None
-    return Pixels(
-        jnp.asarray(layout.rows(values)),
-        jnp.asarray(layout.rows(weights)),
-        None if cross is None else jnp.asarray(np.where(mask, cross, 0.0))[None],
-    )
-
-
 def _passes(like: SpectralLikelihood, params: Mapping[str, Numeric], npix: int) -> Iterator:
     """(layout, slice of pixels, matrix of all pixels (1, row, unknown) or of each) for all maps."""
-    known = _matrices(like, like.check(params) if like.start else {})
+    known = matrices_at(like, like.check(params) if like.start else {})
     for layout, matrix in zip(like.layout, known, strict=True):
         for part in chunks(npix):
             own = matrix if like.of_pixel is None else matrix[jnp.maximum(like.of_pixel[part], 0)]
             yield layout, part, own
-
-
-def _check_data(like: SpectralLikelihood, data: Numeric) -> np.ndarray:
-    data = bare("data", data)
-    wanted = (len(like.mixing.names), len(like.stokes))
-    good = data.ndim == 3 and data.shape[:2] == wanted
-    check_shape("data", data, good, f"have shape (band, stokes, pix) = {(*wanted, 'pix')}")
-    return data
 
 
 def component_maps(
@@ -147,7 +116,9 @@ def component_maps(
     KeyError, TypeError, ValueError
         For unknown parameters, and what `spectral_likelihood` refuses.
     """
-    data = _check_data(like, data)
+    data, wanted = bare("data", data), (len(like.mixing.names), len(like.stokes))
+    good = data.ndim == 3 and data.shape[:2] == wanted
+    check_shape("data", data, good, f"have shape (band, stokes, pix) = {(*wanted, 'pix')}")
     names, (_, stokes, npix) = tuple(like.mixing.sky), data.shape
     noise = as_noise(noise, data.shape)
     used = used_pixels(noise, npix, len(names))
@@ -159,8 +130,9 @@ def component_maps(
     for layout, part, matrix in _passes(like, params, npix):
         own = list(layout.stokes)
         errors = covariance and not (uniform and part.start)
-        found = _separated(matrix, _pixels(layout, noise, used, part, data), errors)
-        solved, squares, *variances = map(np.asarray, found)
+        rows = pixel_rows(data, noise, layout, part, used[part])
+        pixels = Pixels(*jax.tree.map(jnp.asarray, rows))
+        solved, squares, *variances = map(np.asarray, _separated(matrix, pixels, errors))
         amplitude[:, own, part] = layout.maps(solved)
         square[part] += squares
         count[part] += (noise.weights(part) > 0)[own].sum(axis=(0, 1)) - len(names) * len(own)
@@ -170,15 +142,14 @@ def component_maps(
         where = slice(0, 1) if uniform else part
         for k, s in enumerate(own):
             group, first = (0, k * len(names)) if layout.joint else (k, 0)
-            rows = slice(first, first + len(names))
-            blocks[:, :, s, where] = inverse[group, rows, rows]
-            alone[:, s, where] = single[group, rows]
+            cut = slice(first, first + len(names))
+            blocks[:, :, s, where] = inverse[group, cut, cut]
+            alone[:, s, where] = single[group, cut]
     for values in (amplitude, square, count, *(() if uniform else (blocks, alone))):
         values[..., ~used] = np.nan
     probability = scipy.special.chdtrc(count, square)
-    if not covariance:
-        return ComponentMaps(names, amplitude, None, None, square, count, probability)
-    return ComponentMaps(names, amplitude, blocks, alone, square, count, probability)
+    found = ComponentMaps(names, amplitude, blocks, alone, square, count, probability)
+    return found if covariance else found._replace(covariance=None, alone=None)
 
 
 def emission_maps(
@@ -196,23 +167,6 @@ def emission_maps(
             model = np.einsum("pru,kup->krp", np.asarray(matrix), rows)
         result[:, list(layout.stokes), part] = layout.maps(model)
     return result
-
-
-def residual_maps(
-    like: SpectralLikelihood,
-    params: Mapping[str, Numeric],
-    data: Numeric,
-    amplitude: Float[np.ndarray, "component stokes pix"],
-) -> Float[np.ndarray, "band stokes pix"]:
-    """Data less the sum of the components, in the unit of the data; NaN in masked pixels.
-
-    Parameters
-    ----------
-    like, params : as for `component_maps`
-    data : observed maps
-    amplitude : from `component_maps`
-    """
-    return _check_data(like, data) - emission_maps(like, params, amplitude)
 
 
 class HarmonicMaps(ComponentMaps):
@@ -284,9 +238,9 @@ def harmonic_component_maps(
     ell, sigma = multipoles.ell, multipoles.sigma
     of_alm = Noise(sigma[..., ell])
     found = component_maps(like, params, multipoles.without_beams(alm), of_alm, covariance=False)
+    of_noise = found
     if covariance:
         of_noise = component_maps(like, params, np.zeros(sigma.shape), Noise(sigma))
-        found = found._replace(covariance=of_noise.covariance, alone=of_noise.alone)
     used = np.arange(ell.max() + 1) >= lmin
     square, count = (
         np.where(used, np.bincount(ell, np.nan_to_num(each)), np.nan)
@@ -296,8 +250,8 @@ def harmonic_component_maps(
     return HarmonicMaps(
         names,
         np.where(ell >= lmin, found.amplitude, 0.0),
-        found.covariance,
-        found.alone,
+        of_noise.covariance,
+        of_noise.alone,
         square,
         count,
         probability,

@@ -10,30 +10,37 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy.stats
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
+from scipy.integrate import cumulative_trapezoid
 
 from fits.common import CommonMaps
-from fits.grid import grid_fit, grid_is_possible
 from fits.inputs import Inputs
 from fits.kept import KeptChain, fingerprint
 from fits.mixing import nominal
 from fits.optimize import best_fit
-from fits.posterior import chi2
-from fits.priors import Prior, priors_of
-from fits.results import FitResult
+from fits.posterior import Likelihood, Prior, Uniform, check_priors, chi2, priors_of
+from fits.results import Convergence, FitResult
 from fits.sampling import sample
-from fits.template_likelihood import SkyLikelihood, TemplateLikelihood
+from fits.template_likelihood import PixelLikelihood, SkyLikelihood, TemplateLikelihood
 from jaxsky import observe_components, parameter_names, set_parameters
+from jaxsky.checks import Numeric
 from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 
 #: A band in which each template has less than this part of its weight has none.
 WEIGHTLESS = 1e-6
-
 #: A fit whose coefficients change its own errors is repeated until it moves by less [sigma].
 SETTLED = 0.01
+#: The grid is narrowed to where the posterior exceeds exp(-NARROW/2) of its maximum (6 sigma).
+NARROW = 36.0
+#: A posterior that changes by less over the whole prior, in its logarithm, is flat.
+FLAT = 1e-6
+#: Probability of one standard deviation to either side.
+ONE_SIGMA = 0.6826894921370859
 
 
 class RegionFit(NamedTuple):
@@ -42,9 +49,8 @@ class RegionFit(NamedTuple):
     `chi2` is the paper's sum over pixels at the best fit of each method, with `dof` degrees of
     freedom; `chi2_amplitudes` and `dof_amplitudes` are those of the exact likelihood, which
     compares the amplitudes of the templates only. Bands without weight (`weightless`) are not
-    counted in either. `noise_shares`
-    says which part of the weighted power of each template is noise, where there is any, and
-    `corrected` whether the fits know of it.
+    counted in either. `noise_shares` says which part of the weighted power of each template is
+    noise, where there is any, and `corrected` whether the fits know of it.
     """
 
     region: str
@@ -132,14 +138,15 @@ def _fit_pixels(
             make = partial(prepared.likelihood, stokes=stokes, region=used, kind=kind)
             like = make(start) if prepared.template_errors is None else settled(make, start, priors)
     nothing = weightless(prepared, start, used, stokes)
-    weighty = 1 - len(nothing) / len(prepared.bands)
+    number = len(prepared.bands) - len(nothing)
     if exact:
-        dof_amplitudes = round(like.residuals(start).size * weighty) - len(start)
+        values = like.residuals(start).size * number / len(prepared.bands)
+        dof_amplitudes = round(values) - len(start)
     results: dict[str, FitResult] = {}
     for method in settings.fit.methods:
         progress.step(f"{region}, {stokes}: {method}")
         if method == "grid":
-            if grid_is_possible(start, priors):
+            if len(start) <= 2 and all(isinstance(priors.get(n), Uniform) for n in start):
                 results[method] = grid_fit(like, start, priors=priors, points=settings.fit.points)
         elif method == "gradient":
             results[method] = best_fit(like, start, priors=priors, throw=False)
@@ -164,20 +171,33 @@ def _fit_pixels(
         raise SettingsError(
             "fit.methods: a grid alone takes one or two free parameters with uniform priors."
         )
-    values = {method: float(chi2(diagonal, r.best_fit)) for method, r in results.items()}
-    number = len(prepared.bands) - len(nothing)
+    chi2s = {method: float(chi2(diagonal, r.best_fit)) for method, r in results.items()}
     dof = int(used.sum()) * number * len(stokes) - len(start)
     expected = _expected(prepared, used, stokes, nothing)
     results = {
-        method: r.judged(values[method], dof, start, expected) for method, r in results.items()
+        method: r.judged(chi2s[method], dof, start, expected) for method, r in results.items()
     }
-    shares: dict[str, float] = {}
-    if prepared.template_errors is not None:
-        shares = prepared.noise_shares(used, stokes)
-    corrected = isinstance(like, TemplateLikelihood)
-    return RegionFit(
-        region, stokes, results, values, dof, dof_amplitudes, nothing, shares, corrected
-    )
+    noisy = prepared.template_errors is not None
+    shares = _noise_shares(prepared, used, stokes) if noisy else {}
+    known = nothing, shares, isinstance(like, TemplateLikelihood)
+    return RegionFit(region, stokes, results, chi2s, dof, dof_amplitudes, *known)
+
+
+def _noise_shares(
+    prepared: CommonMaps, used: Bool[np.ndarray, " pix"], stokes: str
+) -> dict[str, float]:
+    """Part of the weighted power of each template that is its noise."""
+    errors = prepared.template_errors
+    assert prepared.sky is not None
+    assert errors is not None  # as called
+    keep = np.array([s in stokes for s in "QU"])
+    inside = used & np.isfinite(prepared.sigma) & keep[:, None]
+    weights = np.where(inside, 1 / np.asarray(prepared.sigma) ** 2, 0.0)
+    templates = np.stack([c.amplitude for c in prepared.sky.components.values()])
+    templates = np.where(prepared.used, templates, 0.0)
+    noise = np.einsum("bsp,usp,ku->k", weights, errors.variance, errors.parts**2)
+    shares = noise / np.einsum("bsp,ksp,ksp->k", weights, templates, templates)
+    return dict(zip(prepared.sky, shares.tolist(), strict=True))
 
 
 def _expected(
@@ -240,3 +260,140 @@ def fit_regions(
         for region, pixels in used.items()
         for stokes in settings.fit.stokes
     ]
+
+
+@jax.jit
+def chi2_on_grid(like, axes):
+    """chi^2 on the product of the axes, which are arrays by name of parameter.
+
+    One vmap an axis, so that what depends on one parameter is computed along its axis only.
+    """
+    names = list(axes)
+
+    def point(*values):
+        return chi2(like, dict(zip(names, values, strict=True)))
+
+    if isinstance(like, PixelLikelihood):
+        # One point after the other: all at once would hold the maps once for each of them.
+        mesh = jnp.meshgrid(*axes.values(), indexing="ij")
+        flat = jax.lax.map(lambda values: point(*values), tuple(axis.ravel() for axis in mesh))
+        return flat.reshape(mesh[0].shape)
+    mapped = point
+    for i in reversed(range(len(names))):
+        mapped = jax.vmap(mapped, in_axes=tuple(0 if j == i else None for j in range(len(names))))
+    return mapped(*axes.values())
+
+
+def _weights(axis: np.ndarray) -> np.ndarray:
+    """Trapezoid weights of an even axis."""
+    weights = np.full(len(axis), axis[1] - axis[0])
+    weights[[0, -1]] /= 2
+    return weights
+
+
+def _along(values: np.ndarray, i: int) -> Float[np.ndarray, "point _"]:
+    """Values on the grid, a row for each point of axis i."""
+    return np.moveaxis(values, i, 0).reshape(values.shape[i], -1)
+
+
+def grid_fit(
+    like: Likelihood,
+    start: Mapping[str, Numeric] | None = None,
+    *,
+    priors: Mapping[str, Prior],
+    points: int = 200,
+) -> FitResult:
+    """The posterior on a grid over the ranges of the uniform priors: the paper's test.
+
+    The grid first spans the priors, then is narrowed, again with all its points, to where the
+    posterior is not negligible, until that no longer changes it much.
+
+    Parameters
+    ----------
+    like : from `fits.likelihood` or `fits.spectral_likelihood`
+    start : the free parameters by name (the values do not matter), one or two; by default those
+        of the likelihood
+    priors : a uniform prior for each of them
+    points : points an axis
+
+    Returns
+    -------
+    Result with the values at the highest point, intervals and covariance by integration over
+    the grid. `details` holds "axes" by name, "log_posterior" relative to its maximum, with
+    axes in the order of `free`, and "marginals" by name.
+
+    Raises
+    ------
+    KeyError, ValueError
+        For unknown parameters, more than two of them, or one without a uniform prior.
+    """
+    like = like.at(start)
+    free = like.free
+    priors = check_priors(priors, free)
+    if len(free) > 2:
+        raise ValueError(
+            f"A grid takes one or two free parameters, not {len(free)} ({', '.join(free)}); "
+            "use the gradient fit or MCMC."
+        )
+    ranges = {}
+    for name in free:
+        if (size := like.start[name].size) > 1:
+            raise ValueError(
+                f"A grid takes parameters with one value, but {name!r} has {size}, one for "
+                "each region; use the gradient fit or MCMC."
+            )
+        if not isinstance(prior := priors.get(name), Uniform):
+            raise ValueError(f"A grid needs a uniform prior for {name!r}, to know its range.")
+        ranges[name] = (prior.low, prior.high)
+    limits = ranges
+    for _ in range(6):
+        axes = {name: np.linspace(low, high, points) for name, (low, high) in ranges.items()}
+        chi2s = np.asarray(chi2_on_grid(like, axes))
+        narrowed, shrunk = {}, []
+        for i, (name, axis) in enumerate(axes.items()):
+            # To where the posterior matters, and one step wider on either side.
+            inside = np.flatnonzero(_along(chi2s, i).min(axis=1) - chi2s.min() < NARROW)
+            low, high = axis[max(inside[0] - 1, 0)], axis[min(inside[-1] + 1, points - 1)]
+            narrowed[name] = (float(low), float(high))
+            shrunk.append((high - low) / (axis[-1] - axis[0]))
+        if min(shrunk) > 0.8:
+            break
+        ranges = narrowed
+    log_posterior = (chi2s.min() - chi2s) / 2
+    weights = np.exp(log_posterior)
+    for axis_weights in np.meshgrid(*map(_weights, axes.values()), indexing="ij"):
+        weights = weights * axis_weights
+    weights = weights / weights.sum()
+    marginals, intervals = {}, {}
+    for i, (name, axis) in enumerate(axes.items()):
+        marginals[name] = _along(weights, i).sum(axis=1) / _weights(axis)
+        cumulative = cumulative_trapezoid(marginals[name], axis, initial=0.0)
+        levels = np.array([1 - ONE_SIGMA, 1 + ONE_SIGMA]) / 2
+        low, high = np.interp(levels, cumulative / cumulative[-1], axis).tolist()
+        intervals[name] = (low, high)
+    mesh = np.stack([m.ravel() for m in np.meshgrid(*axes.values(), indexing="ij")])
+    best = int(np.argmin(chi2s))
+    values = dict(zip(free, mesh[:, best].tolist(), strict=True))
+    covariance = np.atleast_2d(np.cov(mesh, aweights=weights.ravel(), ddof=0))
+    edges = [name for name, value in values.items() if value in limits[name]]
+    converged, message = Convergence.converged, "integrated"
+    if edges:
+        converged = Convergence.at_edge
+        message = f"The highest point lies at the edge of the uniform prior of {', '.join(edges)}."
+    if log_posterior.min() > -FLAT:
+        converged = Convergence.undetermined
+        message = f"The posterior is flat: the data do not constrain {', '.join(free)}."
+    result = FitResult(
+        method="grid",
+        best_fit=values,
+        sigma=dict(zip(free, np.sqrt(np.diagonal(covariance)).tolist(), strict=True)),
+        interval_68=intervals,
+        labels=free,
+        covariance=covariance,
+        chi2=float(chi2s.ravel()[best]),
+        dof=like.dof(len(free)),
+        converged=converged,
+        message=message,
+        details={"axes": axes, "log_posterior": log_posterior, "marginals": marginals},
+    )
+    return result.judged(result.chi2, result.dof, like.start)

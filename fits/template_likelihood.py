@@ -5,7 +5,7 @@ dict of parameters, so the grid, the optimiser and the sampler share one definit
 
 * "diagonal", the paper's: sum over pixels of (data - model)^2 / sigma^2.
 * "exact": the data reduced to their inner products with the templates, y = T^T W d, with the
-  exact covariance of y (`fits.fluctuations`). Smoothed noise is correlated between pixels and the
+  exact covariance of y (`fits.common`). Smoothed noise is correlated between pixels and the
   CMB between bands; the diagonal form ignores both and so misstates its errors, while y is
   linear in the data, hence Gaussian with a covariance that can be computed.
 
@@ -21,7 +21,7 @@ templates like the others then, behind them.
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -30,18 +30,20 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float, Int
 
-from fits.compress import gram, square_root
+from fits.compress import square_root
 from fits.mixing import Mixing, named_bands, unit_sky
 from fits.posterior import Likelihood
-from fits.template_noise import TemplateErrors
+from fits.template_noise import TemplateErrors, check_signal
 from jaxsky import Bandpass, Sky, observe_components, parameter_names
 from jaxsky.checks import UNSEEN, Numeric, as_array, check_double, check_shape
 from jaxsky.interpolation import NodeCounts, Nodes
 from jaxsky.sky import OFFSET, interpolation_nodes, unknown_parameter
 
 #: Covariance of the inner products <rows, data>: (band, row, stokes, pix) -> square matrix over
-#: (band, row) flattened. `fits.fluctuations.Fluctuations.covariance` is one.
+#: (band, row) flattened. `fits.common.Fluctuations.covariance` is one.
 CovarianceOf = Callable[[Float[Array, "band row stokes pix"]], Float[np.ndarray, "row row"]]
+#: Pixels per pass over templates; small enough that the weighted copies stay in cache.
+CHUNK = 1 << 14
 
 
 class SkyLikelihood(Likelihood):
@@ -136,15 +138,41 @@ class PixelLikelihood(SkyLikelihood):
         return jnp.asarray(self.whitening) @ products.ravel()
 
 
-def _check_shapes(sky: Sky, bands: Mapping[str, Any], data: Array, sigma: Array) -> None:
-    shape = (len(bands), *sky.shape)
-    form = f"(band, stokes, pix) = {shape}"
-    check_shape("data", data, data.shape == shape, f"have shape {form}")
-    try:
-        broadcasts = jnp.broadcast_shapes(sigma.shape, shape) == shape
-    except ValueError:
-        broadcasts = False
-    check_shape("sigma", sigma, broadcasts, f"broadcast to {form}")
+@partial(jax.jit, static_argnames="chunk")
+def gram(
+    data: Float[Array, "band stokes pix"],
+    templates: Float[Array, "template stokes pix"],
+    weights: Float[Array, "band stokes pix"],
+    chunk: int = CHUNK,
+) -> Float[Array, "band stokes row row"]:
+    """Weighted inner products of (data, templates, 1), for each band and Stokes parameter.
+
+    One pass over the pixels, after which nothing of a fit with constant laws depends on their
+    number: a model is a sum of templates, so chi^2 is a quadratic form in their coefficients.
+    Weights are 1/sigma^2, zero where masked, and broadcast against the data; `chunk` pixels are
+    taken at once. Results for disjoint sets of pixels add up to that of their union.
+    """
+    bands, _, npix = data.shape
+    weights = jnp.broadcast_to(weights, data.shape)
+
+    def products(d, t, w):
+        t = jnp.broadcast_to(t, (bands, *t.shape)).swapaxes(1, 2)
+        rows = jnp.concatenate([d[:, :, None], t, jnp.ones_like(d)[:, :, None]], axis=2)
+        # A masked pixel may hold anything, NaN among it.
+        rows = jnp.where(w[:, :, None] > 0, rows, 0)
+        return jnp.einsum("bsip,bsp,bsjp->bsij", rows, w, rows)
+
+    chunk = min(chunk, npix)
+    whole = npix // chunk * chunk
+
+    def add(total, start):
+        def cut(x):
+            return jax.lax.dynamic_slice_in_dim(x, start, chunk, axis=-1)
+
+        return total + products(cut(data), cut(templates), cut(weights)), None
+
+    total = products(data[..., whole:], templates[..., whole:], weights[..., whole:])
+    return jax.lax.scan(add, total, jnp.arange(0, whole, chunk))[0]
 
 
 def _checked_weights(data: Array, sigma: Array) -> tuple[Array, Int[np.ndarray, "band stokes"]]:
@@ -210,7 +238,12 @@ def likelihood(
     check_double("fits")
     bands = named_bands(bands)
     data, sigma = as_array("data", data), as_array("sigma", sigma)
-    _check_shapes(sky, bands, data, sigma)
+    shape = (len(bands), *sky.shape)
+    form = f"(band, stokes, pix) = {shape}"
+    check_shape("data", data, data.shape == shape, f"have shape {form}")
+    pairs = zip(sigma.shape[::-1], shape[::-1], strict=False)
+    broadcasts = sigma.ndim <= len(shape) and all(n in (1, size) for n, size in pairs)
+    check_shape("sigma", sigma, broadcasts, f"broadcast to {form}")
     weights, counts = _checked_weights(data, sigma)
     labels = "QU" if len(data[0]) == 2 else "IQU"
     stokes = labels if stokes is None else stokes
@@ -249,7 +282,7 @@ def likelihood(
         return dataclasses.replace(like, matrix=matrix)
     # A constant row tells offsets from templates.
     maps = [*templates, *([jnp.ones_like(templates[0])] if offsets else [])]
-    rows = _one_stokes_each(_weighted(jnp.stack(maps), weights))
+    rows = _one_stokes_each(jnp.stack(maps), weights)
     used = slice(1, len(maps) + 1)
     if covariance_of is not None:
         covariance = np.asarray(covariance_of(rows))
@@ -262,7 +295,7 @@ def likelihood(
         seen = np.repeat(np.asarray(like.coefficients(params)), len(maps), axis=1)
         covariance = covariance + template_errors.covariance(rows, seen)
         blocks = blocks - template_errors.mean_products(weights)[:, :, used]
-        _check_signal(blocks[:, keep, : len(templates), used][..., : len(templates)])
+        check_signal(blocks[:, keep, : len(templates), used][..., : len(templates)])
     whitening = _whitening(_of_kept(covariance, rows, keep))
     matrix = _matrix(blocks[:, keep], keep, len(labels), whitening)
     if covariance_of is not None:
@@ -288,12 +321,6 @@ def _weights(data, sigma):
     return weights, used.sum(axis=-1), jnp.sum(~(sigma > 0)), unseen.sum()
 
 
-@jax.jit
-def _weighted(maps, weights):
-    """Rows W T of each band and map, zero where masked."""
-    return weights[:, None] * jnp.where(weights[:, None] > 0, maps, 0)
-
-
 def _matrix(blocks, keep, stokes, whitening=None):
     """Blocks (band, kept stokes, row, vector) on the diagonal of a matrix for all Stokes rows."""
     bands, kept, rows, size = blocks.shape
@@ -306,8 +333,11 @@ def _matrix(blocks, keep, stokes, whitening=None):
 
 
 @jax.jit
-def _one_stokes_each(rows: Array) -> Float[Array, "band row stokes pix"]:
-    """Rows (band, template, stokes, pix) split so that each holds one Stokes parameter."""
+def _one_stokes_each(
+    maps: Float[Array, "*band template stokes pix"], weights: Float[Array, "band stokes pix"]
+) -> Float[Array, "band row stokes pix"]:
+    """Rows W T of each band and map, zero where masked, each with one Stokes parameter."""
+    rows = weights[:, None] * jnp.where(weights[:, None] > 0, maps, 0)
     bands, templates, stokes, npix = rows.shape
     split = jnp.eye(stokes)[None, :, None, :, None] * rows[:, None]
     return split.reshape(bands, stokes * templates, stokes, npix)
@@ -326,17 +356,6 @@ def _of_kept(
     split = covariance.reshape(2 * (bands, stokes, count // stokes))
     size = bands * len(keep) * count // stokes
     return split[:, keep][:, :, :, :, keep].reshape(size, size)
-
-
-def _check_signal(products: Float[np.ndarray, "band stokes template template"]) -> None:
-    """Raise ValueError where the noise of templates leaves none of their power, or less."""
-    total = products.sum(axis=(0, 1))
-    scale = np.sqrt(np.abs(np.diagonal(total)))
-    if np.linalg.eigvalsh(total / scale / scale[:, None])[0] <= 0:
-        raise ValueError(
-            "The noise of the templates is all that they hold in this region, or more than that; "
-            "look at its level and unit."
-        )
 
 
 def _whitening(covariance: Float[np.ndarray, "row row"]) -> Float[np.ndarray, "row row"]:
@@ -370,7 +389,7 @@ def _on_pixels(like, data, weights, keep, covariance_of):
             maps += [_swapped(one) for one in maps]
         if any(name.startswith("offset.") for name in params):
             maps.append(jnp.ones_like(data))
-        rows = _one_stokes_each(_weighted(jnp.stack(maps, axis=1), weights))
+        rows = _one_stokes_each(jnp.stack(maps, axis=1), weights)
         covariance = _of_kept(np.asarray(covariance_of(rows)), rows, keep)
         whitening = jnp.asarray(_whitening(covariance))
         kept = (keep[:, None] * len(maps) + np.arange(len(maps))).ravel()

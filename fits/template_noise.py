@@ -11,18 +11,22 @@ that of the data, at the coefficients of the best fit.
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import healpy
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fits.kept import remembered
 from jaxsky.checks import Numeric, listed
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.inputs import Template, uK_RJ_per
 from jaxsky.noise_inputs import read_noise
 from jaxsky.settings import ComponentTable, SettingsError
+
+if TYPE_CHECKING:
+    from fits.common import MapNoise
 
 
 class TemplateNoise(NamedTuple):
@@ -51,10 +55,11 @@ def level_spectrum(level: float, fwhm: float, lmax: int) -> Float[Array, " ell"]
 
 def read_template_noise(
     folder: Path, name: str, spec: ComponentTable, template: Template
-) -> TemplateNoise:
-    """The noise that the settings state of a template."""
+) -> TemplateNoise | None:
+    """The noise that the settings state of a template; None where they do not."""
     noise, where = spec.noise, f"sky.{name}.noise"
-    assert noise is not None  # as called
+    if noise is None:
+        return TemplateNoise() if spec.file is None else None  # the embedded maps are exact
     if noise.rms == 0 or noise.level == 0:
         return TemplateNoise(shared=noise.shared)
     if spec.angles is not None:
@@ -89,14 +94,13 @@ class TemplateErrors(NamedTuple):
 
     Attributes
     ----------
-    covariance_of : covariance of the products of rows with each source, by
-        `fits.fluctuations.Fluctuations.covariance`
+    covariances_of : covariance of the products of rows with each source, (source, row, row)
     parts : of each source in each template, shape (template, source)
     of_band : 1 where a source is the noise of a band, shape (band, source)
     variance : of each source in each pixel [uK_RJ^2], shape (source, stokes, pix)
     """
 
-    covariance_of: Callable[[Float[Array, "source row stokes pix"]], Float[np.ndarray, "row row"]]
+    covariances_of: Callable[[Float[Array, "row stokes pix"]], Float[np.ndarray, "source row row"]]
     parts: Float[np.ndarray, "template source"]
     of_band: Float[np.ndarray, "band source"]
     variance: Float[Array, "source stokes pix"]
@@ -123,25 +127,53 @@ class TemplateErrors(NamedTuple):
 
         `coefficients` are those of the templates in what each row is multiplied with.
         """
-        bands, count, stokes, npix = rows.shape
-        number, size = len(self.variance), bands * count
-        flat = jnp.broadcast_to(rows.reshape(1, size, stokes, npix), (number, size, stokes, npix))
-        total = self.covariance_of(flat).reshape(number, size, number, size)
-        own = np.repeat(self.of_band, count, axis=0)
-        seen = own - np.asarray(coefficients).reshape(size, -1) @ self.parts
-        each = np.einsum("umun->umn", total)
+        flat = rows.reshape(-1, *rows.shape[2:])
+        each = self.covariances_of(flat)
+        own = np.repeat(self.of_band, rows.shape[1], axis=0)
+        seen = own - np.asarray(coefficients).reshape(len(flat), -1) @ self.parts
         return np.einsum("umn,mu,nu->mn", each, seen, seen) - np.einsum(
             "umn,mu,nu->mn", each, own, own
         )
 
-    def shares(
-        self,
-        templates: Float[np.ndarray, "template stokes pix"],
-        weights: Float[np.ndarray, "band stokes pix"],
-    ) -> np.ndarray:
-        """The part of each template's weighted power that is noise."""
-        noise = np.einsum("bsp,usp,ku->k", weights, self.variance, self.parts**2)
-        return noise / np.einsum("bsp,ksp,ksp->k", weights, templates, templates)
+
+def template_errors(
+    names: Sequence[str],
+    noises: Mapping[str, TemplateNoise],
+    own: Mapping[str, "MapNoise"],
+    bands: Mapping[str, "MapNoise"],
+) -> TemplateErrors | None:
+    """Errors of templates from the noise that some have of their own, and that of all bands.
+
+    None where there is neither.
+    """
+    shared = [noises[name].shared if name in noises else {} for name in names]
+    which = [band for band in bands if any(band in one for one in shared)]
+    if not own and not which:
+        return None
+    sources = [*own.values(), *(bands[band] for band in which)]
+    parts = [
+        [float(n == name) for name in own] + [one.get(band, 0.0) for band in which]
+        for n, one in zip(names, shared, strict=True)
+    ]
+    of_band = [[0.0] * len(own) + [float(b == name) for b in which] for name in bands]
+    variance = np.stack([source.variance() for source in sources])
+    return TemplateErrors(
+        remembered(lambda rows: np.stack([source.covariance(rows) for source in sources])),
+        np.array(parts),
+        np.array(of_band),
+        jnp.asarray(np.where(variance > 0, variance, 0.0)),
+    )
+
+
+def check_signal(products: Float[np.ndarray, "band stokes template template"]) -> None:
+    """Raise ValueError where the noise of templates leaves none of their power, or less."""
+    total = products.sum(axis=(0, 1))
+    scale = np.sqrt(np.abs(np.diagonal(total)))
+    if np.linalg.eigvalsh(total / scale / scale[:, None])[0] <= 0:
+        raise ValueError(
+            "The noise of the templates is all that they hold in this region, or more than that; "
+            "look at its level and unit."
+        )
 
 
 def unknown_noise(names: Sequence[str]) -> str:

@@ -13,11 +13,11 @@ import scipy.stats
 from commands import jaxsky
 from fits.commands.compare import comparison_warnings
 from fits.common import common_maps
-from fits.comparison import compare, compare_pixels, simulated_fluctuations
-from fits.full_sky import compare_spectra, cosmic_error, full_sky_spectra, hotelling
+from fits.comparison import compare, compare_pixels, compare_spectra, simulated_fluctuations
 from fits.inputs import inputs_of
+from fits.pseudo_cl import cosmic_error, hotelling, polarization_alms
 from fits.regions import region_masks
-from jaxsky.harmonics import expand, synthesis
+from jaxsky.harmonics import expand, power_spectrum, synthesis
 from jaxsky.io import InputError
 from jaxsky.noise import draw, uniform_covariance, white_alm
 from jaxsky.settings import Experiment, SettingsError, load
@@ -97,7 +97,7 @@ def test_noise_is_prepared_as_maps_are(prepared):
     for key in jax.random.split(jax.random.key(5), 8):
         fast = white_alm(key, unit, op.window.size - 1) * expand(op.window)
         maps = jnp.stack([op(draw(key, unit)), synthesis(fast, op.nside)])
-        powers.append(full_sky_spectra(maps, 25))
+        powers.append(power_spectrum(polarization_alms(maps, 25)))
     exact, fast = np.mean(powers, axis=0)[..., 2:]
     np.testing.assert_allclose(fast, exact, rtol=5e-3)
     np.testing.assert_allclose(fast.sum(axis=-1), exact.sum(axis=-1), rtol=1e-3)
@@ -200,7 +200,7 @@ def test_hotelling_is_exact():
 
 
 def test_spectra_are_healpys(prepared, model, simulated):
-    found = compare_spectra(prepared, model, simulated.spectra, simulated.noise, 8)
+    found = compare_spectra(prepared, model, simulated, 8)
     zero = np.zeros(prepared.used.size)
     for spectra, maps in zip(found, prepared.data, strict=True):
         cls = healpy.anafast([zero, *np.asarray(maps)], lmax=40, iter=10)[1:3, :26]
@@ -225,7 +225,7 @@ def test_spectra_are_healpys(prepared, model, simulated):
 
 def test_spectra_do_not_depend_on_the_common_nside(settings, prepared):
     fine = common_maps(inputs_of(settings), 32, settings.common.fwhm)
-    found, finer = full_sky_spectra(prepared.data, 25), full_sky_spectra(fine.data, 25)
+    found, finer = (power_spectrum(polarization_alms(m.data, 25)) for m in (prepared, fine))
     np.testing.assert_allclose(found[..., 2:], finer[..., 2:], rtol=1e-2)
 
 
@@ -234,7 +234,7 @@ def test_missing_pixels_leave_spectra_out(settings, prepared, model, regions, si
     used[:3] = False
     holes = prepared._replace(used=used)
     with pytest.raises(ValueError, match="3 of 3072 have no value"):
-        compare_spectra(holes, model, simulated.spectra, simulated.noise, 8)
+        compare_spectra(holes, model, simulated, 8)
     found = compare(settings, holes, regions)
     assert not found.spectra
     assert "3 of 3072 pixels have no value" in comparison_warnings(found, settings)[0]

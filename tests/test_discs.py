@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fits.discs import BICEP2, bicep2_mask, disc_centers, disc_mask, paper_patches
-from fits.power_covariance import ring_functions, zonal
+from fits.tensor_ratio import ring_functions, zonal
 from jaxsky.harmonics import alm_from_healpy, analysis, smooth, synthesis
 
 SQUARE_DEGREES = 4 * np.pi * np.degrees(1) ** 2

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from fits import fisher
-from fits.fisher import ForecastModel, fiducial, fisher_errors
+from fits.fisher import ForecastModel, fiducial, fisher_errors, noise_weights
 from fits.mixing import Mixing, unit_sky
-from fits.tensor_ratio import noise_weights
 from jaxsky import AME, Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.noise import uniform_covariance
 from jaxsky.observation import ObservedBand, load_instrument

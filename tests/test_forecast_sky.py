@@ -10,10 +10,10 @@ import pytest
 from commands import jaxsky, one_sentence
 from fits.commands.forecast import forecast, forecast_warnings
 from fits.commands.run import DEFAULTS
-from fits.power_covariance import covariance_terms
+from fits.fisher import BandLaw, band_correlation, equal_r, fit_law, foreground_powers
 from fits.pseudo_cl import bin_edges, masked_spectra, sky_fraction
 from fits.regions import apodize
-from fits.tensor_ratio import BandLaw, band_correlation, equal_r, fit_law, foreground_powers
+from fits.tensor_ratio import covariance_terms
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe_band
 from jaxsky.harmonics import alm_ell, gaussian_beam, power_spectrum, synthesis
 from jaxsky.io import write_maps

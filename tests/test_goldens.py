@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import systems
-from fits.fluctuations import Fluctuations
+from fits.common import Fluctuations
 from fits.multipoles import harmonic_likelihood
 from fits.posterior import chi2, hessian
 from fits.profile_likelihood import spectral_likelihood

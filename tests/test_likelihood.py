@@ -10,13 +10,12 @@ import pytest
 from jax.test_util import check_grads
 
 import systems
-from fits.compress import gram, square_root
-from fits.fluctuations import Fluctuations
+from fits.common import Fluctuations
+from fits.compress import square_root
 from fits.mixing import NOMINAL
 from fits.optimize import best_fit
-from fits.posterior import chi2
-from fits.priors import Gaussian
-from fits.template_likelihood import likelihood
+from fits.posterior import Gaussian, chi2
+from fits.template_likelihood import gram, likelihood
 from jaxsky import (
     AME,
     Bandpass,

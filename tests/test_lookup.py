@@ -10,8 +10,8 @@ from fits.commands.forecast import forecast_inputs
 from fits.inputs import inputs_of
 from fits.paper.sky import PaperSky
 from fits.regions import region_masks
+from fits.results import write_log
 from fits.separated_data import separation_data
-from fits.writing import write_log
 from jaxsky.experiment import simulation_inputs
 from jaxsky.io import InputError, write_maps
 from jaxsky.io.files import cache_folder

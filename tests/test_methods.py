@@ -1,17 +1,18 @@
 """Grid, gradient and MCMC: they agree, respect priors, resume, and say when they fail."""
 
+import json
+
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
 
-from fits.grid import grid_fit
 from fits.optimize import Newton, best_fit
-from fits.priors import Gaussian, Uniform
-from fits.results import FitError, misfit
+from fits.posterior import Gaussian, Uniform
+from fits.results import Convergence, FitError, misfit, with_error, write_json
 from fits.sampling import sample
+from fits.spectral_index import grid_fit
 from fits.template_likelihood import likelihood
-from fits.writing import with_error
 from jaxsky import Dust, Sky, observe, set_parameters
 from test_likelihood import BANDS, START, fluctuations, problem
 
@@ -138,11 +139,13 @@ def test_an_optimum_at_the_edge_of_a_prior_is_reported(like):
     with pytest.raises(FitError, match=r"'dust.beta_dust' lies at the edge 2.2") as caught:
         best_fit(like, start, priors=narrow)
     assert caught.value.result.best_fit["dust.beta_dust"] == pytest.approx(2.2, abs=1e-3)
-    assert not best_fit(like, start, priors=narrow, throw=False).converged
+    at_edge = best_fit(like, start, priors=narrow, throw=False).converged
+    assert at_edge is Convergence.at_edge
+    assert not at_edge
     # The grid and the chain pile up at the same edge instead of failing.
     grid = grid_fit(like, start, priors=narrow)
     assert grid.best_fit["dust.beta_dust"] == pytest.approx(2.2)
-    assert not grid.converged
+    assert grid.converged is Convergence.at_edge
     assert grid.interval_68["dust.beta_dust"][0] >= 2.2
 
 
@@ -207,6 +210,7 @@ def test_results_are_printed_written_and_given_to_getdist(like):
     with pytest.raises(ValueError, match="method 'gradient' has no samples"):
         fit.to_getdist()
     chain = sample(like, START, priors=PRIORS, nsteps=100, progress=False, throw=False)
+    assert chain.converged is Convergence.unmixed
     assert "not converged: 100 steps are" in str(chain)
     samples = chain.to_getdist("a chain", symbol=lambda name: name[-4:])
     assert [p.label for p in samples.paramNames.names] == ["dust", "_syn"]
@@ -236,6 +240,8 @@ def test_a_chi2_that_is_astronomical_is_no_fit():
     for result in by_each(quick(data=marred), START):
         assert not result.converged
         assert "missing values that are read as data, a wrong unit" in result.message
+    well = best_fit(quick(), START)
+    assert well.judged(1e9, 24, START).converged is Convergence.misfit
     with pytest.raises(FitError, match="degrees of freedom, so the model does not describe"):
         best_fit(quick(data=marred), START, priors=PRIORS)
     # Errors three times too small, and bright pixels that no law describes, are those of real maps.
@@ -270,8 +276,29 @@ def test_a_start_at_the_optimum_is_told_from_a_search_that_does_not_move():
     assert best_fit(quick(data=data), truth, priors=PRIORS).converged
     # Steps of nothing, which optimistix takes for success.
     still = optx.GradientDescent(learning_rate=0.0, rtol=1e-3, atol=1e-3)
-    with pytest.raises(FitError, match=r"did not leave its start, .* sigma from the optimum"):
+    with pytest.raises(FitError, match=r"did not leave its start, .* sigma from the opt") as caught:
         best_fit(quick(data=data), START, solver=still)
+    assert caught.value.result.converged is Convergence.stalled
+
+
+@pytest.mark.parametrize("solver", [Newton(), optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)])
+def test_how_a_fit_ended_is_said_once_and_written_as_true_or_false(solver, tmp_path):
+    like = quick()
+    ended = {
+        Convergence.converged: best_fit(like, START, solver=solver),
+        Convergence.max_steps: best_fit(like, START, solver=solver, max_steps=1, throw=False),
+    }
+    for state, result in ended.items():
+        assert result.converged is state
+        assert bool(result.converged) == (state is Convergence.converged)
+        assert result.to_dict()["converged"] is bool(state)
+        write_json(tmp_path / "result.json", {"converged": state, "message": result.message})
+        written = json.loads((tmp_path / "result.json").read_text())
+        assert written == {"converged": bool(state), "message": result.message}
+    assert f"Fit by gradient, not converged: {result.message}" in str(result)
+    assert (
+        str(Convergence.max_steps) == "The search made all its steps without reaching an optimum."
+    )
 
 
 def test_weights_of_nothing_are_no_fit():
@@ -279,7 +306,7 @@ def test_weights_of_nothing_are_no_fit():
     with pytest.raises(FitError, match=r"do not constrain .*a Gaussian prior on .* would help"):
         best_fit(flat, START)
     grid = grid_fit(flat, START, priors=PRIORS)
-    assert not grid.converged
+    assert grid.converged is Convergence.undetermined
     assert "The posterior is flat" in grid.message
 
 
@@ -291,10 +318,11 @@ def test_a_parameter_that_runs_away_is_no_fit():
     like = likelihood(dust, BANDS, data, np.asarray(sigma) / 1e6, {"dust.T_dust": 19.6})
     result = best_fit(like, {"dust.T_dust": 19.6}, throw=False)
     assert not result.converged
-    away = result._replace(converged=True, best_fit={"dust.T_dust": 1e12})
+    away = result._replace(converged=Convergence.converged, best_fit={"dust.T_dust": 1e12})
     judged = away.judged(1.0, 10, {"dust.T_dust": 19.6})
+    assert judged.converged is Convergence.undetermined
     assert "do not constrain 'dust.T_dust': from 19.6 it went to 1e+12" in judged.message
     offset = result._replace(
-        converged=True, best_fit={"offset.44.Q": 900.0}, sigma={"offset.44.Q": 1.0}
+        converged=Convergence.converged, best_fit={"offset.44.Q": 900.0}, sigma={"offset.44.Q": 1.0}
     )
     assert offset.judged(1.0, 10, {"offset.44.Q": 0.0}).converged

@@ -13,7 +13,7 @@ from fits.inputs import inputs_of
 from fits.paper.figures_model import forecast_settings
 from fits.paper.sky import PaperSky
 from fits.regions import region_masks
-from fits.writing import with_error
+from fits.results import with_error
 from jaxsky.settings import Experiment, load
 
 LABELS = [f"Figure {n}" for n in range(5, 13)]

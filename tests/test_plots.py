@@ -10,9 +10,8 @@ import matplotlib.pyplot as plt
 
 from fits.commands.fit import _drawable, plot_marginals, plot_posterior
 from fits.plots import color_limit, draw_title, in_formula, label, plain, plot_chains, save
-from fits.results import FitResult
+from fits.results import FitResult, with_errors
 from fits.spectral_index import RegionFit
-from fits.writing import with_errors
 
 NAMES = [
     "$x_$",

@@ -12,7 +12,6 @@ import pytest
 from ducc0.misc import wigner3j_int
 
 from fits.discs import disc_mask
-from fits.power_covariance import covariance_terms
 from fits.pseudo_cl import (
     band_powers,
     bin_edges,
@@ -20,6 +19,7 @@ from fits.pseudo_cl import (
     masked_spectra,
     pure_coupling_matrices,
 )
+from fits.tensor_ratio import covariance_terms
 from jaxsky.cmb import gaussian_fields
 from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis
 

@@ -9,13 +9,12 @@ import optimistix as optx
 import pytest
 import scipy.optimize
 
-from fits.noise import as_noise
+from fits.compress import as_noise
 from fits.optimize import best_fit
-from fits.posterior import chi2, fisher_matrix, hessian
-from fits.priors import Uniform
+from fits.posterior import Uniform, chi2, fisher_matrix, hessian
 from fits.profile_likelihood import spectral_likelihood
 from fits.results import FitError
-from fits.separated_maps import component_maps, residual_maps, separate
+from fits.separated_maps import component_maps, emission_maps, separate
 from jaxsky import (
     AME,
     CMB,
@@ -169,7 +168,7 @@ def test_value_amplitudes_and_fisher_are_the_dense_ones(kind, stokes, params):
     np.testing.assert_allclose(spread**2, variances, rtol=1e-8)
     assert maps.chi2.sum() == pytest.approx(value, rel=1e-8)
     assert np.all(maps.dof == (len(BANDS) - 3) * stokes)
-    rest = residual_maps(like, params, data, maps.amplitude)
+    rest = data - emission_maps(like, params, maps.amplitude)
     M = dense_matrix(params, stokes).real
     expected = data.reshape(-1, NPIX) - M @ amplitudes.T
     np.testing.assert_allclose(rest.reshape(-1, NPIX), expected, atol=1e-9)

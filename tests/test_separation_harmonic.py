@@ -10,8 +10,7 @@ import scipy.stats
 
 from fits.multipoles import harmonic_coefficients, harmonic_likelihood, white_spectrum
 from fits.optimize import best_fit
-from fits.posterior import chi2, fisher_matrix
-from fits.priors import Gaussian
+from fits.posterior import Gaussian, chi2, fisher_matrix
 from fits.profile_likelihood import spectral_likelihood
 from fits.separated_maps import harmonic_component_maps
 from jaxsky import Dust

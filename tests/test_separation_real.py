@@ -8,9 +8,9 @@ import healpy
 import numpy as np
 import pytest
 
-from fits.noise import as_noise
+from fits.compress import as_noise
 from fits.optimize import best_fit
-from fits.priors import Gaussian
+from fits.posterior import Gaussian
 from fits.profile_likelihood import spectral_likelihood
 from fits.pseudo_cl import band_powers, bin_edges, masked_spectra
 from fits.regions import apodize, superpixels

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from fits import mixing, systems
-from fits.grid import grid_fit
-from fits.noise import as_noise
+from fits.compress import as_noise
 from fits.optimize import best_fit
-from fits.posterior import chi2
-from fits.priors import Gaussian, Uniform
+from fits.posterior import Gaussian, Uniform, chi2
 from fits.profile_likelihood import spectral_likelihood
 from fits.regions import clusters, latitude_bands, superpixels
 from fits.results import FitError
 from fits.separated_maps import component_maps
+from fits.spectral_index import grid_fit
 from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe, set_parameters
 from test_separation import BANDS, NPIX, START, TRUTH, problem, random_sky
 

@@ -12,10 +12,9 @@ import scipy.stats
 
 from fits.kept import KeptChain
 from fits.optimize import best_fit
-from fits.posterior import Posterior, value_and_gradient
-from fits.priors import Gaussian, Uniform
+from fits.posterior import Gaussian, Posterior, Uniform, value_and_gradient
 from fits.profile_likelihood import spectral_likelihood
-from fits.results import FitError
+from fits.results import Convergence, FitError
 from fits.sampling import agreement, sample
 from fits.unbounded import unbounded_posterior
 from test_separation import BANDS, START, problem, random_sky
@@ -195,7 +194,7 @@ def test_without_data_the_posterior_is_the_prior():
         with pytest.raises(FitError, match=r"do not determine dust.T_dust, .*: there is nothing"):
             draw(empty(), sampler)
         nothing = draw(empty(), sampler, throw=False)
-        assert not nothing.converged
+        assert nothing.converged is Convergence.undetermined
         assert np.isnan(nothing.covariance).all()
         assert not nothing.details
 

@@ -7,10 +7,9 @@ import optimistix as optx
 import pytest
 
 from fits.optimize import Newton, best_fit
-from fits.posterior import Posterior
-from fits.priors import Gaussian, Prior, Uniform
+from fits.posterior import Gaussian, Posterior, Prior, Uniform
 from fits.profile_likelihood import spectral_likelihood
-from fits.results import FitError
+from fits.results import Convergence, FitError
 from test_separation import BANDS, START, problem, random_sky
 from test_separation_regions import with_empty_regions
 
@@ -119,8 +118,9 @@ def test_failures_say_what_they_are(options, error, words):
 
 def test_a_search_that_leaves_the_finite_numbers_says_so(monkeypatch):
     monkeypatch.setattr(Newton, "minimise", lambda _, posterior, __: (posterior.start * np.nan, 7))
-    with pytest.raises(FitError, match="left the finite numbers within 7 steps"):
+    with pytest.raises(FitError, match="left the finite numbers within 7 steps") as caught:
         best_fit(constant())
+    assert caught.value.result.converged is Convergence.not_finite
 
 
 def test_a_minimiser_takes_any_prior():

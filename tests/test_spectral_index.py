@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from fits.commands.run import DEFAULTS
-from fits.common import common_maps, prepare_component
-from fits.fluctuations import Fluctuations
-from fits.inputs import Band, Inputs, inputs_of
+from fits.common import Fluctuations, common_maps
+from fits.inputs import Band, Inputs, inputs_of, prepare_component
 from fits.optimize import best_fit
 from fits.regions import region_masks
 from fits.spectral_index import fit_regions

@@ -13,19 +13,13 @@ from fits import plots
 from fits.commands.report import ResultTable, Row
 from fits.commands.run import Command, Report, Run
 from fits.common import prepared_maps
-from fits.comparison import (
-    Comparison,
-    PatchComparison,
-    Scatter,
-    check_comparison,
-    compare,
-    compare_patches,
-)
-from fits.full_sky import FIELDS, BandSpectra
+from fits.comparison import BandSpectra, Comparison, Scatter, check_comparison, compare
+from fits.discs import PatchComparison, compare_patches
 from fits.inputs import inputs_of
 from fits.patches import PatchFits
+from fits.pseudo_cl import FIELDS
 from fits.regions import region_masks
-from fits.writing import probability, with_error
+from fits.results import probability, with_error
 from jaxsky.harmonics import average_pixels
 from jaxsky.settings import Experiment
 

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from fits import plots, tensor_ratio
+from fits import fisher, plots
 from fits.commands.report import ResultTable, Row
 from fits.commands.run import Command, Report, Run
-from fits.common import prepare_component
 from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors
-from fits.full_sky import FIELDS
+from fits.inputs import prepare_component
 from fits.mixing import Mixing, unit_sky
 from fits.pseudo_cl import (
+    FIELDS,
     LEAST_WINDOW,
     PIVOT,
     MaskedSpectra,
@@ -25,7 +25,7 @@ from fits.pseudo_cl import (
     sky_fraction,
 )
 from fits.regions import apodize, region_mask
-from fits.writing import with_error
+from fits.results import with_error
 from jaxsky import Sky
 from jaxsky.checks import check_double
 from jaxsky.cmb import camb_spectra, tensor_spectra
@@ -72,7 +72,7 @@ class Forecast(NamedTuple):
     inputs: ForecastInputs
     spectra: MaskedSpectra
     powers: dict[str, Float[np.ndarray, "2 bin"]]
-    laws: dict[str, tensor_ratio.BandLaw]
+    laws: dict[str, fisher.BandLaw]
     equal_r: dict[str, dict[str, float]]
     tensors: Float[np.ndarray, "4 ell"]
     lensed: Float[np.ndarray, "4 ell"]
@@ -149,10 +149,10 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
     window = np.asarray(gaussian_beam(inputs.fwhm, 2 * edges[-1]))
     spectra = masked_spectra(inputs.mask, edges, window=window)
     bands = {name: inputs.bands[name].band for name in inputs.shown}
-    powers = tensor_ratio.foreground_powers(inputs.sky, bands, spectra)
+    powers = fisher.foreground_powers(inputs.sky, bands, spectra)
     with at_key("forecast.fit"):
         laws = {
-            name: tensor_ratio.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
+            name: fisher.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
             for name, D in powers.items()
         }
     highest = max(spectra.lmax, spec.fisher_lmax, PIVOT)
@@ -160,13 +160,12 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
         tensors = tensor_spectra(highest, **settings.cmb.cosmology)
         lensed = camb_spectra(highest, **settings.cmb.cosmology)
     equal = {
-        name: tensor_ratio.equal_r(spectra, powers[name], law, tensors)
-        for name, law in laws.items()
+        name: fisher.equal_r(spectra, powers[name], law, tensors) for name, law in laws.items()
     }
     progress.step("Fisher matrix")
     fields = tuple(field for field in FIELDS if field in spec.spectra)
     ell, rows = np.arange(spec.lmin, spec.fisher_lmax + 1), [1 + FIELDS.index(f) for f in fields]
-    weights = [tensor_ratio.noise_weights(b, spec.fisher_lmax)[ell] for b in inputs.bands.values()]
+    weights = [fisher.noise_weights(b, spec.fisher_lmax)[ell] for b in inputs.bands.values()]
     bandpasses = {name: band.band for name, band in inputs.bands.items()}
     model = ForecastModel(
         Mixing.of(unit_sky(inputs.sky, mask=inputs.mask), bandpasses, "uK_CMB"),
@@ -177,7 +176,7 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
         jnp.asarray(sky_fraction(inputs.mask)),
         fields,
     )
-    foregrounds = tensor_ratio.foreground_laws(inputs.sky, spectra, fields, spec.fit)
+    foregrounds = fisher.foreground_laws(inputs.sky, spectra, fields, spec.fit)
     parameters = fiducial(model.sky, foregrounds, settings.cmb.r, settings.cmb.A_lens)
     errors, without = _errors(settings, model, parameters)
     return Forecast(
@@ -300,7 +299,7 @@ def plot_b_modes(path: Path, found: Forecast, settings: Experiment) -> None:
             BB = np.where(powers[1] > 0, powers[1], np.nan)
             title = plots.plain(f"{name} GHz" if name.isdigit() else name)
             axes.loglog(found.spectra.centers, BB, color=color, lw=1.8, label=title)
-            noise = tensor_ratio.noise_weights(found.inputs.bands[name], lmax) ** -2
+            noise = fisher.noise_weights(found.inputs.bands[name], lmax) ** -2
             axes.loglog(*plots.with_powers(noise), color=color, lw=0.7)
         axes.loglog(*plots.with_powers(found.lensed[2, : lmax + 1]), color=LENSING, lw=1.2)
         bottom = 1.0

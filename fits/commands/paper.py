@@ -12,7 +12,7 @@ from fits.commands.report import ResultTable, Row, Section, write_page
 from fits.commands.run import CIRCUMSTANCES, PAGE, Report, Run
 from fits.paper import figures_data, figures_model
 from fits.paper.sky import TEXTS, Impossible, PaperFigure, PaperSky, picture_of
-from fits.writing import write_log
+from fits.results import write_log
 from jaxsky.io import write_text
 from jaxsky.programs import QUIET, Progress, forget_programs
 from jaxsky.settings import Experiment

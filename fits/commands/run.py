@@ -31,7 +31,7 @@ from fits.commands.report import (
     warn,
     write_page,
 )
-from fits.writing import write_json, write_log
+from fits.results import write_json, write_log
 from jaxsky.io.files import ALL, Folder, occupied
 from jaxsky.settings import Experiment, load, of_file
 

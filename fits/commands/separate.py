@@ -9,9 +9,8 @@ from fits import plots
 from fits.cleaning import SAMPLED, Separation, separate_data
 from fits.commands.report import ResultTable, Row
 from fits.commands.run import Command, Report, Run
-from fits.results import FitError
+from fits.results import FitError, probability, two_digits, with_error
 from fits.separated_data import separation_data
-from fits.writing import probability, two_digits, with_error
 from jaxsky.components import parameter_declaration
 from jaxsky.io import write_maps
 from jaxsky.settings import Experiment

@@ -8,11 +8,12 @@ import numpy as np
 from fits.commands import compare as pictures
 from fits.commands.fit import plot_grids
 from fits.common import prepared_maps
-from fits.comparison import Comparison, compare_patches, template_patches
+from fits.comparison import Comparison
+from fits.discs import compare_patches, template_patches
 from fits.paper.sky import TEXTS, Impossible, Number, PaperFigure, PaperSky, filled
 from fits.regions import region_masks, region_words
+from fits.results import probability, with_error, with_errors
 from fits.spectral_index import fit_regions, known_truth
-from fits.writing import probability, with_error, with_errors
 from jaxsky.checks import listed
 from jaxsky.settings import SettingsError
 

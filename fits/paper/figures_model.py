@@ -26,7 +26,7 @@ from fits.paper.sky import (
 )
 from fits.pseudo_cl import PIVOT, sky_fraction
 from fits.regions import region_words, superpixels
-from fits.writing import with_error
+from fits.results import with_error
 from jaxsky.checks import listed
 from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import analysis, expand, gaussian_beam, lmax_of, power_spectrum, synthesis

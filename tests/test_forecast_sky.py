@@ -297,9 +297,9 @@ def test_priors_are_in_the_table_free(folder):
     path.write_text(path.read_text().replace("[forecast]", '[forecast]\nfree = ["amplitude"]'))
     errors = forecast(load(path)).errors
     assert errors.priors == {"dust.beta_dust": 0.5, "A_lens": 0.05, "BB.dust.slope": 0.01}
-    assert errors.sigma("A_lens") < 0.05
-    assert 0 < errors.sigma("BB.dust.slope") < 0.01
-    assert errors.sigma("r") > 0
+    assert errors.sigma["A_lens"] < 0.05
+    assert 0 < errors.sigma["BB.dust.slope"] < 0.01
+    assert errors.sigma["r"] > 0
 
 
 def test_settings_that_come_along():

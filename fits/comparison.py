@@ -9,7 +9,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -62,9 +62,6 @@ class Scatter(NamedTuple):
     from simulations: never below `floor`, one in their number.
     """
 
-    band: str
-    region: str
-    stokes: str
     pixels: int
     slope: float
     error: float
@@ -131,6 +128,10 @@ class BandSpectra(NamedTuple):
         return (self.error[:, LMIN:] / self.observed[:, LMIN:]).max(axis=-1)
 
 
+#: By band, region and Stokes parameters: "Q", "U" or "QU".
+Scatters: TypeAlias = dict[tuple[str, str, str], Scatter]
+
+
 class Comparison(NamedTuple):
     """Observed maps, the model of foregrounds in each band [uK_RJ], and how they compare.
 
@@ -140,13 +141,8 @@ class Comparison(NamedTuple):
     prepared: CommonMaps
     model: Float[Array, "band stokes pix"]
     regions: dict[str, Bool[np.ndarray, " pix"]]
-    scatters: list[Scatter]
+    scatters: Scatters
     spectra: list[BandSpectra]
-
-    def scatter(self, band: str, region: str, stokes: str) -> Scatter:
-        """One of the scatters."""
-        wanted = (band, region, stokes)
-        return next(s for s in self.scatters if (s.band, s.region, s.stokes) == wanted)
 
 
 def check_comparison(
@@ -285,7 +281,7 @@ def compare_pixels(
     model: Float[Array, "band stokes pix"],
     regions: Mapping[str, Bool[np.ndarray, " pix"]],
     simulated: ComparisonRealisations,
-) -> list[Scatter]:
+) -> Scatters:
     """The observed maps against the model, in each region, for Q, U and both."""
     inside = jnp.asarray(np.stack(list(regions.values())))
     slopes, errors = _slopes(prepared, model, inside)
@@ -295,25 +291,21 @@ def compare_pixels(
     pte = floor * (1 + (simulated.chi2 >= found).sum(axis=0))
     squares = simulated.squares.mean(axis=0)
     names = itertools.product(prepared.bands, regions, STOKES)
-    scatters = []
-    for (band, region, stokes), at in zip(names, np.ndindex(slopes.shape), strict=True):
+    scatters = {}
+    for name, at in zip(names, np.ndindex(slopes.shape), strict=True):
+        _, region, stokes = name
         both = (np.asarray(maps[at[0]])[:, regions[region]] for maps in (model, prepared.data))
         x, y = (maps[["QU".index(s) for s in stokes]].ravel() for maps in both)
-        scatters.append(
-            Scatter(
-                band,
-                region,
-                stokes,
-                x.size,
-                float(slopes[at]),
-                float(errors[at]),
-                float(np.corrcoef(x, y)[0, 1]),
-                float(np.sqrt(np.mean((y - x) ** 2))),
-                math.sqrt(float(squares[at]) / x.size),
-                float(found[at]),
-                float(pte[at]),
-                floor,
-            )
+        scatters[name] = Scatter(
+            x.size,
+            float(slopes[at]),
+            float(errors[at]),
+            float(np.corrcoef(x, y)[0, 1]),
+            float(np.sqrt(np.mean((y - x) ** 2))),
+            math.sqrt(float(squares[at]) / x.size),
+            float(found[at]),
+            float(pte[at]),
+            floor,
         )
     return scatters
 

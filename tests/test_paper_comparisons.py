@@ -64,7 +64,7 @@ def test_numbers_are_those_of_the_comparison(small, made):
     )
     shown = numbers(made[1])
     for band in ("44", "70", "353", "K"):
-        scatter = found.scatter(band, "strip", "QU")
+        scatter = found.scatters[band, "strip", "QU"]
         assert shown[f"slope, {band}, Q and U"].ours == with_error(scatter.slope, scatter.error)
     leaky = next(s for s in found.spectra if s.band == "70")
     assert f"after {leaky.pte[1]:.2f}" in shown["PTE of BB, 70"].ours

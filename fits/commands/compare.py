@@ -40,9 +40,8 @@ Series = tuple[str, np.ndarray, tuple[PatchFits, int], tuple[PatchFits, int]]
 def _numbers(comparison: Comparison, patches: PatchComparison | None) -> dict[str, Any]:
     """All numbers: `pixels` by band, region and Stokes parameter, `spectra` by band, `patches`."""
     pixels: dict[str, Any] = {}
-    for s in comparison.scatters:
+    for (band, region, stokes), s in comparison.scatters.items():
         numbers = s._asdict() | {"slope_pte": s.slope_pte}
-        band, region, stokes = (numbers.pop(key) for key in ("band", "region", "stokes"))
         pixels.setdefault(band, {}).setdefault(region, {})[stokes] = numbers
     derived = ("centers", "chi2_bins", "largest_error")
     spectra = {
@@ -72,11 +71,13 @@ def _table(comparison: Comparison) -> ResultTable:
     rows: list[Row] = []
     for band in comparison.prepared.bands:
         powers = [probability(p) for p in spectra[band].pte] if band in spectra else ["", ""]
-        for i, s in enumerate(s for s in comparison.scatters if s.band == band):
-            slope = with_error(s.slope, s.error).replace(" ", "")
-            numbers = (f"{s.correlation:.2f}", f"{s.rms:.2f}", f"{s.expected:.2f}", s.pte_text)
-            first, last = (band, powers) if i == 0 else ("", ["", ""])
-            rows.append((first, s.region, s.stokes, slope, *numbers, *last))
+        first, last = band, powers  # in the first row of a band only
+        for (name, region, stokes), s in comparison.scatters.items():
+            if name == band:
+                slope = with_error(s.slope, s.error).replace(" ", "")
+                numbers = (f"{s.correlation:.2f}", f"{s.rms:.2f}", f"{s.expected:.2f}", s.pte_text)
+                rows.append((first, region, stokes, slope, *numbers, *last))
+                first, last = "", ["", ""]
         rows.append(())
     caption = (
         "Slope of observed on model with the error of noise and CMB; rms of their difference, and "
@@ -95,15 +96,15 @@ def comparison_warnings(comparison: Comparison, settings: Experiment) -> list[st
             f"Spectra were left out: they are those of the full sky, and {missing} of "
             f"{comparison.prepared.used.size} pixels have no value."
         )
-    for s in comparison.scatters:
-        if s.stokes == "QU" and s.slope_pte < UNLIKELY:
+    for (band, region, stokes), s in comparison.scatters.items():
+        if stokes == "QU" and s.slope_pte < UNLIKELY:
             sentences.append(
-                f"{s.band}, {s.region}: the slope is {with_error(s.slope, s.error)}, further from "
+                f"{band}, {region}: the slope is {with_error(s.slope, s.error)}, further from "
                 f"1 than noise and CMB explain (PTE {probability(s.slope_pte)})."
             )
-        if s.stokes == "QU" and s.pte <= s.floor:
+        if stokes == "QU" and s.pte <= s.floor:
             sentences.append(
-                f"{s.band}, {s.region}: the maps differ from the model by {s.rms:.3g} uK_RJ, more "
+                f"{band}, {region}: the maps differ from the model by {s.rms:.3g} uK_RJ, more "
                 f"than in any of {round(1 / s.floor) - 1} realisations of noise and CMB."
             )
     for one in comparison.spectra:
@@ -129,7 +130,8 @@ def plot_scatter(
                 axes = grid[2 * (i // COLUMNS) + s, i % COLUMNS]
                 both = (comparison.model, comparison.prepared.data)
                 x, y = (np.asarray(maps[names.index(band), s])[pixels] for maps in both)
-                _draw_scatter(axes, comparison.scatter(band, region, stokes), x, y)
+                axes.set_title(plots.plain(f"{band}: {stokes}"))
+                _draw_scatter(axes, comparison.scatters[band, region, stokes], x, y)
         for axes in grid[-2:, (len(bands) - 1) % COLUMNS + 1 :].flat:
             axes.set_visible(False)
         for axes in grid[:, 0]:
@@ -146,7 +148,6 @@ def _draw_scatter(axes: Axes, scatter: Scatter, x: np.ndarray, y: np.ndarray) ->
     axes.set(xlim=line, ylim=line, aspect="equal", xlabel=f"model [{UNIT}]")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(mpl.ticker.MaxNLocator(4))
-    axes.set_title(plots.plain(f"{scatter.band}: {scatter.stokes}"))
     slope = f"slope {with_error(scatter.slope, scatter.error)}"
     words = f"{slope}\nr = {scatter.correlation:.3f}\nPTE {scatter.pte_text}"
     axes.text(0.04, 0.96, words, transform=axes.transAxes, va="top", fontsize=7)
@@ -172,7 +173,7 @@ def plot_model_maps(
         )
         row: list[plots.MapPanel] = []
         for kind in stokes:
-            s, scatter = "QU".index(kind), comparison.scatter(band, region, kind)
+            s, scatter = "QU".index(kind), comparison.scatters[band, region, kind]
             limit, slope = plots.color_limit(model[s]), with_error(scatter.slope, scatter.error)
             head = f"model; slope {slope}, r = {scatter.correlation:.2f} ({region})"
             row += [

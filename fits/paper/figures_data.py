@@ -61,7 +61,7 @@ def figure_scatter(paper: PaperSky, picture: Path) -> PaperFigure:
     pictures.plot_scatter(picture, found, region, bands, settings.title)
     numbers = []
     for band in bands:
-        scatter = found.scatter(band, region, "QU")
+        scatter = found.scatters[band, region, "QU"]
         slope = with_error(scatter.slope, scatter.error)
         note = f"r = {scatter.correlation:.3f}, PTE {scatter.pte_text}"
         numbers.append(Number(f"slope, {band}, Q and U", slope, note))

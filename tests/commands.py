@@ -1,12 +1,25 @@
-"""The command line, run in the process of the tests."""
+"""The command line, run in the process of the tests, and experiments for it."""
 
 import re
 import sys
+from pathlib import Path
 
 from fits import app
 
 #: A line about a step of a command's work, in a pipe.
 STEP = re.compile(r"^ *\d+\.\d s  .*\n", re.MULTILINE)
+
+
+EXPERIMENTS = Path(__file__).with_name("experiments")
+
+
+def experiment(name: str, *changes: tuple[str, str]) -> str:
+    """The text of an experiment; each change is a text that is in it, and what replaces it once."""
+    text = (EXPERIMENTS / f"{name}.toml").read_text()
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new, 1)
+    return text
 
 
 def jaxsky(monkeypatch, *arguments) -> int:

@@ -15,6 +15,7 @@ import numpy as np
 from astropy.io import fits as pyfits
 
 from jaxsky.products import Product
+from refusals import cases
 
 NAME = "map.fits"
 OLD, NEW = '"1"', '"2"'
@@ -38,36 +39,16 @@ REISSUED = fits_bytes(scale=2.0)
 #: What comes of a file that is cut.
 CUT = 1000
 
-#: Answers by kind: status, headers that replace those that would be right, and the body.
-ANSWERS = {
-    "empty": (200, {}, b""),
-    "page": (200, {}, b"<html>down</html>"),
-    "other": (200, {}, fits_bytes(8)),
-    "reissued": (200, {}, REISSUED),
-    "unit": (200, {}, fits_bytes(unit="mK_CMB")),
-    "columns": (200, {}, fits_bytes(names=("I_STOKES",))),
-    "short table": (200, {}, CONTENT[:-2880]),
-    "garbage": (200, {}, CONTENT + b"garbage"),
-    "announced short": (200, {"Content-Length": str(len(CONTENT) - 500)}, CONTENT),
-    "announced odd": (200, {"Content-Length": "many"}, CONTENT),
-    "longer": (200, {"Content-Length": str(len(CONTENT))}, CONTENT + b"garbage"),
-    "no length": (200, {"Content-Length": None}, CONTENT),
-    "no length cut": (200, {"Content-Length": None}, CONTENT[:-500]),
-    "gzip": (200, {"Content-Encoding": "gzip"}, CONTENT),
-    "unasked": (206, {"Content-Range": f"bytes 5-9/{len(CONTENT)}"}, CONTENT[5:10]),
-    "nothing": (204, {}, b""),
-    "missing": (404, {}, b"<html>"),
-    "forbidden": (403, {}, b""),
-    "broken": (500, {}, b""),
-    "busy": (429, {"Retry-After": "120"}, b""),
-    "down": (503, {"Retry-After": "Sun, 29 Nov 2026 00:00:00 GMT"}, b""),
-    "elsewhere": (302, {"Location": f"/good/{NAME}"}, b""),
-    "circle": (302, {"Location": f"/circle/{NAME}"}, b""),
-    "to brackets": (302, {"Location": "https://[bad/x"}, b""),
-    "to umlauts": (302, {"Location": "\u00fc"}, b""),
-    "two lengths": (200, {"Content-Length": "10, 12"}, CONTENT),
-    "to a file": (302, {"Location": "file:///etc/passwd"}, b""),
+#: Files by name, of which bodies of answers are parts.
+BODIES = {
+    "content": CONTENT,
+    "reissued": REISSUED,
+    "other": fits_bytes(8),
+    "unit": fits_bytes(unit="mK_CMB"),
+    "columns": fits_bytes(names=("I_STOKES",)),
 }
+#: Answers by kind: status, headers that replace those that would be right, and the body.
+ANSWERS = cases("transfer/answers")
 #: Answers to a request for a rest, of files whose first answer is cut.
 RESTS = {
     "cut": lambda first: (206, {}, CONTENT[first:]),
@@ -84,6 +65,13 @@ RESTS = {
     "gone": lambda first: (404, {}, b""),
     "no versions": lambda first: (206, {}, CONTENT[first:]),
 }
+
+
+def body(given):
+    """Text as it is, or a part of a file, and what is added to it."""
+    if isinstance(given, str):
+        return given.encode()
+    return BODIES[given["of"]][: given.get("last")] + given.get("add", "").encode()
 
 
 def _range(first):
@@ -115,7 +103,8 @@ class Handler(http.server.BaseHTTPRequestHandler):
             cut = CONTENT[:CUT] if seen == 1 else REISSUED if again else CONTENT
             self.answer(200, headers, cut)
         elif kind in ANSWERS:
-            self.answer(*ANSWERS[kind])
+            status, headers, given = ANSWERS[kind]
+            self.answer(status, headers, body(given))
         else:
             getattr(self, kind)(Handler.files.get(name, CONTENT), first)
 

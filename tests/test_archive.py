@@ -11,21 +11,13 @@ from jaxsky.bandpass import parse_unit
 from jaxsky.io import InputError
 from jaxsky.products import ProductSet, catalogue, find, product_sets, total_size, verify
 from jaxsky.settings import load, named_files
-from misbehaving import CONTENT, NAME, SHA, Handler, fits_bytes, product, serving
+from misbehaving import CONTENT, NAME, SHA, body, fits_bytes, product
+from refusals import cases, raises
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-@pytest.fixture(scope="module")
-def server():
-    with serving() as address:
-        yield address
-
-
-@pytest.fixture(autouse=True)
-def log():
-    Handler.log.clear()
-    return Handler.log
+pytestmark = pytest.mark.usefixtures("log")
 
 
 def test_the_catalogue_is_complete():
@@ -49,13 +41,6 @@ def test_the_catalogue_is_complete():
 
 
 def test_sets_are_files_of_the_catalogue():
-    assert {p.name for p in find(["planck-44-70"])} == {
-        "LFI_SkyMap_044-BPassCorrected_1024_R3.00_full.fits",
-        "LFI_SkyMap_070-BPassCorrected_1024_R3.00_full.fits",
-        "COM_CompMap_DustPol-commander_1024_R2.00.fits",
-        "COM_CompMap_SynchrotronPol-commander_0256_R2.00.fits",
-        "LFI_RIMO_R3.31.fits",
-    }
     for name, found in product_sets().items():
         assert len(find([name])) == len(found.files)
         assert name not in {p.group for p in find()}
@@ -96,8 +81,7 @@ def test_products_are_found_by_group_name_and_part():
     assert {p.group[:6] for p in find(["planck"])} == {"planck"}
     assert len(find(["planck"])) > 20
     assert find() == list(catalogue().values())
-    with pytest.raises(ValueError, match=r"no product 'cobe'; give the name .* wmap9, wmap9-masks"):
-        find(["cobe"])
+    raises(ValueError, r"no product 'cobe'; give the name .* wmap9, wmap9-masks", find, ["cobe"])
 
 
 @pytest.mark.parametrize("known", [None, SHA], ids=["without a hash", "with a hash"])
@@ -123,16 +107,9 @@ def test_a_file_is_fetched_once_and_checked(server, tmp_path, log, known):
 def test_what_verify_refuses(tmp_path):
     path = tmp_path / NAME
     wanted = product()
-    with pytest.raises(InputError, match=r"is not there; fetch it with `jaxsky data fetch`"):
-        verify(wanted, tmp_path)
-    for content, changes, words in (
-        (CONTENT[:-3000], {}, "map.fits: not a FITS file, or a truncated one"),
-        (CONTENT, {"size": 7}, f"map.fits: has {len(CONTENT)} bytes, but should have 7."),
-        (CONTENT, {"columns": ("II_COV",)}, "no column 'II_COV'; it has Q_STOKES, U_STOKES"),
-        (CONTENT, {"unit": "uK_RJ"}, "column Q_STOKES is in K_CMB, but uK_RJ is expected"),
-        (CONTENT, {"nside": 8}, "nside is 4, but 8 is expected"),
-    ):
-        path.write_bytes(content)
+    raises(InputError, r"is not there; fetch it with `jaxsky data fetch`", verify, wanted, tmp_path)
+    for content, changes, words in cases("archive/verify"):
+        path.write_bytes(body(content))
         with pytest.raises(InputError) as caught:
             verify(wanted._replace(**changes), tmp_path)
         assert words in str(caught.value)
@@ -186,14 +163,8 @@ def test_the_command(served, monkeypatch, capsys):
 
 
 def test_mistakes_of_the_command(served, server, monkeypatch, capsys, tmp_path):
-    for arguments, words in (
-        (("fetch", "cobe"), "There is no product 'cobe'; give the name of a file, a part of one, "),
-        (("fetch", "cobe"), "a group: test; or a set: both."),
-        (("fetch", NAME, "--mirror", "a.org"), "--mirror must begin with https:// or http://"),
-        (("fetch", NAME, "--mirror", f"{server}/missing"), "answers 404. Try again later"),
-        (("fetch", NAME, "--mirror", f"{server}/cut"), "ended early, after 1000 bytes"),
-    ):
-        assert command(monkeypatch, *arguments) == 2
+    for arguments, words in cases("archive/mistakes"):
+        assert command(monkeypatch, *(a.replace("SERVER", server) for a in arguments)) == 2
         said = capsys.readouterr().err
         assert words in said
         assert "Traceback" not in said

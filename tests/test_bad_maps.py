@@ -3,8 +3,6 @@
 Truth is healpy's: its Rotator for coordinates, its write_map for files.
 """
 
-import gzip
-
 import healpy
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from astropy.io import fits as pyfits
 import mapfiles
 from jaxsky.io import read_maps, read_mask
 from mapfiles import NSIDE, sky
-from refusals import refused
+from refusals import cases, refused, refuses
 
 NPIX = 12 * NSIDE**2
 RNG = np.random.default_rng(7)
@@ -41,8 +39,7 @@ def test_spass_has_one_stokes_parameter_per_file(tmp_path, scheme):
         )
         for name, values in zip("iqu", (I, Q, U), strict=True)
     ]
-    with refused(r"spass.u.*IAU sign of U.*UNKNOWN1.*give `stokes`"):
-        read_maps(paths[2])
+    refuses(r"spass.u.*IAU sign of U.*UNKNOWN1.*give `stokes`", read_maps, paths[2])
     found = read_maps(paths[1:], stokes="QU")
     np.testing.assert_array_equal(found.maps, [Q, -U])
     assert found.stokes == ("Q", "U")
@@ -59,15 +56,13 @@ def test_columns_without_names_are_turned_as_they_are_said_to_be(tmp_path, frame
     healpy.write_map(path, [extra, *source], coord=frame, column_units="K_RJ", dtype=np.float64)
     columns = ["COLUMN_2", "COLUMN_3", "COLUMN_4"]
     words = r"not in Galactic coordinates.*COLUMN_3.*give `stokes`"
-    with refused(words):
-        read_maps(path, fields=columns[1:])
+    refuses(words, read_maps, path, fields=columns[1:])
     found = read_maps(path, fields=columns, stokes="IQU").maps
     assert np.abs(found - expected).max() < 1e-6 * np.abs(expected).max()
     for given in ("Q", "U"):
         with refused(r"COLUMN_3 cannot be turned.*Q followed by U"):
             read_maps(path, fields="COLUMN_3", stokes=given)
-    with refused("cannot be turned"):
-        read_maps(path, fields=columns[1:], stokes="UQ")
+    refuses("cannot be turned", read_maps, path, fields=columns[1:], stokes="UQ")
 
 
 def test_q_and_u_of_two_files_or_hdus_are_one_field(tmp_path):
@@ -88,8 +83,7 @@ def test_q_and_u_of_two_files_or_hdus_are_one_field(tmp_path):
     for path, values in zip(files, source[1:], strict=True):
         options = {"coord": "C", "column_units": "K_CMB", "overwrite": True, "dtype": np.float64}
         healpy.write_map(path, values, **options)
-    with refused(r"name of column T does not say.*give `stokes`"):
-        read_maps(files)
+    refuses(r"name of column T does not say.*give `stokes`", read_maps, files)
     found = read_maps(files, stokes=["Q", "U"]).maps
     assert np.abs(found - expected[1:]).max() < 1e-6 * np.abs(expected).max()
     np.testing.assert_array_equal(
@@ -103,29 +97,9 @@ def test_q_and_u_of_two_files_or_hdus_are_one_field(tmp_path):
 
 def test_files_of_one_field_must_agree(tmp_path):
     q = save(tmp_path / "q.fits", {"Q": Q}, POLCCONV="IAU")
-    for header, unit, arguments, words in [
-        ({}, "K_CMB", {}, "polarization of column U is COSMO, but that of Q .* is IAU; give `pola"),
-        (
-            {"COORDSYS": "C", "POLCCONV": "IAU"},
-            "K_CMB",
-            {},
-            "coordinates of column U is C, but .* is G",
-        ),
-        ({"POLCCONV": "IAU"}, "uK_CMB", {}, "unit of column U is uK_CMB, but .* is K_CMB"),
-        ({"POLCCONV": "IAU"}, "K_CMB", {"hdu": [1, 1, 1]}, "`path` must be one, or as many as"),
-        (
-            {"POLCCONV": "IAU"},
-            "K_CMB",
-            {"fields": ["Q", "U", "V"]},
-            "as many as the other names, 2, but is 3",
-        ),
-        ({"POLCCONV": "IAU"}, "K_CMB", {"stokes": "IQU"}, "names 3 columns, but 2 are read, Q, U"),
-        ({"POLCCONV": "IAU"}, "K_CMB", {"stokes": "UQ"}, "says U of column Q, whose name says Q"),
-        ({"POLCCONV": "IAU"}, "K_CMB", {"stokes": "QV"}, "must name I, Q, U or pairs.*is 'QV'"),
-    ]:
+    for header, unit, arguments, words in cases("bad_maps/files_of_one_field"):
         u = save(tmp_path / "u.fits", {"U": U}, unit, **header)
-        with refused(words):
-            read_maps([q, u], **arguments)
+        refuses(words, read_maps, [q, u], **arguments)
     save(u, {"U": U})
     np.testing.assert_array_equal(read_maps([q, u], polarization="IAU").maps, [Q, -U])
     coarse = save(tmp_path / "c.fits", {"U": np.ones(48)}, NSIDE=2, POLCCONV="IAU")
@@ -134,26 +108,24 @@ def test_files_of_one_field_must_agree(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "sign"),
-    [
-        *((n, -1) for n in ("U", "u_stokes", "U-POLARISATION", "U_POLARIZATION", "U_ML_FULL")),
-        *((n, -1) for n in ("IU_COV", "COV_QU", "QUCOV", "UQ_COV", "TU", "COV_TU", "QU", "U_MEAN")),
-        *((n, 1) for n in ("TEMPERATURE", "T", "Q_ML", "UU_COV", "COVUU", "U_RMS", "HITS", "BETA")),
-    ],
+    ("names", "sign"), [(cases("bad_maps/names_of_u"), -1), (cases("bad_maps/names_of_others"), 1)]
 )
-def test_names_that_are_certain_tell_the_sign(tmp_path, name, sign):
-    path = save(tmp_path / "m.fits", {name: U, "X": Q}, POLCCONV="IAU")
-    np.testing.assert_array_equal(read_maps(path, fields=name).maps[0], sign * U)
+def test_names_that_are_certain_tell_the_sign(tmp_path, names, sign):
+    for name in names:
+        path = save(tmp_path / "m.fits", {name: U, "X": Q}, POLCCONV="IAU")
+        np.testing.assert_array_equal(read_maps(path, fields=name).maps[0], sign * U, name)
 
 
 @pytest.mark.parametrize("name", ["COLUMN_2", "UNKNOWN1", "UNITS", "USTOKES", "SIGNAL", "U_X"])
 def test_other_names_are_asked_about(tmp_path, name):
     path = save(tmp_path / "m.fits", {name: U, "X": Q}, POLCCONV="IAU")
-    with refused(f"the name of column {name} does not say.*`stokes`"):
-        read_maps(path, fields=name)
+    refuses(f"the name of column {name} does not say.*`stokes`", read_maps, path, fields=name)
     np.testing.assert_array_equal(read_maps(path, fields=name, stokes="U").maps[0], -U)
     np.testing.assert_array_equal(read_maps(path, fields=name, stokes=["QU"]).maps[0], -U)
     np.testing.assert_array_equal(read_maps(path, fields=name, stokes="").maps[0], U)
+    # Galactic and COSMO, no name is needed.
+    path = save(path, {name: U, "X": Q})
+    np.testing.assert_array_equal(read_maps(path, fields=name).maps[0], U)
 
 
 # Missing values
@@ -170,18 +142,7 @@ def integers(path, stored, null=None, scale=None, zero=None, kind="I", name="I_S
     return path
 
 
-@pytest.mark.parametrize(
-    ("kind", "null", "scale", "zero"),
-    [
-        ("I", -32768, None, None),
-        ("I", -32768, 0.5, 3.0),
-        ("I", -32768, None, 32768),
-        ("J", -2147483648, 1e-3, None),
-        ("J", -1, None, None),
-        ("K", -999, None, None),
-        ("B", 255, None, None),
-    ],
-)
+@pytest.mark.parametrize(("kind", "null", "scale", "zero"), cases("bad_maps/nulls_of_integers"))
 def test_null_of_integers_is_missing(tmp_path, kind, null, scale, zero):
     stored = np.random.default_rng(0).integers(1, 200, NPIX)
     holes = np.arange(NPIX) % 5 == 0
@@ -197,8 +158,7 @@ def test_hits_have_nulls_too(tmp_path):
     path = integers(tmp_path / "h.fits", hits, -1, kind="J", name="N_OBS")
     assert (~read_maps(path, fields="N_OBS").mask).sum() == 9
     bad = integers(tmp_path / "b.fits", hits, "many", kind="J")
-    with refused("TNULL1 is many, which is not a whole number"):
-        read_maps(bad)
+    refuses("TNULL1 is many, which is not a whole number", read_maps, bad)
 
 
 @pytest.mark.parametrize(
@@ -210,23 +170,20 @@ def test_undeclared_marks_are_asked_about(tmp_path, mark, share):
     values = np.where(holes, mark, 100 * I)
     path = save(tmp_path / "m.fits", {"I": values}, formats={"I": "E"})
     words = rf"m.fits.*column I is .* in {holes.sum()} of 768 pixels.*give `missing`"
-    with refused(words):
-        read_maps(path)
+    refuses(words, read_maps, path)
     found = read_maps(path, missing=mark)
     np.testing.assert_array_equal(found.mask, ~holes)
     np.testing.assert_array_equal(read_maps(path, missing=[1, mark]).mask, ~holes)
     assert read_maps(path, missing=[]).mask.all()
     # A mark that is not in the file does not answer the question.
-    with refused(words):
-        read_maps(path, missing=-12345.0)
+    refuses(words, read_maps, path, missing=-12345.0)
 
 
 def test_the_lowest_integer_is_asked_about(tmp_path):
     stored = np.where(np.arange(NPIX) < 20, -32768, np.arange(NPIX))
     for scale in (None, 0.01):
         path = integers(tmp_path / "i.fits", stored, scale=scale)
-        with refused(r"I_STOKES is -32[76.8]+ in 20 of 768 pixels"):
-            read_maps(path)
+        refuses(r"I_STOKES is -32[76.8]+ in 20 of 768 pixels", read_maps, path)
     assert read_maps(path, missing=-327.68).mask.sum() == NPIX - 20
 
 
@@ -234,8 +191,7 @@ def test_two_marks_are_named_at_once(tmp_path):
     values = I.copy()
     values[:30], values[30:60] = -999.0, 1e30
     path = save(tmp_path / "m.fits", {"I": values})
-    with refused(r"is -999 in 30 .*; column I is 1e.30 in 30"):
-        read_maps(path)
+    refuses(r"is -999 in 30 .*; column I is 1e.30 in 30", read_maps, path)
     assert read_maps(path, missing=[-999, 1e30]).mask.sum() == NPIX - 60
 
 
@@ -244,8 +200,7 @@ def test_footprints_of_zeros_are_asked_about(tmp_path, share):
     holes = np.arange(NPIX) < share * NPIX
     columns = {n: np.where(holes, 0.0, v) for n, v in {"Q": Q, "U": U}.items()}
     path = save(tmp_path / "m.fits", columns | {"I": I})
-    with refused(rf"Q, U: exactly 0 in .*{share:.0%} of.*`missing`"):
-        read_maps(path, fields=["Q", "U"])
+    refuses(rf"Q, U: exactly 0 in .*{share:.0%} of.*`missing`", read_maps, path, fields=["Q", "U"])
     assert read_maps(path).mask.all()  # I has values there
     assert read_maps(path, fields=["Q", "U"], missing=[]).mask.all()
     assert read_maps(path, fields=["Q", "U"], zeros_are_data=True).mask.all()
@@ -294,30 +249,30 @@ def test_bad_data_as_text(tmp_path, text):
     path = save(tmp_path / "m.fits", {"I": values}, BAD_DATA=text)
     assert (~read_maps(path).mask).nonzero()[0].tolist() == list(range(7))
     path = save(path, {"I": values}, BAD_DATA="none")
-    with refused("BAD_DATA is NONE, which is not a number"):
-        read_maps(path)
+    refuses("BAD_DATA is NONE, which is not a number", read_maps, path)
 
 
 @pytest.mark.parametrize(
     ("form", "array", "what"),
     [
         ("C", Q + 1j * U, "complex numbers"),
+        ("M", Q + 1j * U, "complex numbers"),
+        ("L", Q > 0, "logical values"),
+        ("4A", ["1.5"] * NPIX, "text"),
         ("8X", np.ones((NPIX, 8), bool), "bits"),
         ("PD()", np.array([np.ones(2)] * NPIX, dtype=object), "arrays of different lengths"),
     ],
 )
 def test_columns_that_are_no_real_numbers(tmp_path, form, array, what):
     path = save(tmp_path / "m.fits", {"Q": array, "I": I}, formats={"Q": form})
-    with refused(f"column Q holds {what}, not real numbers"):
-        read_maps(path, fields="Q")
+    refuses(f"column Q holds {what}, not real numbers", read_maps, path, fields="Q")
     np.testing.assert_array_equal(read_maps(path, fields="I").maps[0], I)
 
 
 @pytest.mark.parametrize("missing", ["-999", True, [None], ["x"]])
 def test_missing_must_be_numbers(tmp_path, missing):
     path = save(tmp_path / "m.fits", {"I": I})
-    with refused("`missing` must be a number or a list of them, not"):
-        read_maps(path, missing=missing)
+    refuses("`missing` must be a number or a list of them, not", read_maps, path, missing=missing)
 
 
 # Pixel numbers
@@ -332,24 +287,7 @@ def partial(path, pixels=SOME, name="PIXEL", form="J", values=None, **header):
 
 
 @pytest.mark.parametrize("scheme", ["RING", "NESTED"])
-@pytest.mark.parametrize(
-    "given",
-    [
-        {},
-        {"NSIDE": 8.0},
-        {"NSIDE": "8"},
-        {"NSIDE": "8.0"},
-        {"INDXSCHM": None},
-        {"INDXSCHM": None, "OBJECT": None},
-        {"name": "PIX"},
-        {"name": "pixels"},
-        {"name": "HPX_PIX", "INDXSCHM": None},
-        {"form": "K"},
-        {"form": "D"},
-        {"form": "E"},
-        {"form": "I"},
-    ],
-)
+@pytest.mark.parametrize("given", cases("bad_maps/partial_maps"))
 def test_partial_maps(tmp_path, given, scheme):
     found = read_maps(partial(tmp_path / "p.fits", ORDERING=scheme, **given))
     pixels = healpy.nest2ring(NSIDE, SOME) if scheme == "NESTED" else SOME
@@ -357,19 +295,7 @@ def test_partial_maps(tmp_path, given, scheme):
     np.testing.assert_array_equal(found.maps[0, pixels], I[:4])
 
 
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ({"pixels": [3, 768, 4, 900]}, r"PIXEL has 2 of 4 values.*such as 768"),
-        ({"pixels": [3, np.nan, 4, 5], "form": "D"}, "such as nan"),
-        ({"pixels": ["a", "b", "c", "d"], "form": "1A"}, "PIXEL holds text, not real numbers"),
-        ({"pixels": [1, 0, 1, 0], "form": "L"}, "PIXEL holds logical values"),
-        ({"NSIDE": 2**20}, "NSIDE is 1048576, but must be"),
-        ({"NSIDE": None}, "explicit indexing without NSIDE"),
-        ({"name": "NUMBER"}, "explicit indexing, but no column 'PIXEL'; it has NUMBER, I"),
-        ({"INDXSCHM": "IMPLICIT"}, "columns have 4 values, which is not 12 nside"),
-    ],
-)
+@pytest.mark.parametrize(("given", "words"), cases("bad_maps/pixel_numbers_that_are_none"))
 def test_pixel_numbers_that_are_none(tmp_path, given, words):
     path = partial(tmp_path / "p.fits", **given)
     with refused(words, file=path) as info:
@@ -383,8 +309,7 @@ def test_full_maps_with_pixel_numbers(tmp_path):
     np.testing.assert_array_equal(read_maps(path).maps[0, order], I)
     columns = {"PIXEL": order, "I": I}
     path = save(path, columns, formats={"PIXEL": "J"}, INDXSCHM="IMPLICIT")
-    with refused("IMPLICIT, but column PIXEL has another order"):
-        read_maps(path)
+    refuses("IMPLICIT, but column PIXEL has another order", read_maps, path)
     columns["PIXEL"] = np.arange(NPIX)
     path = save(path, columns, formats={"PIXEL": "J"}, INDXSCHM="IMPLICIT")
     np.testing.assert_array_equal(read_maps(path).maps[0], I)
@@ -395,11 +320,9 @@ def test_nested_takes_powers_of_two_and_ring_any(tmp_path):
     path = save(tmp_path / "m.fits", {"I": values}, NSIDE=12)
     np.testing.assert_array_equal(read_maps(path).maps[0], values)
     path = save(tmp_path / "m.fits", {"I": values}, NSIDE=12, ORDERING="NESTED")
-    with refused("ordering is NESTED, but nside is 12, no power of 2"):
-        read_maps(path)
+    refuses("ordering is NESTED, but nside is 12, no power of 2", read_maps, path)
     np.savez(tmp_path / "m.npz", a=np.ones(values.size))
-    with refused("ordering is NESTED, but nside is 12"):
-        read_mask(tmp_path / "m.npz", ordering="NESTED")
+    refuses("ordering is NESTED, but nside is 12", read_mask, tmp_path / "m.npz", ordering="NESTED")
 
 
 @pytest.mark.parametrize("nside", [1, 2, 64])
@@ -416,13 +339,10 @@ def test_sizes_types_and_packing(tmp_path, nside, form):
 def test_columns_in_the_table_by_name(tmp_path):
     path = save(tmp_path / "m.fits", {"beta": I, "BETA": Q})
     np.testing.assert_array_equal(read_maps(path, fields="BETA").maps[0], Q)
-    with refused("2 columns are called 'Beta'"):
-        read_maps(path, fields="Beta")
+    refuses("2 columns are called 'Beta'", read_maps, path, fields="Beta")
     for odd in (True, -1, 7):
-        with refused(f"no column {odd}; it has beta, BETA"):
-            read_maps(path, fields=[odd])
-    with refused("no HDU True"):
-        read_maps(path, hdu=True, fields="BETA")
+        refuses(f"no column {odd}; it has beta, BETA", read_maps, path, fields=[odd])
+    refuses("no HDU True", read_maps, path, hdu=True, fields="BETA")
     columns = ("HITS", "Q_353GHz", "U_353GHz", "Q_RMS")
     path = save(tmp_path / "n.fits", dict.fromkeys(columns, I))
     assert read_maps(path).names == columns[1:3]
@@ -440,17 +360,10 @@ def test_only_what_is_cut_is_called_so(tmp_path):
     with refused("m.fits") as info:
         read_maps(path)
     assert "truncated" not in str(info.value)
-    for cut, packed in ((whole[:-3000], False), (whole[:-3000], True)):
-        path = tmp_path / ("c.fits.gz" if packed else "c.fits")
-        path.write_bytes(gzip.compress(cut) if packed else cut)
-        with refused("not a FITS file, or a truncated one"):
-            read_maps(path)
-    with refused("is a folder"):
-        read_maps(tmp_path)
+    refuses("is a folder", read_maps, tmp_path)
     image = tmp_path / "image.fits"
     pyfits.HDUList([pyfits.PrimaryHDU(), pyfits.ImageHDU(np.ones((3, 4)))]).writeto(image)
-    with refused("HDU 1 holds no binary table"):
-        read_maps(image)
+    refuses("HDU 1 holds no binary table", read_maps, image)
 
 
 # Masks
@@ -482,15 +395,12 @@ def test_masks_with_other_values_say_which(tmp_path):
         (np.full(NPIX, 255.0), "768 of 768 pixels have others, such as 255"),
     ]:
         path = save(tmp_path / "m.fits", {"M": values}, None)
-        with refused(words):
-            read_mask(path)
+        refuses(words, read_mask, path)
     # WMAP's: the mask is N_OBS, and the column TEMPERATURE is zero.
     columns = {"TEMPERATURE": np.zeros(NPIX), "N_OBS": (I > 0).astype(float)}
     wmap = save(tmp_path / "w.fits", columns, None)
-    with refused("leaves no pixel; give `field` out of N_OBS"):
-        read_mask(wmap)
+    refuses("leaves no pixel; give `field` out of N_OBS", read_mask, wmap)
     np.testing.assert_array_equal(read_mask(wmap, field="N_OBS"), I > 0)
     for array in (np.full(NPIX, "a"), np.ones(NPIX, complex), np.ones((4, NPIX))):
         np.savez(tmp_path / "m.npz", a=array)
-        with refused(r"m.npz: a is no mask, but has type"):
-            read_mask(tmp_path / "m.npz")
+        refuses(r"m.npz: a is no mask, but has type", read_mask, tmp_path / "m.npz")

@@ -1,4 +1,4 @@
-"""The CMB: spectra from CAMB and Gaussian realisations of them."""
+"""The CMB: spectra from CAMB, and Gaussian fields, whose spectra may have to be repaired."""
 
 import camb
 import jax
@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from jaxsky import cmb
+from jaxsky.cmb import gaussian_fields, repair
 from jaxsky.harmonics import alm_ell
+from refusals import cases, raises
 
 LMAX = 64
 
@@ -88,29 +90,16 @@ def test_what_a_cosmology_does_not_say_is_that_of_planck():
     assert np.isfinite(cmb.camb_spectra(60, cosmomc_theta=0.0104)).all()
 
 
-@pytest.mark.parametrize(
-    ("cosmology", "words"),
-    [
-        ({"H0": -70.0}, "'H0' of the cosmology is -70.0, which is negative"),
-        ({"H0": np.nan}, "'H0' of the cosmology is nan"),
-        ({"H0": 0.5}, "CAMB does not take the cosmology: H0 is the value in km/s/Mpc"),
-        ({"omega": 0.3}, "CAMB does not take the cosmology: Unrecognized parameter: omega"),
-        ({"max_l_tensor": 100}, "'max_l_tensor' is no parameter of the cosmology"),
-        ({"WantTensors": 1.0}, "'WantTensors' is no parameter of the cosmology"),
-    ],
-)
+@pytest.mark.parametrize(("cosmology", "words"), cases("cmb/cosmologies_that_are_none"))
 def test_cosmologies_that_are_none_are_refused(cosmology, words):
     for spectra in (cmb.camb_spectra, cmb.tensor_spectra):
-        with pytest.raises(ValueError, match=words):
-            spectra(10, **(cmb.PLANCK_2018 | cosmology))
+        raises(ValueError, words, spectra, 10, **cmb.PLANCK_2018 | cosmology)
 
 
 def test_refuses_nonsense():
     for r in (-1, np.nan, np.inf):
-        with pytest.raises(ValueError, match=f"`r` must be a number from 0 on, but is {r}"):
-            cmb.camb_spectra(10, r=r)
-    with pytest.raises(ValueError, match="`lmax` must not be negative, but is -2"):
-        cmb.tensor_spectra(-2)
+        raises(ValueError, f"`r` must be a number from 0 on, but is {r}", cmb.camb_spectra, 10, r=r)
+    raises(ValueError, "`lmax` must not be negative, but is -2", cmb.tensor_spectra, -2)
     with pytest.raises(ValueError, match="`stokes` must be 'QU' or 'IQU', not 'Q'"):
         cmb.realisation(jax.random.key(0), jnp.ones((4, 5)), "Q")
 
@@ -139,3 +128,127 @@ def test_spectra_are_kept_from_one_process_to_the_next(tmp_path, monkeypatch):
     monkeypatch.setenv("JAXSKY_CACHE", str(kept / "no" / "folder"))
     np.testing.assert_allclose(fresh(), first, rtol=1e-9)
     cmb._scalars.cache_clear()
+
+
+DUST_LMAX = 40
+KEY = jax.random.key(0)
+
+
+@pytest.fixture(scope="module")
+def spectra():
+    """Spectra of dust E, B and AME E, B like those of the sky, zero below l = 2."""
+    correlations = np.array(
+        [[1, -0.1, 0.7, 0], [-0.1, 1, 0.05, 0.5], [0.7, 0.05, 1, -0.15], [0, 0.5, -0.15, 1]]
+    )
+    ell = np.arange(DUST_LMAX + 1)
+    slopes = np.array([-2.4, -2.2, -2.8, -2.0])[:, None]
+    root = np.sqrt([[4.0], [2.0], [0.1], [0.05]]) * np.maximum(ell, 1) ** (slopes / 2) * (ell > 1)
+    return jnp.asarray(correlations[..., None] * root[:, None] * root)
+
+
+def mixed(level, coefficient):
+    """Three fields: none, no power in one, uncorrelated, valid, impossible, twice impossible."""
+    ones, zero = jnp.ones(()), jnp.zeros(())
+    c = coefficient
+
+    def matrix(a, b, d):
+        return jnp.array([[1, a, b], [a, 1, d], [b, d, 1]])
+
+    blocks = [
+        matrix(zero, zero, zero) * 0,
+        matrix(c, zero, zero).at[2].set(0),
+        matrix(zero, zero, zero),
+        matrix(0.5 * c, 0.2 * ones, -0.3 * c),
+        matrix(c, c, -0.8 * ones),
+        matrix(-1.5 * c, -1.6 * c, -1.7 * ones),
+    ]
+    scale = jnp.array([1.0, 3.0, 1e-4]) * level
+    return jnp.stack(blocks, axis=-1) * scale[:, None, None] * scale[:, None]
+
+
+def test_a_single_field_is_white_noise_times_the_root_of_its_spectrum():
+    spectrum = jnp.arange(5.0)
+    white = jax.random.normal(KEY, (1, 25))
+    expected = white * np.sqrt(spectrum)[alm_ell(4)]
+    np.testing.assert_allclose(gaussian_fields(KEY, spectrum[None, None]), expected, rtol=1e-14)
+
+
+def test_what_is_fine_is_left_as_it_is(spectra):
+    mended, count = repair(spectra)
+    assert int(count) == 0
+    np.testing.assert_allclose(mended, spectra, rtol=1e-14)
+
+
+def test_two_fields_that_are_too_correlated_become_proportional():
+    # The closest coefficient to 1.3 is 1; the auto-spectra 4 and 9 stay, so the cross is 6.
+    bad = jnp.array([[4.0, -7.8], [-7.8, 9.0]])[..., None]
+    mended, count = repair(bad)
+    assert int(count) == 1
+    # Eigenvalues are kept above 1e-10, so the coefficient is 1 within that.
+    np.testing.assert_allclose(mended[..., 0], [[4, -6], [-6, 9]], rtol=1e-9)
+    E, B = gaussian_fields(KEY, mended)
+    np.testing.assert_allclose(B, -1.5 * E, atol=1e-4 * float(jnp.abs(E).max()))
+
+
+def test_impossible_correlations_are_counted_and_mended():
+    given = mixed(1.0, 0.9)
+    mended, count = repair(given)
+    assert int(count) == 2
+    np.testing.assert_allclose(mended[..., :4], given[..., :4], rtol=1e-14, atol=0)
+    power = np.einsum("iil->li", mended)
+    np.testing.assert_allclose(power, np.einsum("iil->li", given), rtol=1e-13)
+    for ell in (4, 5):
+        scale = np.sqrt(power[ell])
+        correlations = np.asarray(mended[..., ell]) / np.outer(scale, scale)
+        least = np.linalg.eigvalsh(correlations)[0]
+        assert 0 < least < 1e-9
+        assert abs(correlations).max() < 1 + 1e-9
+        # Clipping the eigenvalues and scaling the diagonal back, written out.
+        original = np.asarray(given[..., ell]) / np.outer(scale, scale)
+        values, vectors = np.linalg.eigh(original)
+        assert values[0] < -0.1
+        clipped = vectors @ np.diag(np.maximum(values, 0)) @ vectors.T
+        norm = np.sqrt(np.diag(clipped))
+        np.testing.assert_allclose(correlations, clipped / np.outer(norm, norm), atol=1e-9)
+
+
+def test_without_power_there_are_no_correlations():
+    given = mixed(1.0, 0.9).at[0, 2, 1].set(5.0).at[2, 0, 1].set(5.0)
+    mended, count = repair(given)
+    assert int(count) == 2  # those of before; nothing had to be mended here
+    assert np.all(mended[..., 0] == 0)
+    assert np.all(mended[2, :, 1] == 0)
+    fields = gaussian_fields(KEY, mended)
+    assert bool(jnp.isfinite(fields).all())
+    assert np.all(fields[:, alm_ell(5) == 0] == 0)
+    assert np.all(fields[2, alm_ell(5) == 1] == 0)
+
+
+@pytest.mark.parametrize("argument", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_derivatives_of_fields(argument):
+    # Through multipoles without power, without correlations and with repaired ones.
+    at = [jnp.asarray(1.3), jnp.asarray(0.9)]
+
+    @jax.jit
+    def fields(value):
+        values = [*at[:argument], value, *at[argument + 1 :]]
+        return gaussian_fields(KEY, repair(mixed(*values))[0])
+
+    tangent = jax.jvp(fields, (at[argument],), (jnp.ones(()),))[1]
+    h = 1e-4
+    difference = (fields(at[argument] + h) - fields(at[argument] - h)) / (2 * h)
+    # Of repaired fields the roots of eigenvalues 1e-10 carry rounding of 1e-11 / h.
+    scale = np.abs(fields(at[argument])).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(tangent / scale, difference / scale, atol=1e-6)
+    assert float(np.abs(tangent[2] / scale[2]).max()) > 0.1
+    weights = jax.random.normal(jax.random.key(3), tangent.shape)
+    pulled = jax.grad(lambda value: jnp.vdot(weights, fields(value)))(at[argument])
+    assert float(pulled) == pytest.approx(float(jnp.vdot(weights, tangent)), rel=1e-9)
+
+
+def test_derivatives_in_every_spectrum_are_finite():
+    given = mixed(1.0, 0.9)
+    slopes = jax.grad(lambda s: jnp.sum(gaussian_fields(KEY, repair(s)[0]) ** 2))(given)
+    assert bool(jnp.isfinite(slopes).all())
+    assert np.all(slopes[..., 0] == 0)
+    assert float(slopes[0, 0, 2]) > 0

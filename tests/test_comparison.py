@@ -21,6 +21,7 @@ from jaxsky.harmonics import expand, power_spectrum, synthesis
 from jaxsky.io import InputError
 from jaxsky.noise import draw, uniform_covariance, white_alm
 from jaxsky.settings import Experiment, SettingsError, load
+from refusals import cases, raises
 from settings_fuzz import written
 from systems import small_experiment
 
@@ -270,31 +271,13 @@ def test_what_cannot_be_compared_is_refused(settings, prepared, regions):
         compare(settings, prepared, {"nothing": np.zeros(3072, bool)})
     # Of the other bands it does not matter.
     coarse = prepared._replace(sources=prepared.sources | {"band '44'": 16})
-    patches = {"patches": "K"}
-    for update, maps, words in (
-        ({"lmax": 33}, prepared, "multipoles reach to 2 nside, 32, but 33 is asked"),
-        ({"width": 1}, prepared, r"compare.width: 1 makes 24 bins .*nsims is 30"),
-        (patches, prepared, r"patches_nside: 256 is finer than that of .*, 32"),
-        (patches, coarse, r"256 is finer than that of template .*, 32"),
-        (
-            patches | {"patches_nside": 32},
-            coarse,
-            r"patches_nside: 32 resolves l = 64, .* take 100",
-        ),
-    ):
+    for update, maps, words in cases("comparison/updates"):
         how = settings.compare.model_copy(update=update)
+        given = {"fine": prepared, "coarse": coarse}[maps]
         with pytest.raises(SettingsError, match=words):
-            compare(settings.model_copy(update={"compare": how}), maps, regions)
-    for change, words in (
-        ({"compare": {"patches": "353"}}, r"compare.patches: '353' is none of 44, 70, K"),
-        ({"simulate": {"leakage": {"30": 0.1}}}, r"simulate.leakage: '30' is none of 44, 70, K"),
-        (
-            {"bands": [{"instrument": "wmap", "channels": []}]},
-            r"bands.0.channels\n  List should have at least 1 item",
-        ),
-    ):
-        with pytest.raises(ValueError, match=words):
-            Experiment.model_validate(settings.model_dump() | change)
+            compare(settings.model_copy(update={"compare": how}), given, regions)
+    for change, words in cases("comparison/changes"):
+        raises(ValueError, words, Experiment.model_validate, settings.model_dump() | change)
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """One sweep over every kind of component, then what is particular to each."""
 
-import astropy.units as u
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +20,7 @@ from jaxsky import (
     parameter_names,
     set_parameters,
 )
+from refusals import cases, raises
 
 NAMES = list(systems.components())
 
@@ -142,6 +142,9 @@ MAPS = np.ones((2, 12))
     ("make", "error", "words"),
     [
         (lambda: Dust(np.ones((4, 12))), ValueError, r"`amplitude` .* has shape \(4, 12\)"),
+        (lambda: Dust(np.ones(12)), ValueError, r"`amplitude` .* shape \(12,\)"),
+        (lambda: Dust(MAPS * np.nan), ValueError, "`amplitude` has 24 of 24 values"),
+        (lambda: Dust(MAPS * 1j), TypeError, "`amplitude` must be real"),
         (lambda: Dust(MAPS, np.ones(11)), ValueError, r"`beta_dust` .* shape \(12,\), .* \(11,\)"),
         (lambda: Dust(MAPS, T_dust=-np.ones(12)), ValueError, "`T_dust` must be positive.* is -1"),
         (lambda: Dust(MAPS, E_dust=(1.0,)), ValueError,
@@ -150,7 +153,6 @@ MAPS = np.ones((2, 12))
         (lambda: Dust(MAPS, (1.6, 2.7), (9.4,), (1.0, 1.0)), ValueError,
          r"tuples with one entry a body, but have lengths \[2, 1, 2\]"),
         (lambda: Dust(MAPS, (1.6, 2.7)), ValueError, "must be tuples with one entry a body"),
-        (lambda: Dust(MAPS, T_dust=21 * u.K), TypeError, "`T_dust` carries the unit K"),
         (lambda: Synchrotron(MAPS, "steep"), TypeError, "`beta_syn` must be a number"),
         (lambda: Synchrotron(MAPS, 3j), TypeError, "`beta_syn` must be real"),
         (lambda: Synchrotron(MAPS, np.inf), ValueError, "`beta_syn` has 1 of 1 values"),
@@ -160,8 +162,7 @@ MAPS = np.ones((2, 12))
     ],
 )  # fmt: skip
 def test_bad_arguments_are_refused(make, error, words):
-    with pytest.raises(error, match=words):
-        make()
+    raises(error, words, make)
 
 
 def test_big_endian_maps_are_taken():
@@ -171,19 +172,14 @@ def test_big_endian_maps_are_taken():
 @pytest.mark.parametrize(
     ("component", "parameters", "words"),
     [
-        (Synchrotron, {"beta_syn": -3.1}, "must be from 0 to 10, but is -3.1; T ~ nu.-beta_syn"),
-        (Synchrotron, {"beta_syn": np.linspace(-3.2, 0.1, 12)}, "its median is -1.55"),
-        (Synchrotron, {"nu_ref": 30e9}, r"from 0.01 to 1000, but is 3e\+10; it has to be in GHz"),
-        (Synchrotron, {"nu_ref": -30.0}, "must be positive, but its smallest value is -30"),
-        (Dust, {"nu_ref": 0.353}, "must be from 1 to 20000, but is 0.353; it has to be in GHz"),
-        (Dust, {"nu_ref": 353e3}, r"but is 353000; it has to be in GHz"),
-        (AME, {"nu_ref": 22800.0}, "must be from 0.01 to 1000, but is 22800; it has to be in GHz"),
+        *cases("components/signs_and_units"),
+        ("Synchrotron", {"beta_syn": np.linspace(-3.2, 0.1, 12)}, "its median is -1.55"),
     ],
 )
 def test_signs_and_units_that_are_meant_otherwise(component, parameters, words):
     (name,) = parameters
-    with pytest.raises(ValueError, match=rf"Argument `{name}` .*{words}"):
-        component(np.ones((2, 12)), **parameters)
+    component = {"Synchrotron": Synchrotron, "Dust": Dust, "AME": AME}[component]
+    raises(ValueError, rf"Argument `{name}` .*{words}", component, np.ones((2, 12)), **parameters)
     sky = Sky({"one": component(np.ones((2, 12)))})
     with pytest.raises(ValueError, match=rf"Argument `one.{name}` .*{words}"):
         set_parameters(sky, {f"one.{name}": parameters[name]})

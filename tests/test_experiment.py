@@ -1,5 +1,6 @@
 """Simulations from settings: realisations as files, what each key does, and refusals."""
 
+import itertools
 import json
 import re
 import shutil
@@ -12,6 +13,7 @@ import pytest
 from astropy.io import fits as pyfits
 
 import systems
+from commands import experiment as experiment_text
 from commands import jaxsky, one_sentence
 from fits.commands.run import DEFAULTS
 from jaxsky import experiment, inputs, montecarlo
@@ -23,44 +25,19 @@ from jaxsky.io.files import occupied
 from jaxsky.noise import realisation_key
 from jaxsky.settings import load
 from jaxsky.simulation import simulate
+from refusals import cases
 
 TEMPLATE = DEFAULTS / "experiment.toml"
 NSIDE = 8
 NPIX = 12 * NSIDE**2
-SETTINGS = """
-title = "A small sky"
-seed = 3
-[simulate]
-nside = 8
-fwhm = 1200.0
-sheet = false
-[sky.dust]
-law = "dust"
-file = "dust.fits"
-nu_ref = 353.0
-fwhm = 900.0
-parameters = { beta_dust = { file = "beta.fits", unit = "" } }
-[sky.synchrotron]
-law = "synchrotron"
-file = "synchrotron.fits"
-nu_ref = 30.0
-fwhm = 900.0
-[cmb]
-spectra = "cmb.dat"
-format = "camb"
-[[bands]]
-name = "30"
-bandpass = { center = 30.0, width = 6.0 }
-fwhm = 800.0
-noise = { level = 300.0 }
-[[bands]]
-name = "143"
-bandpass = { center = 143.0, width = 30.0 }
-beam = "beam.txt"
-noise = { rms = 1.0, unit = "uK_RJ" }
-"""
 SMALL = "\n[sky.dust.small_scales]\nEE = [4, 10]\nBB = [3, 8]\nmodulation_fwhm = 1500.0\n"
-BOTH = SMALL + SMALL.replace("dust", "synchrotron")
+#: Changes with a name: small scales of dust, of both components, and templates with intensity.
+NAMED = {
+    "small": [("[cmb]", SMALL + "[cmb]")],
+    "both": [("[cmb]", SMALL + SMALL.replace("dust", "synchrotron") + "[cmb]")],
+    "iqu": [("nside = 8", 'nside = 8\nstokes = "IQU"')]
+    + [(f'"{name}.fits"', f'"{name}_iqu.fits"') for name in ("dust", "synchrotron")],
+}
 
 
 @pytest.fixture(scope="module")
@@ -96,13 +73,11 @@ def folder(tmp_path_factory):
     return folder
 
 
-def write(folder, *changes, text=SETTINGS, name="experiment"):
+def write(folder, *changes, of="simulate", name="experiment"):
     """The settings with some text replaced, as a file."""
-    for old, new in changes:
-        assert text.count(old) >= 1, old
-        text = text.replace(old, new, 1)
+    named = [NAMED[change] if isinstance(change, str) else [change] for change in changes]
     path = folder / f"{name}.toml"
-    path.write_text(text)
+    path.write_text(experiment_text(of, *itertools.chain(*named)))
     return path
 
 
@@ -143,23 +118,7 @@ def test_files_are_the_simulation(folder, tmp_path, monkeypatch, capsys):
         again, header = healpy.read_map(file, field=None, h=True, dtype=np.float64)
         np.testing.assert_array_equal(again, found.maps)
         header = dict(header)
-        wanted = {
-            "BAND": name,
-            "SEED": 3,
-            "SIM": 0,
-            "CONTENT": "dust, synchrotron, cmb, noise",
-            "INSTRUME": "A small sky",
-            "FWHM": 1200.0,
-            "LMAX": 16,
-            "NSIDE": NSIDE,
-            "ORDERING": "RING",
-            "COORDSYS": "G",
-            "POLCCONV": "COSMO",
-            "TTYPE1": "Q",
-            "TTYPE2": "U",
-            "TUNIT1": "uK_RJ",
-            "TUNIT2": "uK_RJ",
-        }
+        wanted = cases("experiment/header") | {"BAND": name}
         assert {k: header[k] for k in wanted} == wanted
         assert header["CREATOR"].startswith("jaxsky ")
         band = setup.observation.channels[name].band
@@ -270,7 +229,7 @@ def test_multipoles_that_no_map_shows_are_left_out(folder):
 def three(folder, tmp_path_factory):
     """Three realisations with small scales, in one run."""
     patch, out = pytest.MonkeyPatch(), tmp_path_factory.mktemp("three") / "out"
-    path = write(folder, ("[cmb]", SMALL + "[cmb]"), name="three")
+    path = write(folder, "small", name="three")
     assert command(patch, path, "--out", out, "--nsims", 3) == 0
     patch.undo()
     return path, content(out)
@@ -297,28 +256,27 @@ def test_a_realisation_does_not_depend_on_the_order(three, tmp_path, monkeypatch
     assert [p for p, t in times.items() if p.stat().st_mtime_ns != t] == [lost]
 
 
-def test_a_monte_carlo_is_split_over_processes(three, tmp_path, monkeypatch, capsys):
+def test_a_monte_carlo_is_split_over_processes(three, tmp_path, monkeypatch, mistake):
     """In one folder, at once or one after the other; each makes its own part."""
     path, expected = three
     out = tmp_path / "out"
     with occupied(out, range(1)):  # another process makes the first realisation
         for options in (["--nsims", 3], ["--overwrite", "--first", 1]):
-            assert command(monkeypatch, path, "--out", out, *options) == 2
-            assert "is being written to by another command (process" in one_sentence(capsys)
+            assert "is being written to by another command (process" in mistake(
+                "simulate", path, "--out", out, *options
+            )
         assert command(monkeypatch, path, "--out", out, "--first", 2) == 0
-        capsys.readouterr()
-        assert command(monkeypatch, path, "--out", out, "--first", 1, "--set", "seed=4") == 2
-        assert "holds a simulation with other settings" in one_sentence(capsys)
+        assert "holds a simulation with other settings" in mistake(
+            "simulate", path, "--out", out, "--first", 1, "--set", "seed=4"
+        )
         assert command(monkeypatch, path, "--out", out, "--first", 1) == 0
-    capsys.readouterr()
-    assert command(monkeypatch, path, "--out", out, "--first", 2) == 2
-    assert "holds a simulation already" in one_sentence(capsys)
+    assert "holds a simulation already" in mistake("simulate", path, "--out", out, "--first", 2)
     assert command(monkeypatch, path, "--out", out) == 0
     assert content(out) == expected
     assert not list(out.glob(".*"))
 
 
-def test_processes_with_other_settings_do_not_meet(three, tmp_path, monkeypatch, capsys):
+def test_processes_with_other_settings_do_not_meet(three, tmp_path, monkeypatch, mistake):
     """Both began in an empty folder, and one left its log before the other had a map."""
     path, _ = three
     out, observe = tmp_path / "out", montecarlo.observe_bands
@@ -329,12 +287,11 @@ def test_processes_with_other_settings_do_not_meet(three, tmp_path, monkeypatch,
         return observe(*arguments, **options)
 
     monkeypatch.setattr(montecarlo, "observe_bands", meanwhile)
-    assert command(monkeypatch, path, "--out", out) == 2
-    assert "holds a simulation with other settings" in one_sentence(capsys)
+    assert "holds a simulation with other settings" in mistake("simulate", path, "--out", out)
     assert list(content(out)) == []
 
 
-def test_a_removed_folder_or_log_stops_the_run(three, tmp_path, monkeypatch, capsys):
+def test_a_removed_folder_or_log_stops_the_run(three, tmp_path, monkeypatch, mistake):
     path, _ = three
     out, write_file = tmp_path / "out", montecarlo.write_maps
 
@@ -347,12 +304,14 @@ def test_a_removed_folder_or_log_stops_the_run(three, tmp_path, monkeypatch, cap
         monkeypatch.setattr(montecarlo, "write_maps", removing)
 
     remove(out)
-    assert command(monkeypatch, path, "--out", out, "--nsims", 3) == 2
-    assert f"{out}: was removed while the command worked in it" in one_sentence(capsys)
+    assert f"{out}: was removed while the command worked in it" in mistake(
+        "simulate", path, "--out", out, "--nsims", 3
+    )
     assert not out.exists()
     remove(out / montecarlo.LOG)
-    assert command(monkeypatch, path, "--out", out, "--nsims", 3) == 2
-    assert "simulation.json: was removed while the simulation ran" in one_sentence(capsys)
+    assert "simulation.json: was removed while the simulation ran" in mistake(
+        "simulate", path, "--out", out, "--nsims", 3
+    )
 
 
 def test_a_stopped_run_goes_on(three, tmp_path, monkeypatch, capsys):
@@ -375,7 +334,7 @@ def test_a_stopped_run_goes_on(three, tmp_path, monkeypatch, capsys):
     assert content(out) == expected
 
 
-def test_what_cannot_be_written_stops_the_run(three, tmp_path, monkeypatch, capsys):
+def test_what_cannot_be_written_stops_the_run(three, tmp_path, monkeypatch, mistake):
     """Bands are written while the next one is made; an error there is one, and leaves no file."""
     path, _ = three
     written, write_maps = [], montecarlo.write_maps
@@ -387,8 +346,9 @@ def test_what_cannot_be_written_stops_the_run(three, tmp_path, monkeypatch, caps
         written.append(where)
 
     monkeypatch.setattr(montecarlo, "write_maps", full)
-    assert command(monkeypatch, path, "--out", tmp_path / "out", "--nsims", 3) == 2
-    assert "No space left on device" in one_sentence(capsys)
+    assert "No space left on device" in mistake(
+        "simulate", path, "--out", tmp_path / "out", "--nsims", 3
+    )
     assert sorted((tmp_path / "out").glob("sim_*/*.fits")) == sorted(written)
 
 
@@ -396,7 +356,7 @@ def test_small_scales_can_be_the_same_for_all(folder, tmp_path, monkeypatch):
     found = {}
     for seed in ("", "small_scales_seed = 0", "small_scales_seed = 1"):
         change = (COMPONENTS[0], f"{COMPONENTS[1]}\n{seed}")
-        path, out = write(folder, change, ("[cmb]", SMALL + "[cmb]")), tmp_path / f"_{seed[-1:]}"
+        path, out = write(folder, change, "small"), tmp_path / f"_{seed[-1:]}"
         assert command(monkeypatch, path, "--out", out, "--nsims", 2) == 0
         found[seed[-1:]] = [columns(out / f"sim_0000{i}" / "30.fits") for i in (0, 1)]
     for name in ("Q_cmb", "Q_noise"):
@@ -421,62 +381,19 @@ def simulated(path):
     return np.asarray(simulate(key, setup.sources, setup.observation, cmb))
 
 
-def small(line, table="dust"):
-    """A key more in the table of small scales."""
-    at = f"[sky.{table}.small_scales]\n"
-    return (at, f"{at}{line}\n")
-
-
 @pytest.fixture(scope="module")
 def reference(folder):
-    return simulated(write(folder, ("[cmb]", BOTH + "[cmb]"), name="reference"))
+    return simulated(write(folder, "both", name="reference"))
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        ("seed = 3", "seed = 4"),
-        ("fwhm = 1200.0", "fwhm = 1250.0"),
-        ("nside = 8", 'nside = 8\ninclude = ["dust", "cmb", "noise"]'),
-        ("[cmb]", '[fixed]\n"synchrotron.beta_syn" = 3.0\n[cmb]'),
-        ("fwhm = 900.0", "fwhm = 880.0"),
-        ("nu_ref = 353.0", "nu_ref = 350.0"),
-        ("EE = [4, 10]", "EE = [4, 9]"),
-        ("BB = [3, 8]", "BB = [2, 8]"),
-        small("slope = -2.0"),
-        small("slope = [-2.0, -2.2]"),
-        small("tilt = 0.1"),
-        small("amplitude = 0.5"),
-        ("modulation_fwhm = 1500.0", "modulation_fwhm = 2000.0"),
-        small('correlated_with = "dust"', "synchrotron"),
-        ('format = "camb"', 'format = "planck"'),
-        ("center = 30.0", "center = 31.0"),
-        ("width = 6.0", "width = 16.0"),
-        ("width = 6.0", 'width = 6.0, convention = "power"'),
-        ("fwhm = 800.0", "fwhm = 700.0"),
-        ("level = 300.0", "level = 200.0"),
-        ("level = 300.0", 'level = 300.0, unit = "uK_RJ"'),
-        ("rms = 1.0", "rms = 2.0"),
-    ],
-    ids=lambda change: change[1].strip().splitlines()[-1],
+    "change", cases("experiment/keys"), ids=lambda change: change[1].strip().splitlines()[-1]
 )
 def test_a_key_changes_the_maps(folder, reference, change):
-    path = write(folder, ("[cmb]", BOTH + "[cmb]"), change, name="changed")
+    path = write(folder, "both", change, name="changed")
     maps = simulated(path)
     assert maps.shape == reference.shape
     assert np.abs(maps / reference - 1).max() > 1e-3
-
-
-INSTRUMENT = """
-[[bands]]
-instrument = "core"
-channels = ["45", "105"]
-[simulate]
-nside = 8
-fwhm = 1200.0
-[sky]
-embedded = { nside = 8 }
-"""
 
 
 def test_keys_of_instruments_and_of_the_embedded_sky(folder, monkeypatch):
@@ -494,7 +411,7 @@ def test_keys_of_instruments_and_of_the_embedded_sky(folder, monkeypatch):
 
     def made(*changes):
         wide = ("fwhm = 1200.0", "fwhm = 1400.0")
-        path = write(folder, wide, *changes, text=INSTRUMENT, name="core")
+        path = write(folder, wide, *changes, of="instrument", name="core")
         return simulation_inputs(load(path)).observation
 
     plain = made()
@@ -522,114 +439,34 @@ def test_keys_of_the_cmb_reach_camb(folder, monkeypatch):
 # Refusals.
 
 
-IQU = [("nside = 8", 'nside = 8\nstokes = "IQU"')] + [
-    (f'"{name}.fits"', f'"{name}_iqu.fits"') for name in ("dust", "synchrotron")
-]
-CMB = "[cmb]"
-RMS = '{ rms = 1.0, unit = "uK_RJ" }'
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
-    [
-        ([("nside = 8", "nside = 4")],
-         "pixels of 879 arcmin (nside 4) are too wide for the beam of 1200 arcmin of band '30'; "
-         "that takes nside 8, or a common simulate.fwhm of at least 1.32e+03 arcmin"),
-        ([("fwhm = 1200.0", "fwhm = 700.0")],
-         "simulate.fwhm: 700 arcmin is finer than the beam of band '30', 800 arcmin"),
-        ([("fwhm = 1200.0", "fwhm = 850.0")],
-         "sky.dust: its resolution, 900 arcmin, is coarser than the 850 arcmin of band '30'; "
-         "add small scales, [sky.dust.small_scales], or bring the maps to a common "
-         "simulate.fwhm of at least 900 arcmin"),
-        ([("nside = 8", 'nside = 8\ninclude = ["dst"]')],
-         "simulate.include: 'dst' is none of dust, synchrotron, cmb, noise"),
-        ([("nside = 8", 'nside = 8\ninclude = ["noise"]'), (f"noise = {RMS}", "")],
-         "Nothing is left to be observed in band '143': no component, no CMB, no noise"),
-        ([('name = "30"', 'name = "30"\nchannels = ["30"]')],
-         "bands.0: channels choose from an instrument, in place of a name"),
-        ([("sheet = false", 'unit = "mK"')], "simulate.unit: input should be 'uK_RJ' or"),
-        # Templates.
-        ([('"dust.fits"', '"dust_cut.fits"')],
-         "sky.dust: 5 pixels have no value; a simulation takes maps of the full sky"),
-        # Small scales.
-        ([(CMB, SMALL + CMB), *IQU], "'dust' has small scales, which are added to Q and U only"),
-        ([(CMB, SMALL.replace("dust", "ame") + CMB)], "sky.ame: law is missing"),
-        ([(CMB, SMALL + CMB), ("EE = [4, 10]", "EE = [4, 30]")],
-         "Small scales of dust: A power law cannot be fitted from l = 4 to 30 to a spectrum that "
-         "ends at 16"),
-        ([(CMB, SMALL + CMB), ("EE = [4, 10]", "EE = [4, 10, 11]")], "sky.dust.small_scales.EE"),
-        ([(CMB, SMALL + CMB), small("amplitude = -1.0")], "sky.dust.small_scales.amplitude"),
-        ([(CMB, SMALL + CMB), small("tilt = nan")],
-         "sky.dust.small_scales.tilt: input should be a finite number, not nan"),
-        ([(CMB, SMALL + CMB), small('correlated_with = "synchrotron"')],
-         "The small scales of 'dust' are to be correlated with those of 'synchrotron'"),
-        ([(CMB, BOTH + CMB), small('correlated_with = "dust"')],
-         "The small scales of 'dust' are to be correlated with those of 'dust'"),
-        ([(CMB, BOTH + CMB), small('correlated_with = "nothing"')],
-         "The small scales of 'dust' are to be correlated with those of 'nothing'"),
-        ([(CMB, BOTH + CMB), small('correlated_with = "synchrotron"'),
-          small('correlated_with = "dust"', "synchrotron")],
-         "the second one must not be correlated with yet another"),
-        ([(CMB, BOTH + CMB), small('correlated_with = "synchrotron"'),
-          ("EE = [4, 10]", "EE = [2, 6]"), ("EE = [4, 10]", "EE = [8, 12]")],
-         "Correlated small scales need ranges that overlap"),
-        # The CMB.
-        ([('"cmb.dat"', '"short.dat"')], "short.dat: ends at l = 9, but lmax is 16"),
-        ([('"cmb.dat"', '"cmb.dat"\nr = 0.1')],
-         "cmb: r, A_lens and cosmology are for CAMB; leave them out with spectra"),
-        ([('"cmb.dat"', '"cmb.dat"\nunit = "uK^2"')], "argument `unit` is for FITS files"),
-        ([('spectra = "cmb.dat"\n', "")], "cmb: format and unit are those of spectra, a file"),
-        # Bands.
-        ([("fwhm = 800.0", 'fwhm = 800.0\nbeam = "beam.txt"')], "give the beam either as fwhm"),
-        ([('"beam.txt"', '"cmb.dat"')], "cmb.dat"),
-        ([("width = 6.0", "width = 70.0")], "bands.30.bandpass: Argument `nu` must be positive"),
-        ([(RMS, '{ rms = { file = "coarse.fits" } }')],
-         "bands.143.noise.rms: nside is 4, but that of the map is 8"),
-        ([(RMS, '{ hits = { file = "hits.fits", fields = ["HITS"], sigma0 = 1.0 } }')],
-         "bands.143.noise: 5 pixels have no noise; a simulation takes maps of the full sky"),
-    ],
+    cases("experiment/refusals"),
     ids=lambda value: value[:40] if isinstance(value, str) else "",
-)  # fmt: skip
-def test_refusals(folder, tmp_path, monkeypatch, capsys, changes, words):
+)
+def test_refusals(folder, tmp_path, changes, words, mistake):
     path, out = write(folder, *changes, name="mistake"), tmp_path / "a" / "out"
-    assert command(monkeypatch, path, "--out", out) == 2
-    assert words in one_sentence(capsys)
+    assert words in mistake("simulate", path, "--out", out)
     assert not (tmp_path / "a").exists()
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (('"core"', '"cor"'), "Unknown instrument 'cor'; known are planck, wmap, core, litebird"),
-        (('"105"', '"106"'), "core has no channel '106'; it has 45, 75, 105"),
-        (("{ nside = 8 }", "{ nside = 8, height = 1.0 }"),
-         "sky.embedded.height: is none of nside, seed, psi0, psi1"),
-        (("{ nside = 8 }", "{ nside = 8, dust_height = -1.0 }"),
-         "sky.embedded: Argument `dust_height` must be positive"),
-        (("{ nside = 8 }", "{ nside = 4 }"),
-         "sky.dust: its resolution, 1.32e+03 arcmin, 1.5 pixels of nside 4, is coarser"),
-    ],
-)  # fmt: skip
-def test_refusals_of_instruments(folder, tmp_path, monkeypatch, capsys, change, words):
-    path = write(folder, change, text=INSTRUMENT, name="core")
-    assert command(monkeypatch, path, "--out", tmp_path / "out") == 2
-    assert words in one_sentence(capsys)
+@pytest.mark.parametrize(("change", "words"), cases("experiment/refusals_of_instruments"))
+def test_refusals_of_instruments(folder, tmp_path, change, words, mistake):
+    path = write(folder, change, of="instrument", name="core")
+    assert words in mistake("simulate", path, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_refusals_of_options(folder, tmp_path, monkeypatch, capsys):
+def test_refusals_of_options(folder, tmp_path, monkeypatch, capsys, mistake):
     path, out = write(folder), tmp_path / "out"
-    for options, words in {
-        ("--only", "dust"): "--only must be one of noise, signal, foregrounds, cmb, not 'dust'",
-        ("--resume", "--overwrite"): "--resume and --overwrite exclude each other",
-    }.items():
-        assert command(monkeypatch, path, "--out", out, *options) == 2
-        assert words in one_sentence(capsys)
+    for options, words in cases("experiment/options"):
+        assert words in mistake("simulate", path, "--out", out, *options)
     for options in (("--nsims", "0"), ("--first", "-1")):
         assert command(monkeypatch, path, "--out", out, *options) == 2
         assert "Traceback" not in capsys.readouterr().err
-    assert command(monkeypatch, tmp_path / "none.toml", "--out", out) == 2
-    assert "none.toml: cannot be read (No such file or directory)" in one_sentence(capsys)
+    assert "none.toml: cannot be read (No such file or directory)" in mistake(
+        "simulate", tmp_path / "none.toml", "--out", out
+    )
     assert not out.exists()
 
 
@@ -649,7 +486,7 @@ def test_a_folder_with_results_is_left_alone(folder, tmp_path, monkeypatch, caps
         said = refused(path, "--resume", *options)
         assert "holds a simulation with other settings; choose another --out" in said
     # A mistake that only the small scales notice does not cost the old results.
-    wrong = write(folder, (CMB, SMALL.replace("[4, 10]", "[4, 30]") + CMB), name="wrong")
+    wrong = write(folder, "small", ("[4, 10]", "[4, 30]"), name="wrong")
     assert "from l = 4 to 30" in refused(wrong, "--overwrite")
     whole = log.read_bytes()
     for damage in (b"{}", b"[1]", b"\xff\xfe", whole[:50]):
@@ -676,20 +513,6 @@ def test_a_folder_with_results_is_left_alone(folder, tmp_path, monkeypatch, caps
 
 
 TABLES = re.split(r"^(?=(?:# )?\[)", TEMPLATE.read_text(), flags=re.MULTILINE)
-#: What is commented out in the template and is not the default.
-ALTERNATIVES = {
-    "[cmb]": "cosmology spectra",
-    "[common]": "mask components maps",
-    "[regions]": "clean",
-    "[free]": "gain.44 angle.44 dust.beta_dust",
-    "[fixed]": "dust.beta_dust",
-    "[truth]": "synchrotron.curvature",
-    "[simulate]": "nside include small_scales_seed leakage",
-    "[compare]": "patches",
-    "[separate]": "nsteps lmax",
-    "[forecast]": "bands",
-    "[paper]": "ame beta_dust beta_syn",
-}
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.partition("\n")[0][:30])
@@ -709,7 +532,8 @@ def test_what_is_commented_out_in_the_template_is_valid(tmp_path, table):
         path.write_text("".join([*others, mine] if title else [mine, *others]))
         if mark and load(path).model_dump(exclude={"data_dir"}) != plain:
             changed.add(key.strip('"'))
-    assert own or changed == set(ALTERNATIVES.get(title, "").split())
+    alternatives = cases("experiment/alternatives")
+    assert own or changed == set(alternatives.get(title, "").split())
 
 
 def test_the_default_is_valid():
@@ -732,7 +556,7 @@ def test_titles_of_all_kinds(folder, tmp_path, monkeypatch, capsys):
 
 
 def test_intensity_and_the_sheet(folder, tmp_path, monkeypatch):
-    path, out = write(folder, ("sheet = false", "sheet = true"), *IQU), tmp_path / "out"
+    path, out = write(folder, ("sheet = false", "sheet = true"), "iqu"), tmp_path / "out"
     assert command(monkeypatch, path, "--out", out, "--first", 7) == 0
     (picture,) = out.glob("*.png")
     assert picture.name == "sim_00007.png"

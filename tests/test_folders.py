@@ -21,6 +21,7 @@ from commands import jaxsky, said
 from fits.kept import KeptChain, fingerprint, kept_realisations
 from jaxsky.io import InputError, whole, write_maps, write_text
 from jaxsky.io.files import ALL, Owner, alone, occupied
+from refusals import raises
 
 COMMANDS = ("fit", "compare", "separate", "simulate", "forecast", "paper")
 
@@ -185,8 +186,7 @@ def test_what_cannot_be_written_is_one_sentence(tmp_path):
     for name, write in written.items():
         write(tmp_path / name)
     assert names(tmp_path) == ["a", "b"]
-    with pytest.raises(OSError, match=r"x: cannot be written \(No such file"):
-        write_text(tmp_path / "none" / "x", "")
+    raises(OSError, r"x: cannot be written \(No such file", write_text, tmp_path / "none" / "x", "")
     with pytest.raises(ZeroDivisionError), whole(tmp_path / "c") as beside:
         beside.write_text(str(1 / 0))
     assert names(tmp_path) == ["a", "b"]
@@ -280,8 +280,7 @@ def test_damaged_chains_are_refused(tmp_path):
         np.savez(file, mark="mark", chain=np.zeros((3, 8, 2)))
     refused()
     path.write_bytes(content)
-    with pytest.raises(InputError, match="a chain of other data or settings"):
-        KeptChain(path, "another mark")
+    raises(InputError, "a chain of other data or settings", KeptChain, path, "another mark")
     assert KeptChain(path, "mark").iteration == 50
 
 
@@ -311,12 +310,10 @@ def test_realisations_go_on_after_a_full_disk(tmp_path, monkeypatch):
     content = path.read_bytes()
     for size in (0, 10, len(content) // 2, len(content) - 1):
         path.write_bytes(content[:size])
-        with pytest.raises(InputError, match="npz: is damaged"):
-            run()
+        raises(InputError, "npz: is damaged", run)
     with path.open("wb") as file:
         np.savez(file, mark="mark", a=np.zeros((3, 100)), b=np.zeros(2))
-    with pytest.raises(InputError, match="npz: is damaged"):
-        run()
+    raises(InputError, "npz: is damaged", run)
 
 
 def test_marks_are_the_same_in_all_processes():
@@ -325,5 +322,4 @@ def test_marks_are_the_same_in_all_processes():
     marks = {fingerprint((arrays, function)) for function in (len, max, fingerprint)}
     assert marks == {fingerprint(arrays)}
     assert fingerprint({"a": np.arange(4.0), "b": [True, 1]}) not in marks
-    with pytest.raises(TypeError, match="is neither an array nor a function"):
-        fingerprint([object()])
+    raises(TypeError, "is neither an array nor a function", fingerprint, [object()])

@@ -16,6 +16,7 @@ from jaxsky import AME, Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.noise import uniform_covariance
 from jaxsky.observation import ObservedBand, load_instrument
 from jaxsky.sky import set_parameters
+from refusals import cases, raises
 from systems import spread
 
 LMIN, LMAX, FRACTION = 2, 40, 0.6
@@ -233,23 +234,11 @@ def test_better_or_other_data():
     assert sigmas[3] > 1.2 * sigmas[0]
 
 
-@pytest.mark.parametrize(
-    ("bodies", "free", "apart"),
-    [
-        (2, ("r", "dust.E_dust.0", "dust.E_dust.1"), "apart: dust.E_dust.0, dust.E_dust.1; hold"),
-        (2, ("dust.nu_pivot", "r", "dust.E_dust.1"), "apart: dust.nu_pivot, dust.E_dust.1; hold"),
-        (
-            1,
-            ("r", "synchrotron.nu_ref", "synchrotron.beta_syn", "BB.synchrotron.amplitude"),
-            "apart: synchrotron.nu_ref, synchrotron.beta_syn, BB.synchrotron.amplitude; hold one",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("bodies", "free", "apart"), cases("forecast/degenerate"))
 def test_degenerate_parameters_are_named(bodies, free, apart):
     system = model(bodies=bodies)
     params = values(system)
-    with pytest.raises(ValueError, match=apart):
-        fisher_errors(system, params, free)
+    raises(ValueError, apart, fisher_errors, system, params, free)
     name = apart.removeprefix("apart: ").split(",")[0]
     prior = fisher_errors(system, params, free, {name: 0.1})
     assert 0 < prior.sigma[name] <= 0.1 * (1 + 1e-9)

@@ -1,5 +1,6 @@
 """The embedded sky: closed forms, symmetries, the seed, gradients, and the real sky."""
 
+import builtins
 import dataclasses
 
 import healpy
@@ -22,6 +23,7 @@ from jaxsky.galaxy import (
 )
 from jaxsky.harmonics import alm_ell, analysis
 from jaxsky.inputs import default_galaxy
+from refusals import cases, raises
 
 NAMES = [field.name for field in dataclasses.fields(GalaxyModel)]
 
@@ -240,29 +242,14 @@ def test_sky_has_the_baseline_of_the_paper(galaxy):
     assert np.std(only) < 0.05 * np.std(galaxy.synchrotron[1:])
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "words"),
-    [
-        (lambda: embedded_sky(48), ValueError, "`nside` must be a power of two, but is 48"),
-        (lambda: embedded_sky(0), ValueError, "`nside` must be a power of two, but is 0"),
-        (lambda: embedded_sky(16.0), TypeError, "`nside` must be an int, but is 16.0"),
-        (lambda: embedded_sky(16, seed=1.5), TypeError, "`seed` must be an int, but is 1.5"),
-        (lambda: embedded_sky(16, seed=True), TypeError, "`seed` must be an int, but is True"),
-        (lambda: embedded_sky(16, seed=-1), ValueError, "`seed` must be from 0 .* but is -1"),
-        (lambda: embedded_sky(16, steps=0), ValueError, "`steps` must be positive, but is 0"),
-        (lambda: GalaxyModel(dust_height=0), ValueError, "`dust_height` must be positive"),
-        (lambda: GalaxyModel(psi0=[1, 2]), ValueError, "`psi0` must be a number"),
-        (lambda: GalaxyModel(slope=np.nan), ValueError, "`slope` has 1 of 1 values"),
-    ],
-)
-def test_bad_input_is_named(call, error, words):
-    with pytest.raises(error, match=words):
-        call()
+@pytest.mark.parametrize(("make", "given", "error", "words"), cases("galaxy/bad_input"))
+def test_bad_input_is_named(make, given, error, words):
+    with pytest.raises(getattr(builtins, error), match=words):
+        {"sky": embedded_sky, "model": GalaxyModel}[make](**given)
 
 
 def test_unknown_stokes_are_named(galaxy):
-    with pytest.raises(ValueError, match="`stokes` must be 'QU' or 'IQU', not 'EB'"):
-        galaxy.sky("EB")
+    raises(ValueError, "`stokes` must be 'QU' or 'IQU', not 'EB'", galaxy.sky, "EB")
 
 
 @pytest.mark.parametrize(

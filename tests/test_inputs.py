@@ -7,16 +7,12 @@ from astropy.io import fits as pyfits
 
 from fits.inputs import inputs_of
 from jaxsky.bandpass import Bandpass
-from jaxsky.inputs import (
-    bandpass_of,
-    read,
-    read_sky,
-    set_parameters_of,
-)
+from jaxsky.inputs import bandpass_of, read, read_sky, set_parameters_of
 from jaxsky.io import InputError
 from jaxsky.noise_inputs import read_noise
 from jaxsky.settings import BandTable, Experiment, MapFile, NoiseTable, SettingsError, load
 from mapfiles import table, write
+from refusals import cases, raises
 
 NSIDE = 4
 NPIX = 12 * NSIDE**2
@@ -63,8 +59,8 @@ def folder(tmp_path_factory, matrices, hits):
     save(folder / "wmap.fits", wmap, units, ORDERING="NESTED", COORDSYS=None)
     rms = {f"{s}_RMS": 1e-6 * (1 + rng.random(NPIX)) for s in "IQU"}
     rms["Q_RMS"][HOLE] = np.nan
-    rms["MINUS"] = -rms["I_RMS"]
-    save(folder / "rms.fits", rms, ["K_CMB"] * 4)
+    rms |= {"MINUS": -rms["I_RMS"], "ZERO": 0 * rms["I_RMS"]}
+    save(folder / "rms.fits", rms, ["K_CMB"] * 5)
     save(folder / "wide.fits", {"RMS": np.ones(12 * 2**2)}, ["uK_RJ"])
     save(folder / "iqu.fits", maps, ["uK_RJ"] * 3)
     polarized = {k: v for k, v in maps.items() if k != "I_STOKES"}
@@ -167,62 +163,22 @@ def test_hits_in_another_file_with_a_unit_of_sigma0(folder):
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("spec", "stokes", "own", "words"),
-    [
-        ({"rms": {"file": "wide.fits"}}, "QU", None,
-         r"noise.rms: nside is 2, but that of the map is 4\."),
-        ({"rms": {"file": "rms.fits", "fields": ["Q_RMS", "U_RMS"]}}, "IQU", None,
-         r"noise.rms.fields: one or 3 are needed, not 2\."),
-        ({"rms": {"file": "rms.fits", "fields": ["MINUS"]}}, "QU", None,
-         r"noise: Argument `rms` has 384 of 384 values that are negative"),
-        ({"rms": {"file": "planck.fits", "fields": ["QQ_COV"]}}, "QU", None,
-         r"noise: Unit 'K_CMB\^2' does not convert to 'uK_RJ'"),
-        ({"covariance": SIX[3:]}, "IQU", PLANCK, r"noise.covariance: I, Q and U need six columns"),
-        ({"covariance": SIX[3:]}, "QU", None, r"noise.covariance: file is missing\."),
-        ({"covariance": [*SIX[:3], "QU_COV", "QQ_COV", "UU_COV"]}, "QU", PLANCK,
-         r"noise.covariance.fields: .*QU_COV, QQ_COV.* are not II, IQ, IU, QQ, QU, UU by their"),
-        ({"hits": {"fields": ["N_OBS"], "sigma0": 1.0}}, "QU", None, "hits: file is missing"),
-        ({"hits": {"fields": ["N_OBS"], "sigma0": [1.0, 2.0]}}, "IQU", WMAP,
-         r"noise.hits.sigma0: one or 3 are needed, not 2\."),
-        ({"hits": {"fields": ["MINUS"], "sigma0": 1.0}}, "QU", WMAP,
-         r"noise: Argument `hits` is not positive in 191 of 192 pixels"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("spec", "stokes", "own", "words"), cases("inputs/mistakes_in_noise"))
 def test_mistakes_in_noise_are_one_sentence(folder, spec, stokes, own, words):
-    with pytest.raises(SettingsError, match=words):
-        noise_of(folder, spec, stokes, own=own)
+    own = {"planck": PLANCK, "wmap": WMAP}.get(own)
+    raises(SettingsError, words, noise_of, folder, spec, stokes, own=own)
 
 
 def test_files_that_cannot_be_read_are_named_once(folder):
     with pytest.raises(InputError, match=r"^[^:]*none.fits: no such file, and none in [^:]*\.$"):
         noise_of(folder, {"rms": {"file": "none.fits"}})
+    with pytest.raises(InputError, match=r"rms.fits.*missing"):
+        noise_of(folder, {"rms": {"file": "rms.fits", "fields": ["ZERO"]}})
     with pytest.raises(InputError, match=r"no column 'XX'"):
         noise_of(folder, {"covariance": ["XX", *SIX[4:]]}, own=PLANCK)
 
 
-@pytest.mark.parametrize(
-    ("noise", "words"),
-    [
-        ("{ }", "one of level, rms, covariance, hits, weights, estimate_above, not none."),
-        ("{ rms = 1.0, covariance = ['a', 'b', 'c'] }", "not rms, covariance."),
-        ("{ level = 1.0, rms = 2.0 }", "not level, rms."),
-        ("{ white = 1.0 }", "noise.white: unknown key"),
-        ("{ level = 1.0, unit = 'MJy/sr' }", "noise.unit: must be a temperature such as uK_RJ or"),
-        ("{ covariance = ['a', 'b', 'c', 'd'] }", "noise.covariance.fields: name the columns QQ, "),
-        ("{ covariance = [] }", "not none."),
-        ("{ covariance = 'QQ' }", "noise.covariance: input should be a valid table"),
-        ("{ hits = { fields = ['N_OBS'] } }", "noise.hits.sigma0: is missing."),
-        ("{ level = 1.0, unit = 'mk' }", "noise.unit: must be a temperature such as uK_RJ or"),
-        ("{ hits = { sigma0 = 1.0 } }", "noise.hits.fields: name the columns N_OBS, not none."),
-        ("{ hits = { fields = ['a', 'b'], sigma0 = 1 } }",
-         "noise.hits.fields: name the columns N_OBS"),
-        ("{ hits = { sigma0 = -1.0 } }", "noise.hits.sigma0: input should be greater than 0"),
-        ("{ hits = { sigma0 = [1, 2, 3, 4] } }", "noise.hits.sigma0: list should have at most 3"),
-        ("{ hits = { sigma0 = 1.0, hdu = 0 } }",
-         "noise.hits.hdu: input should be greater than or equal to 1, not 0"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("noise", "words"), cases("inputs/mistakes_in_the_table_of_noise"))
 def test_mistakes_in_the_table_of_noise_are_one_sentence(tmp_path, noise, words):
     path = tmp_path / "settings.toml"
     path.write_text(f"[[bands]]\nname = 'a'\nfile = 'a.fits'\nnoise = {noise}")
@@ -277,16 +233,10 @@ def test_polarization_is_the_same_with_and_without_intensity(folder):
 
 
 @pytest.mark.parametrize(
-    ("file", "fields", "stokes", "words"),
-    [
-        ("qu.fits", None, "IQU", r"must name I, Q and U, not Q_STOKES, U_STOKES\."),
-        ("iqu.fits", ["Q_STOKES", "U_STOKES", "I_STOKES"], "IQU", "are not I, Q and U by"),
-        ("qu.fits", ["Q_STOKES"], "QU", r"sky.dust: fields must name Q and U, not Q_STOKES\."),
-    ],
+    ("file", "fields", "stokes", "words"), cases("inputs/templates_without_all")
 )
 def test_templates_without_all_that_is_needed_are_refused(folder, file, fields, stokes, words):
-    with pytest.raises(SettingsError, match=words):
-        templates_of(folder, specs(file, fields=fields), stokes)
+    raises(SettingsError, words, templates_of, folder, specs(file, fields=fields), stokes)
 
 
 def test_angles_come_from_a_template_with_some(tmp_path):
@@ -301,8 +251,7 @@ def test_angles_come_from_a_template_with_some(tmp_path):
         (first + second, "b has none of its own"),
     ):
         path.write_text(text)
-        with pytest.raises(SettingsError, match=rf"settings.toml: sky.a.angles: {words}\."):
-            load(path)
+        raises(SettingsError, rf"settings.toml: sky.a.angles: {words}\.", load, path)
 
 
 def test_parameters_are_set_in_a_copy(folder):
@@ -311,8 +260,7 @@ def test_parameters_are_set_in_a_copy(folder):
     assert float(changed["dust"].component.T_dust) == 25.0
     assert float(templates["dust"].component.T_dust) == 20.0
     assert changed["ame"] is templates["ame"]
-    with pytest.raises(KeyError, match=r"Unknown parameter 'dust.T'"):
-        set_parameters_of(templates, {"dust.T": 3.0})
+    raises(KeyError, r"Unknown parameter 'dust.T'", set_parameters_of, templates, {"dust.T": 3.0})
     for fixed, words in (
         ("cmb.T_cmb", r"there is no component 'cmb'; components are ame, dust\."),
         ("dust.T", r"Unknown parameter 'dust.T'"),

@@ -8,7 +8,7 @@ from astropy.io import fits as pyfits
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.io import from_quantity, read_bandpass, unit_factor, unit_name
-from refusals import refused
+from refusals import cases, raises, refused, refuses
 
 #: MJy/sr per K_CMB, Planck 2013 results IX, table 6.
 HFI = {"100": 244.10, "143": 371.74, "217": 483.690, "353": 287.450, "545": 58.04, "857": 2.27}
@@ -128,99 +128,38 @@ def test_text_tables(tmp_path):
 SAMPLES = ([28.0, 30.5, 32.0], [1.0, 2.0, 0.5])
 
 
-@pytest.mark.parametrize(
-    ("content", "arguments"),
-    [
-        (b"28 1\n30.5 2\n32 .5\n", {}),
-        (b"\xef\xbb\xbf28 1\n30.5 2\n32 .5\n", {}),
-        ("28 1\n30.5 2\n32 .5\n".encode("utf-16"), {}),
-        (b"28\t1\r\n30.5\t2\r\n32\t.5\r\n", {}),
-        (b"28,1,0\n30.5,2,0\n32,.5,0\n", {}),
-        (b"28;1\n30,5;2,0\n32;,5\n", {}),
-        (b"nu weight\n2.8D+01 1d0\n30.5 2\n32 5D-01\n", {}),
-        (b"# 30 GHz band\n28 1 # low\n30.5 2 ok\n32 .5\n", {}),
-        (b"0 0\n28 1\n30.5 2\n32 .5\n", {}),
-        (b"nu_MHz weight\n28000 1\n30500 2\n32000 .5\n", {}),
-        (b"# the 30 GHz band: nu [Hz], T [K/GHz]\n28e9 1\n30.5e9 2\n32e9 .5\n", {}),
-        (b"# nu/THz, weight\n.028 1\n.0305 2\n.032 .5\n", {}),
-        (b"# channels in kHz\n# nu [MHz]\n28000 1\n30500 2\n32000 .5\n# mm\n", {}),
-        (b".028 1\n.0305 2\n.032 .5\n", {"unit": "THz"}),
-        (b"28 1\n30.5 2\n32 .5\n", {"unit": "GHz"}),
-        (b"28000 1\n30500 2\n32000 .5\n", {"unit": "mhz"}),
-        (b"i nu w\n0 28 1\n1 30.5 2\n2 32 .5\n", {"fields": [1, 2]}),
-        (b"i nu w\n0 28 1\n1 30.5 2\n2 32 .5\n", {"fields": ["nu", "w"]}),
-        (b"|i|nu|w|\n|int|d|d|\n||GHz||\n 0 28 1\n 1 30.5 2\n 2 32 .5\n", {"fields": ["nu", "w"]}),
-    ],
-)
+@pytest.mark.parametrize(("content", "arguments"), cases("io_bandpasses/read_right"))
 def test_text_that_is_read_right(tmp_path, content, arguments):
     path = tmp_path / "b.txt"
-    path.write_bytes(content)
-    band = read_bandpass(path, convention="RJ", **arguments)
-    np.testing.assert_allclose((band.nu, band.weights), SAMPLES, rtol=1e-12)
+    for encoding in ("utf-8", "utf-16"):
+        path.write_bytes(content.removeprefix("\ufeff" * (encoding != "utf-8")).encode(encoding))
+        band = read_bandpass(path, convention="RJ", **arguments)
+        np.testing.assert_allclose((band.nu, band.weights), SAMPLES, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("content", "arguments"),
-    [
-        (b"# wavenumber [cm^-1]\n1 1\n2 3\n", {}),
-        (b"1 1\n2 3\n", {"unit": "1/cm"}),
-        (b"# wavelength in microns\n5000 3\n10000 1\n", {}),
-        (b"5 3\n10 1\n", {"unit": "mm"}),
-    ],
-)
+@pytest.mark.parametrize(("content", "arguments"), cases("io_bandpasses/wavenumbers"))
 def test_wavenumbers_and_wavelengths(tmp_path, content, arguments):
-    path = tmp_path / "b.txt"
-    path.write_bytes(content)
-    band = read_bandpass(path, convention="power", **arguments)
+    band = read_bandpass(table(tmp_path / "b.txt", content), convention="power", **arguments)
     np.testing.assert_allclose((band.nu, band.weights), ([29.9792458, 59.9584916], [1, 3]))
 
 
-@pytest.mark.parametrize(
-    ("content", "arguments", "words"),
-    [
-        (b"-1 1\n0 1\n", {}, "no sample at a positive frequency"),
-        (b"|nu|w|\n|d|d|\n|parsec| |\n30 1\n", {}, "unit is 'parsec', not one of Hz, kHz, MHz"),
-        (b"30,5 2,0\n31,0 1,0\n", {}, "line 1: '30,5' is two numbers or one with a decimal comma"),
-        (b"nu w\n30.5 2\n31,5\t1\n", {}, "line 3: '31,5' is two numbers or one"),
-        (b"30,5,2,0\n31,5,1,0\n", {}, "line 1: '30,5,2,0' may have decimal commas"),
-        (b"3O.5 2\n31 1\n", {}, "line 1: not a row of numbers: '3O.5 2'"),
-        (b"\xef\xbb\xbf3x 2\n31 1\n", {}, "line 1: not a row of numbers"),
-        (b"nu 1\n30 1\n", {}, "line 1: not a row of numbers: 'nu 1'"),
-        (b"30 1\n\n31 1_0\n", {}, "line 3: not a row of numbers: '31 1_0'"),
-        (b"30 1\n|31 1|\n", {}, "line 2: a header among the rows"),
-        (b"30 1\n31\x00 1\n", {}, "for it has NUL bytes"),
-        ("30 1\n31 1\n".encode("utf-16-le"), {}, "for it has NUL bytes"),
-        (b"", {}, "no line has numbers"),
-        (b"0 28 1\n1 30 2\n2 32 1\n", {}, "first of 3 columns may not be the frequency; give"),
-        (b"1 28 1\n2 30 2\n3 32 1\n", {}, "give `fields`, the columns of frequency and weight"),
-        (b"row nu w\n7 28 1\n8 30 2\n", {}, r"the first of 3 columns \(row nu w\) may not be"),
-        (b"weight nu\n1 28\n2 30\n", {}, r"the first of 2 columns \(weight nu\) may not be"),
-        (b"28 30 1\n30 31 1\n", {"fields": [1, 3]}, "no column 3; it has 0 to 2"),
-        (b"28 30 1\n30 31 1\n", {"fields": ["w", 1]}, "no column 'w'; it has 0 to 2"),
-        (b"28 30 1\n30 31 1\n", {"fields": [1, 1]}, "`fields` names column 1 twice"),
-        (b"28 30 1\n30 31 1\n", {"fields": [1]}, r"`fields` must name two columns, not \[1\]"),
-        (b" ".join([b"1"] * 3000) + b"\n", {}, "3000 columns; give `fields`"),
-        (b"28000 1\n30000 1\n", {}, "middle of the band is at 29000 GHz, .* give `unit`"),
-        (b"0.028 1\n0.03 1\n", {}, "is at 0.029 GHz, outside of 1 to 3000 GHz; give `unit`"),
-        (b"28e9 1\n30e9 1\n", {}, "outside of 1 to 3000 GHz; give `unit`"),
-        (b"# nu [GHz]\n28e9 1\n30e9 1\n", {}, "is at 2.9e.10 GHz, outside of 0.01 to 30000 GHz"),
-        (b"# nu [GHz] or [MHz]\n28 1\n30 1\n", {}, "names the units GHz, MHz; give `unit`"),
-        (b"# nu [GHz]\n28 1\n30 1\n", {"unit": "MHz"}, "is 'MHz', but the file says 'GHz'"),
-        (b"# horns in mm\n28 1\n30 1\n", {}, "what is in mm is not said; give `unit`"),
-        (b"'30','1'\n31 1\n", {}, "line 1: not a row of numbers"),
-        (b"3O,1x\n31 1\n", {}, "line 1: not a row of numbers"),
-        (b"30 1\n31 2\n", {"fields": [0, True]}, "no column True; it has 0 to 1"),
-        (b"# wavelength\n28 1\n30 1\n", {}, "unit of the frequencies is missing; give `unit`"),
-        (b"|nu|w|\n|d|d|\n28 1\n30 1\n", {}, "unit of the frequencies is missing; give `unit`"),
-        (b"28 1\n30 1\n", {"unit": "K"}, "unit is 'K', not one of Hz, kHz, MHz"),
-        (b"-1 .5\n0 1\n30 1\n31 1\n", {}, "2 samples at nu <= 0 have weights"),
-    ],
-)
+@pytest.mark.parametrize(("content", "arguments", "words"), cases("io_bandpasses/refused"))
 def test_text_that_is_refused(tmp_path, content, arguments, words):
     path = tmp_path / "b.txt"
-    path.write_bytes(content)
-    with refused(rf"b\.txt.*{words}"):
+    path.write_bytes(content.encode())
+    with refused(rf"b\.txt.*{words}", file=path):
         read_bandpass(path, convention="RJ", **arguments)
+
+
+def test_other_text_that_is_refused(tmp_path):
+    path = tmp_path / "b.txt"
+    for content, words in (
+        ("30 1\n31 1\n".encode("utf-16-le"), "for it has NUL bytes"),
+        (b" ".join([b"1"] * 3000) + b"\n", "3000 columns; give `fields`"),
+        (bytes(range(128, 200)), "text"),
+    ):
+        path.write_bytes(content)
+        refuses(rf"b\.txt.*{words}", read_bandpass, path, convention="RJ")
 
 
 def test_bad_rimos(tmp_path):
@@ -234,59 +173,27 @@ def test_bad_rimos(tmp_path):
         "twice": rimo(tmp_path / "twice.fits", [*good, ("BANDPASS_030", NU, 1 + NU)]),
         "falling": rimo(tmp_path / "falling.fits", [("BANDPASS_030", NU[::-1], ones)]),
     }
-    for name, arguments, words in [
-        ("good", {}, r"good.fits: give `band`; it has 30\."),
-        ("good", {"band": "44"}, r"no band '44'; it has 30\."),
-        ("good", {"band": "30", "detectors": ["28S"]}, r"'28S' in band 30; it has 27M\."),
-        ("good", {"detectors": []}, "`detectors` is empty"),
-        ("beams", {"band": "30"}, r"no HDU is named BANDPASS_"),
-        ("columns", {"band": "30"}, "no column 'WAVENUMBER'; it has FREQ, TRANSMISSION"),
-        ("unit", {"band": "30"}, "has the unit 'Angstrom', not GHz or 1/cm"),
-        ("twice", {"band": "30"}, "2 HDUs are named 'BANDPASS_030' and differ"),
-        ("falling", {"band": "30"}, r"falling.fits: frequencies must increase"),
-    ]:
-        with refused(words):
-            read_bandpass(files[name], **arguments)
+    for name, arguments, words in cases("io_bandpasses/bad_rimos"):
+        refuses(words, read_bandpass, files[name], **arguments)
     whole = files["good"].read_bytes()
     for length in (2000, 3000, len(whole) - 3000):
         cut = tmp_path / "cut.fits"
         cut.write_bytes(whole[:length])
-        with refused(r"cut.fits"):
-            read_bandpass(cut, "30")
+        refuses(r"cut.fits", read_bandpass, cut, "30")
 
 
 def test_bad_arguments(tmp_path):
-    path = table(tmp_path / "b.txt", "28 1", "30 2")
-    binary = tmp_path / "b.dat"
-    binary.write_bytes(b"\xff\xfe\x00")
-    for arguments, words in [
-        ({"path": path}, "b.txt: the file does not say it; give `convention`, one of RJ, power"),
-        ({"path": path, "band": "30", "convention": "RJ"}, "a text table has one band"),
-        ({"path": path, "convention": "flux"}, "one of RJ, power, CMB, not 'flux'"),
-        ({"path": path, "convention": "RJ", "trim": 1.0}, r"`trim` must be within \[0, 1\)"),
-        ({"path": tmp_path / "none.fits"}, "none.fits: no such file"),
-        ({"path": binary}, "b.dat: neither a FITS file nor a text table"),
-    ]:
-        with pytest.raises(ValueError, match=words):
-            read_bandpass(**arguments)
+    table(tmp_path / "b.txt", "28 1", "30 2")
+    (tmp_path / "b.dat").write_bytes(b"\xff\xfe\x00")
+    for arguments, words in cases("io_bandpasses/bad_arguments"):
+        raises(ValueError, words, read_bandpass, tmp_path / arguments.pop("path"), **arguments)
 
 
 def test_unit_names():
-    spellings = {
-        "uK_RJ": ["uK_RJ", "uK RJ", "muK_rj", "\u03bcK_A", "microK_RJ", "uKantenna"],
-        "K_CMB": ["K_CMB", "Kcmb", "K CMB", "K_cmb", "K,thermodynamic", "KCMB"],
-        "mK_CMB^2": ["mK_CMB^2", "(mK_CMB)^2", "mKcmb**2", "mK_CMB2"],
-        "MJy/sr": ["MJy/sr", "MJy sr-1", "MJy sr^-1", "Mjy/sr", "MJy / sr", "MJy.sr-1"],
-        "MJy/sr^2": ["(MJy/sr)^2", "MJy2 / sr2"],
-        "mK": ["mK"],
-        "": ["", "1", "n/a", "dimensionless"],
-        "GHz": ["GHz"],
-    }
-    for name, texts in spellings.items():
+    for name, texts in cases("io_bandpasses/spellings").items():
         assert {unit_name(text) for text in texts} == {name}
     for text in ("K_BANANA", "furlong_CMB", "counts of sheep"):
-        with pytest.raises(ValueError, match="Unknown unit"):
-            unit_name(text)
+        raises(ValueError, "Unknown unit", unit_name, text)
 
 
 def test_quantities():
@@ -307,13 +214,11 @@ def test_quantities():
 
 
 def test_bad_quantities():
-    with pytest.raises(TypeError, match="`quantity` must carry a unit, but is float"):
-        from_quantity(353.0, "GHz")
+    raises(TypeError, "`quantity` must carry a unit, but is float", from_quantity, 353.0, "GHz")
     for quantity, unit, words in [
         (1 * pu.K_CMB, "K_RJ", "'K_CMB' to 'K_RJ' depends on frequency; give `at`"),
         (1 * u.K, "K_RJ", "'K' does not convert to 'K_RJ'; say K_CMB or K_RJ"),
         (1 * u.GHz, "arcmin", "'GHz' does not convert to 'arcmin'"),
         (1 * pu.K_CMB**2, "K_CMB", "does not convert to 'K_CMB'"),
     ]:
-        with pytest.raises(ValueError, match=words):
-            from_quantity(quantity, unit)
+        raises(ValueError, words, from_quantity, quantity, unit)

@@ -1,4 +1,4 @@
-"""Spectra in files: formats, units, a sentence for whatever is wrong."""
+"""Spectra and beam windows in files: formats, units, a sentence for whatever is wrong."""
 
 import camb
 import healpy
@@ -7,8 +7,10 @@ import pytest
 from astropy.io import fits as pyfits
 
 from jaxsky.cmb import camb_spectra
-from jaxsky.io import read_spectra
-from refusals import refused
+from jaxsky.harmonics import gaussian_beam
+from jaxsky.io import read_beam, read_spectra
+from jaxsky.observation import load_instrument
+from refusals import cases, raises, refused, refuses
 
 LMAX = 30
 ELL = np.arange(LMAX + 1)
@@ -49,16 +51,8 @@ def test_planck_theory(data_dir):
 
 @pytest.mark.parametrize("start", [0, 1, 2])
 def test_text_by_header_or_name(tmp_path, start):
-    planck, of_camb = "L TT TE EE BB PP", "L TT EE BB TE"
-    for path, arguments in [
-        (text(tmp_path / "planck.txt", planck, planck, start), {}),
-        (text(tmp_path / "planck2.txt", planck, planck, start), {"format": "planck"}),
-        (text(tmp_path / "planck3.txt", planck, None, start), {"format": "planck"}),
-        (text(tmp_path / "a_totCls.dat", of_camb, None, start), {}),
-        (text(tmp_path / "a_lensedCls.dat", of_camb, of_camb, start), {"format": "camb"}),
-        (text(tmp_path / "bare.txt", of_camb, None, start), {"format": "camb"}),
-        (text(tmp_path / "bare2.txt", "L TT EE BB TE PP", None, start), {"format": "camb"}),
-    ]:
+    for name, columns, header, arguments in cases("io_spectra/text_by_header_or_name"):
+        path = text(tmp_path / name, columns, header, start)
         np.testing.assert_allclose(read_spectra(path, LMAX, **arguments), CL, rtol=1e-11)
     path = text(tmp_path / "odd.txt", "L TE BB EE TT", "ell te bb ee tt", start)
     np.testing.assert_allclose(read_spectra(path, LMAX - 5), CL[:, : LMAX - 4], rtol=1e-11)
@@ -105,29 +99,13 @@ def test_low_multipoles_alone(tmp_path):
     path = text(tmp_path / "a_totCls.dat", "L TT EE BB TE")
     for lmax in (0, 1, 2):
         np.testing.assert_allclose(read_spectra(path, lmax), CL[:, : lmax + 1], rtol=1e-11)
-    with pytest.raises(ValueError, match="`lmax` must not be negative, but is -1"):
-        read_spectra(path, -1)
+    raises(ValueError, "`lmax` must not be negative, but is -1", read_spectra, path, -1)
 
 
 def test_text_that_leaves_something_open(tmp_path):
-    scalar = "L TT EE TE PP TP"
-    for path, arguments, words in [
-        (text(tmp_path / "a.txt", "L TT EE BB TE"), {},
-         "a.txt: no header names the columns; give `format`, 'planck' for L TT TE EE BB or"),
-        (text(tmp_path / "s_scalCls.dat", scalar), {}, "no BB; read ..._lensedCls.dat and"),
-        (text(tmp_path / "t_scalCls.dat", scalar, scalar), {},
-         "no column BB; it has L, TT, EE, TE, PP, TP; CAMB writes it to ..._lensed"),
-        (text(tmp_path / "u.txt", "L TT EE", "L TT EE"), {}, "no column BB, TE; it has L, TT, EE"),
-        (text(tmp_path / "v.txt", "L TT EE BB TE", "x TT EE BB TE"), {}, "no column L; it has X"),
-        (text(tmp_path / "w_totCls.dat", "L TT EE TE"), {}, "4 columns, but format 'camb' has L"),
-        (text(tmp_path / "p.txt", "L TT TE EE BB", "L TT TE EE BB"), {"format": "camb"},
-         "`format` is 'camb', but the columns are L TT TE EE BB"),
-        (text(tmp_path / "q.txt", "L TT EE BB TE", "L TT EE BB"), {},
-         r"the header names 4 columns \(L TT EE BB\), but there are 5"),
-        (tmp_path / "p.txt", {"unit": "K^2"}, "`unit` is for FITS files, text is in uK"),
-    ]:  # fmt: skip
-        with refused(words):
-            read_spectra(path, LMAX, **arguments)
+    for name, columns, header, arguments, words in cases("io_spectra/text_left_open"):
+        path = text(tmp_path / name, columns, header)
+        refuses(words, read_spectra, path, LMAX, **arguments)
     with pytest.raises(ValueError, match="`format` must be one of planck, camb, not 'class'"):
         read_spectra(tmp_path / "p.txt", LMAX, format="class")
 
@@ -147,13 +125,10 @@ def test_damaged_text(tmp_path):
         (["# L TT EE BB TE"], "b_totCls.dat: no line has numbers"),
     ]:
         bad.write_text("\n".join(lines) + "\n")
-        with refused(words):
-            read_spectra(bad, LMAX)
+        refuses(words, read_spectra, bad, LMAX)
     bad.write_bytes(b"\xff\xfe\x00")
-    with refused("neither a FITS file nor a text table"):
-        read_spectra(bad, LMAX)
-    with refused(r"none.txt: no such file"):
-        read_spectra(tmp_path / "none.txt", LMAX)
+    refuses("neither a FITS file nor a text table", read_spectra, bad, LMAX)
+    refuses(r"none.txt: no such file", read_spectra, tmp_path / "none.txt", LMAX)
 
 
 def test_spectra_that_cannot_be(tmp_path):
@@ -173,8 +148,7 @@ def test_spectra_that_cannot_be(tmp_path):
         cl = CL.copy()
         cl[row, 7] = value
         path = fits(tmp_path / f"{i}.fits", cl, column_units="uK^2")
-        with refused(words):
-            read_spectra(path, LMAX)
+        refuses(words, read_spectra, path, LMAX)
         # What is wrong above lmax does not matter.
         assert read_spectra(path, 6).shape == (4, 7)
     full = CL.copy()
@@ -208,31 +182,18 @@ def test_fits_that_leave_something_open(tmp_path):
         (tmp_path / "image.fits", {}, "image.fits: HDU 1 holds no table"),
         (tmp_path / "empty.fits", {}, r"empty.fits: no HDU 1; it has 0 \(PRIMARY\)"),
     ]:  # fmt: skip
-        with refused(words):
-            read_spectra(path, LMAX, **arguments)
+        refuses(words, read_spectra, path, LMAX, **arguments)
     whole = (tmp_path / "b.fits").read_bytes()
     (tmp_path / "cut.fits").write_bytes(whole[:-2880])
     with refused(r"cut.fits: not a FITS file, or a truncated one"):
         read_spectra(tmp_path / "cut.fits", LMAX)
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ("L TT TE EE BB\n2 1,5 0 1 1\n",
-         "line 2: '1,5' is two numbers or one with a decimal comma"),
-        ("L TT TE EE BB\n2 1O.5 0 1 1\n3 1 0 1 1\n",
-         "line 2: not a row of numbers: '2 1O.5 0 1 1'"),
-        ("L TT TE EE BB\n2 1 0 1 1\nx y z u v\n", "line 3: not a row of numbers: 'x y z u v'"),
-        ("L TT TE EE BB\n2 1 0 1 1\x00\n", "for it has NUL bytes"),
-        ("", "no line has numbers"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("content", "words"), cases("io_spectra/damaged_rows"))
 def test_damaged_rows_are_not_skipped(tmp_path, content, words):
     path = tmp_path / "b.txt"
     path.write_text(content)
-    with refused(rf"b.txt.*{words}"):
-        read_spectra(path, 2)
+    refuses(rf"b.txt.*{words}", read_spectra, path, 2)
 
 
 def test_marks_of_the_encoding_and_exponents_of_fortran(tmp_path):
@@ -240,3 +201,134 @@ def test_marks_of_the_encoding_and_exponents_of_fortran(tmp_path):
     (tmp_path / "b.txt").write_bytes(content)
     spectra = read_spectra(tmp_path / "b.txt", 2)
     np.testing.assert_allclose(spectra[:, 2], np.array([1.5, 1, 0.5, 0]) * 2 * np.pi / 6)
+
+
+BEAM_LMAX = 40
+BEAM_ELL = np.arange(BEAM_LMAX + 1)
+WINDOW = np.asarray(gaussian_beam(120.0, BEAM_LMAX))
+
+
+def beam_text(path, *columns, header=""):
+    np.savetxt(path, np.array(columns).T, header=header)
+    return path
+
+
+def tables(path, **named):
+    """Binary tables by name, each with columns by name."""
+    hdus = [
+        pyfits.BinTableHDU.from_columns(
+            [pyfits.Column(name=n, format="D", array=v) for n, v in columns.items()], name=name
+        )
+        for name, columns in named.items()
+    ]
+    pyfits.HDUList([pyfits.PrimaryHDU(), *hdus]).writeto(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("band", "lmax"), [("K", 750), ("Ka", 850), ("Q", 1100), ("V", 1500), ("W", 2000)]
+)
+def test_wmap_tables_hold_amplitudes(data_dir, band, lmax):
+    path = data_dir / "bandpass" / f"wmap_beam_{band}.tbl"
+    window = read_beam(path, lmax)
+    # The instrument's beam size is the root of the solid angle, 4 pi / sum (2l+1) b_l for a beam
+    # of unit peak. The tables give 2 to 19 % more; were they b_l^2, it would be 19 to 30 % less.
+    angle = 4 * np.pi / np.sum((2 * np.arange(lmax + 1) + 1) * window)
+    size = float(load_instrument("wmap")[band].beam) / 60
+    assert 1.0 < np.degrees(np.sqrt(angle)) / size < 1.2
+    refuses(rf"wmap_beam_{band}.tbl: ends at l = {lmax}, but lmax is", read_beam, path, lmax + 1)
+
+
+def test_planck_instrument_model(data_dir):
+    path = data_dir / "bandpass" / "LFI_RIMO_R3.31.fits"
+    for band, fwhm in [("030", 32.288), ("044", 26.997), ("070", 13.218)]:
+        window = read_beam(path, 1000, hdu=f"BEAMWF_{band}X{band}")
+        assert window[0] == 1
+        # The effective beams are nearly Gaussian; the square is off by 0.2 and more.
+        assert np.abs(window - gaussian_beam(fwhm, 1000)).max() < 0.03
+    refuses(r"give `hdu`, one of BEAMWF_030X030, BEAMWF_044X044", read_beam, path, 1000)
+
+
+def test_text_is_normalised(tmp_path):
+    path = beam_text(tmp_path / "b.txt", BEAM_ELL, 0.97 * WINDOW)
+    np.testing.assert_allclose(read_beam(path, BEAM_LMAX), WINDOW, rtol=1e-12)
+    # As LAMBDA has them: a header, and errors in a third column.
+    path = beam_text(tmp_path / "c.txt", BEAM_ELL, WINDOW, 0 * WINDOW, header="l b_l error")
+    np.testing.assert_allclose(read_beam(path, 20), WINDOW[:21], rtol=1e-12)
+    assert read_beam(path, 0) == 1
+
+
+def test_fits_columns(tmp_path):
+    healpy.write_cl(tmp_path / "a.fits", 2 * WINDOW)
+    np.testing.assert_allclose(read_beam(tmp_path / "a.fits", BEAM_LMAX), WINDOW, rtol=1e-12)
+    other = WINDOW**2
+    for i, columns in enumerate(
+        [
+            {"T": WINDOW, "E": other, "B": other},
+            {"NOMINAL": WINDOW, "EIGEN_1": other},
+            {"EIGEN_1": other, "BL": WINDOW},
+            {"INTENSITY": WINDOW, "TEMPERATURE": other},
+        ]
+    ):
+        path = tables(tmp_path / f"{i}.fits", WINDOW=columns)
+        np.testing.assert_allclose(read_beam(path, 30), WINDOW[:31], rtol=1e-12)
+    path = tables(tmp_path / "two.fits", FIRST={"BL": WINDOW}, SECOND={"BL": other})
+    np.testing.assert_allclose(read_beam(path, BEAM_LMAX, hdu="SECOND"), other, rtol=1e-12)
+    ascii = pyfits.TableHDU.from_columns(
+        [pyfits.Column(name="TEMPERATURE", format="E15.7", array=WINDOW)]
+    )
+    ascii.writeto(tmp_path / "ascii.fits")
+    np.testing.assert_allclose(read_beam(tmp_path / "ascii.fits", BEAM_LMAX), WINDOW, rtol=1e-6)
+
+
+def test_bad_windows(tmp_path):
+    nan, gone = WINDOW.copy(), WINDOW.copy()
+    nan[3], gone[0] = np.nan, 0
+    binary = tmp_path / "b.dat"
+    binary.write_bytes(b"\xff\xfe\x00")
+    squares = tables(tmp_path / "w.fits", WINDOW={"TT_2_TT": WINDOW**2})
+    for path, arguments, words in [
+        (
+            beam_text(tmp_path / "a.txt", BEAM_ELL[1:], WINDOW[1:]),
+            {},
+            "begins at l = 1, but l = 0 is needed",
+        ),
+        (beam_text(tmp_path / "b.txt", 2 * BEAM_ELL, WINDOW), {}, "l = 0 is followed by l = 2"),
+        (
+            beam_text(tmp_path / "c.txt", BEAM_ELL[:-1], WINDOW[:-1]),
+            {},
+            "c.txt: ends at l = 39, but lmax is 40",
+        ),
+        (
+            beam_text(tmp_path / "d.txt", BEAM_ELL, nan),
+            {},
+            "1 of 41 values of the window are not finite",
+        ),
+        (beam_text(tmp_path / "e.txt", BEAM_ELL, gone), {}, "must be positive at l = 0, but is 0"),
+        (beam_text(tmp_path / "f.txt", WINDOW), {}, "one column, but l and b_l are needed"),
+        (
+            beam_text(tmp_path / "g.txt", BEAM_ELL / 60, WINDOW),
+            {},
+            "40 of 41 rows do not begin with a mult",
+        ),
+        (squares, {}, "no column is named TEMPERATURE, .* it has TT_2_TT"),
+        (squares, {"hdu": 2}, r"w.fits: no HDU 2; it has 0 \(PRIMARY\), 1 \(WINDOW\)"),
+        (squares, {"hdu": 0}, "HDU 0 holds no table"),
+        (binary, {}, "b.dat: neither a FITS file nor a text table"),
+        (tmp_path / "none.txt", {}, "none.txt: no such file"),
+    ]:
+        refuses(words, read_beam, path, BEAM_LMAX, **arguments)
+    raises(ValueError, "`lmax` must not be negative, but is -1", read_beam, tmp_path / "c.txt", -1)
+
+
+def test_damaged_rows_of_beams_are_not_skipped(tmp_path):
+    path = tmp_path / "b.txt"
+    path.write_bytes(b"\xef\xbb\xbf0 2D0\n1 1.0\n")
+    assert read_beam(path, 1).tolist() == [1, 0.5]
+    for content, words in [
+        ("O 1\n1 1\n2 1\n", "line 1: not a row of numbers: 'O 1'"),
+        ("l b_l\n0 1,0\n1 0,9\n", "line 2: '1,0' is two numbers or one with a decimal comma"),
+        ("0 1\n1\n", "line 2: 1 numbers, but 2 in the lines above"),
+    ]:
+        path.write_text(content)
+        refuses(rf"b.txt, {words}", read_beam, path, 1)

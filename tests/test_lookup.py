@@ -15,7 +15,8 @@ from fits.separated_data import separation_data
 from jaxsky.experiment import simulation_inputs
 from jaxsky.io import InputError, write_maps
 from jaxsky.io.files import cache_folder
-from jaxsky.settings import Experiment, MapFile, SettingsError, find_file, found_files, load
+from jaxsky.settings import Experiment, SettingsError, find_file, found_files, load
+from refusals import cases, raises
 from settings_fuzz import changed_at, written
 
 KNOWN = "LFI_RIMO_R3.31.fits"
@@ -52,8 +53,7 @@ def test_a_bare_name_is_next_to_the_settings_or_in_the_cache(places):
     # With a folder it is meant where it says.
     for name in ("./b.fits", "sub/b.fits", f"{data}/b.fits"):
         (cache / "b.fits").touch()
-        with pytest.raises(InputError, match=r"b.fits: no such file"):
-            find_file(data, name)
+        raises(InputError, r"b.fits: no such file", find_file, data, name)
     assert find_file(data, "../cache/b.fits").samefile(cache / "b.fits")
     assert find_file(data / "nowhere", "b.fits") == cache / "b.fits"
 
@@ -96,40 +96,29 @@ def test_what_is_there_and_no_file_is_called_what_it_is(places, monkeypatch):
     (cache / "cached").symlink_to(data / "gone.fits")
     (data / "circle").symlink_to("circle")
     os.mkfifo(data / "pipe")
-    for name, words in {
-        "folder": "folder: is a folder, not a file",
-        ".": "is a folder, not a file",
-        "link": "link: is a link to gone.fits, which is not there",
-        "cached": "cached: is a link to .*gone.fits, which is not there",
-        "circle": r"circle: cannot be read \(Too many levels of symbolic links\)",
-        "pipe": "pipe: is no regular file",
-        "file/a.fits": "a.fits: no such file",
-        300 * "a": r"cannot be read \(File name too long\)",
-        "a\0b": r"a\\x00b': is no name of a file",
-    }.items():
-        with pytest.raises(InputError, match=words):
-            find_file(data, name)
+    long = (300 * "a", r"cannot be read \(File name too long\)")
+    for name, words in [*cases("lookup/no_files"), long]:
+        raises(InputError, words, find_file, data, name)
     (data / "file").chmod(0)
     monkeypatch.setattr(os, "access", lambda path, mode: os.stat(path).st_mode & stat.S_IRUSR)
-    with pytest.raises(InputError, match=r"file: cannot be read \(no permission\)"):
-        find_file(data, "file")
+    raises(InputError, r"file: cannot be read \(no permission\)", find_file, data, "file")
 
 
-def test_settings_expand_their_folder_and_refuse_what_is_none(places):
+def test_settings_expand_their_folder_and_refuse_what_is_none(places, monkeypatch):
     data, _, home = places
     path = data / "a.toml"
-    path.write_text("data_dir = '~'")
-    assert load(path).data_dir == str(home)
+    monkeypatch.setenv("MAPS", str(home))
+    for given, folder in (("~", home), ("$MAPS", home), ("${NO_MAPS:-/nowhere}", "/nowhere")):
+        path.write_text(f"data_dir = '{given}'")
+        assert load(path).data_dir == str(folder)
     (data / "circle").symlink_to("circle")
     for given, words in (
         ("a.toml", "a.toml: data_dir: .*a.toml is not a folder"),
         ("circle", "a.toml: data_dir: "),
+        ("$NO_MAPS", "data_dir: the environment variable NO_MAPS is not set"),
     ):
         path.write_text(f"data_dir = '{given}'")
-        with pytest.raises(SettingsError, match=words):
-            load(path)
-    with pytest.raises(ValueError, match="at least 1 character"):
-        MapFile(file="")
+        raises(SettingsError, words, load, path)
 
 
 def test_the_log_names_the_paths_that_were_taken(places, tmp_path):
@@ -166,30 +155,6 @@ def test_the_log_names_the_paths_that_were_taken(places, tmp_path):
     assert '"map.fits": "' + str(cache / "map.fits") in (tmp_path / "log.json").read_text()
 
 
-DUST = {"law": "dust", "file": "dust.fits", "nu_ref": 353.0}
-NARROW = {"center": 44.0, "width": 0.0}
-BAND = {"name": "44", "file": "dust.fits", "bandpass": NARROW, "noise": {"rms": 1.0}}
-COMMON = {"nside": 4}
-ANALYSIS = {"sky": {"dust": DUST}, "bands": [BAND], "common": COMMON}
-SEPARATION = ANALYSIS | {
-    "sky": {"dust": {"law": "dust", "nu_ref": 353.0}},
-    "free": {"dust.beta_dust": {"start": 1.5}},
-}
-FORECAST = {
-    "sky": {"dust": DUST},
-    "bands": [{"instrument": "core"}],
-    "forecast": {"lmax": 7},
-}
-EXPERIMENT = {
-    "sky": {"embedded": {"nside": 8}},
-    "bands": [{"name": "44", "bandpass": NARROW, "noise": {"rms": 1.0}, "fwhm": 30.0}],
-    "simulate": COMMON | {"fwhm": 1800.0, "include": ["cmb", "noise"]},
-}
-SYNCHROTRON = DUST | {"law": "synchrotron", "nu_ref": 30.0}
-PAPER = ANALYSIS | {"sky": {"dust": DUST, "synchrotron": SYNCHROTRON}}
-NONE = {"file": "none.fits"}
-
-
 def fit(settings):
     region_masks(settings, settings.fit.regions)
     inputs_of(settings)
@@ -202,39 +167,19 @@ def paper(settings):
     sources.ame()
 
 
-BETA, REGIONS = "sky/dust/parameters/beta_dust", "free/dust.beta_dust/regions"
+#: What reads the settings of a command.
+COMMANDS = {
+    "fit": fit,
+    "separate": separation_data,
+    "forecast": forecast_inputs,
+    "simulate": simulation_inputs,
+    "paper": paper,
+}
 
 
-@pytest.mark.parametrize(
-    ("command", "raw", "changes"),
-    [
-        (fit, ANALYSIS, {"sky/dust/file": "none.fits"}),
-        (fit, ANALYSIS, {BETA: NONE}),
-        (fit, ANALYSIS, {"bands/0/leakage": NONE}),
-        (fit, ANALYSIS, {"bands/0/bandpass": NONE}),
-        (fit, ANALYSIS, {"bands/0/noise": {"rms": NONE}}),
-        (fit, ANALYSIS, {"bands/0/noise": {"covariance": NONE | {"fields": ["a", "b", "c"]}}}),
-        (fit, ANALYSIS, {"bands/0/noise": {"hits": NONE | {"fields": ["a"], "sigma0": 1.0}}}),
-        (fit, ANALYSIS, {"common/mask": NONE}),
-        (fit, ANALYSIS, {"regions/a": NONE, "fit/regions": ["a"]}),
-        (separation_data, SEPARATION, {"bands/0/file": "none.fits"}),
-        (separation_data, SEPARATION, {"common/mask": NONE}),
-        (separation_data, SEPARATION, {"sky/dust/parameters/T_dust": NONE}),
-        (separation_data, SEPARATION, {REGIONS: NONE}),
-        (separation_data, SEPARATION, {REGIONS: {"clusters": 2, "of": [NONE]}}),
-        (forecast_inputs, FORECAST, {"sky/dust/file": "none.fits"}),
-        (forecast_inputs, FORECAST, {"forecast/region": "a", "regions/a": NONE}),
-        (simulation_inputs, EXPERIMENT, {"bands/0/fwhm": None, "bands/0/beam": "none.fits"}),
-        (simulation_inputs, EXPERIMENT, {"bands/0/bandpass": NONE}),
-        (simulation_inputs, EXPERIMENT, {"bands/0/noise": {"rms": NONE}}),
-        (simulation_inputs, EXPERIMENT, {"cmb/spectra": "none.fits"}),
-        (paper, PAPER, {"sky/dust/file": "none.fits"}),
-        (paper, PAPER, {"paper/ame": NONE | {"nu_ref": 23.0}}),
-        (paper, PAPER, {"paper/beta_syn": NONE}),
-        (paper, PAPER, {"paper/beta_syn": {"file": "beta.fits", "steepening": "none.fits"}}),
-    ],
-)
-def test_all_settings_find_files_in_the_same_places(places, command, raw, changes):
+@pytest.mark.parametrize(("command", "changes"), cases("lookup/missing_files"))
+def test_all_settings_find_files_in_the_same_places(places, command, changes):
+    raw = cases("lookup/bases")[command]
     data, cache, _ = places
     maps = 1 + np.arange(2 * 12 * 4**2).reshape(2, -1)
     write_maps(data / "dust.fits", maps, names=["Q", "U"], unit="uK_RJ")
@@ -244,4 +189,4 @@ def test_all_settings_find_files_in_the_same_places(places, command, raw, change
     path = written(data / "settings.toml", raw)
     words = f"none.fits: no such file, and none in the cache {cache}"
     with pytest.raises(ValueError, match=words):
-        command(load(path))
+        COMMANDS[command](load(path))

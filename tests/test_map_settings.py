@@ -14,6 +14,7 @@ from jaxsky.inputs import read, read_sky
 from jaxsky.io import InputError
 from jaxsky.settings import BandTable, Experiment, MapFile, SettingsError, load
 from mapfiles import NSIDE, table, write
+from refusals import cases, raises
 
 NPIX = 12 * NSIDE**2
 RNG = np.random.default_rng(11)
@@ -46,8 +47,7 @@ def test_spass_with_files_of_its_noise(tmp_path):
         unit = "K_RJ^2" if name == "squ" else "K_RJ"
         write(tmp_path / f"{name}.fits", table({"UNKNOWN1": values}, [unit], form="D", **keys))
     entry = {"file": ["q.fits", "u.fits"], "noise": {"rms": {"file": ["sq.fits", "su.fits"]}}}
-    with pytest.raises(InputError, match=r"q.fits.*UNKNOWN1.*give `stokes`"):
-        band(tmp_path, entry)
+    raises(InputError, r"q.fits.*UNKNOWN1.*give `stokes`", band, tmp_path, entry)
     values, found = band(tmp_path, entry | {"stokes": "QU"}, "K_RJ")
     np.testing.assert_allclose(values, [Q, -U], rtol=1e-12)
     rms = np.sqrt(np.einsum("iip->ip", found.noise)) / 1e6
@@ -70,8 +70,7 @@ def test_noise_in_celestial_coordinates(tmp_path):
     write(tmp_path / "rms.fits", table(columns, ["uK_RJ"] * 2, COORDSYS="C"))
     write(tmp_path / "m.fits", table({"Q": Q, "U": U}, ["uK_RJ"] * 2))
     entry = {"file": "m.fits", "noise": {"rms": {"file": "rms.fits", "fields": ["Q_RMS", "U_RMS"]}}}
-    with pytest.raises(InputError, match=r"rms.fits.*Q_RMS cannot be turned"):
-        band(tmp_path, entry)
+    raises(InputError, r"rms.fits.*Q_RMS cannot be turned", band, tmp_path, entry)
     columns = {"Q_RMS": np.full(NPIX, 2.0)}
     write(tmp_path / "rms.fits", table(columns, ["uK_RJ"], COORDSYS="C"))
     entry["noise"]["rms"]["fields"] = ["Q_RMS"]
@@ -120,8 +119,7 @@ def test_footprints_and_marks_in_settings(tmp_path):
         np.testing.assert_array_equal(found.used, ~north)
     assert band(tmp_path, {"file": "zeros.fits", "missing": []})[1].used.all()
     spec = {"law": "dust", "file": "zeros.fits", "nu_ref": 353.0}
-    with pytest.raises(InputError, match=r"zeros.fits.*give `missing`"):
-        template(tmp_path, spec)
+    raises(InputError, r"zeros.fits.*give `missing`", template, tmp_path, spec)
     # A correction is zero where there is nothing to correct.
     write(tmp_path / "m.fits", table({"Q": Q, "U": U}, ["uK_RJ"] * 2))
     leakage = band(tmp_path, {"file": "m.fits", "leakage": {"file": "zeros.fits"}})[1].leakage
@@ -130,23 +128,9 @@ def test_footprints_and_marks_in_settings(tmp_path):
         band(tmp_path, {"file": "m.fits", "leakage": {"file": "marked.fits"}})
 
 
-@pytest.mark.parametrize(
-    ("entry", "words"),
-    [
-        ({"file": []}, "file.*at least 1 item"),
-        ({"file": ["a.fits", 3]}, "file.*valid string"),
-        ({"hdu": 0}, "hdu.*greater than or equal to 1"),
-        ({"hdu": [1, True]}, "hdu.*valid integer"),
-        ({"hdu": "MAP"}, "hdu.*valid integer"),
-        ({"stokes": "QV"}, "`stokes` must name I, Q, U or pairs"),
-        ({"stokes": 3}, "stokes.*valid string"),
-        ({"missing": "zero"}, "missing.*valid number"),
-        ({"missing": True}, "missing.*valid number"),
-    ],
-)
+@pytest.mark.parametrize(("entry", "words"), cases("map_settings/mistakes_in_map_entries"))
 def test_mistakes_in_map_entries(entry, words):
-    with pytest.raises(ValueError, match=f"(?s){words}"):
-        MapFile.model_validate({"file": "m.fits"} | entry)
+    raises(ValueError, f"(?s){words}", MapFile.model_validate, {"file": "m.fits"} | entry)
 
 
 def test_masks_that_are_coarser_are_named_with_their_key(tmp_path):
@@ -158,25 +142,15 @@ def test_masks_that_are_coarser_are_named_with_their_key(tmp_path):
         ("regions.m", {"common": common, "regions": {"m": mask}, "separate": {"region": "m"}}),
     ):
         settings = separation(tmp_path, **change)
-        with pytest.raises(SettingsError, match=rf"{key}: .*{words}"):
-            region_masks(settings, list(settings.regions))
-        with pytest.raises(SettingsError, match=rf"{key}: .*{words}"):
-            separation_data(settings)
+        raises(SettingsError, rf"{key}: .*{words}", region_masks, settings, list(settings.regions))
+        raises(SettingsError, rf"{key}: .*{words}", separation_data, settings)
 
 
 def test_too_many_columns_or_others(tmp_path):
     columns = {"I": I, "Q": Q, "U": U, "HITS": 9 + 0 * I, "X": Q}
     write(tmp_path / "m.fits", table(columns, ["uK_RJ"] * 5))
-    for fields, words in [
-        (["HITS", "I", "Q", "U"], "fields must name Q and U, not HITS, I, Q, U"),
-        (["HITS", "Q"], "HITS, Q are not Q and U by their names"),
-        (["X", "HITS"], "X, HITS are not Q and U by their names"),
-        (["U", "Q"], "U, Q are not Q and U by their names"),
-        (["HITS", "Q", "U"], "HITS, Q, U are not Q and U by their names"),
-        (["Q"], "fields must name Q and U, not Q"),
-    ]:
-        with pytest.raises(SettingsError, match=words):
-            band(tmp_path, {"file": "m.fits", "fields": fields})
+    for fields, words in cases("map_settings/other_columns"):
+        raises(SettingsError, words, band, tmp_path, {"file": "m.fits", "fields": fields})
     np.testing.assert_allclose(band(tmp_path, {"file": "m.fits", "fields": ["Q", "X"]})[0][1], Q)
 
 
@@ -186,8 +160,7 @@ def test_units_that_are_none_are_named_with_their_key(tmp_path):
     with pytest.raises(SettingsError, match=r"bands.b.unit: Unit 'K' does not convert to 'uK_RJ'"):
         band(tmp_path, entry)
     spec = {"law": "dust", "nu_ref": 353.0} | entry
-    with pytest.raises(SettingsError, match=r"sky.t.unit: Unit 'K' does not convert"):
-        template(tmp_path, spec)
+    raises(SettingsError, r"sky.t.unit: Unit 'K' does not convert", template, tmp_path, spec)
     entry = {"file": "m.fits", "unit": "K_RJ"}
     with pytest.raises(SettingsError, match=r"leakage.unit: Unit 'K' does not convert"):
         band(tmp_path, entry | {"leakage": {"file": "m.fits", "unit": "K"}})
@@ -218,10 +191,11 @@ def folder(tmp_path):
         "KELVIN": 20 + I,
         "MILLI": 1e3 * (20 + I),
         "NEGATIVE": -3.0 + 0.01 * I,
+        "THERMODYNAMIC": 1.5 + 0.01 * I,
         "ZEROS": np.where(holes, 0, 1.5 + 0.01 * I),
         "HOLES": np.where(holes, healpy.UNSEEN, 20 + I),
     }
-    units = ["1", "K", "K", "mK", "1", "1", "K"]
+    units = ["1", "K", "K", "mK", "1", "uK_CMB", "1", "K"]
     write(tmp_path / "p.fits", table(columns, units, form="D"))
     write(tmp_path / "coarse.fits", table({"BETA": np.full(48, 1.5)}, ["1"]))
     return tmp_path
@@ -238,14 +212,10 @@ def parameter(folder, spec, name, entry):
 
 
 @pytest.mark.parametrize(
-    ("spec", "name", "entry", "words"),
-    [
-        (DUST, "beta_dust", {"file": "coarse.fits"}, "nside is 2, but that of the template is 8"),
-        (DUST, "beta_dust", {"fields": ["ZEROS"]}, "ZEROS is 0 in 40 pixels.*give `missing`"),
-        (DUST, "T_dust", {"fields": ["BETA"]}, "T_dust is in K, but column BETA is in no unit"),
-    ],
-)  # fmt: skip
-def test_maps_of_parameters_are_checked(folder, spec, name, entry, words):
+    ("law", "name", "entry", "words"), cases("map_settings/maps_of_parameters")
+)
+def test_maps_of_parameters_are_checked(folder, law, name, entry, words):
+    spec = {"dust": DUST, "synchrotron": SYNCHROTRON}[law]
     with pytest.raises(SettingsError, match=rf"sky.t.parameters.{name}: .*{words}"):
         parameter(folder, spec, name, entry)
 
@@ -263,43 +233,39 @@ def test_maps_of_parameters_that_are_right(folder):
     found, used = parameter(folder, DUST, "beta_dust", {"fields": ["ZEROS"], "missing": 0.0})
     assert used.sum() == NPIX - 40
     assert (found > 1).all()
+    raises(
+        InputError,
+        "'K', which leaves open",
+        parameter,
+        folder,
+        DUST,
+        "beta_dust",
+        {"fields": ["K"]},
+    )
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"nu_ref": 353e3}, "nu_ref is in GHz, for the law 'dust' from 1 to 20000, not 353000"),
-        ({"nu_ref": 0.353}, "nu_ref is in GHz, for the law 'dust' from 1 to 20000, not 0.353"),
-        (
-            {"law": "synchrotron", "nu_ref": 30e3},
-            "nu_ref is in GHz, for the law 'synchrotron' from",
-        ),
-        ({"law": "synchrotron", "parameters": {"beta_syn": 0.0}}, "positive and about 3, not 0"),
-    ],
-)
+def test_noise_of_an_instrument_keeps_its_unit(folder):
+    """That of Planck is in uK_CMB, whatever the unit of the map."""
+    entry = {"name": "44", "instrument": "planck", "file": "m.fits"}
+    settings = Experiment.model_validate({"data_dir": str(folder), "bands": [entry]})
+    found = read_band(folder, settings.bands[0])
+    expected = 240.0 / float(found.bandpass.conversion("uK_RJ", "uK_CMB"))
+    np.testing.assert_allclose(found.noise, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("change", "words"), cases("map_settings/numbers_of_templates"))
 def test_numbers_of_templates_are_checked(change, words):
-    with pytest.raises(ValueError, match=words):
-        Experiment.model_validate({"sky": {"t": DUST | change}})
+    raises(ValueError, words, Experiment.model_validate, {"sky": {"t": DUST | change}})
 
 
-@pytest.mark.parametrize(
-    "table_",
-    [
-        {"fixed": {"synchrotron.beta_syn": -3.1}},
-        {"truth": {"synchrotron.beta_syn": -3.1}},
-        {"free": {"synchrotron.beta_syn": {"start": -3.1}}},
-        {"free": {"synchrotron.beta_syn": {"start": -3.1, "uniform": [-4.0, -2.0]}}},
-        {"free": {"synchrotron.beta_syn": {"start": 3.1, "gaussian": [-3.1, 0.3]}}},
-    ],
-)
+@pytest.mark.parametrize("table_", cases("map_settings/the_other_sign"))
 def test_the_other_sign_of_beta_syn_is_named_with_its_key(table_):
     key = next(iter(table_))
     words = rf"{key}.synchrotron.beta_syn: beta_syn is the index in T ~ nu\^-beta_syn"
     entry = {"name": "b", "file": "m.fits", "bandpass": {"center": 30.0}, "noise": {"rms": 1.0}}
     raw = {"sky": {"synchrotron": SYNCHROTRON}, "bands": [entry]}
     for change in ({}, {"sky": {"s": {"law": "synchrotron"}}}, {"bands": [{"instrument": "wmap"}]}):
-        with pytest.raises(ValueError, match=words):
-            Experiment.model_validate(raw | change | table_)
+        raises(ValueError, words, Experiment.model_validate, raw | change | table_)
     twice = {"fixed": {"synchrotron.nu_ref": 23.0}}
     with pytest.raises(ValueError, match=r"fixed.synchrotron.nu_ref: belongs next to law"):
         Experiment.model_validate(raw | twice)
@@ -331,21 +297,15 @@ def test_maps_of_parameters_in_separations(folder):
             separation(folder, sky={"dust": {"law": "dust", "parameters": parameters}})
         )
 
-    for entry, words in [
-        ({"name": "beta_dust", "file": "coarse.fits"}, "nside is 2, but common.nside is 8"),
-        ({"name": "beta_dust", "fields": ["K"], "unit": "K"}, "beta_dust is a pure number"),
-        ({"name": "T_dust", "fields": ["BETA", "ZEROS"]}, "fields must name one"),
-    ]:
+    for entry, words in cases("map_settings/in_separations"):
         where = rf"sky.dust.parameters.{entry['name']}: {words}"
-        with pytest.raises(SettingsError, match=where):
-            with_(**entry)
+        raises(SettingsError, where, with_, **entry)
     found = with_("T_dust", fields=["HOLES"], unit="K")
     assert not found.used[:40].any()
     regions = {"file": "p.fits", "fields": ["HOLES"], "unit": "K"}
     free = {"dust.beta_dust": {"start": 1.5, "regions": regions}}
     words = r"free.dust.beta_dust.regions: 40 of 768 used pixels have no value"
-    with pytest.raises(SettingsError, match=words):
-        separation_data(separation(folder, free=free))
+    raises(SettingsError, words, separation_data, separation(folder, free=free))
     dust = {"law": "dust", "nu_ref": 353.0, "parameters": {"nu_ref": 545.0}}
     with pytest.raises(
         ValueError, match="nu_ref belongs next to law; here parameters have it, 545"

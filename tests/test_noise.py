@@ -5,7 +5,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from astropy import units as u
 from jax.test_util import check_grads
 
 from jaxsky import noise
@@ -199,28 +198,22 @@ def test_bad_arguments():
     ones = np.ones(12)
     holes = np.array([0.0, -1, *ones[2:]])
     gone = np.array([np.nan, healpy.UNSEEN, *ones[2:]])
-    united = np.ones((2, 12)) * u.K
     for function, arguments, words in [
         (noise.rms_covariance, (ones,),
          r"`rms` must have shape \(stokes, pix\), but has shape \(12,"),
         (noise.rms_covariance, ([gone, ones],), "`rms` has 2 of 24 values that are not finite"),
         (noise.rms_covariance, ([holes, ones],), "`rms` has 1 of 24 values that are negative"),
-        (noise.rms_covariance, (united,), "`rms` carries the unit K"),
         (noise.hits_covariance, (1.0, holes), "`hits` is not positive in 2 of 12 pixels"),
         (noise.hits_covariance, (1.0, gone), "`hits` has 2 of 12 values that are not finite"),
         (noise.hits_covariance, (1.0, [ones]), r"`hits` must have shape \(pix,\), but has shape"),
         (noise.hits_covariance, (np.nan, ones), "`sigma0` has 1 of 1 values that are not finite"),
         (noise.hits_covariance, ([1.0], ones), r"`sigma0` must be a number or have shape \(2,\)"),
-        (noise.hits_covariance, (united[0, 0], ones), "`sigma0` carries the unit K"),
-        (noise.hits_covariance, (1.0, united[0]), "`hits` carries the unit K"),
         (noise.covariance_from_columns, (np.ones((4, 12)),),
          r"\(3, pix\) or \(6, pix\), but has shape .4, 12"),
         (noise.covariance_from_columns, (ones[:3],), r"or \(6, pix\), but has shape \(3,\)"),
-        (noise.covariance_from_columns, (united[[0, 1, 1]],), "`columns` carries the unit K"),
         (noise.uniform_alm, (KEY, 1.0, 4, 4), "`stokes` must be 1, 2 or 3, not 4"),
-        (noise.uniform_alm, (KEY, united[0, 0], 4), "`noise` carries the unit K"),
     ]:  # fmt: skip
-        with pytest.raises((TypeError, ValueError), match=words):
+        with pytest.raises(ValueError, match=words):
             function(*arguments)
 
 

@@ -10,12 +10,23 @@ import numpy as np
 import pytest
 
 import commands
+from fits.commands.forecast import forecast
 from fits.commands.paper import NUMBERS, STEPS, Make, labels_of, make_figures
 from fits.commands.report import Section
 from fits.commands.run import DEFAULTS
+from fits.common import common_maps
+from fits.comparison import compare
+from fits.inputs import inputs_of
 from fits.paper import figures_model
-from fits.paper.figures_model import core_observation, figure_patch, prepared_templates
+from fits.paper.figures_model import (
+    core_observation,
+    figure_patch,
+    forecast_settings,
+    prepared_templates,
+)
 from fits.paper.sky import Impossible, Number, PaperFigure, PaperSky, picture_of
+from fits.regions import region_masks
+from fits.results import with_error
 from jaxsky.checks import listed
 from jaxsky.harmonics import gaussian_beam, power_spectrum
 from jaxsky.io import read_maps
@@ -23,47 +34,10 @@ from jaxsky.observation import Source
 from jaxsky.settings import Experiment, load
 from jaxsky.simulation import harmonic_sources
 from jaxsky.small_scales import fit_power_law
+from refusals import cases, raises
 
 LABELS = [*(f"Figure {n}" for n in (1, 2, 3, 4, 13)), "Table 1", "Figure 14"]
-REAL = """
-title = "Maps of the real sky"
-data_dir = "{folder}"
-[common]
-nside = 32
-fwhm = 0
-[sky.sky_dust]
-law = "dust"
-file = "templates/dust_d1_353GHz_n64.fits"
-fields = ["Q_STOKES", "U_STOKES"]
-nu_ref = 353.0
-[sky.sky_synchrotron]
-law = "synchrotron"
-file = "templates/synch_s1_30GHz_n64.fits"
-fields = ["Q_STOKES", "U_STOKES"]
-nu_ref = 30.0
-[[bands]]
-name = "V"
-file = "wmap7/wmap_band_iqumap_r9_7yr_V_v4_udgraded32.fits"
-fields = ["Q_STOKES", "U_STOKES"]
-unit = "mK_CMB"
-coordinates = "G"
-fwhm = 21.0
-bandpass = {{ file = "bandpass/wmap_V.tbl" }}
-noise = {{ estimate_above = 30.0 }}
-[paper]
-fwhm = 80.0
-[paper.ame]
-file = "templates/ame_a2_30GHz_n64.fits"
-fields = ["I_STOKES"]
-nu_ref = 30.0
-[paper.beta_dust]
-file = "templates/pysm2_d1_QU353GHz_betad_Td_n64.fits"
-fields = ["BETA_D"]
-[paper.beta_syn]
-file = "templates/pysm2_s1_QU23GHz_betas_n64.fits"
-fields = ["BETA_S"]
-steepening = "{spectrum}"
-"""
+EXAMPLE = Path(__file__).parents[1] / "examples" / "paper_real_sky.toml"
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +59,11 @@ def real(data_dir, tmp_path_factory) -> Experiment:
     # 2.7 below 5 GHz, 2.83 above: steeper by the paper's 0.13.
     temperature = np.where(nu < 5, (nu / 5) ** -2.7, (nu / 5) ** -2.83)
     np.savetxt(folder / "spectrum.txt", np.stack([nu, temperature], axis=1))
-    text = REAL.format(folder=data_dir.resolve(), spectrum=folder / "spectrum.txt")
-    (folder / "paper.toml").write_text(text)
-    return load(folder / "paper.toml")
+    # Templates of other names than their laws.
+    (folder / "paper.toml").write_text(EXAMPLE.read_text().replace("[sky.", "[sky.sky_"))
+    values = [f'data_dir = "{data_dir.resolve()}"', "free = {}", "fixed = {}", "paper.fwhm = 80.0"]
+    steepening = f"paper.beta_syn.steepening = '{folder / 'spectrum.txt'}'"
+    return load(folder / "paper.toml", [*values, steepening])
 
 
 def numbers_of(items: dict[str, PaperFigure]) -> dict[str, Number]:
@@ -281,8 +257,7 @@ def test_other_settings_are_refused_or_replaced(small, tmp_path):
     assert [path.name for path in tmp_path.glob("*.png")] == ["figure_01.png"]
     for damaged in ("{", "{}", '[{}, [{"label": "Figure 1"}]]'):
         (tmp_path / "figures.json").write_text(damaged)
-        with pytest.raises(ValueError, match="is damaged"):
-            make_figures(other, tmp_path, steps=steps)
+        raises(ValueError, "is damaged", make_figures, other, tmp_path, steps=steps)
     make_figures(other, tmp_path, overwrite=True, steps=steps)
 
 
@@ -293,16 +268,14 @@ def test_what_fails_removes_nothing(small, tmp_path):
     held = (out / "figures.json").read_text()
     other = small.model_copy(update={"title": "another"})
     fails = drawn([], OSError, "Figure 1")
-    with pytest.raises(OSError, match="it takes a <map>"):
-        make_figures(other, out, steps=fails, overwrite=True)
+    raises(OSError, "it takes a <map>", make_figures, other, out, steps=fails, overwrite=True)
     assert (out / "figures.json").read_text() == held
     assert sorted(path.name for path in out.glob("*.png")) == both
     items = make_figures(other, out, ["2"], steps=fails, overwrite=True)
     assert [item.label for item in items] == ["Figure 2", NUMBERS]
     assert [path.name for path in out.glob("*.png")] == both[1:]
     # A first run that fails leaves nothing that has to be overwritten.
-    with pytest.raises(OSError, match="it takes a <map>"):
-        make_figures(small, tmp_path / "new", steps=fails)
+    raises(OSError, "it takes a <map>", make_figures, small, tmp_path / "new", steps=fails)
     assert not list((tmp_path / "new").iterdir())
 
 
@@ -330,12 +303,7 @@ def test_command_line(monkeypatch, capsys, tmp_path):
     assert "index.html" in said
     page = Page(tmp_path / "out" / "index.html")
     assert page.headings[0] == "Table 1: COrE"
-    for arguments, sentence in {
-        ("--only", "15", "--resume"): "there is no '15'; there are Figure 1,",
-        ("--only", "table 1"): "holds results already",
-        ("--resume", "--overwrite"): "exclude each other",
-        ("absent.toml",): "cannot be read",
-    }.items():
+    for arguments, sentence in cases("paper/command_line"):
         code, said = jaxsky(monkeypatch, capsys, *arguments, "--out", tmp_path / "out")
         assert code == 2
         assert sentence in said.replace("\n", " ")
@@ -351,8 +319,7 @@ def test_settings_that_cannot_work(real):
     with pytest.raises(ValueError, match=r"paper.ame.fields: must name one intensity map"):
         PaperSky(Experiment.model_validate(raw)).ame()
     raw["paper"]["beta_syn"] |= {"steepening": "absent.txt"}
-    with pytest.raises(ValueError, match=r"absent.txt"):
-        PaperSky(Experiment.model_validate(raw)).index("beta_syn")
+    raises(ValueError, r"absent.txt", PaperSky(Experiment.model_validate(raw)).index, "beta_syn")
     del raw["sky"]["sky_synchrotron"]
     with pytest.raises(Impossible, match="one template of the law 'synchrotron', but there are 0"):
         PaperSky(Experiment.model_validate(raw)).template("synchrotron")
@@ -365,6 +332,97 @@ def test_the_cmb_of_figure_13_is_that_of_the_settings(real, monkeypatch, tmp_pat
     monkeypatch.setattr(
         figures_model, "cmb_spectra", lambda s, lmax: asked.append(s) or spectra[:, :10]
     )
-    with pytest.raises(ValueError, match=r"spectra of the CMB end at l = 9"):
-        figure_patch(PaperSky(real), tmp_path)
+    raises(ValueError, r"spectra of the CMB end at l = 9", figure_patch, PaperSky(real), tmp_path)
     assert asked == [real]
+
+
+COMPARED = [f"Figure {n}" for n in range(5, 13)]
+
+
+@pytest.fixture(scope="module")
+def small_maps() -> Experiment:
+    values = [
+        "sky.embedded.nside=64",
+        'bands.0.channels=["44", "70", "353"]',
+        'bands.1.channels=["K"]',
+        "common={ nside = 32, fwhm = 120.0 }",
+        "compare={ nsims = 30, lmax = 60, patches_nside = 64 }",
+    ]
+    return load(DEFAULTS / "paper.toml", values)
+
+
+@pytest.fixture(scope="module")
+def compared(small_maps, tmp_path_factory):
+    out = tmp_path_factory.mktemp("paper") / "out"
+    return out, {item.label: item for item in make_figures(small_maps, out, COMPARED)}
+
+
+@pytest.mark.slow
+def test_figures_of_maps(compared):
+    out, items = compared
+    assert set(COMPARED) <= set(items)
+    for label in COMPARED:
+        item = items[label]
+        assert item.section.caption
+        assert item.section.note
+        assert (out / item.section.picture).read_bytes().startswith(b"\x89PNG")
+    page = (out / "index.html").read_text()
+    assert all(items[label].section.picture in page for label in COMPARED)
+
+
+@pytest.mark.slow
+def test_numbers_are_those_of_the_comparison(small_maps, compared):
+    found = compare(
+        small_maps,
+        common_maps(inputs_of(small_maps), small_maps.common.nside, small_maps.common.fwhm),
+        region_masks(small_maps, small_maps.compare.regions),
+    )
+    shown = numbers_of(compared[1])
+    for band in ("44", "70", "353", "K"):
+        scatter = found.scatters[band, "strip", "QU"]
+        assert shown[f"slope, {band}, Q and U"].ours == with_error(scatter.slope, scatter.error)
+    leaky = next(s for s in found.spectra if s.band == "70")
+    assert f"after {leaky.pte[1]:.2f}" in shown["PTE of BB, 70"].ours
+
+
+@pytest.mark.slow
+def test_indices_agree_with_the_truth(compared):
+    shown = numbers_of(compared[1])
+    for name, truth in (("dust.beta_dust", 1.53), ("synchrotron.beta_syn", 3.1)):
+        number = shown[f"{name}, full, Q and U"]
+        best, low, high = map(float, number.ours.split())
+        assert number.note == f"truth {truth:g}"
+        assert abs(best - truth) < 2 * (high - low)
+
+
+@pytest.mark.slow
+def test_b_modes_are_those_of_the_forecast(small_maps, compared):
+    found = forecast(forecast_settings(PaperSky(small_maps)))
+    shown = numbers_of(compared[1])
+    for band, equal in found.equal_r.items():
+        assert shown[f"r with as much BB at l = 80, {band} GHz"].ours == f"{equal['l = 80']:.3g}"
+
+
+@pytest.mark.slow
+def test_without_bands_of_the_paper(data_dir, monkeypatch, tmp_path):
+    """The real maps are WMAP's: no Planck spectra, no leakage, and patches of the template."""
+    monkeypatch.setenv("JAXSKY_DATA", str(data_dir))
+    settings = load(EXAMPLE)
+    how = settings.compare.model_copy(update={"nsims": 30})
+    settings = settings.model_copy(update={"compare": how})
+    figures = make_figures(settings, tmp_path / "out", [str(n) for n in range(5, 13)])
+    items = {item.label: item for item in figures}
+    assert items["Figure 7"].section.note.startswith(
+        "Not compared: None of the bands 30, 44, 70, 353"
+    )
+    assert items["Figure 9"].section.note.startswith("Not compared: No band has a map of leakage")
+    shown = numbers_of(items)
+    assert {"slope, V, Q and U", "slope, W, Q and U"} <= set(shown)
+    # Planck finds half as much power in B as in E (intermediate results 30).
+    assert 0.4 < float(shown["median A of BB / EE"].ours) < 0.65
+
+
+def test_all_figures_have_a_step():
+    figures = [label for label in STEPS if label.startswith("Figure")]
+    assert figures == [f"Figure {n}" for n in range(1, 15)]
+    assert list(STEPS).index("Table 1") == 13

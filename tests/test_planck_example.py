@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from commands import experiment
 from fits import inputs as fit_inputs
 from fits.commands.fit import _table, fit_numbers, fit_warnings
 from fits.commands.run import DEFAULTS
@@ -24,6 +25,7 @@ from jaxsky.inputs import Template
 from jaxsky.io import write_maps
 from jaxsky.noise import draw, pixel_covariance, uniform_covariance
 from jaxsky.settings import BandTable, Experiment, SettingsError, load
+from refusals import cases, raises
 
 NSIDE = 8
 NPIX = healpy.nside2npix(NSIDE)
@@ -57,41 +59,15 @@ def test_no_example_has_noise_in_a_unit_of_its_own_or_leakage(path):
 
 
 @pytest.mark.parametrize(
-    ("name", "corrected", "correction"),
-    [
-        ("LFI_SkyMap_044_1024_R3.00_full.fits",
-         "LFI_SkyMap_044-BPassCorrected_1024_R3.00_full.fits",
-         "LFI_CorrMap_044-BPassCorr_1024_R3.00_full.fits"),
-        ("maps/LFI_SkyMap_070_1024_R3.00_full-ringhalf-1.fits.gz",
-         "LFI_SkyMap_070-BPassCorrected_1024_R3.00_full-ringhalf-1.fits.gz",
-         "LFI_CorrMap_070-BPassCorr_1024_R3.00_full-ringhalf-1.fits.gz"),
-        ("LFI_SkyMap_030-field-IQU_1024_R3.00_full.fits",
-         "LFI_SkyMap_030-BPassCorrected-field-IQU_1024_R3.00_full.fits",
-         "LFI_CorrMap_030-BPassCorr_1024_R3.00_full.fits"),
-        ("LFI_SkyMap_044_1024_R2.01_full.fits",
-         "LFI_SkyMap_044-BPassCorrected_1024_R3.00_full.fits",
-         'leakage = { file = "LFI_CorrMap_044-BPassCorr_0256_R2.01_full.fits", fwhm = 60.0 }'),
-        ("HFI_SkyMap_353_2048_R2.02_full.fits", "HFI_SkyMap_353_2048_R3.01_full.fits", "Take"),
-    ],
-)  # fmt: skip
+    ("name", "corrected", "correction"), cases("planck_example/maps_with_leakage")
+)
 def test_maps_that_hold_leakage_are_known_by_name(name, corrected, correction):
     (warning,) = Experiment(bands=[band_of(name)]).leaks()
     for word in ("bands.x", Path(name).name, corrected, correction):
         assert word in warning
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "LFI_SkyMap_044-BPassCorrected_1024_R3.00_full.fits",
-        "LFI_SkyMap_030-BPassCorrected-field-IQU_1024_R3.00_full.fits",
-        "LFI_SkyMap_044_2048_R4.00_full.fits",
-        "HFI_SkyMap_353-psb_2048_R3.01_full.fits",
-        "HFI_SkyMap_545_2048_R2.02_full.fits",
-        "wmap_band_iqumap_r9_7yr_V_v4.fits",
-        "my_map.fits",
-    ],
-)
+@pytest.mark.parametrize("name", cases("planck_example/maps_without_leakage"))
 def test_other_maps_are_not(name):
     assert Experiment(bands=[band_of(name)]).leaks() == []
 
@@ -134,24 +110,7 @@ def folder(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(
-    ("noise", "wrong"),
-    [
-        ({"rms": 5e-5}, {"rms": 160.0}),
-        ({"rms": 9e-4}, {"rms": 1.2e-3}),
-        ({"rms": 2e-10}, {"rms": 5e-11}),
-        ({"rms": {"file": "map.fits", "fields": ["RMS"]}},
-         {"rms": {"file": "map.fits", "fields": ["RMS_BIG"]}}),
-        ({"covariance": ["QQ_COV", "QU_COV", "UU_COV"]},
-         {"covariance": ["QQ_COV", "QU_COV", "UU_BIG"]}),
-        ({"hits": {"fields": ["HITS"], "sigma0": 1e-4}},
-         {"hits": {"fields": ["HITS"], "sigma0": 100.0}}),
-        ({"hits": {"fields": ["HITS"], "sigma0": 0.1}, "unit": "mK_CMB"},
-         {"hits": {"fields": ["HITS"], "sigma0": 0.1}}),
-        ({"weights": {"fields": ["QQ", "QU", "UU"], "sigma0": [1e-4]}},
-         {"weights": {"fields": ["QQ", "QU", "UU"], "sigma0": [1e-4, 1e-12]}}),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("noise", "wrong"), cases("planck_example/noise_far_from_the_rms"))
 def test_noise_far_from_the_rms_of_its_map_is_refused(folder, noise, wrong):
     fields = ["Q_STOKES", "U_STOKES"]
     assert read_band(folder, band_of("map.fits", fields=fields, noise=noise)).used.all()
@@ -359,8 +318,7 @@ def test_parameters_of_bands_are_fitted_and_named():
     assert [label(name) for name in own] == [r"\psi_{\rm 44}\ [^\circ]", r"g_{\rm 30}"]
     noisy = dict.fromkeys(("dust", "synchrotron"), TemplateNoise(TEMPLATE_NOISE / 1e4))
     words = "^free: Parameter 'angle.44' cannot be free where noise of templates is given"
-    with pytest.raises(SettingsError, match=words):
-        fitted(inputs_of(sky, bands, noisy), settings, inside)
+    raises(SettingsError, words, fitted, inputs_of(sky, bands, noisy), settings, inside)
     del free["angle.44"]
     assert fitted(inputs_of(sky, bands, noisy), settings_of(free=free), inside).corrected
 
@@ -424,41 +382,10 @@ def test_the_embedded_templates_are_exact():
     assert not any(n.own for n in made.template_noise.values())
 
 
-TEMPLATES = """
-[common]
-nside = 8
-fwhm = 0
-[cmb]
-include = false
-[sky.dust]
-law = "dust"
-file = "map.fits"
-fields = ["Q_STOKES", "U_STOKES"]
-nu_ref = 353.0
-noise = {noise}
-[[bands]]
-name = "44"
-file = "map.fits"
-fields = ["Q_STOKES", "U_STOKES"]
-bandpass = {{ center = 44.0 }}
-noise = {{ rms = 5e-5 }}
-"""
-
-
-@pytest.mark.parametrize(
-    ("noise", "level", "variance"),
-    [
-        ("{ rms = 0.0 }", 0.0, None),
-        ('{ level = 0, shared = { "44" = 0.5 } }', 0.0, None),
-        ("{ level = 1e-4 }", 1e-4, None),
-        ("{ rms = 5e-5 }", 0.0, 2.5e-9),
-        ('{ rms = { file = "map.fits", fields = ["RMS"] } }', 0.0, 2.5e-9),
-        ('{ covariance = ["QQ_COV", "QU_COV", "UU_COV"] }', 0.0, 2.5e-9),
-    ],
-)
+@pytest.mark.parametrize(("noise", "level", "variance"), cases("planck_example/noise_of_templates"))
 def test_noise_of_templates_from_settings(folder, noise, level, variance):
     path = folder / "templates.toml"
-    path.write_text(TEMPLATES.format(noise=noise))
+    path.write_text(experiment("noisy_template", ("{ rms = 0.0 }", noise)))
     found = fit_inputs.inputs_of(load(path)).template_noise["dust"]
     factor = float(Bandpass.delta(353.0).conversion("K_CMB", "uK_RJ"))
     assert found.shared == ({"44": 0.5} if "shared" in noise else {})
@@ -472,19 +399,10 @@ def test_noise_of_templates_from_settings(folder, noise, level, variance):
     np.testing.assert_allclose(covariance[0, 1], 0)
 
 
-@pytest.mark.parametrize(
-    ("noise", "words"),
-    [
-        ("{ rms = 160.0 }", r"sky.dust.noise: the noise of a pixel is 160 K_CMB"),
-        ("{ rms = -1.0 }", r"sky.dust.noise.rms: .*greater than or equal to 0"),
-        ("{ level = 1.0, rms = 1.0 }", r"sky.dust.noise: give the noise as exactly one of"),
-        ("{}", r"sky.dust.noise: give the noise as exactly one of level, rms"),
-        ('{ rms = 0, shared = { "45" = 1.0 } }', "sky.dust.noise.shared: there is no band '45'"),
-    ],
-)
+@pytest.mark.parametrize(("noise", "words"), cases("planck_example/noise_that_cannot_be"))
 def test_noise_of_templates_that_cannot_be(folder, noise, words):
     path = folder / "wrong.toml"
-    path.write_text(TEMPLATES.format(noise=noise))
+    path.write_text(experiment("noisy_template", ("{ rms = 0.0 }", noise)))
     with pytest.raises(SettingsError, match=words):
         fit_inputs.inputs_of(load(path))
 

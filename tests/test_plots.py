@@ -12,24 +12,10 @@ from fits.commands.fit import _drawable, plot_marginals, plot_posterior
 from fits.plots import color_limit, draw_title, in_formula, label, plain, plot_chains, save
 from fits.results import FitResult, with_errors
 from fits.spectral_index import RegionFit
-
-NAMES = [
-    "$x_$",
-    "a $ b",
-    r"\frac{",
-    "100 %",
-    "_",
-    "x^",
-    "{",
-    "[bold]",
-    "[/]",
-    "",
-    "µ ☃ 🙂",
-    90 * "n ",
-]
+from refusals import cases
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", cases("plots/names"))
 def test_any_name_is_drawn(tmp_path, name):
     figure, axes = plt.subplots(layout="constrained")
     draw_title(figure, f"{name}\n{name}")

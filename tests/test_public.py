@@ -24,6 +24,7 @@ from jaxsky.harmonics import smooth
 from jaxsky.io import Maps, unit_factor
 from jaxsky.noise import estimate_variance, realisation_key
 from jaxsky.settings import CommonTable
+from refusals import raises
 
 #: Annotations of arguments that may be numbers, or hold some.
 NUMERIC = re.compile(
@@ -134,8 +135,7 @@ def test_a_quantity_is_refused(where):
         for value in (QUANTITY, [1.0, QUANTITY], {"any": (QUANTITY,)}):
             name = "any" if isinstance(value, dict) else parameter.name
             words = rf"^Argument `{name}` carries the unit GHz; jaxsky"
-            with pytest.raises(TypeError, match=words):
-                call(PUBLIC[where], parameter, value)
+            raises(TypeError, words, call, PUBLIC[where], parameter, value)
 
 
 SEEDED = [
@@ -149,24 +149,17 @@ SEEDED = [
 
 @pytest.mark.parametrize(("function", "parameter"), SEEDED)
 def test_a_seed_is_a_natural_number_of_32_bits(function, parameter):
-    for value, error in [
-        (True, TypeError),
-        (1.0, TypeError),
-        ("1", TypeError),
-        (-1, ValueError),
-        (2**32, ValueError),
-        (2**53, ValueError),
-    ]:
-        with pytest.raises(error, match=f"Argument `seed` must be .*, but is {value!r}"):
-            call(function, parameter, value)
+    for error, values in ((TypeError, (True, 1.0, "1")), (ValueError, (-1, 2**32, 2**53))):
+        for value in values:
+            with pytest.raises(error, match=f"Argument `seed` must be .*, but is {value!r}"):
+                call(function, parameter, value)
 
 
 def test_seeds_that_are_right():
     assert len(SEEDED) >= 6
     keys = [realisation_key(seed, 0) for seed in (0, np.int64(1), 2**32 - 1)]
     assert len({str(key) for key in keys}) == 3
-    with pytest.raises(ValueError, match="Argument `index` must be from 0 to"):
-        realisation_key(0, 2**32)
+    raises(ValueError, "Argument `index` must be from 0 to", realisation_key, 0, 2**32)
 
 
 def test_what_converts_quantities():
@@ -174,8 +167,7 @@ def test_what_converts_quantities():
     maps = Maps(np.ones((1, 12)), np.ones((1, 12), bool), "K_CMB", ("I",), ("I",))
     expected = maps.to("uK_RJ", at=100.0).maps
     np.testing.assert_array_equal(maps.to("uK_RJ", at=100 * u.GHz).maps, expected)
-    with pytest.raises(TypeError, match="Argument `nu` carries the unit MHz"):
-        as_array("nu", 3 * u.MHz)
+    raises(TypeError, "Argument `nu` carries the unit MHz", as_array, "nu", 3 * u.MHz)
 
 
 def test_what_is_refused_inside_of_other_things():
@@ -196,8 +188,7 @@ def test_arrays_of_other_packages_are_refused():
     class Pint:  # pint's quantities say `units` and `magnitude`, those of unyt are arrays
         units, magnitude = "gigahertz", 44.0
 
-    with pytest.raises(TypeError, match="carries the unit gigahertz"):
-        Bandpass.delta(Pint())
+    raises(TypeError, "carries the unit gigahertz", Bandpass.delta, Pint())
 
 
 @pytest.mark.parametrize("value", [UNSEEN, np.nan, np.inf])
@@ -218,5 +209,4 @@ def test_missing_pixels_are_no_values(value):
     maps[0, 400] = value
     for name, function in calls.items():
         argument = "other" if name == "cross" else "maps"
-        with pytest.raises(ValueError, match=rf"Argument `{argument}` has . of .* \(or UNSEEN\)"):
-            function()
+        raises(ValueError, rf"Argument `{argument}` has . of .* \(or UNSEEN\)", function)

@@ -24,6 +24,7 @@ from jaxsky.harmonics import expand, gaussian_beam, lmax_of, power_spectrum, syn
 from jaxsky.io import InputError
 from jaxsky.programs import Progress
 from jaxsky.settings import Experiment, SettingsError, load
+from refusals import cases, raises
 
 NSIDE, FWHM = 16, 360.0
 CHANNELS = ["40", "68", "100", "140", "195", "280", "402"]
@@ -332,49 +333,14 @@ def beta(**changes):
     return {"free": {"dust.beta_dust": {"start": 1.5} | changes}}
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"sky": SKY | {"cmb": {"law": "dust"}}}, "the name 'cmb' has a meaning of its own"),
-        ({"sky": SKY | {"a": {"law": "cmb"}}}, "(?s)sky.*a.law: the CMB is described"),
-        (beta(start=3.0, uniform=[1.0, 2.0]), "start 3 is not inside the uniform prior"),
-        (beta(regions={"nside": 4, "clusters": 3}),
-         "exactly one of nside, latitudes, clusters, file, not nside, clusters"),
-        (beta(regions={}), "exactly one of .*, not none"),
-        (beta(regions={"nside": 2, "of": [{"file": "a"}]}), "of goes with clusters only"),
-        ({"separate": {"nsims": 3}}, "greater than or equal to 20"),
-        ({"separate": {"region": "none"}}, "separate.region: 'none' is none of strip, outside"),
-        ({"bands": [{"instrument": "litebird", "channels": ["40", "41"]}]},
-         "litebird has no channel '41'"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("changes", "words"), cases("separate/contradictions"))
 def test_settings_that_contradict_themselves_are_refused(changes, words):
-    with pytest.raises(ValueError, match=words):
-        settings(**changes)
+    raises(ValueError, words, settings, **changes)
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"bands": []}, "bands: there are none"),
-        ({"cmb": {"include": False}}, "cmb.include: is false"),
-        ({"free": {}}, "free: name at least one parameter"),
-        ({"separate": {"domain": "harmonic"}} | beta(regions={"nside": 2}),
-         "free.dust.beta_dust: regions are those of pixels"),
-        ({"common": {"fwhm": 0.0}}, "common.fwhm: must be positive"),
-        ({"common": {"fwhm": 30.0}}, "common: .*beam of 30 arcmin is finer than"),
-        ({"common": {"nside": 32}}, "common nside 32 is larger than that of"),
-        ({"truth": {"dust.beta": 1.0}}, "truth: Unknown parameter 'dust.beta'"),
-        ({"sky": SKY | {"dust": {"parameters": {"beta": 1.5}}}}, "sky.dust: .*beta"),
-        (beta(regions={"nside": 64}),
-         "free.dust.beta_dust.regions: .* at most that of the map, 16"),
-        (beta(regions={"latitudes": [50.0, 40.0]}),
-         "free.dust.beta_dust.regions: Argument `edges` must increase"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("changes", "words"), cases("separate/cannot_work"))
 def test_settings_that_cannot_work_are_refused(changes, words):
-    with pytest.raises(SettingsError, match=words):
-        separation_data(settings(**changes))
+    raises(SettingsError, words, separation_data, settings(**changes))
 
 
 @pytest.mark.parametrize(
@@ -387,5 +353,4 @@ def test_settings_that_cannot_work_are_refused(changes, words):
 def test_spectra_that_cannot_be_taken_are_refused(changes, words):
     _, given, _ = separated()
     how = settings(separate=changes)
-    with pytest.raises(SettingsError, match=words):
-        separate_data(how, given)
+    raises(SettingsError, words, separate_data, how, given)

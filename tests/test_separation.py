@@ -28,6 +28,7 @@ from jaxsky import (
     set_parameters,
 )
 from jaxsky.sed import H_OVER_K, T_CMB
+from refusals import raises
 
 NPIX = 48
 CENTERS = [23.0, 35.0, 60.0, 95.0, 145.0, 220.0, 280.0, 353.0]
@@ -259,7 +260,10 @@ def check_derivatives(like):
 
 @pytest.mark.parametrize(
     ("kind", "names", "params"),
-    [("band", list(EVERY_LAW), LAW_PARAMETERS), ("covariance", ["cmb", "dust"], BAND_PARAMETERS)],
+    [
+        ("band", list(EVERY_LAW), LAW_PARAMETERS),
+        pytest.param("covariance", ["cmb", "dust"], BAND_PARAMETERS, marks=pytest.mark.slow),
+    ],
 )
 def test_derivatives_in_every_parameter_are_finite_differences(kind, names, params):
     _, data, given, _ = problem(kind)
@@ -347,6 +351,7 @@ def test_a_band_in_K_CMB_is_calibrated_on_the_CMB():
     np.testing.assert_allclose(in_cmb, in_rj / in_rj[:, :1], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_uniform_priors_bound_the_fit_and_edges_are_reported():
     sky, data, given, _ = problem()
     like = spectral_likelihood(sky, BANDS, data, given, START)
@@ -380,17 +385,18 @@ def test_uniform_priors_bound_the_fit_and_edges_are_reported():
 
 def test_separate_is_fit_and_component_maps_in_one_call():
     """Laws by name, start values by default and noise of the instrument, against each step."""
-    instrument = load_instrument("litebird", ["50", "78", "119", "195", "280", "402"])
+    channels = ["40", "50", "78", "119", "195", "280", "337", "402"]
+    instrument = load_instrument("litebird", channels, samples=5)
     bands, ones = instrument.bands(), np.ones((2, 1))
     laws = {"cmb": CMB(ones), "dust": Dust(ones), "synchrotron": Synchrotron(ones)}
     rng, names = np.random.default_rng(3), ["dust.beta_dust", "synchrotron.beta_syn"]
     truth = {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}
-    maps = {name: rng.normal(size=(2, 192)) * 30 for name in laws}
+    maps = {name: rng.normal(size=(2, NPIX)) * 30 for name in laws}
     sky = Sky({name: type(one)(maps[name]) for name, one in laws.items()})
     factors = np.array([band.conversion("uK_RJ", "uK_CMB") for band in bands.values()])
     seen = observe(set_parameters(sky, truth), list(bands.values())) * factors[:, None, None]
     levels = np.array([c.noise for c in instrument.values()]) * factors
-    levels /= healpy.nside2resol(4, arcmin=True)
+    levels /= healpy.nside2resol(2, arcmin=True)
     data = seen + levels[:, None, None] * rng.normal(size=seen.shape)
     found = separate(list(laws), instrument, data)
     assert found.fit.free == tuple(names)
@@ -404,10 +410,8 @@ def test_separate_is_fit_and_component_maps_in_one_call():
     np.testing.assert_allclose(found.maps.amplitude, expected)
     again = separate(laws, bands, data, {"dust.beta_dust": 1.5}, noise=levels)
     assert again.fit.free == ("dust.beta_dust",)
-    with pytest.raises(ValueError, match="`noise` is missing"):
-        separate(laws, bands, data)
-    with pytest.raises(ValueError, match="there is no law 'stars'"):
-        separate(["stars"], instrument, data)
+    raises(ValueError, "`noise` is missing", separate, laws, bands, data)
+    raises(ValueError, "there is no law 'stars'", separate, ["stars"], instrument, data)
     intensity = np.concatenate([data[:, :1], data], axis=1)
     maps = separate([*laws, "free_free"], instrument, intensity, free=names).maps
     assert maps.components == ("cmb", "dust", "free_free", "synchrotron")

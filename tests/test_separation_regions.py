@@ -1,5 +1,7 @@
 """Regions, parameters of each pixel, simulations, and bad input of component separation."""
 
+import builtins
+
 import healpy
 import jax
 import numpy as np
@@ -15,6 +17,7 @@ from fits.results import FitError
 from fits.separated_maps import component_maps
 from fits.spectral_index import grid_fit
 from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe, set_parameters
+from refusals import cases, raises
 from test_separation import BANDS, NPIX, START, TRUTH, problem, random_sky
 
 HALVES = np.arange(NPIX) % 2
@@ -49,6 +52,7 @@ def test_latitude_bands_and_clusters():
     assert 0 <= found[7] < 3
 
 
+@pytest.mark.slow
 def test_two_regions_at_once_are_each_alone():
     _, data, given, _ = problem("full")
     labels = dict.fromkeys(LABELS, HALVES)
@@ -201,55 +205,15 @@ def two_bodies(**changes):
     return {"sky": sky} | changes
 
 
-def same_laws():
-    maps = np.ones((2, 1))
-    return {"a": Synchrotron(maps, 3.1), "b": Synchrotron(maps, 3.1), "cmb": CMB(maps)}
-
-
-LABELLED = {"start": {"dust.beta_dust": 1.5}}
-
-
-def labelled(value, **changes):
-    return LABELLED | {"labels": {"dust.beta_dust": value}} | changes
-
-
-@pytest.mark.parametrize(
-    ("changes", "error", "words"),
-    [
-        ({"start": {"dust.beta": 1.5}}, KeyError, "Unknown parameter 'dust.beta'; .*shift.23"),
-        ({"start": {"ame.m60": 1.5}}, KeyError, "Unknown parameter 'ame.m60'.*dust.T_dust"),
-        ({"start": {"dust.amplitude": 1.5}}, KeyError, "Unknown parameter 'dust.amplitude'"),
-        ({"start": {"dust.nu_ref": 353.0}}, KeyError, "Unknown parameter 'dust.nu_ref'"),
-        ({"start": {"gain.24": 1.0}}, KeyError, "Unknown parameter 'gain.24'"),
-        ({"start": {"dust.beta_dust": np.nan}}, ValueError, "`dust.beta_dust` has 1 of 1 values"),
-        ({"start": {"dust.beta_dust": np.ones(3)}}, ValueError,
-         "'dust.beta_dust' must be a number"),
-        ({"data": np.ones((8, 4, 48))}, ValueError, r"`data` must have .*\(8, 4, 48\)"),
-        ({"data": np.ones((3, 2, 48))}, ValueError, "`data` must have .* with 8 bands"),
-        ({"data": np.full((8, 2, 48), np.nan)}, ValueError, "`data` has 768 values that are not"),
-        ({"data": np.full((8, 2, 48), -1.6375e30)}, ValueError, "`data` has 768 values"),
-        ({"noise": np.ones(7)}, ValueError, r"`noise` must have shape .* has shape \(7,\)"),
-        ({"noise": np.zeros(8)}, ValueError, "`noise` has 8 of 8 values that are not > 0"),
-        ({"noise": -np.ones((8, 2, 48))}, ValueError, "`noise` has 768 of 768 values"),
-        ({"noise": np.full((8, 2, 48), np.inf)}, ValueError, "No pixel is left"),
-        ({"noise": np.full(8, np.inf)}, ValueError, "must be finite for a whole band"),
-        ({"noise": np.ones((8, 2, 2, 48))}, ValueError, "not positive definite in 384 of 384"),
-        ({"unit": "MJy/sr"}, ValueError, "`unit` must be one of K_RJ or K_CMB, not 'MJy/sr'"),
-        ({"sky": same_laws(), "start": {"a.beta_syn": 3.1}}, ValueError,
-         "a, b, cmb cannot be told"),
-        (labelled(np.zeros(12, int)), ValueError, r"must have shape \(48,\) like a map"),
-        (labelled(np.full(48, -1)), ValueError, "'dust.beta_dust' are negative in 48 pixels"),
-        (labelled(np.zeros(48)), TypeError, "'dust.beta_dust' must be integers, but are float64"),
-        (labelled(np.arange(48) % 3, start={"dust.beta_dust": np.ones(2)}), ValueError,
-         "has 2 values, but its labels go up to 2"),
-        (LABELLED | {"labels": {"dust.T_dust": HALVES}}, ValueError, "which is not in `start`"),
-        ({"start": {"gain.23": 1.0}, "labels": {"gain.23": HALVES}}, ValueError,
-         "'gain.23' of a band cannot vary between regions"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("changes", "error", "words"), cases("separation_regions/bad_input"))
 def test_bad_input_is_refused(changes, error, words):
-    with pytest.raises(error, match=words):
-        call(**changes)
+    raises(getattr(builtins, error), words, call, **changes)
+
+
+def test_laws_that_are_alike_are_refused():
+    maps = np.ones((2, 1))
+    sky = {"a": Synchrotron(maps, 3.1), "b": Synchrotron(maps, 3.1), "cmb": CMB(maps)}
+    raises(ValueError, "a, b, cmb cannot be told", call, sky=sky, start={"a.beta_syn": 3.1})
 
 
 def test_too_few_bands_are_refused():
@@ -258,8 +222,7 @@ def test_too_few_bands_are_refused():
         call(bands=few, data=np.ones((3, 2, 48)), noise=np.ones(3))
     sigma = np.ones((8, 2, 48))
     sigma[:6, 0, :5] = np.inf
-    with pytest.raises(ValueError, match="5 pixels are seen in fewer bands than the 3 components"):
-        call(noise=sigma)
+    raises(ValueError, "5 pixels are seen in fewer bands than the 3 components", call, noise=sigma)
     sigma[0, 0, 0] = 2.0
     with pytest.raises(ValueError, match="Only noise that is separable"):
         call(noise=np.where(np.isfinite(sigma), sigma, 1.0), compress=True)
@@ -283,8 +246,7 @@ def test_too_few_bands_are_refused():
     ],
 )  # fmt: skip
 def test_fits_that_cannot_be_made_say_why(changes, error, words):
-    with pytest.raises(error, match=words):
-        fit(**changes)
+    raises(error, words, fit, **changes)
 
 
 def test_a_delta_band_and_a_curved_law():

@@ -1,5 +1,6 @@
 """Samples of spectral parameters against each other, integrals on a grid, and known densities."""
 
+import builtins
 import inspect
 from functools import cache
 
@@ -17,6 +18,7 @@ from fits.profile_likelihood import spectral_likelihood
 from fits.results import Convergence, FitError
 from fits.sampling import agreement, sample
 from fits.unbounded import unbounded_posterior
+from refusals import cases, raises
 from test_separation import BANDS, START, problem, random_sky
 from test_separation_solvers import constant, regions
 
@@ -253,27 +255,17 @@ def test_short_chains_are_reported():
         draw(strong(), "emcee", nsteps=100)
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "words"),
-    [
-        ({"sampler": "gibbs"}, ValueError, "`sampler` must be 'emcee' or 'nuts', not 'gibbs'"),
-        (
-            {"priors": {"dust.T_dust": Uniform(30.0, 40.0)}},
-            ValueError,
-            "Start value 21 of 'dust.T_dust' is not inside",
-        ),
-        ({"priors": {"gain.23": Gaussian(1, 1)}}, KeyError, "'gain.23', which is not free"),
-        ({"start": {"dust.T": 1.0}}, KeyError, "Unknown parameter 'dust.T'"),
-        ({"sampler": "emcee", "nwalkers": 5}, ValueError, "at least 6 walkers .*nwalkers=5"),
-        ({"sampler": "emcee", "nchains": 3}, ValueError, "`nchains` is not one of .* 'emcee'"),
-        ({"nwalkers": 32}, ValueError, "`nwalkers` is not one of the sampler 'nuts'"),
-        ({"nsteps": 3}, ValueError, "at least 4 steps and a chain, not nsteps=3"),
-        ({"nchains": 0}, ValueError, "at least 4 steps and a chain, .*nchains=0"),
-    ],
-)
+@pytest.mark.parametrize(("options", "error", "words"), cases("separation_sample/bad_input"))
 def test_bad_input_is_refused(options, error, words):
-    with pytest.raises(error, match=words):
-        sample(strong(), **({"sampler": "nuts"} | options))
+    raises(getattr(builtins, error), words, sample, strong(), **({"sampler": "nuts"} | options))
+
+
+def test_priors_of_other_parameters_or_without_the_start_are_refused():
+    for priors, error, words in (
+        ({"dust.T_dust": Uniform(30.0, 40.0)}, ValueError, "Start value 21 of 'dust.T_dust' is"),
+        ({"gain.23": Gaussian(1, 1)}, KeyError, "'gain.23', which is not free"),
+    ):
+        raises(error, words, sample, strong(), sampler="nuts", priors=priors)
 
 
 def test_every_argument_is_described():

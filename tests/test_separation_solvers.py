@@ -47,7 +47,7 @@ def deviation(fit, reference) -> float:
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize(
     ("make", "start", "priors"),
-    [(constant, FAR, {}), (regions, None, BOTH)],
+    [(constant, FAR, {}), pytest.param(regions, None, BOTH, marks=pytest.mark.slow)],
     ids=["far", "regions"],
 )
 def test_every_solver_finds_the_same_optimum(make, start, priors, solver):

@@ -1,8 +1,14 @@
-"""Experiment files: values of their types, within bounds, and names that results can bear."""
+"""Experiment files: values of their types, within bounds, and names that results can bear.
+
+Whatever is wrong is refused with one sentence that names the file and the key.
+"""
 
 import pytest
 
-from jaxsky.settings import SettingsError, load
+from jaxsky.io import InputError
+from jaxsky.settings import SettingsError, at_key, load, of_file
+from refusals import cases, raises, refused
+from settings_fuzz import KINDS, changed, changed_at, fault, faults, small, written
 
 #: The least that a file has to say of a band and of a component.
 BAND = '[[bands]]\nname = "{band}"\n'
@@ -15,139 +21,105 @@ FILES = {
     "observed": MAP + TEMPLATE,
     "separated": MAP + SKY + '[free."x.beta_dust"]\nstart = 1.5\n',
 }
-NSIDES = ["common.nside", "simulate.nside", "sky.embedded.nside", "compare.panel_nside"]
-BEAMS = ["common.fwhm", "simulate.fwhm", "paper.fwhm"]
-SEEDS = ["seed", "sky.embedded.seed", "simulate.small_scales_seed"]
 TABLES = ["simulate", "fit", "compare", "separate", "forecast", "paper", "common", "cmb"]
+KEYS = {
+    "nside": ["common.nside", "simulate.nside", "sky.embedded.nside", "compare.panel_nside"],
+    "fwhm": ["common.fwhm", "simulate.fwhm", "paper.fwhm"],
+    "seed": ["seed", "sky.embedded.seed", "simulate.small_scales_seed"],
+    "unknown": ["nonsense", *(f"{table}.nonsense" for table in TABLES)],
+}
+BASES = cases("settings/bases")
+#: A band of an instrument's file.
+OWN = {"name": "a", "bandpass": {"center": 44.0}, "fwhm": 27.0, "noise": {"level": 240.0}}
 
 
-def read(folder, text, main="", band="30", component="dust"):
+def check_refused(path, *words):
+    """Settings are refused with a sentence that begins with the file and has these words."""
+    with refused(".", SettingsError, path) as caught:
+        load(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    for word in words:
+        assert word in str(caught.value)
+
+
+def settings_in(folder, text, band="30", component="dust"):
     path = folder / "settings.toml"
-    path.write_text(f"{main}\n" + text.format(band=band, component=component))
-    return load(path)
-
-
-def refused(folder, words, text="", **arguments):
-    with pytest.raises(SettingsError) as mistake:
-        read(folder, text, **arguments)
-    sentence = str(mistake.value)
-    assert sentence.startswith(f"{folder / 'settings.toml'}: ")
-    assert words in sentence
-    assert "\n" not in sentence
+    path.write_text(text.format(band=band, component=component))
+    return path
 
 
 @pytest.mark.parametrize("text", FILES.values(), ids=FILES)
 def test_files_that_are_right(tmp_path, text):
     for band in ("30", "Ka", "100-1a", "44.1", "L1+040_x", "b" * 40):
-        assert read(tmp_path, text, band=band).bands[0].name == band
+        assert load(settings_in(tmp_path, text, band)).bands[0].name == band
     for component in ("dust", "Dust_1", "2nd-dust", "d" * 40):
-        assert component in read(tmp_path, text, component=component).sky.components
+        assert component in load(settings_in(tmp_path, text, component=component)).sky.components
+
+
+@pytest.mark.parametrize("command", BASES)
+def test_settings_that_are_right(tmp_path, command):
+    load(written(tmp_path / "settings.toml", BASES[command]))
+    for key, value in (("seed", 2**32 - 1), ("common/fwhm", 60)):
+        load(written(tmp_path / "settings.toml", changed_at(BASES[command], key, value)))
 
 
 @pytest.mark.parametrize(
-    ("keys", "value", "words"),
-    [
-        (NSIDES, "true", "input should be a valid integer, not True."),
-        (NSIDES, '"16"', "input should be a valid integer, not '16'."),
-        (NSIDES, "16.0", "input should be a valid integer, not 16.0."),
-        (NSIDES, "12", "nside must be a power of two, not 12."),
-        (NSIDES, "0", "input should be greater than 0, not 0."),
-        (NSIDES, "-8", "input should be greater than 0, not -8."),
-        (NSIDES, "16384", "input should be less than or equal to 8192, not 16384."),
-        (NSIDES, f"{2**40}", "input should be less than or equal to 8192, not 10995116"),
-        (NSIDES, "[16]", "input should be a valid integer, not [16]."),
-        (BEAMS, '"60"', "input should be a valid number"),
-        (BEAMS, "true", "input should be a valid number"),
-        (BEAMS, "nan", "input should be a finite number"),
-        (SEEDS, "true", "input should be a valid integer, not True."),
-        (SEEDS, '"1"', "input should be a valid integer, not '1'."),
-        (SEEDS, "1.0", "input should be a valid integer, not 1.0."),
-        (SEEDS, "-1", "input should be greater than or equal to 0, not -1."),
-        (SEEDS, f"{2**32}", "input should be less than 4294967296, not 4294967296."),
-        (SEEDS, f"{2**53}", "input should be less than 4294967296, not 9007199254740992."),
-        (["nonsense", *(f"{table}.nonsense" for table in TABLES)], "1", "unknown key."),
-    ],
+    ("command", "row"), [(name, row) for name in BASES for row in cases(f"settings/{name}")]
 )
-def test_numbers_of_other_types_or_out_of_bounds(tmp_path, keys, value, words):
-    for key in keys:
-        refused(tmp_path, f"{key}: {words}", FILES["observed"], main=f"{key} = {value}")
+def test_values_that_are_refused(tmp_path, command, row):
+    key, value, *words = row
+    path = written(tmp_path / "settings.toml", changed_at(BASES[command], key, value))
+    check_refused(path, *words)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("simulate.include = []", "simulate.include: list should have at least 1 item"),
-        ('simulate.include = [""]', "simulate.include.0: string should have at least 1"),
-        ('simulate.include = ["cmb", "cmb"]', "simulate.include: has 'cmb' twice."),
-        ('simulate.sheet = "no"', "simulate.sheet: input should be a valid boolean, not 'no'."),
-        ('bands = [{ instrument = "" }]', "bands.0.instrument: must not be empty."),
-        ('fit.regions = ["full", "full"]', "fit.regions: has 'full' twice."),
-        ('fit.stokes = ["Q", "Q"]', "fit.stokes: has 'Q' twice."),
-        ('fit.methods = ["grid", "grid"]', "fit.methods: has 'grid' twice."),
-        ("fit.methods = []", "fit.methods: list should have at least 1 item"),
-        ("regions.strip = 20", "regions.strip: input should be a valid string or a valid table, "),
-        ("common.mask = 1", "common.mask: input should be a valid table, not 1."),
-        ('common.mask = { file = "" }', "common.mask.file: "),
-        ('free."dust.beta_dust" = { start = 1.5, uniform = [1, true] }',
-         "free.dust.beta_dust.uniform.1: input should be a valid number, not True."),
-        ('free."dust.beta_dust" = { start = 1.5, uniform = [1, 2, 3] }',
-         "free.dust.beta_dust.uniform: tuple should have at most 2 items"),
-        ('fixed."dust.beta_dust" = "1.5"',
-         "fixed.dust.beta_dust: input should be a valid number, not '1.5'."),
-        ("separate.nsims = true", "separate.nsims: input should be a valid integer, not True."),
-        ("separate.nsteps = 200.0", "separate.nsteps: input should be a valid integer"),
-        ("separate.purify = 0", "separate.purify: input should be a valid boolean"),
-        ('forecast.spectra = ["BB", "BB"]', "forecast.spectra: has 'BB' twice."),
-        ("forecast.spectra = []", "forecast.spectra: list should have at least 1 item"),
-        ("forecast.fisher_lmax = 300.0",
-         "forecast.fisher_lmax: input should be a valid integer, not 300.0."),
-        ("cmb.r = false", "cmb.r: input should be a valid number, not False."),
-        ("forecast.show_r = [0.1, 0.1]", "forecast.show_r: has 0.1 twice."),
-        ("forecast.fit = [20, true]", "forecast.fit.1: input should be a valid integer"),
-        ("paper.center = [180, true]", "paper.center.1: input should be a valid number"),
-        ("compare.regions = 'm.fits'", "compare.regions: input should be a valid list, not"),
-    ],
-)  # fmt: skip
-def test_lists_and_switches(tmp_path, text, words):
-    refused(tmp_path, words, main=text)
+@pytest.mark.parametrize(("kind", "value", "words"), cases("settings/numbers"))
+def test_numbers_of_other_types_or_out_of_bounds(tmp_path, kind, value, words):
+    for key in KEYS[kind]:
+        raw = changed_at(BASES["fit"], key.replace(".", "/"), value)
+        check_refused(written(tmp_path / "settings.toml", raw), f"{key}: {words}")
+
+
+@pytest.mark.parametrize("row", cases("settings/instruments"))
+def test_instruments_of_ones_own(tmp_path, row):
+    changes, *words = row
+    path = written(tmp_path / "settings.toml", {"bands": [{"instrument": "own.toml"}]})
+    written(tmp_path / "own.toml", {"bands": [OWN]})
+    load(path)
+    bands = [{k: v for k, v in (OWN | change).items() if v is not None} for change in changes]
+    written(tmp_path / "own.toml", {"bands": bands})
+    check_refused(path, "bands.0.instrument", "own.toml", *words)
 
 
 @pytest.mark.parametrize("text", FILES.values(), ids=FILES)
 @pytest.mark.parametrize("name", ["", " ", "a b", "a/b", "..", ".a", "-a", "\u03b2", "a:b", "a$b$"])
 def test_names_that_files_or_columns_cannot_bear(tmp_path, text, name):
     letters = "a name consists of letters, digits and _ + -"
-    refused(tmp_path, f"bands.0.name: {letters} ., and", text, band=name)
-    refused(tmp_path, f"sky.{name}: {letters}, and", text, component=name)
-    refused(tmp_path, f"regions.{name}: {letters}, and", main=f'regions."{name}" = "full"')
+    check_refused(settings_in(tmp_path, text, name), f"bands.0.name: {letters} ., and")
+    check_refused(settings_in(tmp_path, text, component=name), f"sky.{name}: {letters}, and")
+    path = settings_in(tmp_path, f'regions."{name}" = "full"')
+    check_refused(path, f"regions.{name}: {letters}, and")
 
 
 @pytest.mark.parametrize("text", FILES.values(), ids=FILES)
 def test_names_that_are_long_dotted_or_taken(tmp_path, text):
     long = "a" * 80
     words = "bands.0.name: a name has at most 40 characters, not 80"
-    refused(tmp_path, words, text, band=long)
-    refused(tmp_path, f"sky.{long}: a name has at most 40", text, component=long)
-    refused(tmp_path, "sky.a.b: a name consists of", text, component="a.b")
+    check_refused(settings_in(tmp_path, text, long), words)
+    words = f"sky.{long}: a name has at most 40"
+    check_refused(settings_in(tmp_path, text, component=long), words)
+    check_refused(settings_in(tmp_path, text, component="a.b"), "sky.a.b: a name consists of")
     taken = ["noise", "Total", "residual", "r", "A_lens", "offset", "center"]
     for name in (*taken, "gain", "shift", "width", "angle", "cmb", "CMB"):
         words = f"sky.{name}: the name {name!r} has a meaning of its own in results"
-        refused(tmp_path, words, text, component=name)
+        check_refused(settings_in(tmp_path, text, component=name), words)
 
 
 def test_names_that_are_alike(tmp_path):
-    second = MAP.replace("{band}", "{{}}") + MAP
     for name, words in [("30a", "must differ, but"), ("30A", "must differ by more than capitals")]:
-        text = second.replace("{{}}", name)
-        refused(tmp_path, f"names of the bands {words}", text, band="30a")
-    second = '[sky.Dust]\nlaw = "dust"\n'
-    words = "names of the components must differ by more than"
-    refused(tmp_path, words, second + TEMPLATE)
-
-
-def test_the_cmb_is_described_in_its_table(tmp_path):
-    refused(tmp_path, "sky.other.law: the CMB is described in", main='sky.other.law = "cmb"')
-    words = "sky.cmb: the name 'cmb' has a meaning of its own"
-    refused(tmp_path, words, main='sky.cmb.law = "dust"')
+        path = settings_in(tmp_path, MAP.replace("{band}", name) + MAP, "30a")
+        check_refused(path, f"names of the bands {words}")
+    path = settings_in(tmp_path, '[sky.Dust]\nlaw = "dust"\n' + TEMPLATE)
+    check_refused(path, "names of the components must differ by more than")
 
 
 def test_set_replaces_a_key_and_nothing_else(tmp_path):
@@ -187,33 +159,64 @@ def test_set_replaces_a_key_and_nothing_else(tmp_path):
         load(path, ["bands=[]", "bands.0.fwhm=3"])
 
 
-@pytest.mark.parametrize(
-    ("assignment", "words"),
-    [
-        (
-            "fixed = { 'dust.nu_ref' = 545.0 }",
-            "fixed.dust.nu_ref: belongs next to law",
-        ),
-        ("sky.dust.parameters = { nu_ref = 545.0 }", "sky.dust: nu_ref belongs next to law"),
-        ("sky.dust.noise = { level = 3.0 }", "sky.dust: fwhm, angles and noise are of a map"),
-        (
-            "sky.dust.small_scales = { EE = [9, 3], BB = [3, 9] }",
-            "sky.dust.small_scales.EE: must increase, but is 9, 3",
-        ),
-        ("common.nside", "--set common.nside: must be KEY=VALUE"),
-        ("=3", "--set =3: must be KEY=VALUE"),
-        ("common.nside=33", "common.nside: nside must be a power of two, not 33 (given with --set"),
-        (
-            "fit.regions=[3]",
-            "fit.regions.0: input should be a valid string, not 3 (given with --set",
-        ),
-        ("common=3", "common: input should be a valid table"),
-        ("cmb.cosmology = { r = 0.1 }", "cmb.cosmology: 'r' is no parameter of the cosmology"),
-    ],
-)
+@pytest.mark.parametrize(("assignment", "words"), cases("settings/assignments"))
 def test_keys_without_a_meaning_are_refused(tmp_path, assignment, words):
-    path = tmp_path / "x.toml"
-    path.write_text("[sky]\nembedded = { nside = 16 }\n")
+    path = written(tmp_path / "x.toml", {"sky": {"embedded": {"nside": 16}}})
     with pytest.raises(SettingsError) as mistake:
         load(path, [assignment])
     assert words in str(mistake.value)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("every", "build"), [(2, False), pytest.param(11, True, marks=pytest.mark.slow)]
+)
+def test_any_value_at_any_key_works_or_is_refused(tmp_path, kind, every, build):
+    assert faults(kind, tmp_path / "settings.toml", every, build) == []
+
+
+@pytest.mark.parametrize(("kind", "at", "value"), cases("settings/built"))
+def test_settings_that_cannot_work_are_refused(tmp_path, kind, at, value):
+    path = tmp_path / "settings.toml"
+    raw = changed(small(kind), tuple(at), value)
+    assert fault(kind, raw, tuple(at), path) is None
+    key = ".".join(map(str, at[:2]))
+    with pytest.raises(SettingsError, match=rf"^{path}: {key}"), of_file(path):
+        KINDS[kind].build(load(path))
+
+
+def test_what_a_command_leaves_out_of_free_parameters_is_said(tmp_path):
+    free = {
+        "dust.beta_dust": {"uniform": [0.5, 2.5], "regions": {"nside": 2}},
+        "offset.44.Q": {"gaussian": [1.0, 0.1]},
+        "dust.T_dust": {},
+    }
+    settings = load(written(tmp_path / "settings.toml", {"free": free}))
+    said = {name: settings.left_out(name) for name in ("fit", "separate", "forecast")}
+    assert [len(sentences) for sentences in said.values()] == [1, 1, 3]
+    assert "jaxsky fit does not have regions of parameters: dust.beta_dust." in said["fit"][0]
+    assert "jaxsky separate does not have them: offset.44.Q." in said["separate"][0]
+    assert "jaxsky forecast does not have uniform ones: dust.beta_dust." in said["forecast"][2]
+    raises(SettingsError, r"^free\.dust\.T_dust: start is missing\.$", settings.start, "fit")
+
+
+def test_a_key_is_named_once():
+    for error in (SettingsError("a.b: x"), InputError("file: x")):
+        with pytest.raises(type(error), match=f"^{error}$"), at_key("a"):
+            raise error
+    for error in (ValueError("x"), KeyError("x"), TypeError("x"), ZeroDivisionError("x")):
+        with pytest.raises(SettingsError, match=r"^a\.b: x\.$"), at_key("a.b"):
+            raise error
+
+
+def test_what_is_no_toml_is_refused(tmp_path):
+    path = tmp_path / "settings.toml"
+    for content, words in (
+        (b"this is not TOML", "TOML"),
+        (b"title = 'a'\ntitle = 'b'\n", "TOML"),
+        (b"\xff\xfe\x00", "TOML"),
+        (b"a = " + 10000 * b"[" + 10000 * b"]", "nested"),
+        (b"a = " + 3000 * b"{a=" + b"1" + 3000 * b"}", ""),
+    ):
+        path.write_bytes(content)
+        check_refused(path, words)

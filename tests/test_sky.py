@@ -17,6 +17,7 @@ from jaxsky import (
     parameter_names,
     set_parameters,
 )
+from refusals import raises
 
 
 def test_one_band_is_a_row_of_a_list():
@@ -79,8 +80,7 @@ def test_unknown_names_are_answered_with_the_known_ones():
         lambda: set_parameters(sky, {"dust.beta": 1.5}),
         lambda: set_parameters(sky, {"dust.beta.offset": 1.5}),
     ):
-        with pytest.raises(KeyError, match=r"Unknown parameter 'dust\.beta.*dust\.beta_dust, dust"):
-            call()
+        raises(KeyError, r"Unknown parameter 'dust\.beta.*dust\.beta_dust, dust", call)
 
 
 @pytest.mark.parametrize(
@@ -104,8 +104,7 @@ def test_unknown_names_are_answered_with_the_known_ones():
     ],
 )  # fmt: skip
 def test_bad_arguments_are_refused(call, error, words):
-    with pytest.raises(error, match=words):
-        call(systems.dust_and_synchrotron())
+    raises(error, words, call, systems.dust_and_synchrotron())
 
 
 def test_importing_jaxsky_touches_neither_healpy_nor_precision():

@@ -1,4 +1,7 @@
-"""The spectral-index test: common resolution, honest errors over simulated skies."""
+"""The spectral-index fit: common resolution, honest errors over simulated skies, the real sky."""
+
+import json
+from pathlib import Path
 
 import healpy
 import jax
@@ -6,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from commands import jaxsky
 from fits.commands.run import DEFAULTS
 from fits.common import Fluctuations, common_maps
 from fits.inputs import Band, Inputs, inputs_of, prepare_component
@@ -25,6 +29,7 @@ from jaxsky.harmonics import (
 from jaxsky.inputs import Template
 from jaxsky.noise import draw, fit_knee, knee_spectrum, uniform_covariance
 from jaxsky.settings import SettingsError, load
+from refusals import cases, raises
 
 QUICK = ["common.nside=16", "common.fwhm=300.0", "seed=3", "sky.embedded.nside=32"]
 
@@ -144,11 +149,9 @@ def one_band_inputs(nside=16, fwhm=0.0, used=None, template_fwhm=0.0) -> Inputs:
 
 def test_a_target_finer_than_a_map_names_both():
     words = r"target beam of 30 arcmin is finer than that of band '353', 60 arcmin"
-    with pytest.raises(ValueError, match=words):
-        common_maps(one_band_inputs(fwhm=60.0), 8, 30.0)
+    raises(ValueError, words, common_maps, one_band_inputs(fwhm=60.0), 8, 30.0)
     words = r"target beam of 30 arcmin is finer than that of template 'dust', 40 arcmin"
-    with pytest.raises(ValueError, match=words):
-        common_maps(one_band_inputs(template_fwhm=40.0), 8, 30.0)
+    raises(ValueError, words, common_maps, one_band_inputs(template_fwhm=40.0), 8, 30.0)
     with pytest.raises(ValueError, match=r"nside 32 is larger than that of template 'dust', 16"):
         common_maps(one_band_inputs(), 32, 0.0)
 
@@ -221,6 +224,7 @@ def quick_settings():
     return load(DEFAULTS / "fit.toml", QUICK)
 
 
+@pytest.mark.slow
 def test_embedded_run_recovers_the_truth(quick_settings, tmp_path):
     inputs = inputs_of(quick_settings)
     free = {"dust.beta_dust": 1.53, "synchrotron.beta_syn": 3.1}
@@ -245,14 +249,7 @@ def test_embedded_run_recovers_the_truth(quick_settings, tmp_path):
                 assert r.sigma[name] == pytest.approx(sigma, rel=0.05)
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("Strip", "regions must differ by more than capitals"),
-        ("m" * 41, "at most 40 characters"),
-        ("../m", "begins with a letter or digit"),
-    ],
-)
+@pytest.mark.parametrize(("name", "words"), cases("spectral_index/names_of_regions"))
 def test_regions_with_names_that_results_cannot_bear(name, words):
     with pytest.raises(SettingsError, match=rf"fit.toml: .*{words}"):
         load(DEFAULTS / "fit.toml", [f"regions.{name!r} = {{ file = 'mask.fits' }}"])
@@ -263,3 +260,39 @@ def test_regions(quick_settings):
     np.testing.assert_array_equal(masks["strip"] ^ masks["outside"], masks["full"])
     # |b| <= 20 deg covers sin(20 deg) of the sphere.
     assert masks["strip"].mean() == pytest.approx(np.sin(np.radians(20)), abs=0.03)
+
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "wmap7_vw.toml"
+
+
+@pytest.fixture
+def wmap(data_dir, monkeypatch):
+    monkeypatch.setenv("JAXSKY_DATA", str(data_dir))
+    return load(EXAMPLE)
+
+
+@pytest.mark.slow
+def test_wmap_from_the_command_line(wmap, tmp_path, monkeypatch):
+    assert jaxsky(monkeypatch, "fit", EXAMPLE, "--out", tmp_path) == 0
+    results = json.loads((tmp_path / "result.json").read_text())["results"]
+    assert set(results) == {"strip", "full"}
+    for region in results.values():
+        assert set(region) == {"Q", "U", "QU"}
+        for methods in region.values():
+            gradient, grid = methods["gradient"]["best_fit"], methods["grid"]["best_fit"]
+            assert gradient == pytest.approx(grid, abs=0.02)
+        # The indices of the real sky, which the templates' makers find to be 1.5 and 3.0.
+        best = region["QU"]["gradient"]["best_fit"]
+        assert 1.2 < best["dust.beta_dust"] < 1.8
+        assert 2.7 < best["synchrotron.beta_syn"] < 3.9
+    for picture in ("grid.png", "marginals.png", "posterior.png"):
+        assert (tmp_path / picture).stat().st_size > 10_000
+
+
+def test_published_noise_is_recovered_from_the_maps(wmap):
+    """About 5.5 uK_CMB a pixel in V and 8.6 in W at high latitude, large scales included."""
+    inputs = inputs_of(wmap)
+    sigma = common_maps(inputs, 32, 0.0).sigma[:, :, 0]
+    for (name, expected), row in zip({"V": 5.5, "W": 8.6}.items(), sigma, strict=True):
+        factor = float(inputs.bands[name].bandpass.conversion("uK_CMB", "uK_RJ"))
+        assert float(row[0]) / factor == pytest.approx(expected, rel=0.06)

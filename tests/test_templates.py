@@ -11,15 +11,9 @@ from fits import superpixels
 from jaxsky import AME, Dust
 from jaxsky.harmonics import analysis, beam_ratio, gaussian_beam, power_spectrum
 from jaxsky.io import read_maps
-from jaxsky.templates import (
-    HIGH,
-    LOW,
-    correlation,
-    dust_index,
-    polarization_template,
-    steepening,
-)
+from jaxsky.templates import HIGH, LOW, correlation, dust_index, polarization_template, steepening
 from mapfiles import table, write
+from refusals import raises
 
 
 def coefficients(lmax, fwhm=0.0, rows=3, seed=0):
@@ -318,8 +312,7 @@ MAPS, INDEX, T = np.ones((2, 192)), np.ones(192), NU**-3.0
 @pytest.mark.parametrize("shape", [(192,), (1, 192), (4, 192), (2, 100), (2, 108), (2, 12), ()])
 def test_refused_shapes_of_maps(shape):
     message = r"`maps` must have shape \(2 or 3, pix\) with 12 nside\^2 pixels, nside 2, 4, 8"
-    with pytest.raises(ValueError, match=message):
-        polarization_template(np.ones(shape), 1.0, 2.0, 8)
+    raises(ValueError, message, polarization_template, np.ones(shape), 1.0, 2.0, 8)
 
 
 def test_holes_wider_than_the_beam_are_refused():
@@ -328,8 +321,7 @@ def test_holes_wider_than_the_beam_are_refused():
     with pytest.raises(ValueError, match=r"leaves \d+ of 768 pixels .* beam of 600 arcmin"):
         dust_index(beta, 0.0, 600.0, 8, mask)
     # The count: pixels further than a FWHM (here 10 degrees) inside the edge.
-    with pytest.raises(ValueError, match="leaves 768 of 768"):
-        dust_index(beta, 0.0, 600.0, 8, np.zeros_like(mask))
+    raises(ValueError, "leaves 768 of 768", dust_index, beta, 0.0, 600.0, 8, np.zeros_like(mask))
     assert np.isfinite(dust_index(beta, 0.0, 3000.0, 8, mask)).all()
 
 
@@ -350,8 +342,7 @@ def test_holes_wider_than_the_beam_are_refused():
     ],
 )
 def test_refused_spectra(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        steepening(*arguments)
+    raises(ValueError, message, steepening, *arguments)
 
 
 HOLES = MAPS.copy()
@@ -386,5 +377,4 @@ NO_POWER = "`nside` must be a power of 2, but is 12"
     ],
 )  # fmt: skip
 def test_refusals(call, words):
-    with pytest.raises(ValueError, match=words):
-        call()
+    raises(ValueError, words, call)

@@ -9,6 +9,7 @@ from fits.pseudo_cl import masked_spectra
 from fits.tensor_ratio import PowerModel, fit_tensors, power_model
 from jaxsky.cmb import camb_spectra, tensor_spectra
 from jaxsky.harmonics import gaussian_beam
+from refusals import cases, raises
 
 NSIDE, LMAX = 16, 32
 ELL = np.arange(LMAX + 1)
@@ -110,24 +111,12 @@ def test_simulations_set_the_errors():
     np.testing.assert_allclose(found, draws.std(axis=0, ddof=1), rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"lensed": np.ones((4, 10))}, r"`lensed` must have shape \(4, ell\) up to l = 32"),
-        ({"tensors": np.ones(40)}, r"`tensors` must have shape .* has shape \(40,\)"),
-        ({"noise": np.ones(20)}, r"`noise` must reach l = 32, but has shape \(20,\)"),
-        ({"window": np.ones((2, 40))}, r"`window` must reach l = 32"),
-        ({"additive": np.ones(3)}, r"`additive` must have a value for each of 18 bins"),
-        ({"simulated": np.ones((1, 18))}, r"`simulated` must have shape \(sim, 18\) with two"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "words"), cases("tensor_ratio/bad_input"))
 def test_bad_input_is_refused(changes, words):
-    with pytest.raises(ValueError, match=words):
-        model(**changes)
+    raises(ValueError, words, model, **changes)
 
 
 def test_powers_that_are_none_are_refused():
     with pytest.raises(ValueError, match=r"`powers` must be 18 finite numbers, .* shape \(2,\)"):
         fit_tensors(model(), np.ones(2))
-    with pytest.raises(ValueError, match="18 that are not finite"):
-        fit_tensors(model(), np.full(18, np.nan))
+    raises(ValueError, "18 that are not finite", fit_tensors, model(), np.full(18, np.nan))

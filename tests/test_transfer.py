@@ -24,22 +24,13 @@ from misbehaving import (
     REISSUED,
     SHA,
     Handler,
+    body,
     fetch_command,
     product,
-    serving,
 )
+from refusals import cases, raises
 
-
-@pytest.fixture(scope="module")
-def server():
-    with serving() as address:
-        yield address
-
-
-@pytest.fixture(autouse=True)
-def log():
-    Handler.log.clear()
-    return Handler.log
+pytestmark = pytest.mark.usefixtures("log")
 
 
 def refused(wanted, folder, **options):
@@ -60,39 +51,10 @@ def test_right_files(server, tmp_path, kind):
     assert left == {NAME, "checksums.json", ".checksums.json.lock"}
 
 
-@pytest.mark.parametrize(
-    ("kind", "words", "changes"),
-    [
-        ("empty", "sent another file (map.fits: is empty)", {}),
-        ("page", "(map.fits: is no FITS file, it begins with '<html>down</html>')", {}),
-        ("other", "nside is 8, but 4 is expected", {}),
-        ("unit", "column Q_STOKES is in mK_CMB, but K_CMB is expected", {}),
-        ("columns", "no column 'Q_STOKES'; it has I_STOKES", {}),
-        ("short table", "truncated", {}),
-        ("garbage", "sent another file (map.fits: ", {}),
-        ("announced short", "truncated", {}),
-        ("no length cut", "truncated", {}),
-        ("reissued", f"but should have {SHA}; if the archive has issued", {"hash": SHA}),
-        ("good", f"has {len(CONTENT)} bytes, but should have 7; if the archive", {"size": 7}),
-        ("no length", f"has {len(CONTENT)} bytes, but should have 7; if the", {"size": 7}),
-        ("gzip", "sends the file compressed (gzip), unasked", {}),
-        ("unasked", "answers 206", {}),
-        ("nothing", "answers 204", {}),
-        ("missing", "answers 404. Try again later, give another --mirror, or put", {}),
-        ("forbidden", "answers 403", {}),
-        ("broken", "answers 500", {}),
-        ("busy", "answers 429, and asks to wait 120 s", {}),
-        ("down", "answers 503, and asks to wait until Sun, 29 Nov 2026 00:00:00 GMT", {}),
-        ("circle", "sends on and on", {}),
-        ("to a file", "is, or sends on to, no http or https address", {}),
-        ("to brackets", "sends on to no address", {}),
-        ("to umlauts", "sends on to no address", {}),
-        ("two lengths", "cannot be reached", {}),
-        ("hang_up", "cannot be reached", {}),
-        ("gibberish", "cannot be reached", {}),
-    ],
-)
+@pytest.mark.parametrize(("kind", "words", "changes"), cases("transfer/wrong_answers"))
 def test_wrong_answers(server, tmp_path, kind, words, changes):
+    words = words.replace("SHA", SHA)
+    changes |= {"hash": SHA} if "hash" in changes else {}
     said = refused(product(f"{server}/{kind}/{NAME}", **changes), tmp_path)
     assert words in said
     assert said.startswith(f"{NAME}: {server}/{kind}/{NAME} ".replace(" /", "/"))
@@ -114,24 +76,7 @@ def test_transfers_that_end_early(server, tmp_path, monkeypatch, kind, size):
     assert (tmp_path / f"{NAME}.part").read_bytes() == CONTENT[:size]
 
 
-@pytest.mark.parametrize(
-    ("kind", "asked"),
-    [
-        ("cut", [None, CUT]),
-        ("dated", [None, CUT]),
-        ("capped", [None, *range(CUT, len(CONTENT), CUT)]),
-        # What is no rest of the same file is fetched anew.
-        ("whole", [None, CUT, None]),
-        ("offset", [None, CUT, None]),
-        ("total", [None, CUT, None]),
-        ("no range", [None, CUT, None]),
-        ("untagged", [None, CUT, None]),
-        ("new", [None, CUT, None]),
-        ("new, whole", [None, CUT, None]),
-        ("beyond", [None, CUT, None]),
-        ("no versions", [None, None]),
-    ],
-)
+@pytest.mark.parametrize(("kind", "asked"), cases("transfer/resumed"))
 def test_files_are_resumed_only_with_the_same_version(server, tmp_path, log, kind, asked):
     wanted = product(f"{server}/{kind}/{NAME}")
     assert "ended early" in refused(wanted, tmp_path)
@@ -167,27 +112,11 @@ def test_the_address_that_began_goes_on(server, tmp_path, log):
     assert log[-1] == ("good", None)
 
 
-@pytest.mark.parametrize(
-    ("part", "state"),
-    [
-        (CONTENT[:500], None),
-        (CONTENT[:500], "{"),
-        (CONTENT[:500], "[1]"),
-        (CONTENT[:500], '{"address": 1}'),
-        (CONTENT, None),
-        (2 * CONTENT, {"total": len(CONTENT)}),
-        (b"", {"total": len(CONTENT)}),
-        (REISSUED[:500], {"version": '"0"'}),
-        (REISSUED[:500], {"total": 17}),
-        (REISSUED[:500], {"address": "http://127.0.0.1:9/map.fits"}),
-        (CONTENT[:500], {}),
-        (CONTENT, {"total": len(CONTENT)}),
-    ],
-)
+@pytest.mark.parametrize(("part", "state"), cases("transfer/partial_files"))
 def test_partial_files_are_not_trusted(server, tmp_path, part, state):
     address = f"{server}/cut/{NAME}"
     Handler.log.append(("cut", None))  # only the first answer is cut
-    (tmp_path / f"{NAME}.part").write_bytes(part)
+    (tmp_path / f"{NAME}.part").write_bytes(body(part))
     if isinstance(state, dict):
         state = json.dumps({"address": address, "version": OLD, "total": None} | state)
     if state is not None:
@@ -199,14 +128,7 @@ def test_partial_files_are_not_trusted(server, tmp_path, part, state):
 def test_https_is_not_left():
     answer = requests.Response()
     answer.status_code, answer.url = 302, "https://archive.org/maps/a.fits"
-    for there, leaves in (
-        ("http://archive.org/a.fits", True),
-        ("//elsewhere.org/a.fits", False),
-        ("https://elsewhere.org/a.fits", False),
-        ("../a.fits", False),
-        ("ftp://archive.org/a.fits", True),
-        ("file:///etc/passwd", True),
-    ):
+    for there, leaves in cases("transfer/redirections"):
         answer.headers["Location"] = there
         if leaves:
             with pytest.raises(archive.RefusedError, match=r"sends on to .*, which is not https"):
@@ -230,18 +152,10 @@ def test_mirrors_end_as_they_like(server, tmp_path, log):
     assert [kind for kind, _ in log] == 3 * ["good"]
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"17 bytes of words", "map.fits: is no FITS file, it begins with '17 bytes of words'."),
-        (b"", "map.fits: is empty."),
-        (CONTENT[:-2880], "truncated"),
-        (CONTENT[:3000], "truncated"),
-        (None, "map.fits: is no file, or a link to none."),
-    ],
-)
+@pytest.mark.parametrize(("content", "words"), cases("transfer/what_is_there"))
 def test_what_is_there_is_checked_and_left(server, tmp_path, log, content, words):
     path = tmp_path / NAME
+    content = content if content is None else body(content)
     path.mkdir() if content is None else path.write_bytes(content)
     with pytest.raises(InputError) as caught:
         fetch(product(f"{server}/good/{NAME}"), tmp_path)
@@ -254,8 +168,7 @@ def test_what_is_there_is_checked_and_left(server, tmp_path, log, content, words
 def test_sizes_of_what_is_there(server, tmp_path):
     path, wanted = tmp_path / NAME, product(f"{server}/good/{NAME}", size=7)
     path.write_bytes(CONTENT)
-    with pytest.raises(InputError, match=r"map.fits: has \d+ bytes, but should have 7\."):
-        fetch(wanted, tmp_path)
+    raises(InputError, r"map.fits: has \d+ bytes, but should have 7\.", fetch, wanted, tmp_path)
     path.unlink()
     # One that was accepted is not asked about again.
     assert fetch(wanted, tmp_path, accept=True) == fetch(wanted, tmp_path) == path
@@ -270,21 +183,7 @@ def test_accepted_files_still_have_the_structure(server, tmp_path):
     assert fetch(wanted, tmp_path, accept=True).read_bytes() == REISSUED
 
 
-SPECTRA = "# L TT TE EE BB PP\n" + "".join(f"{ell} 1 0 0.1 0 0\n" for ell in range(2, 9))
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (SPECTRA, None),
-        ("<html>\n<p>2 1 0 0.1 0 0</p>\n</html>\n", "is no table, it begins with '<html> <p>2 1"),
-        ("Please log in.\n", "no line has numbers"),
-        (SPECTRA[:-1], "ends in the middle of a line"),
-        (SPECTRA[:-8], "3 numbers, but 6 in the lines above"),
-        (SPECTRA[: SPECTRA.rindex("8 1")], "l = 7"),
-        ("", "is empty"),
-    ],
-)
+@pytest.mark.parametrize(("text", "words"), cases("transfer/texts"))
 def test_text_is_the_table_that_it_should_be(server, tmp_path, text, words):
     name = "spectra.txt"
     Handler.files[name] = text.encode()
@@ -333,8 +232,7 @@ def test_disks_are_called_full(server, tmp_path, monkeypatch, number, words):
     for module, name in ((Path, "mkdir"), (os, "replace"), (Path, "write_text")):
         with monkeypatch.context() as patch:
             patch.setattr(module, name, no_room(number))
-            with pytest.raises(DownloadError, match=words):
-                fetch(wanted, tmp_path)
+            raises(DownloadError, words, fetch, wanted, tmp_path)
         assert not (tmp_path / NAME).exists()
     assert fetch(wanted, tmp_path).read_bytes() == CONTENT
 

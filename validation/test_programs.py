@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from refusals import cases
+
 #: At most; a change may make them fewer.
 PROGRAMS = {"fit": 138, "compare": 149, "separate": 135, "simulate": 48, "forecast": 54}
 COUNTED = """
@@ -22,29 +24,11 @@ try:
 finally:
     print("programs:", len(programs))
 """
-SMALL = {
-    "common.nside": "16",
-    "common.fwhm": "300.0",
-    "sky.embedded.nside": "32",
-    "fit.methods": '["grid", "gradient"]',
-    "compare.nsims": "30",
-    "compare.lmax": "30",
-    "separate.nsims": "20",
-    "separate.lmax": "24",
-    "separate.width": "5",
-    "separate.sampler": '"none"',
-    "simulate.fwhm": "200.0",
-    "forecast.lmax": "60",
-    "forecast.width": "5",
-    "forecast.fit": "[20, 55]",
-    "bands": '[{ instrument = "planck" }]',
-    "forecast.bands": '["30", "353"]',
-}
 
 
 @pytest.mark.parametrize("command", PROGRAMS)
 def test_programs_do_not_become_more(command, tmp_path):
-    keys = [word for key, value in SMALL.items() for word in ("--set", f"{key}={value}")]
+    keys = [word for key, value in cases("programs/small") for word in ("--set", f"{key}={value}")]
     file = Path(__file__).parents[1] / f"fits/defaults/{command}.toml"
     text = file.read_text().replace('patches = "353"', "").replace('leakage = { "70" = 0.02 }', "")
     (tmp_path / "x.toml").write_text(text)

@@ -2,8 +2,6 @@
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxsky.bandpass import Bandpass
 from jaxsky.checks import Printed, shown
 from jaxsky.components import Component
+from jaxsky.public import packaged
 from jaxsky.small_scales import SmallScales
 
 #: Types of numbers by the name of their precision.
@@ -170,11 +169,6 @@ class Instrument(Printed, dict[str, ObservedBand]):
         return f"Instrument {self.title}", [("channel", *table[0]), *rows]
 
 
-@cache
-def _presets() -> dict[str, dict[str, Any]]:
-    return tomllib.loads((files("jaxsky") / "instruments.toml").read_text())
-
-
 def load_instrument(
     name: str,
     channels: Sequence[str] | None = None,
@@ -207,8 +201,9 @@ def load_instrument(
     >>> list(planck), f"{planck['353'].band.center:.1f}"
     (['353', '30'], '361.3')
     """
-    if name not in _presets():
-        raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(_presets())}.")
+    presets = packaged("instruments.toml")
+    if name not in presets:
+        raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(presets)}.")
     if isinstance(channels, str):
         raise TypeError(
             f"Argument `channels` must be a list of names, not the string {channels!r}."
@@ -219,7 +214,7 @@ def load_instrument(
         noise = table["noise"]
         level = noise["level"] * band.conversion(noise.get("unit", "uK_CMB"), "uK_RJ")
         found[table["name"]] = ObservedBand(band, jnp.asarray(table["fwhm"]), target, level)
-    return Instrument(_presets()[name]["title"], found)
+    return Instrument(presets[name]["title"], found)
 
 
 def band_tables(
@@ -229,7 +224,7 @@ def band_tables(
 
     Its name is that of a preset, or of a file with a list `bands`, relative to `folder`.
     """
-    presets, path = _presets(), folder / name
+    presets, path = packaged("instruments.toml"), folder / name
     if name in presets:
         bands = presets[name]["bands"]
     elif path.is_file():

@@ -3,12 +3,10 @@
 import json
 import os
 import re
-import tomllib
 from collections.abc import Sequence
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pooch
 from astropy.io import fits as pyfits
@@ -18,6 +16,7 @@ from jaxsky.io import InputError, read_spectra
 from jaxsky.io.files import UnfitError, locked
 from jaxsky.io.quantities import unit_name
 from jaxsky.io.tables import HealpixTable, open_fits, open_table
+from jaxsky.public import packaged
 
 
 class Product(NamedTuple):
@@ -50,26 +49,23 @@ class ProductSet(NamedTuple):
 
 
 @cache
-def _table() -> dict[str, Any]:
-    return tomllib.loads((files("jaxsky") / "products.toml").read_text())
-
-
-@cache
 def product_sets() -> dict[str, ProductSet]:
     """All sets by name."""
-    sets = _table()["sets"].items()
+    sets = packaged("products.toml")["sets"].items()
     return {name: ProductSet(entry["title"], tuple(entry["files"])) for name, entry in sets}
 
 
 @cache
 def catalogue() -> dict[str, Product]:
     """All products by the name of their file."""
-    found, sources = {}, _table()["sources"]
-    for group, common in _table()["groups"].items():
+    found, table = {}, packaged("products.toml")
+    for group, common in table["groups"].items():
         shared = {key: value for key, value in common.items() if key != "files"}
         for name, entry in common["files"].items():
             said = {"name": name, "group": group, "columns": ()} | shared | entry
-            said["addresses"] = tuple(sources[source] + name for source in said.pop("sources"))
+            said["addresses"] = tuple(
+                table["sources"][source] + name for source in said.pop("sources")
+            )
             found[name] = Product(**said | {"columns": tuple(said["columns"])})
     return found
 

@@ -11,8 +11,10 @@ import functools
 import importlib
 import inspect
 import sys
+import tomllib
 from collections.abc import Callable
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from importlib.resources import files
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -49,6 +51,12 @@ def exported(package: str) -> tuple[list[str], Callable[[str], Any], Callable[[]
         return value
 
     return sorted(places), get, lambda: sorted({*vars(module), *places})
+
+
+@functools.cache
+def packaged(name: str) -> dict[str, Any]:
+    """Read a table that comes with the package, once."""
+    return tomllib.loads((files("jaxsky") / name).read_text())
 
 
 def refuse_unit(name: str, value: object) -> None:

@@ -9,11 +9,9 @@ how the paper compares the two.
 """
 
 import math
-import tomllib
 from collections.abc import Callable
-from functools import cache, partial
-from importlib.resources import files
-from typing import Any, NamedTuple, TypeAlias
+from functools import partial
+from typing import NamedTuple, TypeAlias
 
 import healpy
 import jax
@@ -24,6 +22,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from jaxsky.checks import Numeric, as_array, check_finite, check_positive, check_shape, is_concrete
 from jaxsky.components import Component, component_class
 from jaxsky.harmonics import beam_ratio, resample, shortened
+from jaxsky.public import packaged
 
 #: First and last frequency of an interval [GHz].
 Interval: TypeAlias = tuple[ArrayLike, ArrayLike] | Float[Array, "2"]
@@ -204,11 +203,6 @@ def _jackknife(x: Array, y: Array, labels: Array, number: int) -> tuple[Array, A
     return coefficient(*full), error, least
 
 
-@cache
-def _presets() -> dict[str, dict[str, Any]]:
-    return tomllib.loads((files("jaxsky") / "presets.toml").read_text())
-
-
 def from_pysm_beta(beta: ArrayLike) -> Float[Array, "..."]:
     """beta_syn of this package, T ~ nu^-beta_syn, from PySM's T ~ nu^beta."""
     return -as_array("beta", beta)
@@ -235,7 +229,7 @@ def preset(name: str, amplitude: ArrayLike, **maps: ArrayLike) -> Component:
     >>> float(dust.nu_ref)
     353.0
     """
-    presets = _presets()
+    presets = packaged("presets.toml")
     if name not in presets:
         raise KeyError(f"Unknown preset {name!r}; known are {', '.join(presets)}.")
     constants = dict(presets[name])

@@ -18,6 +18,7 @@ from jaxsky.checks import (
     Numeric,
     Printed,
     as_array,
+    check_choice,
     check_finite,
     check_positive,
     is_concrete,
@@ -73,9 +74,7 @@ class Bandpass(Printed, eqx.Module):
     def __init__(self, nu: ArrayLike, weights: ArrayLike, convention: str = "RJ") -> None:
         self.nu, self.weights = as_array("nu", nu), as_array("weights", weights)
         self.convention = convention
-        if convention not in CONVENTIONS:
-            known = ", ".join(CONVENTIONS)
-            raise ValueError(f"Argument `convention` must be one of {known}, not {convention!r}.")
+        check_choice("convention", convention, CONVENTIONS)
         if self.nu.ndim != 1 or self.nu.shape != self.weights.shape or not self.nu.size:
             raise ValueError(
                 "Arguments `nu` and `weights` must have one shape (sample,), "

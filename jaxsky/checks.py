@@ -95,6 +95,12 @@ def check_seed(name: str, value: object) -> None:
         raise ValueError(f"Argument `{name}` must be from 0 to 2^32 - 1, but is {value}.")
 
 
+def check_choice(name: str, value: object, known: Iterable[str]) -> None:
+    """Raise ValueError unless an argument is one of the words that are known."""
+    if value not in (words := tuple(known)):
+        raise ValueError(f"Argument `{name}` must be one of {', '.join(words)}, not {value!r}.")
+
+
 def check_double(what: str) -> None:
     """Raise RuntimeError if JAX is not in double precision, which `what` needs."""
     if not jax.config.read("jax_enable_x64"):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxsky.checks import check_choice
 from jaxsky.harmonics import expand
 from jaxsky.noise import cholesky, normal
 
@@ -138,8 +139,7 @@ def realisation(
 
     `spectra` are C_l of TT, EE, BB, TE in any unit squared; `stokes` is "QU" or "IQU".
     """
-    if stokes not in ("QU", "IQU"):
-        raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")
+    check_choice("stokes", stokes, ("QU", "IQU"))
     TT, EE, BB, TE = spectra
     zero = jnp.zeros_like(TT)
     rows = [TT, TE, zero], [TE, EE, zero], [zero, zero, BB]

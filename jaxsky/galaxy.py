@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsky.checks import Parameter, as_number, check_seed
+from jaxsky.checks import Parameter, as_number, check_choice, check_seed
 from jaxsky.components import Dust, Synchrotron
 from jaxsky.harmonics import degrees, resample, synthesis
 from jaxsky.sky import Sky
@@ -116,8 +116,7 @@ class EmbeddedSky(eqx.Module):
 
         `stokes` is "QU" or "IQU".
         """
-        if stokes not in ("QU", "IQU"):
-            raise ValueError(f"Argument `stokes` must be 'QU' or 'IQU', not {stokes!r}.")
+        check_choice("stokes", stokes, ("QU", "IQU"))
         rows = slice(3 - len(stokes), 3)
         return Sky(
             {

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsky.bandpass import Bandpass
-from jaxsky.checks import Printed, shown
+from jaxsky.checks import Printed, check_choice, shown
 from jaxsky.components import Component
 from jaxsky.public import packaged
 from jaxsky.small_scales import SmallScales
@@ -108,10 +108,8 @@ class Observation(eqx.Module):
             self.lmax = 2 * self.nside
         if not self.channels:
             raise ValueError("Argument `channels` must have at least one channel.")
-        for name, known in {"stokes": ("QU", "IQU"), "precision": tuple(DTYPES)}.items():
-            if (value := getattr(self, name)) not in known:
-                one, other = known
-                raise ValueError(f"Argument `{name}` must be {one!r} or {other!r}, not {value!r}.")
+        check_choice("stokes", self.stokes, ("QU", "IQU"))
+        check_choice("precision", self.precision, DTYPES)
 
     @property
     def dtype(self) -> type[np.floating]:

@@ -528,4 +528,4 @@ def test_refusals():
     with pytest.raises(ValueError, match="end at l = 10, but nside 8 needs 16"):
         simulate(KEY, {}, how, SPECTRA[:, :11])
     raises(ValueError, "at least one channel", Observation, {}, NSIDE)
-    raises(ValueError, "'QU' or 'IQU', not 'I'", Observation, how.channels, NSIDE, "I")
+    raises(ValueError, "one of QU, IQU, not 'I'", Observation, how.channels, NSIDE, "I")

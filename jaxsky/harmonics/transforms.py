@@ -28,7 +28,7 @@ from jaxbind import get_linear_call, jaxbind, load_kwargs
 from jaxbind.contrib.jaxducc0 import get_healpix_sht
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from jaxsky.checks import check_double
+from jaxsky.checks import check_choice, check_double
 
 
 def alm_ell(lmax: int) -> np.ndarray:
@@ -229,9 +229,7 @@ def rotate(alm: Float[Array, "stokes alm"], source: str, target: str) -> Float[A
     These are "G" Galactic, "E" ecliptic or "C" celestial (equatorial), both J2000.
     """
     for name, value in {"source": source, "target": target}.items():
-        if value not in COORDINATES:
-            known = ", ".join(COORDINATES)
-            raise ValueError(f"Argument `{name}` must be one of {known}, not {value!r}.")
+        check_choice(name, value, COORDINATES)
     check_double("A rotation")
     _finish_at_exit()
     angles = tuple(map(float, healpy.rotator.coordsys2euler_zyz((source, target))))

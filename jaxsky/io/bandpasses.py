@@ -11,6 +11,7 @@ from astropy.io import fits as pyfits
 from jaxtyping import Float
 
 from jaxsky.bandpass import CONVENTIONS, Bandpass
+from jaxsky.checks import check_choice
 from jaxsky.io.curves import TextTable, read_text
 from jaxsky.io.files import UnfitError, in_file, is_fits
 from jaxsky.io.tables import open_fits, select_hdu
@@ -279,9 +280,8 @@ def read_bandpass(
         If `convention` or `trim` is no valid value.
     """
     path = Path(path)
-    if convention is not None and convention not in CONVENTIONS:
-        known = ", ".join(CONVENTIONS)
-        raise ValueError(f"Argument `convention` must be one of {known}, not {convention!r}.")
+    if convention is not None:
+        check_choice("convention", convention, CONVENTIONS)
     if unit is not None and not isinstance(unit, str):
         raise TypeError(f"Argument `unit` must be the name of a unit, not {unit!r}.")
     if not 0 <= trim < 1:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxsky.checks import check_choice
 from jaxsky.io.files import UnfitError, in_file, is_fits
 from jaxsky.io.quantities import unit_factor, unit_name
 from jaxsky.io.tables import TABLES, open_fits, select_hdu
@@ -302,8 +303,8 @@ def read_spectra(
         If `format` is unknown or lmax is negative.
     """
     path = Path(path)
-    if format is not None and format not in _ORDERS:
-        raise ValueError(f"Argument `format` must be one of {', '.join(_ORDERS)}, not {format!r}.")
+    if format is not None:
+        check_choice("format", format, _ORDERS)
     with in_file(path):
         if is_fits(path):
             if format is not None:

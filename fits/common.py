@@ -20,9 +20,9 @@ from jaxtyping import Array, Bool, Float
 from fits.compress import Noise, as_noise, chunks
 from fits.inputs import Inputs, prepare_component
 from fits.kept import remembered
+from fits.mixing import TemplateErrors, template_errors
 from fits.regions import common_holes
 from fits.template_likelihood import CovarianceOf, SkyLikelihood, likelihood
-from fits.template_noise import TemplateErrors, template_errors
 from jaxsky import Bandpass, Sky, observe
 from jaxsky.checks import Numeric
 from jaxsky.cmb import realisation

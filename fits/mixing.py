@@ -1,15 +1,24 @@
-"""The mixing matrix: what each component of unit amplitude shows in each band.
+"""What templates show in bands: the mixing matrix, and the noise that comes with them.
 
-Names of parameters are those of the sky ("dust.beta_dust"), and of bands:
+The matrix is what each component of unit amplitude shows in each band. Names of parameters are
+those of the sky ("dust.beta_dust"), and of bands:
 
 * "shift.<band>": the band is moved by this fraction of its center; 0 if not given
 * "width.<band>": it is stretched about its center by this factor; 1
 * "gain.<band>": factor on what the band shows; 1
 * "angle.<band>": rotation of its polarization, Q + iU times exp(2i angle) [deg]; 0
+
+With templates T = t + n the products with the data have the mean t^T W d, but those of templates
+with each other t^T W t + <n^T W n>: amplitudes come out too small, and indices are moved. The
+mean of the noise is known where its covariance is, and is subtracted (errors in variables; Fuller
+1987, Measurement Error Models, ch. 2). What is left, sum_j c_j T_k^T W n_j in a band where
+template j is seen with the coefficient c_j, is the same noise in all bands; its covariance joins
+that of the data, at the coefficients of the best fit.
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,11 +26,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fits.kept import remembered
 from jaxsky import Bandpass, Sky, parameter_names, set_parameters
 from jaxsky.bandpass import Samples, average, parse_unit, stack_bands
 from jaxsky.checks import Numeric
 from jaxsky.interpolation import band_seds, choose_nodes
 from jaxsky.sed import cmb_derivative
+
+if TYPE_CHECKING:
+    from fits.common import MapNoise
+    from fits.inputs import TemplateNoise
 
 #: parameter of a band -> its value if not given
 NOMINAL = {"shift": 0.0, "width": 1.0, "gain": 1.0, "angle": 0.0}
@@ -179,3 +193,93 @@ class Mixing(eqx.Module):
         angle = angle.reshape(len(self.names), -1).T[..., None]
         cosine, sine = jnp.cos(angle) * matrix, jnp.sin(angle) * matrix
         return jnp.block([[cosine, -sine], [sine, cosine]])
+
+
+class TemplateErrors(NamedTuple):
+    """Noise of templates at the common resolution, as a sum of independent sources.
+
+    Sources are the noise of each template that no other map has, and that of bands which
+    templates share.
+
+    Attributes
+    ----------
+    covariances_of : covariance of the products of rows with each source, (source, row, row)
+    parts : of each source in each template, shape (template, source)
+    of_band : 1 where a source is the noise of a band, shape (band, source)
+    variance : of each source in each pixel [uK_RJ^2], shape (source, stokes, pix)
+    """
+
+    covariances_of: Callable[[Float[Array, "row stokes pix"]], Float[np.ndarray, "source row row"]]
+    parts: Float[np.ndarray, "template source"]
+    of_band: Float[np.ndarray, "band source"]
+    variance: Float[Array, "source stokes pix"]
+
+    def mean_products(
+        self, weights: Float[Array, "band stokes pix"]
+    ) -> Float[np.ndarray, "band stokes row row"]:
+        """Means of what noise adds to the products of (data, templates, 1), as `gram` has them."""
+        power = np.einsum("bsp,usp->bsu", weights, self.variance)
+        bands, stokes, _ = power.shape
+        size = len(self.parts) + 2
+        total = np.zeros((bands, stokes, size, size))
+        total[..., 1:-1, 1:-1] = np.einsum("bsu,ku,ju->bskj", power, self.parts, self.parts)
+        with_data = np.einsum("bsu,bu,ku->bsk", power, self.of_band, self.parts)
+        total[..., 0, 1:-1] = total[..., 1:-1, 0] = with_data
+        return total
+
+    def covariance(
+        self,
+        rows: Float[Array, "band row stokes pix"],
+        coefficients: Float[np.ndarray, "band row template"],
+    ) -> Float[np.ndarray, "bandrow bandrow"]:
+        """What noise of templates adds to the covariance of products of rows with residuals.
+
+        `coefficients` are those of the templates in what each row is multiplied with.
+        """
+        flat = rows.reshape(-1, *rows.shape[2:])
+        each = self.covariances_of(flat)
+        own = np.repeat(self.of_band, rows.shape[1], axis=0)
+        seen = own - np.asarray(coefficients).reshape(len(flat), -1) @ self.parts
+        return np.einsum("umn,mu,nu->mn", each, seen, seen) - np.einsum(
+            "umn,mu,nu->mn", each, own, own
+        )
+
+
+def template_errors(
+    names: Sequence[str],
+    noises: Mapping[str, "TemplateNoise"],
+    own: Mapping[str, "MapNoise"],
+    bands: Mapping[str, "MapNoise"],
+) -> TemplateErrors | None:
+    """Errors of templates from the noise that some have of their own, and that of all bands.
+
+    None where there is neither.
+    """
+    shared = [noises[name].shared if name in noises else {} for name in names]
+    which = [band for band in bands if any(band in one for one in shared)]
+    if not own and not which:
+        return None
+    sources = [*own.values(), *(bands[band] for band in which)]
+    parts = [
+        [float(n == name) for name in own] + [one.get(band, 0.0) for band in which]
+        for n, one in zip(names, shared, strict=True)
+    ]
+    of_band = [[0.0] * len(own) + [float(b == name) for b in which] for name in bands]
+    variance = np.stack([source.variance() for source in sources])
+    return TemplateErrors(
+        remembered(lambda rows: np.stack([source.covariance(rows) for source in sources])),
+        np.array(parts),
+        np.array(of_band),
+        jnp.asarray(np.where(variance > 0, variance, 0.0)),
+    )
+
+
+def check_signal(products: Float[np.ndarray, "band stokes template template"]) -> None:
+    """Raise ValueError where the noise of templates leaves none of their power, or less."""
+    total = products.sum(axis=(0, 1))
+    scale = np.sqrt(np.abs(np.diagonal(total)))
+    if np.linalg.eigvalsh(total / scale / scale[:, None])[0] <= 0:
+        raise ValueError(
+            "The noise of the templates is all that they hold in this region, or more than that; "
+            "look at its level and unit."
+        )

@@ -31,9 +31,8 @@ import scipy.linalg
 from jaxtyping import Array, Float, Int
 
 from fits.compress import square_root
-from fits.mixing import Mixing, named_bands, unit_sky
+from fits.mixing import Mixing, TemplateErrors, check_signal, named_bands, unit_sky
 from fits.posterior import Likelihood
-from fits.template_noise import TemplateErrors, check_signal
 from jaxsky import Bandpass, Sky, observe_components, parameter_names
 from jaxsky.checks import UNSEEN, Numeric, as_array, check_double, check_shape
 from jaxsky.interpolation import NodeCounts, Nodes

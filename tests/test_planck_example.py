@@ -13,12 +13,11 @@ from fits import inputs as fit_inputs
 from fits.commands.fit import _table, fit_numbers, fit_warnings
 from fits.commands.run import DEFAULTS
 from fits.common import Fluctuations, common_maps
-from fits.inputs import Band, Inputs, read_band
+from fits.inputs import Band, Inputs, TemplateNoise, level_spectrum, read_band
 from fits.plots import label
 from fits.posterior import chi2
 from fits.spectral_index import fit_regions, known_truth
 from fits.template_likelihood import _one_stokes_each, gram
-from fits.template_noise import TemplateNoise, level_spectrum
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, inputs, observe
 from jaxsky.harmonics import Preparation, alm_ell, gaussian_beam, resample, synthesis
 from jaxsky.inputs import Template

@@ -10,12 +10,11 @@ from matplotlib.axes import Axes
 from fits.commands.report import ResultTable, Row
 from fits.commands.run import Command, Report, Run
 from fits.common import prepared_maps
-from fits.inputs import Inputs, inputs_of
+from fits.inputs import Inputs, inputs_of, unknown_noise
 from fits.plots import COLORS, TRUTH, draw_panels, label, legend_below, plain, plot_chains
 from fits.regions import region_masks
 from fits.results import FitResult, with_errors
 from fits.spectral_index import RegionFit, all_free, fit_regions, known_truth
-from fits.template_noise import unknown_noise
 from jaxsky.settings import WORDS, Experiment
 
 #: A fit with a smaller probability to exceed its chi^2 is pointed out.

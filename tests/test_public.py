@@ -8,6 +8,7 @@ import importlib
 import inspect
 import pkgutil
 import re
+from enum import Enum
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ NUMERIC = re.compile(
     r"\b(int|float|complex|Array|ArrayLike|Numeric|Parameter|Float|Int|Bool|ndarray|Any|object)\b"
 )
 #: They convert quantities, or refuse them under a name that they are given.
-BY_THEMSELVES = {"from_quantity", "unit_factor", "Maps.to", "refuse_unit", "noise.bare"}
+BY_THEMSELVES = {"from_quantity", "unit_factor", "Maps.to", "refuse_unit", "compress.bare"}
 BY_THEMSELVES |= {"as_array", "as_number"}
 
 
@@ -76,7 +77,7 @@ def public():
             where = f"{module.__name__}.{name}"
             if not inspect.isclass(value):
                 yield where, value
-            elif not issubclass(value, BaseModel | BaseException | str):
+            elif not issubclass(value, BaseModel | BaseException | Enum | str):
                 if not issubclass(value, tuple):
                     yield where, value
                 for method in vars(value):

@@ -246,11 +246,11 @@ def plot_leakage(path: Path, spectra: Sequence[BandSpectra], title: str) -> None
 
 def _draw_patches(axes: Axes, series: Sequence[Series], what: str) -> None:
     """A or alpha with errors, and the line of equals; the field of BICEP2 is a star."""
-    drawn: list[float] = []
+    drawn, at = list[float](), ("A", "alpha").index(what)
     for (name, shown, *pair), color in zip(series, plots.COLORS, strict=False):
         star = np.array([patch == "BICEP2" for patch in pair[0][0].names])
         x, y = (getattr(fit, what)[:, index] for fit, index in pair)
-        dx, dy = (getattr(fit, f"{what}_error")[:, index] for fit, index in pair)
+        dx, dy = (np.sqrt(fit.covariance[:, index, at, at]) for fit, index in pair)
         style: Any = {"color": color, "elinewidth": 0.4, "alpha": 0.8, "zorder": 3}
         for kept, marker, size in ((shown & ~star, "x", 4), (shown & star, "*", 11)):
             axes.errorbar(x[kept], y[kept], dy[kept], dx[kept], fmt=marker, ms=size, **style)

@@ -254,10 +254,7 @@ def test_unknown_stokes_are_named(galaxy):
 
 @pytest.mark.parametrize(
     ("name", "file", "least_Q", "least_U"),
-    [
-        ("dust", "dust_d1_353GHz_n64", 0.4, 0.1),
-        ("synchrotron", "synch_s1_30GHz_n64", 0.7, 0.4),
-    ],
+    [("dust", "dust_d1_353GHz_n64", 0.4, 0.1), ("synchrotron", "synch_s1_30GHz_n64", 0.7, 0.4)],
 )
 def test_resembles_the_real_sky(data_dir, galaxy, name, file, least_Q, least_U):
     real = healpy.read_map(data_dir / "templates" / f"{file}.fits", field=(0, 1, 2))

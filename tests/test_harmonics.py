@@ -188,11 +188,7 @@ def test_gradients_in_maps_and_beams():
 
 def test_gradients_in_beams_and_tables():
     table = h.gaussian_beam(200.0, 30) * (1 - 0.01 * jnp.sin(jnp.arange(31)) ** 2)
-    for arguments in [
-        (jnp.asarray(6.0), table),
-        (table**3, jnp.asarray(1.0)),
-        (table**3, table),
-    ]:
+    for arguments in [(jnp.asarray(6.0), table), (table**3, jnp.asarray(1.0)), (table**3, table)]:
         check_grads(
             lambda over, under: h.beam_ratio(
                 over if over.ndim else 100 * over, under if under.ndim else 100 * under, 16

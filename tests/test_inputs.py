@@ -72,10 +72,7 @@ def folder(tmp_path_factory, matrices, hits):
 
 PLANCK = MapFile(file="planck.fits", fields=["Q_STOKES", "U_STOKES"])
 WMAP = MapFile(
-    file="wmap.fits",
-    fields=["Q_POLARISATION", "U_POLARISATION"],
-    unit="mK_CMB",
-    coordinates="G",
+    file="wmap.fits", fields=["Q_POLARISATION", "U_POLARISATION"], unit="mK_CMB", coordinates="G"
 )
 
 

@@ -98,10 +98,7 @@ def test_a_gaussian_prior_pulls_by_its_weight():
 def test_more_free_parameters_by_name():
     sky, data, sigma = problem()
     start = {**START, "dust.T_dust": 20.0, "synchrotron.curvature": 0.0, "offset.44.Q": 0.0}
-    priors = {
-        "dust.T_dust": Gaussian(21.0, 1.0),
-        "synchrotron.curvature": Gaussian(0.0, 0.1),
-    }
+    priors = {"dust.T_dust": Gaussian(21.0, 1.0), "synchrotron.curvature": Gaussian(0.0, 0.1)}
     found = best_fit(likelihood(sky, BANDS, data, sigma, start), start, priors=priors)
     for name, value in (("dust.beta_dust", 1.53), ("offset.44.Q", 0.0), ("dust.T_dust", 21.0)):
         assert abs(found.best_fit[name] - value) < 4 * found.sigma[name]

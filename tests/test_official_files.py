@@ -94,12 +94,7 @@ LEAKAGE = {"file": CORRECTION, "fields": ["Q_STOKES", "U_STOKES"], "fwhm": 700.0
 
 def settings(folder, band):
     return Experiment.model_validate(
-        {
-            "data_dir": str(folder),
-            "sky": {"dust": DUST},
-            "bands": [band],
-            "cmb": {"include": False},
-        }
+        {"data_dir": str(folder), "sky": {"dust": DUST}, "bands": [band], "cmb": {"include": False}}
     )
 
 

@@ -36,8 +36,7 @@ def spectrum(maps, lmax):
 
 
 @pytest.mark.parametrize(
-    ("nside_in", "nside", "lmax", "fwhm"),
-    [(16, 32, 32, 500.0), (32, 16, 24, 400.0)],
+    ("nside_in", "nside", "lmax", "fwhm"), [(16, 32, 32, 500.0), (32, 16, 24, 400.0)]
 )
 def test_template_against_healpy(nside_in, nside, lmax, fwhm):
     alm = coefficients(lmax)

@@ -42,8 +42,7 @@ def refused(wanted, folder, **options):
 
 
 @pytest.mark.parametrize(
-    "kind",
-    ["good", "longer", "announced odd", "no length", "chunked", "trickle", "elsewhere"],
+    "kind", ["good", "longer", "announced odd", "no length", "chunked", "trickle", "elsewhere"]
 )
 def test_right_files(server, tmp_path, kind):
     assert fetch(product(f"{server}/{kind}/{NAME}"), tmp_path).read_bytes() == CONTENT

@@ -11,31 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from refusals import cases
 from settings_fuzz import written
 from systems import small_experiment
 
 COMMANDS = ("fit", "simulate", "compare", "separate", "paper")
-FREE = {"dust.beta_dust": {"start": 1.6, "uniform": [0.5, 2.5]}}
-FIT = {"regions": ["full"], "stokes": ["Q", "U"], "methods": ["mcmc"], "likelihood": "diagonal"}
 #: Small settings of each command, on the embedded sky: most of a run is to start and compile.
-SETTINGS = {
-    "fit": small_experiment(("44", "70"), free=FREE, fit=FIT | {"nwalkers": 8, "nsteps": 500}),
-    "simulate": small_experiment(
-        ("45", "105"), "core", simulate={"nside": 16, "fwhm": 600.0, "sheet": False}
-    ),
-    "compare": small_experiment(
-        ("70",), compare={"regions": ["full"], "nsims": 30, "lmax": 12, "width": 4}
-    ),
-    "separate": small_experiment(
-        ("40", "100", "140", "280"),
-        "litebird",
-        free=FREE,
-        separate={"nsims": 20, "sampler": "emcee", "nsteps": 100, "width": 3},
-    ),
-    "paper": small_experiment(
-        ("44", "70"), nside=64, free=FREE, common={"nside": 16, "fwhm": 300.0}
-    ),
-}
+SETTINGS = {name: small_experiment(**given) for name, given in cases("kills/settings").items()}
 OPTIONS = {"simulate": ("--nsims", "4"), "paper": ("--only", "1", "--only", "table 1")}
 #: What says when and how long a run was, and how it was called.
 CIRCUMSTANCES = {"date", "seconds", "command"}

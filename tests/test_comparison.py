@@ -1,4 +1,4 @@
-"""Observed maps against the model: slopes and spectra with errors that simulations confirm."""
+"""Observed maps against the model: slopes, spectra, patches; their errors are confirmed."""
 
 import json
 from pathlib import Path
@@ -11,15 +11,17 @@ import pytest
 import scipy.stats
 
 from commands import jaxsky
-from fits.commands.compare import comparison_warnings
+from fits.commands.compare import comparison_warnings, plot_patches, plot_template_patches
 from fits.common import common_maps
 from fits.comparison import compare, compare_pixels, compare_spectra, simulated_fluctuations
+from fits.discs import _patch_noise, compare_patches, paper_patches, template_patches
 from fits.inputs import inputs_of
-from fits.pseudo_cl import cosmic_error, hotelling, polarization_alms
+from fits.patches import fit_patches
+from fits.pseudo_cl import band_powers, cosmic_error, hotelling, polarization_alms, prepare_patches
 from fits.regions import region_masks
-from jaxsky.harmonics import expand, power_spectrum, synthesis
+from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis
 from jaxsky.io import InputError
-from jaxsky.noise import draw, uniform_covariance, white_alm
+from jaxsky.noise import draw, pixel_covariance, uniform_covariance, white_alm
 from jaxsky.settings import Experiment, SettingsError, load
 from refusals import cases, raises
 from settings_fuzz import written
@@ -327,3 +329,87 @@ def test_wmap_on_the_real_sky(data_dir, monkeypatch):
         assert abs(scatter.slope - 1) < 3 * scatter.error
         assert scatter.rms == pytest.approx(scatter.expected, rel=0.15)
     assert found.scatters["V", "strip", "QU"].correlation > 0.5
+
+
+FINE = 64
+
+
+@pytest.fixture(scope="module")
+def of_patches():
+    return Experiment.model_validate(
+        {
+            "sky": {"embedded": {"nside": FINE}},
+            "bands": [{"instrument": "planck", "channels": ["353"]}],
+            "compare": {"patches": "353", "patches_nside": FINE},
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def observed(of_patches):
+    return inputs_of(of_patches)
+
+
+@pytest.fixture(scope="module")
+def found(of_patches, observed):
+    return compare_patches(of_patches, observed)
+
+
+@pytest.mark.slow
+def test_noise_is_that_of_each_patch(observed):
+    """Twice as much on one half of the sky."""
+    band = observed.bands["353"]
+    north = healpy.pix2ang(FINE, np.arange(band.used.size), lonlat=True)[1] > 0
+    uneven = band._replace(noise=pixel_covariance(band.noise, FINE) * jnp.where(north, 4.0, 1.0))
+    prepared = common_maps(observed._replace(bands={"353": uneven}), FINE, 60.0)
+    some = dict(list(paper_patches(FINE).items())[:48:16])
+    patches = prepare_patches(some, np.asarray(gaussian_beam(60.0, 128)))
+    noise = _patch_noise(uneven, prepared, patches)
+    keys = jax.random.split(jax.random.key(1), 40)
+    maps = [prepared.fluctuations.noise_realisation(key)[0] for key in keys]
+    for one, row in zip(patches.spectra, noise, strict=True):
+        expected = np.einsum("ibjl,jklm,km->ib", one.inverse, one.mixing, row)
+        powers = np.array([band_powers(one, m) for m in maps])
+        error = powers.std(axis=0) / np.sqrt(len(maps))
+        assert np.abs((powers.mean(axis=0) - expected) / error).max() < 4
+    levels = noise[:, 0, 80]
+    assert levels.max() / levels.min() == pytest.approx(4.0, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_map_and_model_agree(found, tmp_path):
+    """The same sky with noise of its own: amplitudes agree, and correlate."""
+    assert found.band == "353"
+    assert found.observed.A.shape == (49, 2)
+    assert found.observed.names[-1] == "BICEP2"
+    for index in (0, 1):
+        variance = (found.observed.covariance + found.model.covariance)[:, index, 0, 0]
+        pulls = (found.observed.A - found.model.A)[:, index] / np.sqrt(variance)
+        # Both have the sky in common, so they agree better than their errors say.
+        assert np.std(pulls) < 1.2
+        assert abs(np.mean(pulls)) < 4 / 7
+        ratio, error = found.ratio(index)
+        assert abs(np.log(ratio)) < 4 * error / ratio
+        difference, error = found.slope_difference(index)
+        assert abs(difference) < 4 * error
+    plot_patches(tmp_path / "patches.png", found, "small")
+    assert (tmp_path / "patches.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_a_template_alone(observed, tmp_path):
+    maps = observed.templates["dust"].component.amplitude
+    fit = template_patches(maps, 0.0)
+    expected = fit_patches(maps, prepare_patches(paper_patches(FINE), np.ones(2 * FINE + 1)))
+    np.testing.assert_allclose(fit.A, expected.A)
+    plot_template_patches(tmp_path / "patches.png", fit, ["A", "alpha"], "dust")
+    assert (tmp_path / "patches.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_pixels_too_wide_for_the_multipoles(of_patches, observed):
+    how = of_patches.compare.model_copy(update={"patches_nside": 32})
+    with pytest.raises(
+        ValueError, match=r"Argument `lmax` must be between .* 100, and 2 nside, 64"
+    ):
+        compare_patches(of_patches.model_copy(update={"compare": how}), observed)

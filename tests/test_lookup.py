@@ -19,9 +19,6 @@ from jaxsky.settings import Experiment, SettingsError, find_file, found_files, l
 from refusals import cases, raises
 from settings_fuzz import changed_at, written
 
-KNOWN = "LFI_RIMO_R3.31.fits"
-MASK = "wmap_polarization_analysis_mask_r9_9yr_v5.fits"
-
 
 @pytest.fixture
 def places(tmp_path, monkeypatch):
@@ -74,18 +71,10 @@ def test_home_and_environment_are_expanded(places, monkeypatch):
 
 def test_missing_files_are_answered_with_the_command_that_brings_them(places):
     data, cache, _ = places
-    command = f"`jaxsky data fetch {KNOWN}`"
-    for name, sentence in {
-        "a.fits": f"{data}/a.fits: no such file, and none in the cache {cache}.",
-        "sub/a.fits": f"{data}/sub/a.fits: no such file, nor folder.",
-        KNOWN: f"{data}/{KNOWN}: no such file, and none in the cache {cache}; fetch it with "
-        f"{command} (all files of such an analysis: `jaxsky data fetch planck-44-70`).",
-        f"./{MASK}": f"{data}/{MASK}: no such file; fetch it with `jaxsky data fetch {MASK}` into "
-        f"{cache}, and name it without a folder.",
-    }.items():
+    for name, sentence in cases("lookup/missing"):
         with pytest.raises(InputError) as caught:
             find_file(data, name)
-        assert str(caught.value) == sentence
+        assert str(caught.value) == sentence.format(data=data, cache=cache)
 
 
 def test_what_is_there_and_no_file_is_called_what_it_is(places, monkeypatch):

@@ -9,6 +9,7 @@ from jax.test_util import check_grads
 
 from jaxsky import noise
 from jaxsky.harmonics import alm_ell, analysis, synthesis
+from refusals import cases, raises
 
 KEY = jax.random.key(1)
 
@@ -195,26 +196,9 @@ def test_covariances_that_cannot_be(covariance):
 
 
 def test_bad_arguments():
-    ones = np.ones(12)
-    holes = np.array([0.0, -1, *ones[2:]])
-    gone = np.array([np.nan, healpy.UNSEEN, *ones[2:]])
-    for function, arguments, words in [
-        (noise.rms_covariance, (ones,),
-         r"`rms` must have shape \(stokes, pix\), but has shape \(12,"),
-        (noise.rms_covariance, ([gone, ones],), "`rms` has 2 of 24 values that are not finite"),
-        (noise.rms_covariance, ([holes, ones],), "`rms` has 1 of 24 values that are negative"),
-        (noise.hits_covariance, (1.0, holes), "`hits` is not positive in 2 of 12 pixels"),
-        (noise.hits_covariance, (1.0, gone), "`hits` has 2 of 12 values that are not finite"),
-        (noise.hits_covariance, (1.0, [ones]), r"`hits` must have shape \(pix,\), but has shape"),
-        (noise.hits_covariance, (np.nan, ones), "`sigma0` has 1 of 1 values that are not finite"),
-        (noise.hits_covariance, ([1.0], ones), r"`sigma0` must be a number or have shape \(2,\)"),
-        (noise.covariance_from_columns, (np.ones((4, 12)),),
-         r"\(3, pix\) or \(6, pix\), but has shape .4, 12"),
-        (noise.covariance_from_columns, (ones[:3],), r"or \(6, pix\), but has shape \(3,\)"),
-        (noise.uniform_alm, (KEY, 1.0, 4, 4), "`stokes` must be 1, 2 or 3, not 4"),
-    ]:  # fmt: skip
-        with pytest.raises(ValueError, match=words):
-            function(*arguments)
+    for function, arguments, words in cases("noise/bad_arguments"):
+        raises(ValueError, words, getattr(noise, function), *arguments)
+    raises(ValueError, "`stokes` must be 1, 2 or 3, not 4", noise.uniform_alm, KEY, 1.0, 4, 4)
 
 
 def test_noise_is_estimated_from_a_smooth_sky():

@@ -16,7 +16,7 @@ from fits.separated_maps import harmonic_component_maps
 from jaxsky import Dust
 from jaxsky import harmonics as h
 from jaxsky.noise import uniform_alm
-from refusals import raises
+from refusals import cases, raises
 from test_separation import BANDS, START, TRUTH, check_derivatives, dense_matrix, random_sky
 
 #: Most tests have the shapes of each other, so that programs are compiled once.
@@ -274,16 +274,7 @@ def test_maps_of_bands_may_differ_in_resolution():
 GOOD = np.random.default_rng(0).normal(size=(8, 2, 12 * 4**2))
 
 
-@pytest.mark.parametrize(
-    ("change", "lmax", "message"),
-    [
-        (np.nan, None, r"`maps` has 2 pixels of band 3 that are masked .* takes the full sky; .*"),
-        (-1.6375e30, None, r"common resolution and separate them pixel by pixel"),
-        (0.0, None, r"`maps` has 2 pixels of band 3"),
-        (1.0, 9, r"`lmax` must lie between 2 and 2 nside = 8, .* but is 9"),
-        (1.0, 1, r"`lmax` must lie between 2 and 2 nside = 8, .* but is 1"),
-    ],
-)
+@pytest.mark.parametrize(("change", "lmax", "message"), cases("separation_harmonic/maps_of_a_part"))
 def test_maps_of_a_part_of_the_sky_are_refused(change, lmax, message):
     maps = GOOD.copy()
     maps[3, :, 5:7] = change

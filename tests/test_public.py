@@ -27,6 +27,7 @@ from jaxsky.noise import estimate_variance, realisation_key
 from jaxsky.settings import CommonTable
 from refusals import raises
 
+README = Path(__file__).parent.parent / "README.md"
 #: Annotations of arguments that may be numbers, or hold some.
 NUMERIC = re.compile(
     r"\b(int|float|complex|Array|ArrayLike|Numeric|Parameter|Float|Int|Bool|ndarray|Any|object)\b"
@@ -211,3 +212,23 @@ def test_missing_pixels_are_no_values(value):
     for name, function in calls.items():
         argument = "other" if name == "cross" else "maps"
         raises(ValueError, rf"Argument `{argument}` has . of .* \(or UNSEEN\)", function)
+
+
+def readme_code() -> str:
+    """The Python of the README, in order."""
+    return "\n".join(re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL))
+
+
+def test_what_the_readme_imports_is_there():
+    for line in re.findall(r"^from .* import .*", readme_code(), re.MULTILINE):
+        exec(line, {})
+
+
+@pytest.mark.slow
+def test_the_code_of_the_readme_runs(capsys):
+    names = {}
+    exec(readme_code(), names)
+    assert "dust.beta_dust" in capsys.readouterr().out
+    for name in ("fit", "found"):
+        assert names[name].best_fit["dust.beta_dust"] == pytest.approx(1.53, abs=0.01)
+    assert np.isfinite(names["sky_maps"]).all()

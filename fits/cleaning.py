@@ -172,12 +172,8 @@ def separate_data(
 ) -> Separation:
     """Fit the laws, separate the components, and measure r.
 
-    Parameters
-    ----------
-    settings : how
-    data : what is separated, from `fits.separated_data.separation_data`
-    out : folder that keeps simulations and chains; what it holds is not made again
-    progress : told of each step of the work
+    `data` are from `fits.separated_data.separation_data`, and `out` is the folder that keeps
+    simulations and chains; what it holds is not made again.
     """
     check_double("A separation")
     spec, priors = settings.separate, priors_of(settings, "separate")
@@ -190,8 +186,7 @@ def separate_data(
     response = Response(like, fit.best_fit, priors)
     progress.step("components")
     best = like.named(jnp.asarray(response.theta))
-    found = data.components(like, best, data.observed)
-    maps = data.maps(found, like, best, data.observed)
+    found, maps = data.components(like, best, data.observed)
     amplitude = found.amplitude if data.exact else maps
     row = found.components.index("cmb")
 
@@ -255,8 +250,8 @@ def cleaned_cmb(
     observed: np.ndarray,
 ) -> Float[np.ndarray, "stokes pix"]:
     """The map of the CMB in what is observed, with these parameters."""
-    found = data.components(like, params, observed, covariance=False)
-    return data.maps(found, like, params, observed)[found.components.index("cmb")]
+    found, maps = data.components(like, params, observed, covariance=False)
+    return maps[found.components.index("cmb")]
 
 
 def simulated_noise(

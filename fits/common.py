@@ -281,13 +281,8 @@ def prepared_maps(settings: Experiment, inputs: Inputs) -> CommonMaps:
 def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
     """Bring templates and maps to a common nside and, if fwhm > 0, a common beam.
 
-    With fwhm = 0 pixels are averaged and beams stay as they are. Otherwise all maps are cut at
-    one multipole, that to which the coarsest is good.
-
-    Parameters
-    ----------
-    inputs : templates and maps
-    nside, fwhm : common resolution; fwhm in arcmin
+    With fwhm = 0 pixels are averaged and beams stay as they are. Otherwise, with fwhm in arcmin,
+    all maps are cut at one multipole, that to which the coarsest is good.
     """
     templates = {f"template {name!r}": t for name, t in inputs.templates.items()}
     bands = {f"band {name!r}": b for name, b in inputs.bands.items()}

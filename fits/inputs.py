@@ -354,10 +354,7 @@ def prepare_component(
 ) -> Component:
     """A component with its amplitude, and parameters that are maps, at the common resolution.
 
-    Parameters
-    ----------
-    component, preparation : what is prepared, and how
-    kept : pixels of the amplitude that are not set to zero; default all
+    Pixels of the amplitude that are not kept are set to zero; by default all are.
     """
 
     def brought(leaf):

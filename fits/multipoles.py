@@ -84,7 +84,8 @@ def harmonic_coefficients(
     check_double("fits")
     rows = [bare("maps", each) for each in maps]
     shapes = {each.shape for each in rows}
-    if len({shape[:-1] for shape in shapes}) != 1 or not all(map(_is_map, shapes)):
+    alike = len({shape[:-1] for shape in shapes}) == 1
+    if not (alike and all(len(s) == 2 and s[0] in (2, 3) and _is_map(s[1]) for s in shapes)):
         raise ValueError(
             "Argument `maps` must have shape (band, stokes, pix) with Stokes Q, U or I, Q, U, "
             f"but has {len(rows)} bands of shape {', '.join(map(str, sorted(shapes)))}."
@@ -103,11 +104,9 @@ def harmonic_coefficients(
     return result
 
 
-def _is_map(shape: tuple[int, ...]) -> bool:
-    """True for two or three Stokes parameters at an nside that is a power of 2."""
-    if len(shape) != 2 or shape[0] not in (2, 3) or not healpy.isnpixok(shape[1]):
-        return False
-    return healpy.isnsideok(healpy.npix2nside(shape[1]), nest=True)
+def _is_map(npix: int) -> bool:
+    """True for the pixels of an nside that is a power of 2."""
+    return healpy.isnpixok(npix) and healpy.isnsideok(healpy.npix2nside(npix), nest=True)
 
 
 def _check_full_sky(band: int, maps: np.ndarray) -> None:

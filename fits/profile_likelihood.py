@@ -262,7 +262,11 @@ def spectral_likelihood(
             )
         varying[name] = np.unique(value, return_inverse=True)[1]
     cells = intersections(varying, used)
-    first = _first_pixels(cells, used)
+    # A pixel of each cell.
+    first = np.flatnonzero(used)[:1]
+    if cells.of_pixel is not None:
+        found, at = np.unique(cells.of_pixel, return_index=True)
+        first = at[found >= 0]
     angles = any(name.startswith("angle.") for name in start)
     like = SpectralLikelihood(
         values,
@@ -299,14 +303,6 @@ def spectral_likelihood(
         values=number - components * data.shape[1] * int(used.sum()),
         weightless=tuple(name for name, some in zip(bands, heavy, strict=True) if not some),
     )
-
-
-def _first_pixels(cells: Cells, used: np.ndarray) -> np.ndarray:
-    """A pixel of each cell."""
-    if cells.of_pixel is None:
-        return np.flatnonzero(used)[:1]
-    found, first = np.unique(cells.of_pixel, return_index=True)
-    return first[found >= 0]
 
 
 def _index(values: Mapping[str, Array], cells: Cells) -> Array:

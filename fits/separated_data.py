@@ -20,7 +20,6 @@ from fits.multipoles import harmonic_coefficients, harmonic_likelihood, masked_n
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.regions import apodize, parameter_labels, region_mask
 from fits.separated_maps import (
-    HarmonicMaps,
     component_maps,
     emission_maps,
     harmonic_component_maps,
@@ -83,12 +82,9 @@ class PixelData(_Data):
         return np.asarray(noise) * self.factors[:, None, None]
 
     def components(self, like: SpectralLikelihood, params: Mapping, data, **options):
-        """Amplitudes of the components with all that is known of them."""
-        return component_maps(like, params, data, self.noise, **options)
-
-    def maps(self, found: Any, like: SpectralLikelihood, params: Mapping, data):
-        """Amplitudes as maps, those of `components` with the same arguments."""
-        return found.amplitude
+        """Amplitudes of the components with all that is known of them, and as maps."""
+        found = component_maps(like, params, data, self.noise, **options)
+        return found, found.amplitude
 
     def residuals(self, like: SpectralLikelihood, params: Mapping, amplitude):
         """Maps (band, stokes, pix) of the data less the components; NaN in masked pixels."""
@@ -124,13 +120,10 @@ class _Multipoles(_Data):
         )
 
     def components(self, like: SpectralLikelihood, params: Mapping, data, **options):
-        """Amplitudes of the components with all that is known of them."""
-        alm = self.alm(data)
-        return harmonic_component_maps(like, params, alm, self.spectra, beams=self.fwhms, **options)
-
-    def maps(self, found: HarmonicMaps, like: SpectralLikelihood, params: Mapping, data):
-        """Amplitudes as maps."""
-        return found.maps(self.nside, self.fwhm)
+        """Amplitudes of the components with all that is known of them, and as maps."""
+        alm, given = self.alm(data), {"beams": self.fwhms, **options}
+        found = harmonic_component_maps(like, params, alm, self.spectra, **given)
+        return found, found.maps(self.nside, self.fwhm)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,16 +140,17 @@ class MaskedSkyData(_Multipoles, PixelData):
         seen, lmax = np.where(self.mask > 0, data, 0.0) * self.mask, self.spectra.shape[-1] - 1
         return np.stack([np.asarray(low_multipoles(jnp.asarray(rows), lmax)) for rows in seen])
 
-    def maps(self, found, like, params, data):
-        """Amplitudes as maps; NaN where masked.
+    def components(self, like, params, data, **options):
+        """Amplitudes of the components with all that is known of them, and as maps.
 
-        Those of pixels, plus what multipoles find beyond: the same of all components, so that only
-        the noise is another, and nothing of the sky is lost at the last multipole.
+        Maps are those of pixels, plus what multipoles find beyond: the same of all components, so
+        that only the noise is another, and nothing of the sky is lost at the last multipole.
         """
-        maps = PixelData.components(self, like, params, data, covariance=False).amplitude
+        found, whole = super().components(like, params, data, **options)
+        _, maps = PixelData.components(self, like, params, data, covariance=False)
         pixels = [np.asarray(synthesis(jnp.asarray(a), self.nside)) for a in self.alm(maps)]
         weight = np.where(self.used, self.mask, np.nan)
-        return maps + (super().maps(found, like, params, data) - np.stack(pixels)) / weight
+        return found, maps + (whole - np.stack(pixels)) / weight
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -100,8 +100,7 @@ def test_pulls_of_laws_and_r(domain, region, r):
         prior["dust.T_dust"] = type(prior["dust.T_dust"])(mean, 2.0)
         fit = best_fit(like, found.fit.best_fit, priors=prior)
         pulls.append([(fit.best_fit[n] - given.truth[n]) / found.sigma[n] for n in fit.free])
-        parts = given.components(like, fit.best_fit, data, covariance=False)
-        maps = given.maps(parts, like, fit.best_fit, data)
+        _, maps = given.components(like, fit.best_fit, data, covariance=False)
         powers = band_powers(found.spectra, maps[found.components.index("cmb")])[1]
         ratios.append(fit_tensors(model, powers))
     every = np.column_stack([pulls, [(ratio.r - r) / sigma for ratio in ratios]])
@@ -163,8 +162,7 @@ def test_multipoles_of_a_masked_sky_lose_nothing_of_the_cmb():
     cmb = np.asarray(synthesis(alm * expand(gaussian_beam(FWHM, 2 * NSIDE)), NSIDE))
     data = np.where(given.used, np.broadcast_to(cmb, given.observed.shape), 0.0)
     like = given.likelihood(data)
-    found = given.components(like, given.start, data, covariance=False)
-    maps = given.maps(found, like, given.start, data)
+    found, maps = given.components(like, given.start, data, covariance=False)
     for name, one in zip(found.components, maps, strict=True):
         expected = cmb[:, given.used] if name == "cmb" else 0.0
         np.testing.assert_allclose(one[:, given.used], expected, atol=1e-6 * cmb.std())

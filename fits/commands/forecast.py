@@ -37,7 +37,6 @@ from jaxsky.io import degrade_mask
 from jaxsky.observation import ObservedBand
 from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
-from jaxsky.sky import unknown_parameter
 
 #: Spectra are taken in so many bands, if the settings name none.
 SHOWN = 5
@@ -198,13 +197,9 @@ def _errors(
     ]
     spectral = settings.free_in("forecast")
     widths = {n: one.gaussian[1] for n, one in spectral.items() if one.gaussian is not None}
+    own = [name for name in spec.free if name in parameters]
+    free = list(dict.fromkeys((*own, *spectral, *nuisance)))
     with at_key("free"):
-        for name in spectral:
-            if name not in parameters:
-                raise unknown_parameter(name, parameters)
-    with at_key("forecast"):
-        own = [name for name in spec.free if name in parameters]
-        free = list(dict.fromkeys((*own, *spectral, *nuisance)))
         errors = fisher_errors(model, parameters, free, widths)
     if "r" not in free:
         return errors, None

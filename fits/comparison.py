@@ -318,9 +318,14 @@ def compare_spectra(
 ) -> list[BandSpectra]:
     """Spectra of the observed maps against those of the complete model.
 
-    They are those of the full sky, which the paper takes: no mode of E shows as B there. So all
-    pixels have a value; `width` counts the multipoles in a bin.
+    They are those of the full sky, which the paper takes: no mode of E shows as B there. `width`
+    counts the multipoles in a bin.
     """
+    if missing := int(np.sum(~prepared.used)):
+        raise ValueError(
+            f"Spectra of the full sky need all pixels, but {missing} of {prepared.used.size} have "
+            "no value."
+        )
     lmax = simulated.spectra.shape[-1] - 1
     edges = bin_edges(LMIN, lmax, width)
     observed = np.asarray(power_spectrum(polarization_alms(prepared.data, lmax)))

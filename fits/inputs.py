@@ -40,6 +40,7 @@ from jaxsky.settings import (
     ComponentTable,
     Experiment,
     MapFile,
+    MapKeys,
     SettingsError,
     at_key,
     find_file,
@@ -297,20 +298,19 @@ def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -
 
     What they do not say is that of the simulation which made the map, `observed`.
     """
-    where, found = f"bands.{spec.name}", read(folder, spec)
-    check_stokes(where, found, "QU")
+    where = f"bands.{spec.name}"
     if spec.bandpass is None and observed is not None:
         bandpass = observed.bandpass
     else:
         bandpass = bandpass_of(folder, spec)
-    maps = narrow(found.maps[-2:] * uK_RJ_per(found.unit, bandpass, where))
-    used, unit, nside = np.asarray(found.mask), found.unit, found.nside
-    del found  # as large as all else
+    maps, used, unit = _polarization(folder, spec, bandpass, where)
+    nside = healpy.npix2nside(used.size)
     if (beam := beam_of(folder, spec, 2 * nside)) is None:
         beam = 0.0 if observed is None else observed.beam
     leakage = _leakage_of(observed, used)
     if spec.leakage is not None:
-        leakage = _read_leakage(folder, spec, bandpass)
+        own = _polarization(folder, spec.leakage, bandpass, f"{where}.leakage", True)
+        leakage = Leakage(*own[:2], spec.leakage.fwhm or 0.0)
     where, correlated = f"{where}.noise", None
     if spec.noise is None:
         if observed is None:
@@ -327,13 +327,14 @@ def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -
     return Band(maps, used, bandpass, beam, noise, correlated, leakage)
 
 
-def _read_leakage(folder: Path, spec: BandTable, bandpass: Bandpass) -> Leakage:
-    assert spec.leakage is not None  # as called
-    found = read(folder, spec.leakage, zeros_are_data=True)
-    check_stokes(f"bands.{spec.name}.leakage", found, "QU")
-    factor = uK_RJ_per(found.unit, bandpass, f"bands.{spec.name}.leakage")
-    maps = narrow(found.maps[-2:] * factor)
-    return Leakage(maps, np.asarray(found.mask), spec.leakage.fwhm or 0.0)
+def _polarization(
+    folder: Path, spec: MapKeys, bandpass: Bandpass, where: str, zeros_are_data: bool = False
+) -> tuple[Array, Bool[np.ndarray, " pix"], str]:
+    """Q and U of a map [uK_RJ], where they are known, and the unit of its file."""
+    found = read(folder, spec, zeros_are_data=zeros_are_data)
+    check_stokes(where, found, "QU")
+    maps = narrow(found.maps[-2:] * uK_RJ_per(found.unit, bandpass, where))
+    return maps, np.asarray(found.mask), found.unit
 
 
 def _estimated_noise(noise, maps, used):

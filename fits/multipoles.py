@@ -99,7 +99,13 @@ def harmonic_coefficients(
         )
     result = np.empty((len(rows), len(rows[0]), (lmax + 1) ** 2))
     for i, each in enumerate(rows):
-        _check_full_sky(i, each)
+        wrong = (~np.isfinite(each) | (each < UNSEEN)).any(axis=0) | (each == 0).all(axis=0)
+        if bad := int(wrong.sum()):
+            raise ValueError(
+                f"Argument `maps` has {bad} pixels of band {i} that are masked (not finite, UNSEEN "
+                "or zero), but the harmonic domain takes the full sky; bring maps of a part of it "
+                "to a common resolution and separate them pixel by pixel (`spectral_likelihood`)."
+            )
         result[i] = low_multipoles(jnp.asarray(each, float), lmax)
     return result
 
@@ -107,16 +113,6 @@ def harmonic_coefficients(
 def _is_map(npix: int) -> bool:
     """True for the pixels of an nside that is a power of 2."""
     return healpy.isnpixok(npix) and healpy.isnsideok(healpy.npix2nside(npix), nest=True)
-
-
-def _check_full_sky(band: int, maps: np.ndarray) -> None:
-    wrong = (~np.isfinite(maps) | (maps < UNSEEN)).any(axis=0) | (maps == 0).all(axis=0)
-    if bad := int(wrong.sum()):
-        raise ValueError(
-            f"Argument `maps` has {bad} pixels of band {band} that are masked (not finite, UNSEEN "
-            "or zero), but the harmonic domain takes the full sky; bring maps of a part of it to "
-            "a common resolution and separate them pixel by pixel (`spectral_likelihood`)."
-        )
 
 
 class Multipoles(NamedTuple):
@@ -248,16 +244,6 @@ def _compressed(rows: np.ndarray, multipoles: Multipoles, layout: Layout) -> Pix
     return Pixels(jnp.asarray(root), jnp.asarray(weights))
 
 
-def _refuse_maps(sky: Sky, start: Mapping[str, Numeric]) -> None:
-    names = [name for name in spectral_names(sky) if name not in start]
-    for name, value in get_parameters(sky, names).items():
-        if jnp.ndim(value):
-            raise ValueError(
-                f"Parameter {name!r} is a map of {value.size} pixels, but in the harmonic domain "
-                "it must be a number: laws that vary over the sky mix multipoles."
-            )
-
-
 def harmonic_likelihood(
     sky: Sky | Mapping[str, Component],
     bands: Mapping[str, Bandpass] | Sequence[Bandpass],
@@ -310,7 +296,13 @@ def harmonic_likelihood(
     sky = sky if isinstance(sky, Sky) else Sky(sky)
     bands = named_bands(bands)
     alm = check_alm(alm, len(bands))
-    _refuse_maps(sky, start)
+    held = get_parameters(sky, [name for name in spectral_names(sky) if name not in start])
+    for name, value in held.items():
+        if jnp.ndim(value):
+            raise ValueError(
+                f"Parameter {name!r} is a map of {value.size} pixels, but in the harmonic domain "
+                "it must be a number: laws that vary over the sky mix multipoles."
+            )
     # The laws and their parameters, on a pixel without data.
     nothing = np.zeros((len(bands), alm.shape[1], 1))
     like = spectral_likelihood(

@@ -50,6 +50,7 @@ def test_tensors_are_what_r_adds():
         np.testing.assert_array_equal(cmb.camb_spectra(LMAX, r), scalars + r * tensors)
 
 
+@pytest.mark.slow
 def test_tensors_are_those_of_cambs_r():
     """With the scalars in the same run, and r and the tilt as they are written in CAMB."""
     changes = {"r": 0.1, "nt": 0.0, "WantTensors": True, "lSampleBoost": 2}
@@ -80,6 +81,7 @@ def test_lensing_does_not_end_with_a_piece():
     np.testing.assert_allclose(first[:3, 2:], longer[:3, 2:], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_what_a_cosmology_does_not_say_is_that_of_planck():
     known = cmb.camb_spectra(60)
     np.testing.assert_array_equal(cmb.camb_spectra(60, H0=cmb.PLANCK_2018["H0"]), known)

@@ -97,10 +97,11 @@ def test_version(monkeypatch, capsys):
         assert capsys.readouterr().out == printed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "completed"),
     [
-        pytest.param("se", ["separate"], marks=pytest.mark.slow),
+        ("se", ["separate"]),
         ("init pl", ["planck-44-70", "planck-separate"]),
     ],
 )

@@ -194,6 +194,7 @@ def test_steps_have_converged():
     assert np.all(errors[1] < 2e-3)
 
 
+@pytest.mark.slow
 def test_gradients_of_all_parameters():
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3, healpy.nside2npix(4))))
     # Scaled so that dust and synchrotron count alike.

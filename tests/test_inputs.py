@@ -95,16 +95,7 @@ def test_rms_is_in_the_unit_of_the_map(folder, stokes):
     assert noise_of(folder, {"rms": 2.0}, stokes, unit="uK_RJ")[0] == pytest.approx(2.0 * pixel)
 
 
-@pytest.mark.parametrize(
-    ("fields", "stokes", "used"),
-    [
-        (["I_RMS"], "QU", ["I_RMS"] * 2),
-        (["I_RMS"], "IQU", ["I_RMS"] * 3),
-        (["Q_RMS", "U_RMS"], "QU", ["Q_RMS", "U_RMS"]),
-        (["I_RMS", "Q_RMS", "U_RMS"], "QU", ["Q_RMS", "U_RMS"]),
-        (["I_RMS", "Q_RMS", "U_RMS"], "IQU", ["I_RMS", "Q_RMS", "U_RMS"]),
-    ],
-)
+@pytest.mark.parametrize(("fields", "stokes", "used"), cases("inputs/rms_maps"))
 def test_rms_maps(folder, fields, stokes, used):
     spec = {"rms": {"file": "rms.fits", "fields": fields}}
     covariance, known = noise_of(folder, spec, stokes)
@@ -132,16 +123,7 @@ def test_covariance_columns(folder, matrices, names, stokes, inside):
     np.testing.assert_allclose(covariance, expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("sigma0", "stokes", "each"),
-    [
-        (1.4, "QU", [1.4, 1.4]),
-        (1.4, "IQU", [1.4, 1.4, 1.4]),
-        ([1.5, 1.6], "QU", [1.5, 1.6]),
-        ([1.4, 1.5, 1.6], "QU", [1.5, 1.6]),
-        ([1.4, 1.5, 1.6], "IQU", [1.4, 1.5, 1.6]),
-    ],
-)
+@pytest.mark.parametrize(("sigma0", "stokes", "each"), cases("inputs/hits"))
 def test_hits_are_wmaps_numbers_of_observations(folder, hits, sigma0, stokes, each):
     """The variance is sigma_0^2 / N_obs; ordering and coordinates are those of the map."""
     spec = {"hits": {"fields": ["N_OBS"], "sigma0": sigma0}}

@@ -68,17 +68,7 @@ def test_camb_writes_what_is_read(tmp_path):
 
 
 def test_healpix_fits(tmp_path):
-    for i, (scale, arguments, given) in enumerate(
-        [
-            (1.0, {"column_units": "uK^2"}, {}),
-            (1.0, {"column_units": "uK_CMB^2"}, {"unit": "uK^2"}),
-            (1e-12, {"column_units": "K^2"}, {}),
-            (1e-6, {"column_units": "mK2"}, {"unit": "mK_CMB^2"}),
-            (1.0, {}, {"unit": "uK_CMB^2"}),
-            (1e-12, {"column_units": "unknown"}, {"unit": "K_CMB^2"}),
-            (1.0, {"column_units": "uK^2", "column_names": ["TT", "EE", "BB", "TE"]}, {}),
-        ]
-    ):
+    for i, (scale, arguments, given) in enumerate(cases("io_spectra/healpix_fits")):
         path = fits(tmp_path / f"{i}.fits", CL * scale, **arguments)
         np.testing.assert_allclose(read_spectra(path, LMAX, **given), CL, rtol=1e-12)
     # Six spectra, single precision.

@@ -403,7 +403,8 @@ EVERYTHING = Sky(
 )
 
 
-@pytest.mark.parametrize("pixelwise", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("pixelwise", [False, True])
 def test_gradients_against_finite_differences(pixelwise):
     """Every parameter of the sky and of a band, and offsets."""
     sky, data, sigma = problem(sky=EVERYTHING)

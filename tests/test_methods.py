@@ -95,6 +95,7 @@ def test_a_gaussian_prior_pulls_by_its_weight():
     assert pulled.sigma[name] == pytest.approx(free.sigma[name] / np.sqrt(2), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_more_free_parameters_by_name():
     sky, data, sigma = problem()
     start = {**START, "dust.T_dust": 20.0, "synchrotron.curvature": 0.0, "offset.44.Q": 0.0}
@@ -223,11 +224,7 @@ def test_a_chi2_that_is_astronomical_is_no_fit():
         assert best_fit(other, START, priors=PRIORS).converged
 
 
-@pytest.mark.parametrize(
-    ("chi2", "dof", "fits"),
-    [(730.0 * 24, 24, False), (730.0 * 6000, 6000, False), (60.0 * 6000, 6000, True),
-     (3000.0, 2, True), (1e5, 0, False), (np.nan, 10, False), (np.inf, 10, False)],
-)  # fmt: skip
+@pytest.mark.parametrize(("chi2", "dof", "fits"), cases("methods/astronomical"))
 def test_what_is_astronomical(chi2, dof, fits):
     assert (misfit(chi2, dof) is None) == fits
 

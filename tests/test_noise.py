@@ -90,7 +90,7 @@ def test_diagonal_of_the_factor_as_in_the_paper(covariance):
     np.testing.assert_array_equal(noise.draw(KEY, uniform, diagonal=True), noise.draw(KEY, uniform))
 
 
-@pytest.mark.parametrize("diagonal", [False, True])
+@pytest.mark.parametrize("diagonal", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_gradient_in_the_covariance(covariance, diagonal):
     drawn = jax.jit(lambda c: noise.draw(KEY, c, diagonal=diagonal))
     check_grads(drawn, (covariance,), order=1, rtol=1e-5, eps=1e-6)

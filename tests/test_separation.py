@@ -258,12 +258,10 @@ def check_derivatives(like):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "names", "params"),
-    [
-        ("band", list(EVERY_LAW), LAW_PARAMETERS),
-        pytest.param("covariance", ["cmb", "dust"], BAND_PARAMETERS, marks=pytest.mark.slow),
-    ],
+    [("band", list(EVERY_LAW), LAW_PARAMETERS), ("covariance", ["cmb", "dust"], BAND_PARAMETERS)],
 )
 def test_derivatives_in_every_parameter_are_finite_differences(kind, names, params):
     _, data, given, _ = problem(kind)

@@ -82,6 +82,7 @@ def test_units_of_the_maps_do_not_matter(solver):
     assert small.details["steps"] == pytest.approx(large.details["steps"], abs=20)
 
 
+@pytest.mark.slow
 def test_units_of_parameters_do_not_matter():
     """A shift near zero, and a gain of one."""
     _, data, given, _ = problem()

@@ -129,20 +129,7 @@ def test_set_replaces_a_key_and_nothing_else(tmp_path):
         "[[bands]]\nname = 'a'\nfwhm = 30.0\nnoise = { level = 2.0 }\n"
         "[free]\n'dust.beta_dust' = { start = 1.5, uniform = [1.0, 2.0] }\n"
     )
-    changed = load(
-        path,
-        [
-            "truth = {}",
-            "bands.0.noise = { rms = 1.0 }",
-            "free.'dust.beta_dust'.start = 1.6",
-            'free."dust.T_dust"={start = 20.0, gaussian = [20.0, 1.0]}',
-            "seed=3",
-            "common.nside=32",
-            "fit.regions = ['full']",
-            "cmb.include=false",
-            "title = \N{GREEK SMALL LETTER BETA} \N{COMET} = 2",
-        ],
-    )
+    changed = load(path, cases("settings/several_assignments"))
     assert changed.truth == {}
     (band,) = changed.bands
     assert (band.fwhm, band.noise.rms, band.noise.level) == (30.0, 1.0, None)

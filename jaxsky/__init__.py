@@ -1,6 +1,6 @@
 """jaxsky: a JAX-differentiable model of the polarized microwave sky.
 
-What users need is imported from here (`__all__`); each name when it is first asked for, so that
+Users import everything they need from here (`__all__`). Each name is loaded on first use, so that
 `import jaxsky` is quick.
 """
 

@@ -1,4 +1,4 @@
-"""Download of products into a cache: resumed, checked, whole or not at all."""
+"""Download public data products into a cache: transfers resume, are checked, and are atomic."""
 
 import errno
 import json
@@ -31,10 +31,10 @@ TIMEOUT = (10.0, 60.0)
 CHUNK = 2**20
 _RANGE = re.compile(r"bytes (\d+)-\d+/(\d+|\*)")
 
-#: What may be done about a file of another size or hash.
+#: Hint for a file whose size or hash differs from the catalogue's.
 ANEW = "; if the archive has issued the file anew, --accept takes it"
 
-#: What is wrong with a disk.
+#: Disk errors in words.
 _FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used up"}
 
 
@@ -42,25 +42,25 @@ Report = Callable[..., None]
 
 
 class CutError(Exception):
-    """A transfer that ended early, after so many bytes."""
+    """A transfer that ended early; its argument is the number of bytes received."""
 
 
 class RefusedError(Exception):
-    """An answer that is not the file; what it is."""
+    """A response that is not the file; its argument says what it is instead."""
 
 
 class _State(NamedTuple):
-    """What a partial file is of, kept next to it."""
+    """The origin of a partial file, stored next to it."""
 
     address: str
-    #: The server's strong ETag or date of the file.
+    #: The file's strong ETag or modification date, from the server.
     version: str
-    #: Bytes of the whole file, None if the server did not say.
+    #: Size of the complete file in bytes, None if the server did not say.
     total: int | None
 
 
 def _state(part: Path) -> _State | None:
-    """What is known of a partial file; None if it has to be begun anew."""
+    """Return the origin of a partial file, or None if the download has to start afresh."""
     try:
         state = _State(**json.loads(part.with_name(f"{part.name}.json").read_text()))
         have = part.stat().st_size
@@ -70,13 +70,13 @@ def _state(part: Path) -> _State | None:
 
 
 def discard(part: Path) -> None:
-    """Remove a partial file and what is known of it, in an order that allows to be interrupted."""
+    """Remove a partial file and its record, in an order that is safe to interrupt."""
     part.with_name(f"{part.name}.json").unlink(missing_ok=True)
     part.unlink(missing_ok=True)
 
 
 def _transfer(address: str, part: Path, size: int | None, report: Report) -> None:
-    """Bring a file of so many bytes, or what is missing of the part that is there."""
+    """Download a file of a known size (or None), resuming from a partial file if there is one."""
     state = _state(part)
     if state is not None and state.address == address:
         have = part.stat().st_size
@@ -103,7 +103,7 @@ def _transfer(address: str, part: Path, size: int | None, report: Report) -> Non
 
 
 def _rest(answer: requests.Response, state: _State, have: int) -> _State | None:
-    """The version of a file of which an answer is the rest; None if it is that of another."""
+    """Return the state of a partial file if the response is its remainder, otherwise None."""
     if answer.status_code == requests.codes.range_not_satisfiable:
         return None
     answer.raise_for_status()
@@ -111,14 +111,14 @@ def _rest(answer: requests.Response, state: _State, have: int) -> _State | None:
     if answer.status_code != requests.codes.partial_content or found is None:
         return None
     total = state.total if found[2] == "*" else int(found[2])
-    dated = not state.version.startswith('"')  # a date need not be said again, a tag must
+    dated = not state.version.startswith('"')  # a date need not be repeated, an ETag must
     same = _version(answer) in (None if dated else state.version, state.version)
     fits = int(found[1]) == have and state.total in (None, total)
     return state._replace(total=total) if same and fits else None
 
 
 def _get(address: str, headers: dict[str, str]) -> requests.Response:
-    # Compressed transfers would have other lengths than the file.
+    # A compressed transfer would have a different length from the file.
     headers = {"Accept-Encoding": "identity", **headers}
     try:
         return requests.get(
@@ -126,12 +126,12 @@ def _get(address: str, headers: dict[str, str]) -> requests.Response:
         )
     except requests.RequestException:
         raise
-    except ValueError:  # of an address that cannot be taken apart
+    except ValueError:  # from an address that cannot be parsed
         raise RefusedError("sends on to no address") from None
 
 
 def _stay_safe(answer: requests.Response, **_: object) -> None:
-    """Refuse to be sent from https to an address that is not."""
+    """Refuse a redirect from https to an address that is not https."""
     if answer.is_redirect and urlsplit(answer.url).scheme == "https":
         there = urljoin(answer.url, answer.headers["Location"])
         if urlsplit(there).scheme != "https":
@@ -139,7 +139,7 @@ def _stay_safe(answer: requests.Response, **_: object) -> None:
 
 
 def _version(answer: requests.Response) -> str | None:
-    """What tells this version of the file from others; weak tags do not."""
+    """Return what identifies this version of the file: a strong ETag, else the date."""
     tag = answer.headers.get("ETag", "")
     return tag if tag.startswith('"') else answer.headers.get("Last-Modified")
 
@@ -147,7 +147,7 @@ def _version(answer: requests.Response) -> str | None:
 def _check(
     answer: requests.Response, part: Path, have: int, total: int | None, size: int | None
 ) -> None:
-    """Refuse what need not be transferred to know that it is wrong, or has no room."""
+    """Refuse, before the transfer, a file that is compressed, of the wrong size, or too large."""
     encoding = answer.headers.get("Content-Encoding", "identity")
     if encoding not in ("", "identity"):
         raise RefusedError(f"sends the file compressed ({encoding}), unasked")
@@ -163,7 +163,7 @@ def _receive(
     answer: requests.Response, part: Path, have: int, total: int | None, report: Report
 ) -> None:
     report(completed=have, total=total)
-    # What has come counts, also before a break.
+    # Keep the bytes received before a connection breaks.
     answer.raw.enforce_content_length = False
     with part.open("ab" if have else "wb") as file:
         while True:
@@ -182,7 +182,7 @@ def _receive(
 
 
 def _reason(error: requests.RequestException) -> str:
-    """What is wrong with an address, to follow it in a sentence."""
+    """Return what went wrong with an address, as a predicate for a sentence about it."""
     if isinstance(error, requests.HTTPError) and error.response is not None:
         later = error.response.headers.get("Retry-After")
         said = f"answers {error.response.status_code}"
@@ -210,31 +210,31 @@ def fetch(
     report: Report = lambda completed, total: None,
     waiting: Callable[[], None] = lambda: None,
 ) -> Path:
-    """A product's file, downloaded unless it is there; of either, size and structure are checked.
+    """Return the path of a product's file, downloading it if needed; check size and structure.
 
-    What has come of a file that was cut is kept next to its place (`.part`, and `.part.json` for
-    its version) and resumed if the server still has that version. Processes that want the same
-    file wait for the one that fetches it (`.lock`). All three go when the file is complete. The
-    hash is checked when a file comes; that of one that is there by `verify`. Hashes that the
-    catalogue has none of are recorded in `checksums.json` (with a lock that stays).
+    An interrupted download is kept next to its destination (`.part`, and `.part.json` for its
+    version) and resumed if the server still has that version. Processes that want the same file
+    wait for the one that fetches it (`.lock`). All three are removed once the file is complete.
+    The hash is checked after a download; `verify` checks that of a file already present. Hashes
+    missing from the catalogue are recorded in `checksums.json` (whose lock file stays).
 
     Parameters
     ----------
     product : from the catalogue
     folder : where files are kept, by default `cache_folder`
-    mirror : address of a folder with the files, instead of the archives
-    accept : take a file of another size or hash than the catalogue says; its structure counts
-    report : called with the bytes that are there as `completed`, and all or None as `total`
-    waiting : called if another process fetches the file
+    mirror : address of a folder with the files, used instead of the archives
+    accept : take a file whose size or hash differs from the catalogue's, if its structure is right
+    report : called with the bytes received as `completed`, and all (or None) as `total`
+    waiting : called if another process is fetching the file
 
     Raises
     ------
     DownloadError
-        If no address has the file, a transfer is cut, or it cannot be written.
+        If no address has the file, a transfer ends early, or the file cannot be written.
     jaxsky.io.InputError
-        If what is there, file or record of hashes, is damaged; it is left as it is.
+        If the existing file or the record of hashes is damaged; it is left unchanged.
     ValueError
-        If the mirror is no http or https address.
+        If the mirror is not an http or https address.
     """
     folder = cache_folder() if folder is None else folder
     path, part = folder / product.name, folder / f"{product.name}.part"
@@ -243,18 +243,18 @@ def fetch(
         if not mirror.lower().startswith(("http://", "https://")):
             raise ValueError(f"--mirror must begin with https:// or http://, but is {mirror!r}.")
         wanted = wanted._replace(addresses=(f"{mirror.rstrip('/')}/{product.name}",))
-    checksums(folder)  # a damaged record is said before anything is transferred
+    checksums(folder)  # raises for a damaged record before anything is transferred
     if os.path.lexists(path):
         return _kept(product, path, part)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with locked(folder / f".{product.name}.lock", waiting=waiting):
-            if path.exists():  # another process has brought it
+            if path.exists():  # another process has downloaded it
                 return _kept(product, path, part)
             _download(wanted, part, report)
             if wanted.hash is None:
                 remember(product, folder, part)
-            # A cached file is never anything but whole.
+            # The final name appears only once the file is complete.
             os.replace(part, path)
             _tidy(part)
     except OSError as error:
@@ -268,26 +268,26 @@ def fetch(
 
 
 def _kept(product: Product, path: Path, part: Path) -> Path:
-    """A file that is there, after a check that takes no time."""
+    """Return the path of an existing file after a quick check (not of its hash)."""
     try:
         if not path.is_file():
             raise InputError(f"{path}: is no file, or a link to none.")
         check_product(recorded(product, path.parent)._replace(hash=None), path)
     except InputError as error:
         raise InputError(f"{error} It is left as it is; move it away and fetch it again.") from None
-    with suppress(OSError):  # the cache may be of someone else
+    with suppress(OSError):  # the cache may belong to someone else
         _tidy(part)
     return path
 
 
 def _tidy(part: Path) -> None:
-    """Remove what a download needs beside its file; processes that wait look for that first."""
+    """Remove a download's auxiliary files; waiting processes look for the product first."""
     discard(part)
     part.with_name(f".{part.stem}.lock").unlink(missing_ok=True)
 
 
 def _download(product: Product, part: Path, report: Report) -> None:
-    """Bring the file from the first address that has it."""
+    """Download the file from the first address that has it."""
     failures, begun = [], _state(part)
     for address in sorted(product.addresses, key=lambda a: begun is None or a != begun.address):
         try:

@@ -1,7 +1,7 @@
-"""Bandpasses: weights over frequency, the average of a spectrum, and brightness units.
+"""Bandpasses: weights over frequency, band averages of spectra, and brightness units.
 
-Units are named by strings such as "uK_CMB", "mK_RJ", "MJy/sr", which are static. Inside the package
-everything is uK_RJ.
+Units are named by strings such as "uK_CMB", "mK_RJ", "MJy/sr", which are static under jit. Inside
+the package everything is in uK_RJ.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,18 +34,18 @@ CONVENTIONS: dict[str, Callable[[Array], Array]] = {
 }
 
 
-#: Higher frequencies [GHz] are taken for a mistake of unit.
+#: Higher frequencies [GHz] are taken to be given in the wrong unit.
 MAX_NU = 1e6
 
 
 class Bandpass(Printed, eqx.Module):
-    """The response of a detector to the frequencies of a band.
+    """The response of a detector as a function of frequency.
 
     A band observes the weighted mean of the antenna temperature, int W S dnu / int W dnu (the
     paper's eq. 8, by the trapezoid rule). Tables of W come in three conventions: the response
     to unit antenna temperature ("RJ": the paper, Planck LFI), to unit power, Jy/sr ("power":
     WMAP, Planck HFI, PySM) or to unit thermodynamic temperature ("CMB"). They differ by a
-    factor of frequency that is applied here, so all else is the same for the three.
+    frequency-dependent factor that is applied here; everything else is the same for all three.
 
     Parameters
     ----------
@@ -58,7 +58,8 @@ class Bandpass(Printed, eqx.Module):
     TypeError
         If an argument carries a unit or is not numeric.
     ValueError
-        For a wrong shape or convention, frequencies that do not increase, or a zero integral.
+        For a wrong shape or convention, frequencies that are not finite, positive and increasing
+        or above 1e6 GHz, weights that are not finite, or an integral that is not positive.
 
     Examples
     --------
@@ -92,7 +93,7 @@ class Bandpass(Printed, eqx.Module):
 
     @classmethod
     def delta(cls, nu: ArrayLike) -> "Bandpass":
-        """A monochromatic band at nu [GHz]."""
+        """Return a monochromatic band at nu [GHz]."""
         nu = jnp.atleast_1d(as_array("nu", nu))
         return cls(nu, jnp.ones_like(nu))
 
@@ -100,7 +101,7 @@ class Bandpass(Printed, eqx.Module):
     def top_hat(
         cls, center: ArrayLike, width: ArrayLike, convention: str = "RJ", samples: int = 51
     ) -> "Bandpass":
-        """A band of constant weight over center +- width/2 [GHz], differentiable in both."""
+        """Return a band of constant weight over center +- width/2 [GHz], differentiable in both."""
         center, width = as_array("center", center), as_array("width", width)
         check_positive("width", width)
         if samples < 2:
@@ -124,25 +125,25 @@ class Bandpass(Printed, eqx.Module):
 
     @property
     def center(self) -> Float[Array, ""]:
-        """Mean frequency, weighted as antenna temperature is [GHz]."""
+        """Mean frequency with the weights on antenna temperature [GHz]."""
         return jnp.dot(self.quadrature, self.nu)
 
     def shifted(self, delta: ArrayLike) -> "Bandpass":
-        """The band moved by delta [GHz]; renormalised, since all averages are."""
+        """Return the band shifted by delta [GHz]; averages over it are normalised again."""
         return Bandpass(self.nu + delta, self.weights, self.convention)
 
     def stretched(self, factor: ArrayLike) -> "Bandpass":
-        """The band widened by a factor about its center; renormalised, since all averages are."""
+        """Return the band widened by a factor about its center; its averages are renormalised."""
         nu = self.center + factor * (self.nu - self.center)
         return Bandpass(nu, self.weights, self.convention)
 
     def conversion(
         self, source: str, target: str, nu_ref: Numeric | None = None
     ) -> Float[Array, ""]:
-        """Factor between brightness units in this band; see `band_conversion`.
+        """Return the factor between brightness units in this band; see `band_conversion`.
 
-        MJy/sr needs `nu_ref`, the frequency at which it is quoted [GHz], and is refused without:
-        the published factors are for nominal frequencies, and the center differs by percents.
+        MJy/sr requires `nu_ref`, the frequency at which it is quoted [GHz]: published factors
+        are for nominal frequencies, from which the center differs by a few percent.
         """
         if nu_ref is None and "MJy/sr" in (parse_unit(source)[1], parse_unit(target)[1]):
             raise ValueError("Over a band MJy/sr needs `nu_ref`, the frequency it is quoted at.")
@@ -150,8 +151,8 @@ class Bandpass(Printed, eqx.Module):
         return band_conversion(source, target, self.nu, self.quadrature, nu_ref)
 
 
-# What a band is made of is computed in compiled pieces: one operation at a time, each is a
-# program of its own, and those of a simulation's bands would take longer than its maps.
+# These pieces are compiled: outside jit every operation is a program of its own, and compiling
+# those for the bands of a simulation would take longer than making its maps.
 
 
 @partial(jax.jit, static_argnames="samples")
@@ -163,7 +164,7 @@ def _across(center: Array, width: Array, samples: int) -> Float[Array, " sample"
 def _integrand(
     nu: Float[Array, " sample"], weights: Float[Array, " sample"], convention: str
 ) -> Float[Array, " sample"]:
-    """Weights on antenna temperature times the steps of the trapezoid rule."""
+    """Return the weights on antenna temperature times the steps of the trapezoid rule."""
     weights = weights * CONVENTIONS[convention](nu)
     if nu.size == 1:
         return weights
@@ -179,7 +180,7 @@ def _quadrature(nu, weights, convention):
 
 
 class Samples(NamedTuple):
-    """What is needed of bands to average a spectrum: frequencies [GHz], and weights with sum 1."""
+    """Frequencies [GHz] of one or several bands, and weights with sum 1, to average spectra."""
 
     nu: Float[Array, "... sample"]
     quadrature: Float[Array, "... sample"]
@@ -187,7 +188,7 @@ class Samples(NamedTuple):
 
 @jax.jit
 def stack_bands(bands: Sequence[Bandpass]) -> Samples:
-    """Bands as tables with one row each, for `jax.vmap`; short ones end in samples of weight 0."""
+    """Return bands as tables with one row each, for `jax.vmap`, padded by samples of weight 0."""
     longest = max(band.nu.size for band in bands)
     missing = [(0, longest - band.nu.size) for band in bands]
     nu = [jnp.pad(band.nu, n, mode="edge") for band, n in zip(bands, missing, strict=True)]
@@ -196,11 +197,11 @@ def stack_bands(bands: Sequence[Bandpass]) -> Samples:
 
 
 def average(sed: Callable[[Array], Array], band: Bandpass | Samples) -> Float[Array, "..."]:
-    """Band average sum_k w_k S(nu_k) of a spectrum: the direct sum, and the reference.
+    """Return the band average sum_k w_k S(nu_k) of a spectrum, by direct summation.
 
-    `sed` is a function of one frequency [GHz] that returns a number or a map; so is the result.
-    Maps are summed one sample at a time, so that memory does not grow with the number of samples,
-    and gradients recompute rather than store them.
+    `sed` is a function of one frequency [GHz] that returns a number or a map; the result has the
+    same shape. Maps are summed one sample at a time, so that memory does not grow with the number
+    of samples; gradients recompute the maps instead of storing them.
     """
     shape = jax.eval_shape(sed, band.nu[0]).shape
     if shape == ():
@@ -230,7 +231,7 @@ UNITS: dict[str, tuple[float, str]] = {
 
 
 def parse_unit(unit: str) -> tuple[float, str]:
-    """Size and kind ("K_RJ", "K_CMB" or "MJy/sr") of a unit's name."""
+    """Return the size and kind ("K_RJ", "K_CMB" or "MJy/sr") of a unit, given its name."""
     try:
         return UNITS[unit]
     except KeyError:
@@ -238,7 +239,7 @@ def parse_unit(unit: str) -> tuple[float, str]:
 
 
 def conversion(source: str, target: str, nu: Numeric) -> Float[Array, "..."]:
-    """Factor from one brightness unit to another at a frequency [GHz]."""
+    """Return the factor from one brightness unit to another at a frequency [GHz]."""
     nu = jnp.asarray(nu)
     return band_conversion(source, target, nu[..., None], jnp.ones(1, nu.dtype), nu)
 
@@ -251,12 +252,12 @@ def band_conversion(
     weights: Float[Array, " sample"],
     nu_ref: Numeric,
 ) -> Float[Array, "..."]:
-    """Factor from one brightness unit to another over a band.
+    """Return the factor from one brightness unit to another over a band.
 
     A band reports the weighted mean of the antenna temperature, so 1 K_CMB reads sum w g(nu)
-    K_RJ, g being `cmb_derivative`. A value in MJy/sr is that at `nu_ref` [GHz] of a spectrum
-    I ~ 1/nu (the IRAS convention, which Planck HFI follows: Planck 2013 results IX). The weights
-    are those on antenna temperature, with sum 1 (`Bandpass.quadrature`).
+    K_RJ, where g is `cmb_derivative`. A value in MJy/sr is the intensity at `nu_ref` [GHz] of a
+    spectrum I ~ 1/nu (the IRAS convention, which Planck HFI follows: Planck 2013 results IX).
+    The weights act on antenna temperature and have sum 1 (`Bandpass.quadrature`).
     """
     (source_size, source_kind), (target_size, target_kind) = parse_unit(source), parse_unit(target)
     scale = source_size / target_size

@@ -1,4 +1,4 @@
-"""Values: their types and checks, one sentence an error, and how they print."""
+"""Check arguments, with one sentence per error, and print values as text or HTML."""
 
 import html
 from collections.abc import Iterable, Sequence
@@ -11,20 +11,20 @@ from jaxtyping import Array, Float
 
 from jaxsky.public import refuse_unit, takes_quantities
 
-#: What the spectral laws take: numbers or arrays that broadcast.
+#: Arguments of the spectral laws: numbers or arrays that broadcast.
 Numeric: TypeAlias = float | Array | np.ndarray
-#: A spectral parameter: a number or a map; an array, once a component holds it.
+#: A spectral parameter: a number or a map; inside a component always an array.
 Parameter: TypeAlias = Float[Array, ""] | Float[Array, " pix"] | float
 
 
 def is_concrete(x: object) -> bool:
-    """True if the values of `x` can be looked at now (it is not being traced)."""
+    """Return whether `x` has values that can be read now (it is not being traced)."""
     return not isinstance(x, jax.core.Tracer)
 
 
 @takes_quantities
 def as_array(name: str, value: object) -> Array:
-    """`value` as a floating-point JAX array in native byte order."""
+    """Return `value` as a floating-point JAX array in native byte order."""
     refuse_unit(name, value)
     if isinstance(value, np.ndarray) and not value.dtype.isnative:
         value = value.astype(value.dtype.newbyteorder("="))
@@ -40,13 +40,13 @@ def as_array(name: str, value: object) -> Array:
 
 
 def listed(words: Iterable[str]) -> str:
-    """Words as a list in a sentence: "a, b and c"."""
+    """Join words as in a sentence: "a, b and c"."""
     first = list(words)
     return " and ".join(filter(None, (", ".join(first[:-1]), *first[-1:])))
 
 
 def check_shape(name: str, array: Array | np.ndarray, good: bool, form: str) -> None:
-    """Raise ValueError, with the form that an array must have, unless its shape is good."""
+    """Raise ValueError, which states the required form, unless `good`."""
     if not good:
         raise ValueError(f"Argument `{name}` must {form}, but has shape {array.shape}.")
 
@@ -56,7 +56,7 @@ UNSEEN = -1.6e30
 
 
 def check_finite(name: str, value: Array | np.ndarray) -> None:
-    """Raise ValueError if a concrete array has NaN, infinite or UNSEEN values; says how many."""
+    """Raise ValueError if a concrete array has NaN, infinite or UNSEEN values, and count them."""
     if not is_concrete(value):
         return
     numbers = np.asarray(value)
@@ -77,7 +77,7 @@ def check_positive(name: str, value: Array | np.ndarray) -> None:
 
 @takes_quantities
 def as_number(name: str, value: object, positive: bool = False) -> Float[Array, ""]:
-    """`value` as an array without axes, finite or positive."""
+    """Return `value` as an array without axes, checked to be finite (and positive on request)."""
     number = as_array(name, value)
     check_shape(name, number, not number.shape, "be a number")
     (check_positive if positive else check_finite)(name, number)
@@ -85,9 +85,9 @@ def as_number(name: str, value: object, positive: bool = False) -> Float[Array, 
 
 
 def check_seed(name: str, value: object) -> None:
-    """Raise TypeError if a seed is no integer, ValueError if it is not within 0 and 2^32 - 1.
+    """Raise TypeError if a seed is not an integer, ValueError unless it is from 0 to 2^32 - 1.
 
-    Without double precision, JAX keeps the lower 32 bits of other seeds without a word.
+    Without double precision, JAX silently keeps only the lower 32 bits of other seeds.
     """
     if not isinstance(value, int | np.integer) or isinstance(value, bool):
         raise TypeError(f"Argument `{name}` must be an int, but is {value!r}.")
@@ -96,7 +96,7 @@ def check_seed(name: str, value: object) -> None:
 
 
 def check_choice(name: str, value: object, known: Iterable[str]) -> None:
-    """Raise ValueError unless an argument is one of the words that are known."""
+    """Raise ValueError unless an argument is one of the known words."""
     if value not in (words := tuple(known)):
         raise ValueError(f"Argument `{name}` must be one of {', '.join(words)}, not {value!r}.")
 
@@ -109,15 +109,15 @@ def check_double(what: str) -> None:
         )
 
 
-#: A heading, and rows of equally many cells.
+#: A heading, and rows that all have the same number of cells.
 Summary = tuple[str, Sequence[Sequence[str]]]
 
 
 class Printed:
-    """Base class of what has a `summary`; in notebooks it is a table."""
+    """Base class of objects that print their `summary`; in notebooks as an HTML table."""
 
     def summary(self) -> Summary:
-        """The heading, and rows of cells."""
+        """Return a heading and rows of cells."""
         raise TypeError(f"{type(self).__name__} must define `summary`.")
 
     def __str__(self) -> str:
@@ -128,7 +128,7 @@ class Printed:
 
 
 def as_text(summary: Summary) -> str:
-    """Lines of a terminal."""
+    """Format a summary as lines for a terminal."""
     heading, rows = summary
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
@@ -136,7 +136,7 @@ def as_text(summary: Summary) -> str:
 
 
 def as_html(summary: Summary) -> str:
-    """A table of a notebook."""
+    """Format a summary as an HTML table for a notebook."""
     heading, rows = summary
     cells = ["".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows]
     body = "".join(f"<tr>{row}</tr>" for row in cells)
@@ -144,7 +144,7 @@ def as_html(summary: Summary) -> str:
 
 
 def shown(value: Any, unit: str = "") -> str:
-    """A number, the range of a map or several numbers, with their unit."""
+    """Format a number, the range of a map, or a tuple of either, with the unit."""
     if isinstance(value, tuple):
         return ", ".join(shown(one, unit) for one in value)
     if not is_concrete(value):

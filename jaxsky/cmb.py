@@ -1,4 +1,4 @@
-"""The CMB: power spectra from CAMB; and Gaussian fields with given auto- and cross-spectra."""
+"""CMB power spectra from CAMB, and Gaussian fields with given auto- and cross-spectra."""
 
 from functools import cache, partial
 from importlib.metadata import version
@@ -25,33 +25,33 @@ PLANCK_2018 = {
     "ns": 0.9649,
 }
 
-#: What stands for H0 in a cosmology.
+#: Parameters that a cosmology may have instead of H0.
 EXPANSION = {"cosmomc_theta", "thetastar"}
-#: What this module gives to `camb.set_params` itself.
+#: Arguments of `camb.set_params` that this module sets itself.
 OWN = ("r", "lmax", "max_l_tensor", "max_eta_k_tensor", "WantScalars", "WantTensors")
-#: Where the first pieces of spectra end. Each piece is a run of its own with the same settings
-#: whatever is asked for, so a multipole has one value; the next piece ends at twice that.
+#: Where the first pieces of spectra end. Each piece is a CAMB run with settings that do not depend
+#: on the lmax asked for, so a multipole has one value; the next piece ends at twice that.
 SCALARS_END, TENSORS_END = 1500, 3000
 
 
 def camb_spectra(lmax: int, r: float = 0.0, **cosmology: float) -> Float[np.ndarray, "4 ell"]:
-    """Spectra C_l of TT, EE, BB, TE [uK_CMB^2], l = 0 ... lmax: lensed scalars, and r tensors.
+    """Return C_l of TT, EE, BB, TE [uK_CMB^2], l = 0 ... lmax: lensed scalars plus tensors.
 
-    The primordial spectra are power laws about k = 0.05 / Mpc: that of scalars with the
-    amplitude `As` and the tilt `ns` of the cosmology, that of tensors with r `As` and no tilt,
-    unless the cosmology has another, `nt`. So the spectra are linear in r, with `tensor_spectra`
-    as the slope. A multipole has the same value whatever lmax is.
+    The primordial spectra are power laws with pivot k = 0.05 / Mpc: scalars with the amplitude
+    `As` and tilt `ns` of the cosmology, tensors with amplitude r `As` and no tilt unless the
+    cosmology sets `nt`. The spectra are therefore linear in r, with slope `tensor_spectra`. The
+    value at a multipole does not depend on lmax.
 
     Parameters
     ----------
     lmax : largest multipole
     r : tensor-to-scalar ratio at k = 0.05 / Mpc
-    **cosmology : of `camb.set_params`, in place of those in `PLANCK_2018`
+    **cosmology : arguments of `camb.set_params` that replace or extend `PLANCK_2018`
 
     Raises
     ------
     ValueError
-        If lmax or r are negative, or CAMB does not take the cosmology.
+        If lmax or r is negative, or CAMB rejects the cosmology.
     """
     if not (np.isfinite(r) and r >= 0):
         raise ValueError(f"Argument `r` must be a number from 0 on, but is {r}.")
@@ -60,16 +60,16 @@ def camb_spectra(lmax: int, r: float = 0.0, **cosmology: float) -> Float[np.ndar
 
 
 def tensor_spectra(lmax: int, **cosmology: float) -> Float[np.ndarray, "4 ell"]:
-    """Spectra C_l of TT, EE, BB, TE of tensors with r = 1 [uK_CMB^2], l = 0 ... lmax.
+    """Return C_l of TT, EE, BB, TE of tensors with r = 1 [uK_CMB^2], l = 0 ... lmax.
 
-    For another r they are these times r. They are not lensed. See `camb_spectra` for their
-    primordial spectrum and the parameters of the cosmology.
+    They scale linearly with r, and are not lensed. See `camb_spectra` for the primordial
+    spectrum and the parameters of the cosmology.
     """
     return _joined(_tensors, TENSORS_END, lmax, cosmology)
 
 
 def _joined(piece, end, lmax, cosmology):
-    """Spectra up to lmax from pieces, the first of which ends at `end`."""
+    """Return spectra up to lmax, joined from pieces of which the first ends at `end`."""
     if lmax < 0:
         raise ValueError(f"Argument `lmax` must not be negative, but is {lmax}.")
     for name, value in cosmology.items():
@@ -87,8 +87,8 @@ def _joined(piece, end, lmax, cosmology):
 
 @cache
 def _scalars(end, **cosmology):
-    """Lensed scalars up to l = end: BB within 0.2 % of CAMB at its highest accuracy."""
-    # The lensing of l = end needs higher multipoles.
+    """Return lensed scalars up to l = end: BB within 0.2 % of CAMB at its highest accuracy."""
+    # Lensing at l = end needs higher multipoles.
     lmax = end + 1000
     accuracy = {"lens_potential_accuracy": max(4.0, (lmax - 1500) / 500)} | cosmology
     return _spectra("get_lensed_scalar_cls", end, **accuracy, lmax=lmax)
@@ -96,9 +96,9 @@ def _scalars(end, **cosmology):
 
 @cache
 def _tensors(end, **cosmology):
-    """Tensors with r = 1 up to l = end: within 0.7 % up to l = 1000."""
+    """Return tensor spectra for r = 1 up to l = end: within 0.7 % up to l = 1000."""
     lmax = end + 500
-    # Between too few multipoles, CAMB's interpolation is off by 2 % beyond l = 500.
+    # With CAMB's default sampling in l, its interpolation is off by 2 % beyond l = 500.
     accuracy = {"nt": 0.0, "lSampleBoost": 2, "lAccuracyBoost": 2} | cosmology
     return _spectra(
         "get_tensor_cls",
@@ -114,8 +114,8 @@ def _tensors(end, **cosmology):
 
 
 def _spectra(which: str, end: int, **arguments: Any) -> Float[np.ndarray, "4 ell"]:
-    """What CAMB computes up to l = end for arguments of `camb.set_params`, once and for all."""
-    from jaxsky.io.files import kept  # the border is slow to import, as CAMB is
+    """Run CAMB up to l = end with arguments of `camb.set_params`, or take the cached result."""
+    from jaxsky.io.files import kept  # jaxsky.io is slow to import, as CAMB is
 
     def computed() -> np.ndarray:
         import camb
@@ -135,9 +135,9 @@ def _spectra(which: str, end: int, **arguments: Any) -> Float[np.ndarray, "4 ell
 def realisation(
     key: Array, spectra: Float[Array | np.ndarray, "4 ell"], stokes: str = "QU"
 ) -> Float[Array, "stokes alm"]:
-    """Packed coefficients (E, B or I, E, B) of a Gaussian realisation of spectra.
+    """Return packed coefficients (E, B or I, E, B) of a Gaussian realisation of spectra.
 
-    `spectra` are C_l of TT, EE, BB, TE in any unit squared; `stokes` is "QU" or "IQU".
+    `spectra` are the C_l of TT, EE, BB, TE, in the square of any unit; `stokes` is "QU" or "IQU".
     """
     check_choice("stokes", stokes, ("QU", "IQU"))
     TT, EE, BB, TE = spectra
@@ -147,9 +147,9 @@ def realisation(
     return gaussian_fields(key, fields)[3 - len(stokes) :]
 
 
-# Fields that are correlated with each other, after Brown & Battye (2011).
+# Mutually correlated fields, after Brown & Battye (2011).
 
-#: Smallest eigenvalue that a repaired matrix of correlations keeps.
+#: Smallest eigenvalue of a repaired correlation matrix.
 LEAST = 1e-10
 
 
@@ -157,7 +157,7 @@ LEAST = 1e-10
 def _positive(
     matrix: Float[Array, "ell field field"],
 ) -> tuple[Float[Array, "ell field field"], Float[Array, " ell"]]:
-    """Symmetric matrices with eigenvalues of at least `LEAST`, and the smallest that they had."""
+    """Raise the eigenvalues of symmetric matrices to `LEAST`; also return the smallest before."""
     values, vectors = jnp.linalg.eigh(matrix)
     kept = jnp.maximum(values, LEAST)
     return (vectors * kept[:, None]) @ vectors.mT, values[:, 0]
@@ -165,9 +165,9 @@ def _positive(
 
 @_positive.defjvp
 def _positive_jvp(primals, tangents):
-    """Derivative of a function of a matrix (Daleckii & Krein): no eigenvectors to differentiate.
+    """Differentiate `_positive` by the formula of Daleckii & Krein, not through the eigenvectors.
 
-    Those have no derivative where eigenvalues coincide, as without correlations they all do.
+    Eigenvectors have no derivative where eigenvalues coincide, as all do without correlations.
     """
     values, vectors = jnp.linalg.eigh(primals[0])
     kept = jnp.maximum(values, LEAST)
@@ -186,10 +186,10 @@ def _positive_jvp(primals, tangents):
 def repair(
     spectra: Float[Array, "field field ell"],
 ) -> tuple[Float[Array, "field field ell"], Int[Array, ""]]:
-    """Spectra whose matrix at each multipole is positive semi-definite, and how many were not.
+    """Make the matrix of spectra positive semi-definite at each l; also count those that were not.
 
     Extrapolated cross-spectra may exceed what the auto-spectra allow. Such a matrix keeps its
-    auto-spectra; of its correlation coefficients the negative eigenvalues are set to zero and
+    auto-spectra; the negative eigenvalues of its correlation matrix are raised to `LEAST`, and
     the diagonal is scaled back to one. No multipole is left out. Differentiable in the spectra.
     """
     n = len(spectra)
@@ -211,9 +211,9 @@ def repair(
 def gaussian_fields(
     key: Array, spectra: Float[Array, "field field ell"]
 ) -> Float[Array, "field alm"]:
-    """Packed coefficients of Gaussian fields with given auto- and cross-spectra C_l.
+    """Draw packed coefficients of Gaussian fields with given auto- and cross-spectra C_l.
 
-    The matrix of these has to be positive semi-definite at each l (see `repair`).
+    The matrix of spectra must be positive semi-definite at each l (see `repair`).
     """
     n, lmax = len(spectra), spectra.shape[-1] - 1
     lower = cholesky(spectra)

@@ -27,41 +27,41 @@ from jaxsky.components import Dust, Synchrotron
 from jaxsky.harmonics import degrees, resample, synthesis
 from jaxsky.sky import Sky
 
-#: Standard deviations of Q and U over the real sky at nside 64 [uK_RJ], added in quadrature.
+#: Standard deviations of Q and U over the observed sky at nside 64 [uK_RJ], added in quadrature.
 DUST_RMS, SYNCHROTRON_RMS = np.hypot(14.7, 6.8), np.hypot(17.2, 9.1)
 #: Resolution at which the maps are scaled and up to which the turbulence is normalised.
 NSIDE_SCALE = 64
-#: Intrinsic polarization fraction of the synchrotron, (p + 1)/(p + 7/3) for electrons E^-3.
+#: Intrinsic polarization fraction of synchrotron, (p + 1)/(p + 7/3) for electrons E^-p, p = 3.
 SYNCHROTRON_FRACTION = 0.75
-#: Steps along the line of sight; the maps are then converged to about 1e-3 of their rms.
+#: Steps along the line of sight; with these the maps have converged to about 1e-3 of their rms.
 STEPS = 96
-#: Pixels that are integrated at once.
+#: Pixels integrated at once.
 BLOCK = 12 * 32**2
 #: The steps are equal in ln(1 + s / STEP_SCALE), from the Sun to s = FARTHEST [kpc].
 STEP_SCALE, FARTHEST = 0.1, 30.0
 #: Distances of the shells of independent turbulence [kpc].
 SHELLS = 0.05 * 3.0 ** np.arange(6)
-#: Within this distance of its axis the Galaxy's field is vertical [kpc].
+#: Within this distance of its axis the Galaxy's field turns vertical [kpc].
 CORE = 0.5
 
 
 class GalaxyModel(eqx.Module):
-    """Parameters of the magnetic field, of the emitting matter and of the turbulence.
+    """Parameters of the Galaxy's magnetic field, emitting matter and turbulence.
 
     Parameters
     ----------
     psi0, psi1 : angle of the field to the azimuthal direction [deg], psi0 + psi1 ln(r / r_sun)
-    chi0, chi_height : angle to the Galactic plane chi0 tanh(z / chi_height) [deg], [kpc]
+    chi0, chi_height : [deg] and [kpc]; the angle to the Galactic plane is chi0 tanh(z / chi_height)
     r_sun : distance of the Sun from the Galactic centre [kpc]
     electron_radius, electron_height : scale lengths of the cosmic-ray electrons [kpc]
     dust_radius, dust_height : scale lengths of the dust [kpc]; with the defaults the polarized
-        rms falls with latitude as that of the real sky, 16 times from |b| < 10 to above 45 deg
+        rms falls with latitude as on the observed sky, 16-fold from |b| < 10 to above 45 deg
     p0 : intrinsic polarization fraction of the dust, about 0.2 (Planck int. results XX, 2015)
     turbulence : rms of the turbulent field relative to the regular one; 0.9 in Planck XLIV
-    coherence : length of the turbulence along the line of sight [kpc]. What is coherent over a
-        stretch as long as its distance s is the mean of about s / coherence cells, so the rms
-        there is turbulence / sqrt(1 + s / coherence).
-    slope : exponent of its power spectrum, C_l ~ l^slope for l >= 2
+    coherence : length of the turbulence along the line of sight [kpc]. A shell at distance s,
+        as deep as it is far away, averages about s / coherence cells, so the rms there is
+        turbulence / sqrt(1 + s / coherence).
+    slope : exponent of the turbulence's power spectrum, C_l ~ l^slope for l >= 2
     """
 
     psi0: Parameter = 27.0
@@ -85,10 +85,10 @@ class GalaxyModel(eqx.Module):
 
 
 class EmbeddedSky(eqx.Module):
-    """Maps of the model Galaxy, from `embedded_sky`.
+    """Maps of the model Galaxy, made by `embedded_sky`.
 
-    I, Q, U of dust and synchrotron at their reference frequencies [uK_RJ], and the seed of the
-    turbulence.
+    They are I, Q, U of dust and synchrotron at their reference frequencies [uK_RJ]; `seed` is that
+    of the turbulence.
     """
 
     dust: Float[Array, "3 pix"]
@@ -99,7 +99,7 @@ class EmbeddedSky(eqx.Module):
 
     @property
     def description(self) -> str:
-        """What the maps are, for headers and captions."""
+        """A sentence that describes the maps, for headers and captions."""
         return (
             "Model of the Galaxy (not data): line-of-sight integral through the spiral magnetic "
             "field of Page et al. (2007) with Gaussian turbulence, "
@@ -112,7 +112,7 @@ class EmbeddedSky(eqx.Module):
         return healpy.npix2nside(self.dust.shape[-1])
 
     def sky(self, stokes: str = "QU") -> Sky:
-        """A sky of dust and synchrotron with the paper's baseline spectral parameters.
+        """Return a sky of dust and synchrotron with the paper's baseline spectral parameters.
 
         `stokes` is "QU" or "IQU".
         """
@@ -129,15 +129,15 @@ class EmbeddedSky(eqx.Module):
 def magnetic_field(
     model: GalaxyModel, x: Float[Array, "..."], y: Float[Array, "..."], z: Float[Array, "..."]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
-    """Cartesian components of the regular field, of strength 1, at a Galactocentric position [kpc].
+    """Return the Cartesian components of the regular field, of strength 1, at x, y, z [kpc].
 
-    Logarithmic spiral arms,
+    The field follows logarithmic spiral arms,
     sin psi(r) cos chi(z) r_hat + cos psi(r) cos chi(z) phi_hat + sin chi(z) z_hat, eq. 9 of Page
-    et al. (2007) with the first two terms as the hammurabi code has them (Waelkens et al. 2009,
-    A&A 495, 697). With sine and cosine exchanged the field near the Sun would point to
-    l = 27 degrees; so it points to 63, near the 70 that Planck XLIV measured, and the maps at
-    high latitude agree better with the observed ones. Within `CORE` of its axis, where a spiral
-    has no direction, the field turns vertical.
+    et al. (2007) with the first two terms as in the hammurabi code (Waelkens et al. 2009,
+    A&A 495, 697). It points to l = 63 degrees near the Sun, close to the 70 that Planck XLIV
+    measured; with sine and cosine exchanged it would point to 27, and the maps would agree less
+    well with the observed ones at high latitude. Within `CORE` of its axis, where a spiral has no
+    direction, the field turns vertical.
     """
     r2 = x**2 + y**2 + 1e-12
     psi = jnp.deg2rad(model.psi0 + model.psi1 * jnp.log(jnp.sqrt(r2) / model.r_sun))
@@ -150,9 +150,9 @@ def magnetic_field(
 
 
 def _sine_and_cosine(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Sine and cosine to some roundings, in a tenth of the time of XLA's, which do one at a time.
+    """Return sine and cosine to a few roundings, ten times faster than XLA's separate functions.
 
-    The series at an eighth of the angle, doubled three times, with 1 - cos in place of the cosine.
+    Sums the series at an eighth of the angle and doubles it three times, with 1 - cos for cos.
     """
     z = (x - 2 * np.pi * jnp.round(x / (2 * np.pi))) / 8
     square = z**2
@@ -168,25 +168,25 @@ def _sine_and_cosine(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float
 
 
 def _density(r, z, r_sun, radius, height):
-    """exp(-(r - r_sun)/radius) sech^2(z/height), 1 at the Sun."""
+    """Return exp(-(r - r_sun)/radius) sech^2(z/height), which is 1 at the Sun."""
     falling = jnp.exp(-2 * jnp.abs(z) / height)
     return jnp.exp((r_sun - r) / radius) * 4 * falling / (1 + falling) ** 2
 
 
 def _turbulence(key, slope, basis):
-    """Gaussian vector fields of rms 1 on each shell, in the local basis; (shell, 3, pix)."""
+    """Draw Gaussian vector fields of rms 1 on each shell, in the local basis; (shell, 3, pix)."""
     nside = healpy.npix2nside(basis.shape[-1])
     ell, m, part = degrees(3 * nside - 1)
     # Drawn in the order of l, so a coefficient keeps its place when higher multipoles are added.
     place = ell**2 + jnp.maximum(2 * m - 1, 0) + part
-    # The normalisation ends at one multipole for all resolutions, so that all see one field.
+    # The normalisation sums to the same multipole at every nside, so that all see one field.
     reference = jnp.arange(2, 3 * NSIDE_SCALE, dtype=basis.dtype)
     variance = jnp.sum((2 * reference + 1) / (4 * np.pi) * reference**slope)
     power = jnp.maximum(ell, 1).astype(basis.dtype) ** slope
     scale = jnp.where(ell >= 2, jnp.sqrt(power / (3 * variance)), 0.0)
 
     def component(index):
-        # In single precision always, so that a seed means one sky in either precision.
+        # Always in single precision, so that a seed means one sky in either precision.
         white = jax.random.normal(jax.random.fold_in(key, index), ell.shape, jnp.float32)
         return synthesis((white[place] * scale)[None], nside)[0]
 
@@ -199,7 +199,7 @@ def _turbulence(key, slope, basis):
 
 @cache
 def _path(steps: int) -> dict[str, np.ndarray]:
-    """Distances and lengths of the steps [kpc], and the two shells that each lies between."""
+    """Return distances and lengths of the steps [kpc], and the two shells around each."""
     step = np.log1p(FARTHEST / STEP_SCALE) / steps
     t = (np.arange(steps) + 0.5) * step
     s = STEP_SCALE * np.expm1(t)
@@ -225,12 +225,12 @@ def _integrate(
     path = {name: jnp.asarray(values) for name, values in _path(steps).items()}
 
     def integral(pixels):
-        """Of a few pixels, which stay in the processor's cache from step to step."""
+        """Integrate a few pixels, which stay in the processor's cache from step to step."""
 
         def add(total, step):
             return tuple(map(jnp.add, total, _emission(model, *pixels, step))), None
 
-        # Six maps rather than one array, which XLA would fill with one pass a row.
+        # Six maps rather than one array, which XLA would fill in one pass per row.
         start = (jnp.zeros(pixels[0].shape[-1], dtype),) * 6
         return jnp.stack(jax.lax.scan(add, start, path)[0])
 
@@ -241,7 +241,7 @@ def _integrate(
 
 @jax.checkpoint
 def _emission(model, basis, turbulence, step):
-    """I, Q, U of dust and of synchrotron from a step along the line of sight."""
+    """Return I, Q, U of dust and of synchrotron from one step along the line of sight."""
     x, y, z = basis[2] * step["s"]
     x = x - model.r_sun
     Bx, By, Bz = magnetic_field(model, x, y, z)
@@ -253,9 +253,9 @@ def _emission(model, basis, turbulence, step):
     )
     across = Bt**2 + Bp**2
     fraction = model.p0 / (across + Bs**2)
-    # Polarized perpendicular to the field: along theta_hat (Q > 0) for one along phi_hat.
+    # Polarized perpendicular to the field: along theta_hat (Q > 0) for a field along phi_hat.
     Q, U = Bp**2 - Bt**2, -2 * Bt * Bp
-    # Kept off zero, where its derivative is not defined.
+    # Kept away from zero, where its derivative is not defined.
     r = jnp.sqrt(x**2 + y**2 + 1e-12)
     dust = _density(r, z, model.r_sun, model.dust_radius, model.dust_height)
     electrons = _density(r, z, model.r_sun, model.electron_radius, model.electron_height)
@@ -285,7 +285,7 @@ def _check(nside: int, seed: int, steps: int) -> None:
 def line_of_sight(
     model: GalaxyModel, nside: int, seed: int = 0, *, steps: int = STEPS
 ) -> Float[Array, "2 3 pix"]:
-    """I, Q, U of dust and of synchrotron [kpc], integrated along the line of sight, not yet scaled.
+    """Integrate I, Q, U of dust and of synchrotron along the line of sight [kpc], not yet scaled.
 
     With B_t, B_p the components of the field along theta_hat and phi_hat (COSMO), alpha its
     angle to the line of sight, and the densities n in units of those at the Sun,
@@ -293,9 +293,9 @@ def line_of_sight(
     dust         int n_d [1 - p0 (sin^2 alpha - 2/3), p0 (B_p^2 - B_t^2)/B^2, -2 p0 B_t B_p/B^2] ds
     synchrotron  int n_e [B_t^2 + B_p^2, 3/4 (B_p^2 - B_t^2), -3/4 2 B_t B_p] ds
 
-    the dust as in Planck int. results XX (2015), the synchrotron for electrons E^-3.
-    Differentiable in the parameters of the model. The maps are samples at the pixel centres; one
-    seed is one sky at every nside.
+    dust as in Planck int. results XX (2015), synchrotron for electrons with E^-3. Differentiable
+    in the parameters of the model. The maps are samples at the pixel centres; a seed means the
+    same sky at every nside.
     """
     _check(nside, seed, steps)
     angles = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
@@ -304,7 +304,7 @@ def line_of_sight(
 
 @jax.jit
 def _scaled(maps, calibrator):
-    """Maps of both components times a number each, by which the calibrator is as the real sky."""
+    """Scale both components by the factors that give the calibrator the observed rms."""
     spread = jnp.sqrt(jnp.var(calibrator[:, 1:], axis=-1).sum(axis=-1))
     return (jnp.array([DUST_RMS, SYNCHROTRON_RMS]) / spread)[:, None, None] * maps
 
@@ -312,18 +312,18 @@ def _scaled(maps, calibrator):
 def embedded_sky(
     nside: int, seed: int = 0, model: GalaxyModel | None = None, *, steps: int = STEPS
 ) -> EmbeddedSky:
-    """A model of the polarized Galaxy: dust at 353 GHz and synchrotron at 30 GHz; not data.
+    """Make a model of the polarized Galaxy (not data): dust at 353 GHz and synchrotron at 30 GHz.
 
-    Each component of `line_of_sight` times a number, the same at all resolutions, by which the
-    standard deviations of Q and U at nside 64 add in quadrature to those of the real sky, uK_RJ:
-    (14.7, 6.8) for the dust, (17.2, 9.1) for the synchrotron.
+    Each component of `line_of_sight` is scaled by one factor, the same at all resolutions, so
+    that at nside 64 the standard deviations of Q and U, added in quadrature, equal those of the
+    observed sky [uK_RJ]: (14.7, 6.8) for dust, (17.2, 9.1) for synchrotron.
 
     Parameters
     ----------
     nside : resolution. Below 64, where pixels are too wide to sample the Galactic plane, the maps
-        are those at 64 cut at l = 3 nside - 1; the dust's intensity then rings about the plane
+        are those at 64 cut at l = 3 nside - 1; the dust intensity then rings around the plane
         and is negative in places.
-    seed : of the turbulence; at another nside it is the same sky with more detail or less
+    seed : seed of the turbulence; a different nside shows the same sky in more or less detail
     model : the parameters, by default `GalaxyModel()`
     steps : number of steps along the line of sight
 

@@ -1,4 +1,4 @@
-"""What settings name, read: maps, templates with their laws, maps of parameters, bandpasses."""
+"""Read what the settings name: templates with their laws and parameters, bandpasses and beams."""
 
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
@@ -42,9 +42,9 @@ def parameter_map(
     of: str = "that of the template",
     stated: bool = False,
 ) -> tuple[Float[np.ndarray, " pix"], Bool[np.ndarray, " pix"]]:
-    """The map of a spectral parameter in its unit, with the median where it is not known.
+    """Return the map of a spectral parameter in its unit, median-filled, and where it is known.
 
-    `of` says whose nside it must have; if it is `stated` which values are missing, zeros are data.
+    `of` says whose nside it must have; if missing values were `stated`, zeros count as data.
     """
     values, used = one_column(found, nside, where, of), np.asarray(found.mask)
     declared = parameter_declaration(name)
@@ -71,7 +71,7 @@ def parameter_map(
 
 
 def one_column(found: Maps, nside: int, where: str, of: str) -> Float[np.ndarray, " pix"]:
-    """The one column that was read, of the resolution that it must have."""
+    """Return the only column that was read, after checking its resolution."""
     if len(found.maps) != 1:
         raise SettingsError(f"{where}: fields must name one column, not {', '.join(found.names)}.")
     if found.nside != nside:
@@ -79,14 +79,14 @@ def one_column(found: Maps, nside: int, where: str, of: str) -> Float[np.ndarray
     return np.asarray(found.maps[0])
 
 
-#: Maps with at least so many pixels are kept in single precision, which is that of their files.
+#: Maps with at least this many pixels are kept in single precision, as in their files.
 LARGE = 12 * 512**2
-#: The embedded model is kept in the cache up to here: 38 MB of maps.
+#: Largest nside at which the embedded model is cached: 38 MB of maps.
 KEPT_NSIDE = 256
 
 
 class Template(NamedTuple):
-    """A component at the resolution of its map; `unit` is that of the map's file."""
+    """A component at the resolution of its map, where it is known, and the unit in the file."""
 
     component: Component
     fwhm: float
@@ -101,7 +101,7 @@ def read(
     stokes: str | Sequence[str] | None = None,
     zeros_are_data: bool = False,
 ) -> Maps:
-    """The maps of a file; `stokes` where its use tells the Stokes parameters, not the settings."""
+    """Read the maps of a table of settings; `stokes` overrides its Stokes parameters."""
     keys = {"hdu", "fields", "unit", "ordering", "coordinates", "polarization", "missing", "stokes"}
     options = spec.model_dump(include=keys, exclude_none=True)
     if stokes is not None:
@@ -113,7 +113,7 @@ def read(
 def read_parameters(
     folder: Path, name: str, spec: ComponentTable, nside: int, of: str = "that of the template"
 ) -> tuple[dict[str, Any], Bool[np.ndarray, " pix"]]:
-    """Parameters of a component's law, maps among them, and where these are known."""
+    """Read the parameters of a component's law, numbers or maps, and where they are known."""
     parameters: dict[str, Any] = {} if spec.nu_ref is None else {"nu_ref": spec.nu_ref}
     used = np.ones(healpy.nside2npix(nside), bool)
     for key, value in spec.parameters.items():
@@ -128,7 +128,7 @@ def read_parameters(
 
 
 def narrow(values: ArrayLike) -> Array:
-    """Values as an array, of a large map in single precision."""
+    """Return values as an array, in single precision if they are a large map."""
     values = np.asarray(values)
     large = values.ndim and values.shape[-1] >= LARGE
     return jnp.asarray(values, jnp.float32 if large else float)
@@ -142,17 +142,17 @@ def read_sky(
     names: Collection[str] | None = None,
     galaxy: EmbeddedSky | None = None,
 ) -> tuple[dict[str, Template], str]:
-    """Components of the sky that have maps [uK_RJ], in order, and what they are in a sentence.
+    """Read the components named `names` (default: all) as templates [uK_RJ], in order.
 
-    Templates from files are the last two or three columns, and have the `dtype`; parameters that
-    are maps are always in double precision. `galaxy` is the embedded model, if it is made already.
+    Also returns a sentence about them. Templates from files are the last two or three columns, as
+    `dtype`; parameters that are maps are always double. `galaxy` is the embedded model, if made.
     """
     tables, folder = settings.sky.components, Path(settings.data_dir)
     wanted = [name for name in tables if names is None or name in names]
     for name in wanted:
         if name not in settings.sky.templates:
             raise SettingsError(f"sky.{name}: file is missing; here a component has a map.")
-    # Those with the angles of others come after these.
+    # Components that take the polarization angles of others come after them.
     others = [angles for name in wanted if (angles := tables[name].angles)]
     order = list(dict.fromkeys((*others, *wanted)))
     description = (settings.title or "Templates from files.") if wanted else "No foregrounds."
@@ -171,9 +171,9 @@ def read_sky(
 
 
 def embedded_galaxy(settings: Experiment) -> EmbeddedSky:
-    """The embedded model of the Galaxy that the settings describe."""
+    """Make the embedded model of the Galaxy that the settings describe."""
     embedded = settings.sky.embedded
-    assert embedded is not None  # as called
+    assert embedded is not None  # callers have checked
     numbers: dict[str, Any] = embedded.numbers
     with at_key("sky.embedded"):
         model = GalaxyModel(**numbers)
@@ -183,7 +183,7 @@ def embedded_galaxy(settings: Experiment) -> EmbeddedSky:
 
 
 def default_galaxy(nside: int) -> EmbeddedSky:
-    """The embedded model with its default numbers, which is made once and kept in the cache."""
+    """Return the embedded model with default parameters, made once and kept in the cache."""
 
     def computed() -> np.ndarray:
         made = embedded_sky(nside)
@@ -196,7 +196,7 @@ def default_galaxy(nside: int) -> EmbeddedSky:
 
 
 def _embedded(folder: Path, name: str, spec: ComponentTable, component: Component) -> Template:
-    """A component of the embedded model, with parameters of the settings."""
+    """Return a component of the embedded model, with parameters from the settings."""
     nside = healpy.npix2nside(component.template.shape[-1])
     parameters, used = read_parameters(folder, name, spec, nside)
     if parameters:
@@ -214,7 +214,7 @@ def _read_template(
     stokes: str,
     dtype: type[np.floating],
 ) -> Template:
-    assert spec.law is not None  # as the settings see to
+    assert spec.law is not None  # the settings ensure this
     found = read(folder, spec)
     law = component_class(spec.law)
     if not law.polarized and stokes == "QU":
@@ -245,9 +245,9 @@ def set_parameters_of(
     fixed: Mapping[str, float],
     components: Collection[str] = (),
 ) -> dict[str, Template]:
-    """Templates with some of their parameters set, by dotted name.
+    """Return templates with some of their parameters set, by dotted name.
 
-    Those of components without a template here are left out.
+    Parameters of known `components` that have no template here are ignored.
     """
     for name in (key.split(".")[0] for key in fixed):
         if name not in templates and name not in components:
@@ -263,13 +263,13 @@ def set_parameters_of(
 
 
 def uK_RJ_per(unit: str, at: Bandpass | float | None, where: str) -> float:
-    """What a map is multiplied by to be in uK_RJ, at a frequency [GHz] or over a band."""
+    """Return the factor from a unit to uK_RJ, at a frequency [GHz] or over a band."""
     with at_key(f"{where}.unit"):
         return float(unit_factor(unit, "uK_RJ", at))
 
 
 def check_stokes(where: str, found: Maps, wanted: str) -> None:
-    """Refuse other Stokes parameters than wanted, Q and U of all three aside, or another number."""
+    """Refuse columns that are not the Stokes parameters wanted; I, Q, U will do for Q, U."""
     names, expected = ", ".join(found.names), "IQU" if len(found.names) == 3 else wanted
     if len(found.names) != len(expected) or not expected.endswith(wanted):
         raise SettingsError(f"{where}: fields must name {listed(wanted)}, not {names}.")
@@ -278,7 +278,7 @@ def check_stokes(where: str, found: Maps, wanted: str) -> None:
 
 
 def bandpass_of(folder: Path, spec: BandTable) -> Bandpass:
-    """The bandpass of a band: of a file, or a top-hat."""
+    """Return the bandpass of a band: read from a file, a top-hat, or a single frequency."""
     where, given = f"bands.{spec.name}.bandpass", spec.bandpass
     if given is None:
         raise SettingsError(f"{where}: is missing.")
@@ -292,7 +292,7 @@ def bandpass_of(folder: Path, spec: BandTable) -> Bandpass:
 
 
 def beam_of(folder: Path, spec: BandTable, lmax: int) -> Float[Array, " ell"] | float | None:
-    """The FWHM [arcmin] of a band, or the window of its beam; None if neither is said."""
+    """Return the FWHM [arcmin] of a band, or the window of its beam; None if neither is given."""
     if spec.beam is None:
         return spec.fwhm
     with at_key(f"bands.{spec.name}.beam"):

@@ -1,9 +1,9 @@
-"""Band averages of components by interpolation in their spectral parameters.
+"""Fast band averages of components, by interpolation in their spectral parameters.
 
-The band-averaged law is a smooth function of the spectral parameters, so where these are maps it
-is summed over the band at a few Chebyshev nodes only and interpolated in every pixel. The cost
-does not depend on the number of samples in the band, and the error is that asked for: the number
-of nodes is read off the decay of the Chebyshev coefficients over the range of the maps.
+The band-averaged law is a smooth function of the spectral parameters. Where these are maps, it is
+summed over the band at a few Chebyshev nodes only and interpolated in every pixel. The cost per
+pixel does not depend on the number of samples in the band, and the error is at most that asked
+for: the number of nodes follows from the decay of the Chebyshev coefficients over the maps' range.
 """
 
 import itertools
@@ -24,7 +24,7 @@ from jaxsky.components import Component
 
 
 class NodeCounts(NamedTuple):
-    """Counts for each parameter that is a map, and the error to check, if any has to be."""
+    """Node counts for each parameter that is a map, and a tolerance if still to be checked."""
 
     counts: tuple[int, ...]
     tolerance: float | None = None
@@ -33,19 +33,19 @@ class NodeCounts(NamedTuple):
 #: How a component is averaged; None for the direct sum.
 Nodes: TypeAlias = NodeCounts | None
 
-#: Nodes tried; a law that is not resolved by them is summed directly.
+#: Most nodes tried; a law that they do not resolve is summed directly.
 MAX_NODES = 33
-#: Nodes tried when the range of a map is not known because it is being traced by JAX: 1e-10 for
-#: indices within +-0.7 and temperatures within 15-30 K, over any band from 20 to 900 GHz.
+#: Nodes used when JAX is tracing, so that the range of a map is unknown: error 1e-10 for indices
+#: within +-0.7 and temperatures within 15-30 K, over any band from 20 to 900 GHz.
 TRACED_NODES = 16
 #: Pixels interpolated at once in many bands.
 AT_ONCE = 4096
-#: With more maps than this in one component, a tensor of nodes would cost more than the sum.
+#: With more parameter maps than this, a tensor of nodes would cost more than the direct sum.
 MAX_DIMENSIONS = 2
 
 
 def _coefficients(values: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Chebyshev coefficients of the tensor of values at the nodes, along every axis."""
+    """Return Chebyshev coefficients along every axis of a tensor of values at the nodes."""
     for axis, n in enumerate(values.shape):
         inverse = chebvander(chebpts1(n), n - 1).T * 2 / n
         inverse[0] /= 2
@@ -55,9 +55,9 @@ def _coefficients(values: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def _evaluate(coefs: Float[Array, "..."], *points: Float[Array, " pix"]) -> Float[Array, " pix"]:
-    """The series at points in [-1, 1]^d (one array a dimension), by Clenshaw's recurrence.
+    """Sum the series at points in [-1, 1]^d (one array per dimension), by Clenshaw's recurrence.
 
-    The loops are unrolled: the node counts are small and the whole becomes one fused pass.
+    The loops are unrolled: node counts are small, and everything fuses into one pass.
     """
     if not points:
         return coefs
@@ -72,14 +72,14 @@ def _evaluate(coefs: Float[Array, "..."], *points: Float[Array, " pix"]) -> Floa
 
 
 def _split(component: Component) -> tuple[list[Array], Callable[..., Component]]:
-    """The parameters that are maps, and a function from numbers in their place to a component."""
+    """Return the parameters that are maps, and a function that puts other values in their place."""
     maps, rest = eqx.partition(component, lambda leaf: eqx.is_array(leaf) and leaf.ndim == 1)
     leaves, structure = jax.tree.flatten(maps)
     return leaves, lambda values: eqx.combine(jax.tree.unflatten(structure, values), rest)
 
 
 def _range(values: Array) -> tuple[Array, Array]:
-    """Middle and half-width of the values; a constant map gets a small width of its own."""
+    """Return the middle and half-width of the values; a constant map gets a small width."""
     low, high = jax.lax.stop_gradient((values.min(), values.max()))
     middle = (low + high) / 2
     # Wide enough that the slope of the series is not lost in the rounding of its values.
@@ -89,9 +89,9 @@ def _range(values: Array) -> tuple[Array, Array]:
 
 @jax.jit
 def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
-    """Bound of the relative error of a series cut at each length, for each map, over all bands.
+    """Bound the relative error of a series cut at each length, for each map, over all bands.
 
-    The series along one parameter is taken at the ends and the middle of the others.
+    The series along one parameter is taken at the ends and the middle of the others' ranges.
     """
     maps, rebuild = _split(component)
 
@@ -115,9 +115,9 @@ def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
 
 
 def choose_nodes(component: Component, bands: tuple[Bandpass, ...], tolerance: float) -> Nodes:
-    """Node counts with which the band averages of a component are right to a relative tolerance.
+    """Choose node counts that give band averages of a component to a relative tolerance.
 
-    None where the direct sum is the better way, or there is no map.
+    None where the direct sum is better, or no parameter is a map.
     """
     maps, _ = _split(component)
     if not maps or len(maps) > MAX_DIMENSIONS or tolerance <= 0:
@@ -125,7 +125,7 @@ def choose_nodes(component: Component, bands: tuple[Bandpass, ...], tolerance: f
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((component, bands))):
         return NodeCounts((TRACED_NODES,) * len(maps), tolerance)
     tails = np.asarray(_tails(component, stack_bands(bands)))
-    # A series of n terms leaves out the tail from n on; what rounding leaves there is noise.
+    # A series of n terms leaves out the tail from n on; below the floor that is rounding.
     floor = 8 * np.finfo(tails.dtype).eps
     resolved = tails <= max(tolerance / (2 * len(maps)), floor)
     if not resolved.any(axis=1).all():
@@ -137,9 +137,9 @@ def choose_nodes(component: Component, bands: tuple[Bandpass, ...], tolerance: f
 def _series(
     component: Component, band: Bandpass | Samples, counts: tuple[int, ...]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Chebyshev coefficients of the band average in the parameters that are maps, and its values.
+    """Return Chebyshev coefficients of the band average, and its values at the nodes.
 
-    The axes are the maps, as long as their node counts.
+    There is one axis per parameter that is a map, as long as its node count.
     """
     maps, rebuild = _split(component)
     if not maps:
@@ -158,21 +158,21 @@ def _series(
 def _all_series(
     component: Component, samples: Samples, counts: tuple[int, ...]
 ) -> Float[Array, "band node"]:
-    """The coefficients of `_series` in each band."""
+    """Return the coefficients of `_series` in each band."""
     return jax.vmap(lambda band: _series(component, band, counts)[0].ravel())(samples)
 
 
 def _points(component: Component) -> list[Float[Array, " pix"]]:
-    """The maps, scaled to [-1, 1]."""
+    """Return the parameters that are maps, scaled to [-1, 1]."""
     maps, _ = _split(component)
     return [(m - mid) / half for m, (mid, half) in zip(maps, map(_range, maps), strict=True)]
 
 
 class Terms(NamedTuple):
-    """Combinations of Chebyshev polynomials that the band averages of a component are made of.
+    """Combinations of Chebyshev polynomials that span the band averages of a component.
 
-    `vectors` are orthonormal combinations of the nodes, whose `counts` are those of each map;
-    `sizes` what each adds to the maps at most, relative to the maps.
+    `vectors` are orthonormal vectors of Chebyshev coefficients, `counts` the number of nodes along
+    each parameter map; `sizes` bound what each term adds to the maps, relative to the maps.
     """
 
     vectors: Float[np.ndarray, "term node"]
@@ -180,7 +180,7 @@ class Terms(NamedTuple):
     sizes: tuple[float, ...]
 
     def coefs(self, index: int) -> Float[np.ndarray, "..."]:
-        """Chebyshev coefficients of a term in the scaled parameters that are maps."""
+        """Return Chebyshev coefficients of a term in the scaled parameters that are maps."""
         return self.vectors[index].reshape(self.counts)
 
 
@@ -190,13 +190,13 @@ def choose_terms(
     importance: Float[Array, " band"] | None,
     tolerance: float,
 ) -> Terms | None:
-    """The fewest maps from which a component's emission in all bands can be summed up.
+    """Find the fewest maps whose linear combinations give a component's emission in all bands.
 
-    The law's matrix (band, node) has singular values that fall fast, so a few combinations of
-    polynomials serve all bands, and what is linear (a transform) is done to these only. The
-    `importance` is what the template, times its law, is multiplied by to be relative to the maps,
-    as is the tolerance; not needed where no parameter is a map, which makes one constant term. None
-    where bands are better averaged one by one.
+    The singular values of the law's matrix (band, node) fall fast, so a few combinations of
+    polynomials serve all bands, and linear operations (a transform) are applied to these only.
+    `importance` times the law is the component's size relative to the maps of a band, and so is
+    the tolerance; it is not needed where no parameter is a map, which gives one constant term.
+    Returns None where bands are better averaged one by one.
     """
     if not _split(component)[0]:
         return Terms(np.ones((1, 1)), (), (1.0,))
@@ -213,7 +213,7 @@ def choose_terms(
 def term_weights(
     component: Component, bands: tuple[Bandpass, ...], terms: Terms
 ) -> tuple[Float[Array, " term"], ...]:
-    """How much of each term a component shows in each band."""
+    """Return the weight of each term of a component in each band."""
     return _weights(component, stack_bands(bands), terms.vectors, terms.counts)
 
 
@@ -224,16 +224,16 @@ def _weights(component, samples, vectors, counts):
 
 @jax.jit
 def term(component: Component, coefs: Float[Array, "..."]) -> Float[Array, " pix"]:
-    """A term (`Terms.coefs`) in each pixel; a number if no parameter is a map."""
+    """Evaluate a term (`Terms.coefs`) in each pixel; a number if no parameter is a map."""
     return _evaluate(coefs, *_points(component))
 
 
 def band_sed(
     component: Component, band: Bandpass, nodes: Nodes
 ) -> Float[Array, ""] | Float[Array, " pix"]:
-    """Band-averaged law of a component: a number, or a map if a parameter is one.
+    """Return the band-averaged law of a component: a number, or a map if a parameter is one.
 
-    The nodes are those of `choose_nodes`; None sums directly over the band in every pixel.
+    The nodes come from `choose_nodes`; None sums directly over the band in every pixel.
     """
     if nodes is None:
         return average(component.sed, band)
@@ -251,8 +251,8 @@ def band_sed(
 def _resolved(
     coefs: Float[Array, "..."], values: Float[Array, "..."], tolerance: float
 ) -> Bool[Array, ""]:
-    """Whether a series is long enough; `values` are those at its nodes."""
-    # What the last two orders along each axis add bounds what the orders left out would.
+    """Return whether a series is long enough; `values` are those at its nodes."""
+    # The last two orders along each axis bound the contribution of the orders left out.
     size = jnp.abs(coefs)
     tail = sum(jnp.moveaxis(size, axis, 0)[-2:].sum() for axis in range(size.ndim))
     limit = max(tolerance, 8 * float(jnp.finfo(values.dtype).eps))
@@ -262,7 +262,7 @@ def _resolved(
 def band_seds(
     component: Component, samples: Samples, nodes: Nodes
 ) -> Float[Array, " band"] | Float[Array, "pix band"]:
-    """`band_sed` in many bands (`stack_bands`), as products of matrices: one small program."""
+    """Compute `band_sed` in many bands (`stack_bands`) by matrix products: one small program."""
     maps, _ = _split(component)
     if not maps:
         return jax.vmap(lambda band: average(component.sed, band))(samples)

@@ -1,9 +1,9 @@
-"""Components of the sky: template maps times a spectral law, one class each.
+"""Components of the sky, one class each: template maps times a spectral law.
 
-A component is its parameters. Each spectral parameter is a number or a map of shape (pix,); the
-law is written once, for a frequency, in `sed`, and everything else (band averages, gradients,
-parameter names, keys of settings, symbols in pictures) follows from the fields. All modules of
-this folder are imported, so that a new one is complete as it is.
+The fields of a component are its parameters. Each spectral parameter is a number or a map of shape
+(pix,). The law is written once, for one frequency, in `sed`; everything else (band averages,
+gradients, parameter names, keys of settings, symbols in figures) follows from the fields. All
+modules in this folder are imported automatically, so a new one needs no registration.
 """
 
 import importlib

@@ -1,4 +1,4 @@
-"""What a component of the sky is, and the registry in which its law has a name."""
+"""The base class of sky components, its fields, and the registry of laws by name."""
 
 import dataclasses
 import importlib
@@ -21,12 +21,12 @@ from jaxsky.checks import (
     shown,
 )
 
-#: Components by the name of their law, or module and class, from the moment a class is defined.
+#: Components by the name of their law, or "module:Class"; filled as classes are defined.
 _LAWS: dict[str, type["Component"]] = {}
 
 
 def template() -> Any:
-    """Field of a component for its amplitude, (stokes, pix)."""
+    """Declare the field of a component for its amplitude, (stokes, pix)."""
     return eqx.field(converter=_converted)
 
 
@@ -40,17 +40,17 @@ def parameter(
     unit: str = "",
     zero: bool = True,
 ) -> Any:
-    """Field of a component for a spectral parameter: a number, or a map of shape (pix,).
+    """Declare the field of a component for a spectral parameter: a number, or a map (pix,).
 
     Parameters
     ----------
-    default : value if none is given; without, the parameter is required
+    default : default value; without one, the parameter is required
     positive : refuse values that are not positive
-    within : refuse a number, or a map by its median, outside of this range
-    hint : what to do about that
-    symbol : in TeX, for pictures; by default the name
+    within : refuse a number, or the median of a map, outside this range
+    hint : what to do if a value is outside the range
+    symbol : in TeX, for figures; by default the name
     unit : "" for a pure number
-    zero : an exact zero in a map of it can be data; if not, it is taken to mark a missing value
+    zero : whether exact zeros in a map are data; if not, they are taken to mark missing values
     """
     metadata = {
         "positive": positive,
@@ -64,7 +64,7 @@ def parameter(
 
 
 def reference(default: float, within: tuple[float, float]) -> Any:
-    """Field for the reference frequency of a law [GHz], and where it may lie."""
+    """Declare the field for the reference frequency of a law [GHz], within a range."""
     return parameter(
         default,
         positive=True,
@@ -76,7 +76,7 @@ def reference(default: float, within: tuple[float, float]) -> Any:
 
 
 def _converted(value: Any) -> Any:
-    """An array, or several in a tuple; what cannot be one is left for the check by name."""
+    """Convert to an array, or a tuple of them; leave anything else for the later check by name."""
     if value is None or isinstance(value, tuple):
         return value and tuple(map(_converted, value))
     try:
@@ -86,25 +86,26 @@ def _converted(value: Any) -> Any:
 
 
 class Component(Printed, eqx.Module):
-    """Base class: `amplitude` (stokes, pix) times `sed(nu)`.
+    """Base class of sky components: `amplitude` (stokes, pix) times `sed(nu)`.
 
     Stokes parameters are I, Q, U (3 rows) or Q, U (2 rows), in uK_RJ at the component's
     reference frequency, HEALPix RING order, Galactic coordinates, COSMO sign of U.
 
-    A subclass declares its fields with `template` and `parameter`, and writes `sed`. With a name
-    for its law, or as `law = "module:Class"`, it can be used in the settings of every command.
+    A subclass declares its fields with `template` and `parameter`, and defines `sed`. By the name
+    of its law, or as `law = "module:Class"`, it can be used in the settings of every command.
 
     Attributes
     ----------
-    law : name of the law in settings, given with the class; by default "module:Class"
+    law : name of the law in settings, given in the class statement; by default "module:Class"
     polarized : whether there is anything in Q and U; if not, an amplitude has to be I, Q, U
-    unit : of the amplitude
+    unit : unit of the amplitude
 
     Raises
     ------
     TypeError, ValueError
-        On construction, for units, wrong shapes, values that are not finite, or not positive
-        where they have to be; for a beta_syn with the other sign, and a nu_ref that is not in GHz.
+        On construction, for quantities with units, wrong shapes, values that are not finite or
+        not positive where they must be, and values outside a declared range, such as a beta_syn
+        of the opposite sign or a nu_ref that is not in GHz.
 
     Examples
     --------
@@ -136,12 +137,12 @@ class Component(Printed, eqx.Module):
         _LAWS[cls.law] = cls
 
     def sed(self, nu: ArrayLike) -> Float[Array, ""] | Float[Array, " pix"]:
-        """The spectral law at one frequency [GHz]; a map if any parameter is one."""
+        """Return the spectral law at one frequency [GHz]; a map if any parameter is a map."""
         raise TypeError(f"{type(self).__name__} must define `sed`.")
 
     @property
     def template(self) -> Float[Array, "stokes pix"]:
-        """What the law multiplies; the amplitude, unless parameters other than spectral act."""
+        """The maps that the law multiplies: the amplitude, unless a class scales it first."""
         return self.amplitude
 
     def summary(self):
@@ -188,7 +189,7 @@ class Component(Printed, eqx.Module):
 
 
 def check_value(name: str, value: Array, metadata: Mapping[str, Any]) -> None:
-    """Raise ValueError if a concrete value is none that a field so `declared` may have."""
+    """Raise ValueError if a concrete value violates the declaration of its field (`declared`)."""
     (check_positive if metadata.get("positive") else check_finite)(name, value)
     within = metadata.get("within")
     if within is None or not is_concrete(value):
@@ -203,20 +204,20 @@ def check_value(name: str, value: Array, metadata: Mapping[str, Any]) -> None:
 
 
 def declared(component: type[Component], field: str) -> Mapping[str, Any]:
-    """What a component declares about a field with `parameter`; nothing if it has no such field."""
+    """Return what a component declares about a field with `parameter`; empty if there is none."""
     return next((f.metadata for f in dataclasses.fields(component) if f.name == field), {})
 
 
 def parameter_declaration(name: str) -> Mapping[str, Any]:
-    """What the first law with a parameter of this name, dotted or not, declares about it."""
+    """Return what the first law with a parameter of this name, dotted or not, declares about it."""
     found = (declared(component, name.split(".")[-1]) for component in _LAWS.values())
     return next((metadata for metadata in found if "symbol" in metadata), {})
 
 
 def component_class(law: str) -> type[Component]:
-    """The component with a law, by its name or as "module:Class" from a package of one's own.
+    """Return the component class of a law, by name or as "module:Class" for a class of your own.
 
-    Such a module is looked for where Python does, and in the current folder.
+    Such a module is looked for in the current folder and on Python's path.
     """
     if ":" not in law:
         if law not in _LAWS:
@@ -230,7 +231,7 @@ def component_class(law: str) -> type[Component]:
     sys.path.insert(0, os.getcwd())
     try:
         found = getattr(importlib.import_module(module), name)
-    except Exception as error:  # whatever a module of the user's does
+    except Exception as error:  # a module of the user may raise anything
         raise ValueError(f"{law!r} cannot be imported ({type(error).__name__}: {error})") from error
     finally:
         sys.path.pop(0)

@@ -1,4 +1,4 @@
-"""The components that come with the package."""
+"""The components that come with the package: dust, synchrotron, AME, free-free and the CMB."""
 
 from typing import Any, ClassVar
 
@@ -18,8 +18,8 @@ class Dust(Component, law="dust"):
     Parameters
     ----------
     amplitude : template at nu_ref [uK_RJ], shape (stokes, pix)
-    beta_dust, T_dust : index and temperature [K], or a tuple of them with one entry a body;
-        the paper's baseline 1.53 and 21 K
+    beta_dust, T_dust : index and temperature [K], or tuples of them with one entry per body;
+        the paper's baseline is 1.53 and 21 K
     E_dust : tuple of relative amplitudes, only for several bodies (`sed.modified_blackbodies`)
     nu_ref : reference frequency [GHz]
     nu_pivot : pivot of the emissivities [GHz], only for several bodies; default 3000
@@ -27,8 +27,8 @@ class Dust(Component, law="dust"):
     Raises
     ------
     ValueError
-        For tuples of different lengths, E_dust or nu_pivot with a single body, and what
-        `Component` refuses.
+        For tuples of different lengths, for E_dust or nu_pivot with a single body, and as for
+        any `Component`.
 
     Examples
     --------
@@ -90,7 +90,7 @@ class Synchrotron(Component, law="synchrotron"):
     Parameters
     ----------
     amplitude : template at nu_ref [uK_RJ], shape (stokes, pix)
-    beta_syn : spectral index, T ~ nu^-beta_syn; the paper's baseline 3.10
+    beta_syn : spectral index, T ~ nu^-beta_syn; the paper's baseline is 3.10
     curvature : C of the paper, 0 for a pure power law
     nu_piv : pivot frequency of the curvature [GHz]
     nu_ref : reference frequency [GHz]
@@ -117,10 +117,10 @@ class AME(Component, law="ame"):
 
     Parameters
     ----------
-    amplitude : template at nu_ref [uK_RJ], shape (stokes, pix), its Q and U for a polarization
-        fraction of 1; `from_dust_angles` makes one
-    polarization_fraction : what Q and U are multiplied by; 1 for maps that are measured Q and U
-    m60, nu_max : slope at 60 GHz and peak frequency in flux [GHz] (below 60)
+    amplitude : template at nu_ref [uK_RJ], shape (stokes, pix), with Q and U for a polarization
+        fraction of 1; see `from_dust_angles`
+    polarization_fraction : factor on Q and U; 1 for measured maps of Q and U
+    m60, nu_max : minus the slope of ln S at 60 GHz, and the peak frequency of S [GHz] (below 60)
     nu_ref : reference frequency [GHz]
     """
 
@@ -143,14 +143,14 @@ class AME(Component, law="ame"):
         polarization_fraction: Parameter = 0.01,
         **parameters: Any,
     ) -> "AME":
-        """AME that is polarized along the dust: Q, U = f T (cos, sin)(2 chi), the paper's eq. 5.
+        """Return AME polarized along the dust: Q, U = f T (cos, sin)(2 chi), the paper's eq. 5.
 
         Parameters
         ----------
         intensity : AME intensity [uK_RJ], shape (pix,)
         dust : dust polarization Q, U or I, Q, U in any unit, shape (stokes, pix); the result
-            has the same Stokes parameters. Where the dust is not polarized, nor is the AME.
-        polarization_fraction : f, the paper's 1 %
+            has the same Stokes parameters. Where the dust is unpolarized, so is the AME.
+        polarization_fraction : f, 1 % in the paper
         **parameters : further parameters of `AME`
         """
         intensity, dust = as_array("intensity", intensity), as_array("dust", dust)
@@ -172,7 +172,7 @@ class AME(Component, law="ame"):
 
 
 def _emissivity(nu: Numeric, T_e: Numeric) -> Float[Array, "..."]:
-    """nu^-2 T_e^-1/2 times the Gaunt factor of Draine (2011), eq. 10.9, with nu in units of GHz."""
+    """Return nu^-2 T_e^-1/2 times the Gaunt factor of Draine (2011), eq. 10.9, with nu in GHz."""
     falling = jnp.exp(5.960 - jnp.sqrt(3) / jnp.pi * jnp.log(nu * (T_e / 1e4) ** -1.5))
     return jnp.log(falling + jnp.e) / (jnp.sqrt(T_e) * nu**2)
 
@@ -181,11 +181,11 @@ def _emissivity(nu: Numeric, T_e: Numeric) -> Float[Array, "..."]:
 def amplitude_from_emission_measure(
     EM: Numeric, T_e: Numeric, nu_ref: Numeric
 ) -> Float[Array, "..."]:
-    """Antenna temperature of optically thin free-free emission [uK_RJ] from its emission measure.
+    """Return the antenna temperature of optically thin free-free emission [uK_RJ].
 
-    0.05468 T_e^-3/2 nu^-2 EM g_ff is the optical depth of Draine (2011), with nu in GHz and EM in
-    cm^-6 pc; times T_e it is the temperature (Planck 2015 results X, table 4, to first order in
-    the depth).
+    The optical depth of Draine (2011) is 0.05468 T_e^-3/2 nu^-2 EM g_ff, with T_e in K, nu in GHz
+    and the emission measure EM in cm^-6 pc. Multiplied by T_e it is the temperature (Planck 2015
+    results X, table 4, to first order in the depth).
     """
     return jnp.asarray(1e6 * 0.05468 * EM * _emissivity(nu_ref, T_e))
 
@@ -198,8 +198,8 @@ class FreeFree(Component, law="free_free"):
 
     Parameters
     ----------
-    amplitude : template at nu_ref [uK_RJ], I, Q, U with nothing in Q and U, shape (3, pix);
-        `amplitude_from_emission_measure` makes the one of I
+    amplitude : template at nu_ref [uK_RJ], I, Q, U with zeros in Q and U, shape (3, pix);
+        `amplitude_from_emission_measure` gives the map of I
     T_e : electron temperature [K]
     nu_ref : reference frequency [GHz]
     """
@@ -215,11 +215,11 @@ class FreeFree(Component, law="free_free"):
 
 
 class CMB(Component, law="cmb"):
-    """The CMB anisotropies: the derivative of a black body (`sed.cmb_derivative`).
+    """CMB anisotropies, with the derivative of a black body as law (`sed.cmb_derivative`).
 
     Parameters
     ----------
-    amplitude : map in thermodynamic temperature [uK_CMB], shape (stokes, pix)
+    amplitude : maps in thermodynamic temperature [uK_CMB], shape (stokes, pix)
     T_cmb : temperature of the monopole [K]
     """
 

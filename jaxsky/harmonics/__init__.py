@@ -1,9 +1,9 @@
 """Spherical harmonics of HEALPix maps: synthesis, analysis, rotation, smoothing, resolution.
 
-The transforms are ducc0's through jaxbind, so they can be jitted and differentiated and their
-transposes are exact; healpy supplies the bookkeeping (ring weights, sizes). Coefficients are packed
-as real numbers (`transforms`). Q and U are one spin-2 field with coefficients E and B. Smoothing Q
-and U as two scalars would be wrong by several percent.
+The transforms are those of ducc0, called through jaxbind, so they can be jitted and differentiated
+and have exact transposes; healpy supplies the bookkeeping (ring weights, sizes). Coefficients are
+packed as real numbers (`transforms`). Q and U are one spin-2 field with coefficients E and B:
+smoothing them as two scalars would be wrong by several percent.
 """
 
 from jaxsky.harmonics.resolution import (

@@ -1,8 +1,8 @@
-"""Synthesis, analysis and rotation: ducc0 through jaxbind, inside jit and with gradients.
+"""Spherical harmonic synthesis, analysis and rotation by ducc0, inside jit and with gradients.
 
-Coefficients are packed as real numbers: for each m the a_lm of l = m ... lmax, real and imaginary
-part times sqrt(2) for m > 0, so that the sum of squares of the packed numbers is the sum over all m
-of |a_lm|^2.
+Coefficients are packed as real numbers: for each m the a_lm of l = m ... lmax, and for m > 0 their
+real and imaginary parts times sqrt(2), so that the sum of squares of the packed numbers is the sum
+of |a_lm|^2 over all m.
 """
 
 import atexit
@@ -32,19 +32,19 @@ from jaxsky.checks import check_choice, check_double
 
 
 def alm_ell(lmax: int) -> np.ndarray:
-    """Multipole l of each packed coefficient, shape (alm,)."""
+    """Return the multipole l of each packed coefficient, shape (alm,)."""
     ell, m = healpy.Alm.getlm(lmax)
     return np.concatenate([ell[m == 0], np.repeat(ell[m > 0], 2)])
 
 
 def degrees(lmax: int) -> tuple[Array, Array, Array]:
-    """l, m and part (0 real, 1 imaginary) of each packed coefficient, computed in the program.
+    """Return l, m and part (0 real, 1 imaginary) of each packed coefficient.
 
-    As a constant of a program they would be as large as the coefficients.
+    They are computed inside the program: as constants they would be as large as the coefficients.
     """
     i = jnp.arange((lmax + 1) ** 2)
     pair, part = jnp.divmod(jnp.maximum(i - (lmax + 1), 0), 2)
-    # Counted from the end, m = lmax has one pair, lmax - 1 two, ...: triangular numbers.
+    # Counted from the end, m = lmax has one pair, m = lmax - 1 two, ...: triangular numbers.
     back = lmax * (lmax + 1) // 2 - 1 - pair
     length = jnp.floor((1 + jnp.sqrt(1.0 + 8 * back)) / 2).astype(i.dtype)
     ell = lmax - (back - length * (length - 1) // 2)
@@ -53,19 +53,19 @@ def degrees(lmax: int) -> tuple[Array, Array, Array]:
 
 
 def lmax_of(alm: Array | np.ndarray) -> int:
-    """Largest multipole of packed coefficients."""
+    """Return the largest multipole of packed coefficients."""
     return math.isqrt(alm.shape[-1]) - 1
 
 
 @jax.jit
 def expand(values: Float[Array, "... ell"]) -> Float[Array, "... alm"]:
-    """A function of l = 0 ... lmax at each packed coefficient."""
+    """Return the values of a function of l = 0 ... lmax at each packed coefficient."""
     return values[..., degrees(values.shape[-1] - 1)[0]]
 
 
 @partial(jax.jit, static_argnames="lmax")
 def resize(alm: Float[Array, "... alm"], lmax: int) -> Float[Array, "... alm"]:
-    """Packed coefficients cut at another lmax, or filled up with zeros."""
+    """Cut packed coefficients at another lmax, or pad them with zeros."""
     own = lmax_of(alm)
     ell, m, part = degrees(lmax)
     pairs = (m - 1) * (own + 1) - m * (m - 1) // 2 + ell - m
@@ -77,7 +77,7 @@ def resize(alm: Float[Array, "... alm"], lmax: int) -> Float[Array, "... alm"]:
 def power_spectrum(
     alm: Float[Array, "... alm"], other: Float[Array, "... alm"] | None = None
 ) -> Float[Array, "... ell"]:
-    """Spectrum C_l of packed coefficients, or the cross-spectrum with others, row by row."""
+    """Return C_l of packed coefficients, or the cross-spectrum with others, row by row."""
     lmax = lmax_of(alm)
     product = (alm * (alm if other is None else other)).reshape(-1, alm.shape[-1])
     ell = degrees(lmax)[0]
@@ -86,12 +86,12 @@ def power_spectrum(
 
 
 def map_variance(spectrum: Float[Array | np.ndarray, " ell"]) -> float:
-    """Variance of a pixel of maps that have a spectrum."""
+    """Return the variance of a pixel in maps with a given spectrum."""
     return float(np.sum((2 * np.arange(spectrum.size) + 1) * np.asarray(spectrum)) / (4 * np.pi))
 
 
 def alm_from_healpy(alm: np.ndarray, lmax: int) -> Float[np.ndarray, "... alm"]:
-    """healpy's complex coefficients as packed real ones, along the last axis."""
+    """Convert healpy's complex coefficients to packed real ones, along the last axis."""
     alm = np.asarray(alm, dtype=complex)
     high = np.sqrt(2) * alm[..., lmax + 1 :]
     pairs = np.stack([high.real, high.imag], axis=-1).reshape(*alm.shape[:-1], -1)
@@ -99,7 +99,7 @@ def alm_from_healpy(alm: np.ndarray, lmax: int) -> Float[np.ndarray, "... alm"]:
 
 
 def alm_to_healpy(alm: ArrayLike, lmax: int) -> np.ndarray:
-    """Packed real coefficients as healpy's complex ones, along the last axis."""
+    """Convert packed real coefficients to healpy's complex ones, along the last axis."""
     alm = np.asarray(alm, dtype=float)
     pairs = alm[..., lmax + 1 :] / np.sqrt(2)
     return np.concatenate([alm[..., : lmax + 1], pairs[..., ::2] + 1j * pairs[..., 1::2]], axis=-1)
@@ -110,10 +110,10 @@ COORDINATES = ("G", "E", "C")
 
 
 def _lower(ctx: Any, *operands: Any, **parameters: Any) -> Any:
-    """Lower a transform, and say that it calls Python: JAX keeps no such program on disk.
+    """Lower a transform, and tell JAX that it calls Python, so that it is not cached on disk.
 
-    jaxbind writes the address of a Python object into the program, which is another one in the
-    next process, where something else may be at this place.
+    jaxbind writes the address of a Python object into the program; in another process something
+    else may be at that address.
     """
     ctx.module_context.add_host_callback(lambda *_: ())
     return jaxbind._lowering(ctx, *operands, **parameters)
@@ -124,7 +124,7 @@ mlir.register_lowering(jaxbind._prim, _lower, platform="cpu")
 
 @cache
 def _ring_weights(nside: int) -> np.ndarray:
-    """healpy's ring weights times the area of a pixel [sr], shape (ring,)."""
+    """Return healpy's ring weights times the area of a pixel [sr], shape (ring,)."""
     path = files("healpy") / "data" / f"weight_ring_n{nside:05d}.fits"
     with path.open("rb") as stream, pyfits.open(stream) as hdus:
         north = 1 + hdus[1].data.field(0).astype(float).ravel()
@@ -132,7 +132,7 @@ def _ring_weights(nside: int) -> np.ndarray:
 
 
 def _rings(nside: int) -> Int[Array, " pix"]:
-    """Ring of each pixel, from 0, computed in the program: a constant would be a map."""
+    """Return the ring of each pixel, from 0; computed, as a constant would be as large as a map."""
     npix, cap = 12 * nside**2, 2 * nside * (nside - 1)
     pixel = jnp.arange(npix)
     mirrored = jnp.minimum(pixel, npix - 1 - pixel)
@@ -143,7 +143,7 @@ def _rings(nside: int) -> Int[Array, " pix"]:
 
 
 def _blocks(stokes: int, spin: int) -> list[tuple[slice, int]]:
-    """Rows of I, of Q, U or of I, Q, U maps that are transformed together, with their spin."""
+    """Return the rows of I, Q, U or I, Q, U maps that are transformed together, and their spin."""
     scalar, polarized = (slice(0, 1), 0), (slice(stokes - 2, stokes), spin)
     return {1: [scalar], 2: [polarized], 3: [scalar, polarized]}[stokes]
 
@@ -160,9 +160,9 @@ def _transform(nside: int, lmax: int, spin: int):
 def synthesis(
     alm: Float[Array, "stokes alm"], nside: int, spin: int = 2
 ) -> Float[Array, "stokes pix"]:
-    """Maps I, or Q, U, or I, Q, U from packed coefficients I, or E, B, or I, E, B.
+    """Return maps of I, or Q, U, or I, Q, U from packed coefficients I, or E, B, or I, E, B.
 
-    Above lmax = 3 nside - 1 the maps are samples. `spin` is that of the last two rows.
+    With lmax > 3 nside - 1 the maps are undersampled. `spin` is that of the last two rows.
     """
     lmax = lmax_of(alm)
     return jnp.concatenate(
@@ -174,7 +174,7 @@ def synthesis(
 def adjoint_synthesis(
     maps: Float[Array, "stokes pix"], lmax: int, spin: int = 2
 ) -> Float[Array, "stokes alm"]:
-    """Transpose of `synthesis`: inner products of maps with the spherical harmonics."""
+    """Apply the transpose of `synthesis`: inner products of maps with the spherical harmonics."""
     nside = healpy.npix2nside(maps.shape[-1])
     empty = jax.ShapeDtypeStruct((len(maps), (lmax + 1) ** 2), maps.dtype)
     return jax.linear_transpose(partial(synthesis, nside=nside, spin=spin), empty)(maps)[0]
@@ -187,12 +187,12 @@ def analysis(
     iterations: int | None = None,
     spin: int = 2,
 ) -> Float[Array, "stokes alm"]:
-    """Packed coefficients of maps I, or Q, U, or I, Q, U: the inverse of `synthesis`.
+    """Return packed coefficients of maps of I, or Q, U, or I, Q, U: the inverse of `synthesis`.
 
-    Ring-weighted quadrature, refined by Jacobi steps on the residual map. For a map without
-    multipoles above lmax the rms error is below 1e-6 of the rms coefficient up to lmax = 2 nside,
-    at nside 512 about 1e-7; above, no number of steps (`iterations`) is enough. There are by
-    default one up to lmax = 1.5 nside and two above, and one more below nside 128, where the
+    Uses ring-weighted quadrature, refined by Jacobi steps on the residual map. For a map without
+    multipoles above lmax <= 2 nside the rms error is below 1e-6 of the rms coefficient, and about
+    1e-7 at nside 512; for higher lmax no number of steps (`iterations`) suffices. By default there
+    is one step up to lmax = 1.5 nside and two above, plus one below nside 128, where the
     quadrature is worse. Maps are in RING order, lmax at most 3 nside - 1.
     """
     nside = healpy.npix2nside(maps.shape[-1])
@@ -224,9 +224,9 @@ _rotation = get_linear_call(_turn, partial(_turn, inverse=True), _same, _same)
 
 @partial(jax.jit, static_argnames=("source", "target"))
 def rotate(alm: Float[Array, "stokes alm"], source: str, target: str) -> Float[Array, "stokes alm"]:
-    """Packed coefficients in other coordinates; those of polarization as scalars E and B.
+    """Rotate packed coefficients to other coordinates; E and B rotate like scalars.
 
-    These are "G" Galactic, "E" ecliptic or "C" celestial (equatorial), both J2000.
+    Coordinates are "G" Galactic, "E" ecliptic or "C" celestial (equatorial), both J2000.
     """
     for name, value in {"source": source, "target": target}.items():
         check_choice(name, value, COORDINATES)
@@ -236,19 +236,19 @@ def rotate(alm: Float[Array, "stokes alm"], source: str, target: str) -> Float[A
     return _rotation(alm, lmax=lmax_of(alm), angles=angles)[0]
 
 
-# The end of a Python process in which transforms run.
+# Ending a Python process in which transforms may still run.
 
-#: What Linux says of each thread of this process; elsewhere, threads are not unwound.
+#: Linux's record of each thread of this process; on other systems, threads are not unwound.
 _THREADS = Path("/proc/self/task")
 
 
 @cache
 def _finish_at_exit() -> None:
-    """Have the interpreter wait for transforms that still run when it ends.
+    """Make the interpreter wait at exit for transforms that are still running.
 
-    JAX returns before a computation is done. A transform is Python code that a thread of JAX
-    calls, and a thread that asks for the interpreter while that ends is unwound by Python, through
-    frames of C++ that do not allow it: the process aborts ("terminate called without an active
+    JAX returns before a computation is done. A transform is Python code called by a thread of JAX.
+    If that thread asks for the interpreter while it shuts down, Python unwinds the thread through
+    C++ frames that do not allow it, and the process aborts ("terminate called without an active
     exception", exit code 134).
     """
     atexit.register(_finish)  # handlers run in reverse order, so this one before JAX's own
@@ -257,8 +257,8 @@ def _finish_at_exit() -> None:
 def _finish() -> None:
     """Wait for the computations of this thread, then for those of others."""
     with contextlib.suppress(Exception), jax.default_device(jax.devices("cpu")[0]):
-        # JAX runs the computations of a thread one after the other, those whose results nobody
-        # has kept among them; only the cheapest skip the queue, and none that calls Python.
+        # JAX runs the computations of a thread one after the other, even those whose results
+        # were dropped; only the cheapest skip the queue, and none that calls Python.
         jax.jit(lambda: jax.pure_callback(lambda: np.int32(0), np.int32(0)))().block_until_ready()
     daemons = [thread for thread in threading.enumerate() if thread.daemon]
     if _THREADS.is_dir() and not _calm(seconds=1.0 if daemons else 60.0):
@@ -268,7 +268,7 @@ def _finish() -> None:
 
 
 def _calm(seconds: float) -> bool:
-    """Wait until no other thread computes; False if some still do after so many seconds."""
+    """Wait until no other thread computes; False if some still do after `seconds`."""
     end, looks = time.monotonic() + seconds, 0
     while looks < 5 and time.monotonic() < end:  # a thread may just have waited for this one
         time.sleep(0.003)
@@ -288,6 +288,6 @@ def _computing() -> bool:
 
 
 def _end(thread: threading.Thread) -> None:
-    """Have a thread end where it next runs Python code, which is now or never."""
+    """Make a thread end where it next runs Python code."""
     ident, error = ctypes.c_ulong(thread.ident or 0), ctypes.py_object(SystemExit)
     ctypes.pythonapi.PyThreadState_SetAsyncExc(ident, error)

@@ -1,8 +1,8 @@
-"""The border: maps, masks, bandpasses, beams and spectra in files, and quantities with units.
+"""Read and write maps, masks, bandpasses, beams and spectra, and convert quantities with units.
 
 Inside the package there are only bare arrays (GHz, uK_RJ, K, arcmin; Galactic, RING, COSMO).
 Everything else is converted and checked here, once. A file that cannot be used raises
-`InputError`, a sentence with the file, the argument and the value.
+`InputError`, one sentence with the file, the argument and the value.
 """
 
 from jaxsky.io.bandpasses import read_bandpass

@@ -1,4 +1,4 @@
-"""Bandpasses in files: Planck RIMO (FITS), IPAC tables and plain text."""
+"""Read bandpasses from Planck instrument models (RIMO, FITS), IPAC tables and plain text."""
 
 import re
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from jaxsky.io.curves import TextTable, read_text
 from jaxsky.io.files import UnfitError, in_file, is_fits
 from jaxsky.io.tables import open_fits, select_hdu
 
-#: astropy's name of a unit -> how it is spelt; wavenumbers and wavelengths are converted.
+#: astropy's name of a unit -> how files spell it; wavenumbers and wavelengths are converted.
 _UNITS = {
     **{f"{prefix}Hz": re.compile(f"{prefix}hz", re.I) for prefix in ("", "k", "M", "G", "T")},
     "1/cm": re.compile(r"1/cm|cm(\^|\*\*)?[({]?-1[)}]?", re.I),
@@ -27,21 +27,21 @@ _UNIT = re.compile(
     rf"(?<![a-z0-9])(?:{'|'.join(f'(?:{x.pattern})' for x in _UNITS.values())})(?![a-z0-9^*/-])",
     re.I,
 )
-#: What may stand before "/GHz"; weights per GHz are no statement about frequencies.
+#: Words that may precede "/GHz"; otherwise it may be the unit of weights, per GHz.
 _FREQUENCY = re.compile(r"(nu|\u03bd|f|freq\w*|wavenumbers?|wavelengths?|lambda)\s*/$", re.I)
 _WAVES = re.compile(r"wave(number|length)|lambda|\u03bb", re.I)
-#: Middle of a band [GHz]: where no unit is stated, and where one is.
+#: Allowed middle of a band [GHz], where the file states no unit and where it does.
 _BARE, _STATED = (1.0, 3000.0), (0.01, 30000.0)
 
 
 def _known(text: str) -> str:
-    """astropy's spelling of a unit, whose case files do not respect; as it is if there is none."""
+    """Return astropy's spelling of a unit, as files often ignore case; unknown ones unchanged."""
     word = text.strip()
     return next((name for name, spelling in _UNITS.items() if spelling.fullmatch(word)), word)
 
 
 def _units(line: str) -> list[str]:
-    """Units that a line of a header states; "30 GHz" is a name."""
+    """Return the units that a line of a header states; "30 GHz" is a name, not a unit."""
     found: dict[str, None] = {}  # a set that keeps its order
     for match in _UNIT.finditer(line):
         before = line[: match.start()].rstrip(" ([")
@@ -52,10 +52,10 @@ def _units(line: str) -> list[str]:
 
 
 def _frequency_unit(table: TextTable, column: int, given: str | None) -> str | None:
-    """The unit of the frequencies in a column, by the header or the argument `unit`.
+    """Return the unit of the frequencies in a column, from the header or the argument `unit`.
 
-    Of a text table the line above the rows counts first; what is said above that is overruled by
-    the argument. Lengths are units of wavelengths only where these are spoken of.
+    The line directly above the rows must agree with the argument, which overrides lines further
+    up. Outside IPAC tables a length is accepted only if the header mentions wavelengths.
     """
     last = _units(table.header[-1]) if table.header else []
     if table.bars:
@@ -79,7 +79,7 @@ def _frequency_unit(table: TextTable, column: int, given: str | None) -> str | N
 
 
 def _to_GHz(samples: Float[np.ndarray, "2 sample"], unit: str) -> Float[np.ndarray, "2 sample"]:
-    """Frequencies, wavenumbers or wavelengths with their weights, as frequencies in GHz."""
+    """Convert frequencies, wavenumbers or wavelengths to GHz, in order, with their weights."""
     known = _known(unit)
     if known not in _UNITS:
         raise UnfitError(f"the frequencies' unit is {unit!r}, not one of {', '.join(_UNITS)}.")
@@ -92,22 +92,22 @@ def _to_GHz(samples: Float[np.ndarray, "2 sample"], unit: str) -> Float[np.ndarr
 #: Frequencies [GHz] and weights of a table.
 Curve: TypeAlias = tuple[np.ndarray, np.ndarray]
 
-#: Unit of a RIMO's WAVENUMBER -> convention. The LFI column holds frequencies, and its weights act
-#: on antenna temperature; those of HFI act on power.
+#: Unit of a RIMO's WAVENUMBER -> convention. For LFI the column contains frequencies, and the
+#: weights act on antenna temperature; those of HFI act on power.
 _RIMO = {"GHz": "RJ", "1/cm": "power"}
-#: Names of columns that hold no frequencies.
+#: Names of columns that do not contain frequencies.
 _NO_FREQUENCY = re.compile(
     r"index|idx|i|n|no\.?|number|row|sample|channel|id|weights?|w|t|trans\w*|response|bandpass",
     re.I,
 )
-#: Weights below this fraction of the largest are none.
+#: Weights below this fraction of the largest count as zero.
 _NO_WEIGHT = 1e-6
-#: A band has more columns than these only if its table is something else, or lies on its side.
+#: A table with more columns than this is something else, or transposed.
 _WIDEST = 8
 
 
 def _checked(nu: np.ndarray, weights: np.ndarray) -> Curve:
-    """The samples at positive frequencies [GHz]; raises InputError if they are no bandpass."""
+    """Return the samples at positive frequencies [GHz]; refuse what is not a bandpass."""
     if bad := int(np.sum(~np.isfinite(nu) | ~np.isfinite(weights))):
         raise UnfitError(f"{bad} of {nu.size} samples of the bandpass are not finite.")
     low = nu <= 0
@@ -140,7 +140,7 @@ def _rimo_samples(hdus: pyfits.HDUList, name: str) -> tuple[Curve, str]:
         known = " or ".join(_RIMO)
         raise UnfitError(f"HDU {name!r}: WAVENUMBER has the unit {unit!r}, not {known}.")
     nu, weights = _to_GHz(data[0], unit)
-    # Neighbours that share a frequency, as single precision makes some do, count as their mean.
+    # Neighbours that share a frequency, as happens in single precision, are averaged.
     starts = np.flatnonzero(np.concatenate([[True], np.diff(nu) != 0]))
     counts = np.diff(np.append(starts, nu.size))
     return _checked(nu[starts], np.add.reduceat(weights, starts) / counts), _RIMO[unit]
@@ -149,7 +149,7 @@ def _rimo_samples(hdus: pyfits.HDUList, name: str) -> tuple[Curve, str]:
 def _rimo_names(
     names: Sequence[str], band: str | None, detectors: Sequence[str] | None
 ) -> list[str]:
-    """Names of the HDUs of a band average, or of its detectors."""
+    """Return the names of the HDUs of a band average, or of its detectors."""
     wanted = None if band is None else band.upper().lstrip("F0")
     averages, single = {}, {}
     for name in names:
@@ -190,7 +190,7 @@ def _read_rimo(path: Path, band: str | None, detectors: Sequence[str] | None) ->
 
 
 def _columns(table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
-    """Numbers of the columns of frequency and weight."""
+    """Return the numbers of the columns of frequency and weight."""
     width, names = table.width, table.names()
     if fields is None:
         shown = f" ({' '.join(names)})" if names else ""
@@ -219,7 +219,7 @@ def _columns(table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
 def _read_text(
     table: TextTable, fields: Sequence[int | str] | None, given: str | None
 ) -> tuple[Curve, str]:
-    """Frequencies and weights of a table, and the convention, which IPAC tables have, or ""."""
+    """Return frequencies and weights of a table, and the convention of IPAC tables, else ""."""
     columns = _columns(table, fields)
     samples = table.numbers(columns).T
     unit = _frequency_unit(table, columns[0], given)
@@ -243,18 +243,18 @@ def read_bandpass(
     fields: Sequence[int | str] | None = None,
     trim: float = 0.0,
 ) -> Bandpass:
-    r"""The bandpass of a band or of some detectors, from a file.
+    r"""Read the bandpass of a band, or the mean of some detectors, from a file.
 
     * Planck instrument models (RIMO, FITS): `band` is "30" or "044" for LFI, in convention "RJ";
-      "100", "353" for HFI, "power". "PSB353" is the average of the polarization-sensitive
-      bolometers only, the one for maps of Q and U. `detectors=("24M", "24S")` averages single
-      detectors instead, each normalised to unit integral. Samples that HFI flags as interpolated
-      over CO lines are used like the others.
-    * IPAC tables (WMAP), with the frequency's unit from their header: convention "power".
+      "100", "353" for HFI, in convention "power". "PSB353" is the average of the polarization-
+      sensitive bolometers only, which is right for maps of Q and U. `detectors=("24M", "24S")`
+      averages single detectors instead, each normalised to unit integral. Samples that HFI flags
+      as interpolated over CO lines are used like the others.
+    * IPAC tables (WMAP), with the unit of frequency from their header: convention "power".
     * Text with two columns, frequency and weight, separated by blanks, commas or semicolons
-      (`jaxsky.io.curves.read_text`). Their unit is the one that the header states ("nu [MHz]",
-      "nu_GHz"), else GHz, provided that the middle of the band is then within 1 and 3000 GHz.
-      Such a file does not say its convention, so it has to be given.
+      (`jaxsky.io.curves.read_text`). The unit is the one stated in the header ("nu [MHz]",
+      "nu_GHz"), else GHz, provided that the middle of the band is then between 1 and 3000 GHz.
+      Such a file does not state its convention, so it has to be given.
 
     Samples without weight at nu <= 0 are dropped.
 
@@ -263,7 +263,7 @@ def read_bandpass(
     path : FITS, IPAC or text file
     band : band of a RIMO
     detectors : detectors of a RIMO
-    convention : "RJ", "power" or "CMB" (`Bandpass`), where the format's is not right
+    convention : "RJ", "power" or "CMB" (`Bandpass`), to override that of the format
     unit : unit of the frequencies of a text file that does not state it: "Hz", "kHz", "MHz",
         "GHz", "THz", wavenumbers "1/cm", wavelengths "um" or "mm"
     fields : columns of frequency and weight of a text file that has more than these, by number
@@ -277,7 +277,7 @@ def read_bandpass(
     InputError
         If the file has no such bandpass, or convention, unit or columns are not certain.
     ValueError
-        If `convention` or `trim` is no valid value.
+        If `convention` or `trim` is invalid.
     """
     path = Path(path)
     if convention is not None:

@@ -1,7 +1,7 @@
-"""Columns of HEALPix tables: what names, headers, values and arguments say of them.
+"""Read columns of HEALPix tables, and work out their Stokes parameters, units and missing pixels.
 
-Only names on a list say which Stokes parameter a column holds. They are those of Planck, WMAP,
-healpy, the HEALPix libraries, PySM and this package; where a column stands says nothing.
+Only names on a list identify the Stokes parameter of a column. They are those of Planck, WMAP,
+healpy, the HEALPix libraries, PySM and this package; the position of a column is no evidence.
 """
 
 import numbers
@@ -38,12 +38,12 @@ _SCALARS = (
 
 
 def _known() -> dict[str, str]:
-    """Names that are certain -> one Stokes parameter, two of a covariance, or "" for neither."""
+    """Map certain names to one Stokes parameter, two of a covariance, or "" for neither."""
     names = dict.fromkeys(("TEMPERATURE", "INTENSITY", "I_MAP", "T_MAP"), "I")
     for letter, one in _LETTERS.items():
         names |= {letter: one, f"STOKES_{letter}": one}
         names |= {f"{letter}_{word}": one for word in _OF_ONE}
-        # The spread of a Stokes parameter has no sign: it goes with the variance.
+        # The spread of a Stokes parameter has no sign, so it is treated like a variance.
         names |= {f"{letter}_{word}": one * 2 for word in _SPREADS}
         names |= {f"{word}_{letter}": one * 2 for word in _SPREADS}
     for (a, first), (b, second) in product(_LETTERS.items(), repeat=2):
@@ -56,22 +56,22 @@ def _known() -> dict[str, str]:
 
 
 _KNOWN = _known()
-#: What `stokes` takes for one column.
+#: Values of `stokes` for one column.
 _CHOICES = ("", "I", "Q", "U", "II", "IQ", "IU", "QQ", "QU", "UU")
 
 
 def stokes_of(name: str) -> str | None:
-    """Stokes parameter of a column as far as its name is certain; None if it is not.
+    """Return the Stokes parameter that a column's name identifies; None if it is not certain.
 
-    Two of them for a covariance, and for an rms, which has no sign either; "" for hits and others.
+    Two letters stand for a covariance, or an rms, which has no sign either; "" for hits and others.
     """
     return _KNOWN.get(name.strip().upper().replace("-", "_").replace(" ", "_"))
 
 
 def parse_stokes(given: str | Sequence[str]) -> list[str]:
-    """The Stokes parameters that an argument names, one entry per column.
+    """Parse the argument `stokes` into one entry per column.
 
-    A letter per column, or words in a sequence or in text; "" is a column without one.
+    It has a letter per column, or words in a list or a string; "" is a column without one.
 
     Examples
     --------
@@ -96,24 +96,24 @@ def parse_stokes(given: str | Sequence[str]) -> list[str]:
     return found
 
 
-#: Numbers that are written in place of a value that is missing, of either sign.
+#: Numbers commonly written in place of missing values, with either sign.
 USUAL = (999.0, 9999.0, 99999.0, 999999.0, 32767.0, 32768.0, 2147483647.0, 2147483648.0)
-#: Beyond any value of a sky map in any unit, unless its others are as large.
+#: Larger than any value of a sky map in any unit, unless the other values are as large.
 HUGE = 1e15
-#: A sentinel is repeated so often, and so much more often than its neighbour among the values.
+#: A sentinel occurs at least this often, and more than this many times as often as the next value.
 REPEATED, MORE_OFTEN = 4, 3
-#: A map that is exactly 0 in more of its pixels than this fraction is taken to have a footprint.
+#: A map that is exactly 0 in more than this fraction of its pixels is taken to have a footprint.
 ZEROS = 0.3
 
 
 def sentinels(
     values: Float[np.ndarray, " pix"], lowest: float | None = None, *, zero: bool = False
 ) -> list[tuple[float, int]]:
-    """Values that look like marks of missing pixels, with the number of their pixels.
+    """Find values that look like marks of missing pixels, and count their pixels.
 
-    A mark is an extreme far from the rest, further out than the rest is from its median, and
-    repeated, or huge; the usual numbers (-999, -32768, ...; `lowest`; zero, if so wished) count
-    also where they are nearer. Values are NaN where they are known to be missing.
+    A mark is an extreme value, farther from the next value than that is from the others' median,
+    which is repeated, huge or usual (-999, -32768, ...; `lowest`; on request zero). Usual numbers
+    that occur twice also count where nearer, unless all others are whole. NaN: known to be missing.
     """
     known = np.isfinite(values)
     rest = values if known.all() else values[known]
@@ -134,7 +134,7 @@ def sentinels(
 
 
 def _marks(rest: np.ndarray, extreme: float, count: int, usual: bool) -> np.ndarray | None:
-    """The other values if an extreme marks missing pixels, else None."""
+    """Return the other values if an extreme value marks missing pixels, else None."""
     if count < 2 and not usual and abs(extreme) < HUGE:
         return None
     others = rest[rest != extreme]
@@ -143,7 +143,7 @@ def _marks(rest: np.ndarray, extreme: float, count: int, usual: bool) -> np.ndar
     near = others.min() if extreme < others.min() else others.max()
     far = abs(near - extreme) > abs(np.median(others) - near)
     often = max(REPEATED, 1 + MORE_OFTEN * int(np.count_nonzero(others == near)))
-    # Most values of a map are there once, unlike labels, steps and rings.
+    # Most values of a map occur once, unlike those of labels, steps and rings.
     some = others[:: max(1, others.size // 1000)]
     repeated = count >= often and np.unique(some).size > some.size / 2
     is_mark = far and (usual or abs(extreme) >= HUGE or repeated)
@@ -153,10 +153,10 @@ def _marks(rest: np.ndarray, extreme: float, count: int, usual: bool) -> np.ndar
 
 
 class Column(NamedTuple):
-    """A column of a HEALPix table: values in RING order, NaN where missing, and what it is.
+    """A column of a HEALPix table: values in RING order, NaN where missing, and its metadata.
 
-    `lowest` is what the lowest integer stands for that it can store, None for other types; `alone`
-    says that its table has no other column.
+    `lowest` is the value of the lowest integer that the column can store, None for other types;
+    `alone` is True if its table has no other column.
     """
 
     where: str
@@ -174,7 +174,7 @@ class Column(NamedTuple):
         return healpy.npix2nside(self.values.size)
 
 
-#: What all columns of one field have in common, and what to do where they do not.
+#: Attributes that all columns read together must share, and the advice if they do not.
 _COMMON = {
     "nside": "one field has one nside",
     "unit": "read columns of different units each by itself",
@@ -184,9 +184,9 @@ _COMMON = {
 
 
 def default_fields(table: HealpixTable, argument: str = "fields") -> list[int]:
-    """The first I, Q and U columns that are there, by their names; else a column that is alone.
+    """Choose the first columns named as I, Q and U, whichever exist; else the only column.
 
-    What follows after "_" or "-" does not count: good enough to choose by, but no evidence.
+    Anything after "_" or "-" is ignored: good enough to choose a column by, but not evidence.
     """
     kinds = [stokes_of(name) for name in table.names]
     for i, name in enumerate(table.names):
@@ -203,7 +203,7 @@ def default_fields(table: HealpixTable, argument: str = "fields") -> list[int]:
 
 
 def _unit(table: HealpixTable, column: int, given: str | None) -> str:
-    """The unit of a column, from the header or the argument that stands in for it."""
+    """Return the unit of a column, from the header or the argument `unit`."""
     text, name, found = table.unit(column), table.names[column], None
     if text is not None:
         with suppress(ValueError):
@@ -214,7 +214,7 @@ def _unit(table: HealpixTable, column: int, given: str | None) -> str:
             '"uK_CMB", "K_RJ", "MJy/sr", "K" for a temperature of matter or "" for a pure number'
         )
         raise UnfitError(f"column {name} {says}; give `unit`, such as {units}.")
-    # An argument may make the header's bare kelvins definite.
+    # The argument may specify which kelvins the header means.
     if given is not None and found not in (None, given, re.sub("_(CMB|RJ)", "", given)):
         is_in = f"in {found}" if found else "a pure number"
         raise UnfitError(f"argument `unit` is {given or 'no unit'}, but column {name} is {is_in}.")
@@ -226,7 +226,7 @@ def _several(value: Any) -> list[Any]:
 
 
 def _split(path: Any, hdu: Any, fields: Any) -> list[tuple[Path, Any, list[Any] | None]]:
-    """File, HDU and columns of each table, from arguments that may be lists."""
+    """Return file, HDU and columns of each table, from arguments that may be lists."""
     wanted = None if fields is None else _several(fields)
     given: dict[str, list[Any]] = {"path": _several(path), "hdu": _several(hdu)}
     number = max(map(len, given.values()))
@@ -269,9 +269,9 @@ def _read_table(
 def read_columns(
     path: Any, hdu: Any, fields: Any, unit: str | None, stated: Mapping[str, str | None]
 ) -> list[Column]:
-    """The columns of one or several tables, together; arguments as those of `read_maps`.
+    """Read the columns of one or several tables; arguments as in `read_maps`.
 
-    `stated` are ordering, coordinates and polarization.
+    `stated` contains ordering, coordinates and polarization.
     """
     tables = [_read_table(*one, unit, stated) for one in _split(path, hdu, fields)]
     first, *others = (column for table in tables for column in table)
@@ -288,9 +288,9 @@ def read_columns(
 def column_stokes(
     columns: Sequence[Column], given: str | Sequence[str] | None
 ) -> tuple[str | None, ...]:
-    """The Stokes parameter of each column, where it has to be known."""
+    """Return the Stokes parameter of each column; None where it is unknown and not needed."""
     first, names = columns[0], [column.name for column in columns]
-    # healpy calls any map T or TEMPERATURE that is alone in its file.
+    # healpy names any map that is alone in its file T or TEMPERATURE.
     doubtful = ("T", "TEMPERATURE") if len(names) > 1 or given is not None else ()
     certain = [None if c.alone and c.name in doubtful else stokes_of(c.name) for c in columns]
     if given is None:
@@ -312,7 +312,7 @@ def column_stokes(
     for column, one, found in zip(columns, stated, certain, strict=True):
         if not one or found is None:
             continue
-        # Any may be a spread, or have no Stokes parameter.
+        # Whatever its name, a column may be a spread, or have no Stokes parameter.
         if not (found in ("I", "") if one == "I" else one in (found, found * 2)):
             raise InputError(
                 f"{column.where}: argument `stokes` says {one} of column {column.name}, whose "
@@ -322,9 +322,9 @@ def column_stokes(
 
 
 def mark_missing(columns: Sequence[Column], missing: Any, zeros_are_data: bool) -> None:
-    """Set the values that an argument says to mark missing pixels to NaN, in place.
+    """Set values listed in `missing` to NaN, in place.
 
-    Refuses columns in which other numbers seem to mark them, unless it says that none do.
+    If there are none, refuse columns with suspected sentinels, unless `missing` is an empty list.
     """
     marks = None if missing is None else _several(missing)
     if any(isinstance(x, bool) or not isinstance(x, numbers.Real) for x in marks or ()):
@@ -342,7 +342,7 @@ def mark_missing(columns: Sequence[Column], missing: Any, zeros_are_data: bool) 
         for c in columns
         for number, count in sentinels(c.values, c.lowest)
     ]
-    # One after the other: an array of all of them may be large.
+    # One after the other: an array of all columns may be large.
     known = reduce(np.logical_and, (np.isfinite(c.values) for c in columns))
     empty = reduce(np.logical_and, (c.values == 0 for c in columns))
     share = np.count_nonzero(empty & known) / max(1, int(np.count_nonzero(known)))

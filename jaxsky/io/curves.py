@@ -1,4 +1,4 @@
-"""Curves in files: tables of numbers as text, power spectra, and windows of beams."""
+"""Read text tables of numbers, power spectra and beam windows."""
 
 import codecs
 import re
@@ -19,9 +19,9 @@ _TRAILING = re.compile(r"\s(?:[#!%\\]|//).*")
 _NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:[ed][+-]?\d+)?|nan|inf|infinity)", re.I | re.ASCII
 )
-#: What to do about decimal commas.
+#: Advice for decimal commas.
 _WRITE = "write decimal points, or semicolons between the columns"
-#: A field that begins as a number does, if not as a word.
+#: The beginning of a field that looks like a number.
 _DAMAGED = re.compile(r"[\"'(\[+-]*\.?\d")
 
 
@@ -38,7 +38,7 @@ def _words(line: str) -> list[str]:
 
 
 class TextTable(NamedTuple):
-    """Lines of a text file: comments and names of columns, the bars of an IPAC header, rows."""
+    """Lines of a text file: comments and column names, the IPAC header lines ("|"), and rows."""
 
     path: Path
     header: list[str]
@@ -51,17 +51,17 @@ class TextTable(NamedTuple):
         return len(self.rows[0].cells)
 
     def words(self) -> list[list[str]]:
-        """The lines above the rows, split into words."""
+        """Return the lines above the rows, split into words."""
         return [_words(line) for line in [*self.bars, *self.header]]
 
     def names(self) -> list[str]:
-        """Names of the columns: those of the last line of the header with so many words."""
+        """Return the column names: the last line of the header with a word per column."""
         lines = [re.sub(r"[(\[].*?[)\]]", "", line) for line in [*self.bars[:1], *self.header]]
         named = (words for words in map(_words, reversed(lines)) if len(words) == self.width)
         return next(named, [])
 
     def numbers(self, columns: Sequence[int] | None = None) -> Float[np.ndarray, "row column"]:
-        """The numbers of some columns; without, of all, of which each row must have as many."""
+        """Return the numbers of some columns; by default all, with equally many in each row."""
         table = []
         for line, text, cells in self.rows:
             wanted = range(len(cells)) if columns is None else columns
@@ -76,7 +76,7 @@ class TextTable(NamedTuple):
 
 
 def _number(cell: str) -> float | None:
-    """The value of a field, exponents of Fortran (1.0D+01) included; None if it is no number."""
+    """Return the value of a field, also with a Fortran exponent (1.0D+01); None if not a number."""
     if not _NUMBER.fullmatch(cell):
         return None
     word = cell.lower()
@@ -84,7 +84,7 @@ def _number(cell: str) -> float | None:
 
 
 def _cells(text: str) -> list[str]:
-    """Fields between semicolons, commas or blanks; a comma may be decimal in the first."""
+    """Split a line at semicolons, commas or blanks; between semicolons, commas are decimal."""
     if ";" in text:
         return [cell.strip().replace(",", ".") for cell in text.strip(" ;").split(";")]
     words = [word.strip(",") for word in text.split()]
@@ -95,11 +95,11 @@ def _cells(text: str) -> list[str]:
 
 
 def read_text(path: Path) -> TextTable:
-    r"""The lines of a text table; UTF-8, or UTF-16 with its mark.
+    r"""Read the lines of a text table in UTF-8, or UTF-16 with a byte order mark.
 
     Comments start with # ; % ! \ | // or *. Columns are separated by blanks, commas or semicolons.
-    A line before the first row is a header if none of its fields is a number, and they do not all
-    begin with a digit.
+    A line before the first row is a header if none of its fields is a number, and not all of them
+    begin like one.
     """
     table, content = TextTable(path, [], [], []), path.read_bytes()
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
@@ -121,7 +121,7 @@ def read_text(path: Path) -> TextTable:
 
 
 def _add_line(table: TextTable, line: int, text: str) -> None:
-    """Put a line of the file where it belongs."""
+    """Add a line of the file to the header, the IPAC header lines or the rows."""
     if text.startswith("|") and table.rows:
         raise UnfitError(f"a header among the rows: {text!r}.")
     if text.startswith("|"):
@@ -140,7 +140,7 @@ def _add_line(table: TextTable, line: int, text: str) -> None:
 
 
 def _check_commas(rows: list[TextRow]) -> None:
-    """Refuse rows such as 30,5,2,0: two numbers with decimal commas, or four."""
+    """Refuse rows such as 30,5,2,0, which may be four numbers or two with decimal commas."""
     cells = [cell for row in rows for cell in row.cells]
     halves = all(len(row.cells) % 2 == 0 and len(row.cells) > 2 for row in rows)
     commas = all(len(row.text.split()) == 1 and "," in row.text for row in rows)
@@ -153,7 +153,7 @@ def _check_commas(rows: list[TextRow]) -> None:
 SPECTRA = ("TT", "EE", "BB", "TE")
 #: First columns of text files, by format.
 _ORDERS = {"planck": ("L", "TT", "TE", "EE", "BB"), "camb": ("L", "TT", "EE", "BB", "TE")}
-#: Names of columns, upper case -> the package's: HEALPix (IDL, Fortran, healpy), HEALPix C++.
+#: Column names in upper case -> the package's: HEALPix (IDL, Fortran, healpy), HEALPix C++.
 _NAMES = {
     **dict.fromkeys(("ELL", "INDEX", "MULTIPOLE"), "L"),
     **dict.fromkeys(("TEMPERATURE", "TEMPERATURE C_L"), "TT"),
@@ -163,14 +163,14 @@ _NAMES = {
 }
 _CAMB = "..._lensedCls.dat and ..._totCls.dat"
 _D_ELL = re.compile(r"(?<![a-z0-9])D_?(L|ELL)(?![a-z])|\bL\s*\*?\s*\(L\s*\+\s*1\)", re.I)
-#: |TE| may exceed sqrt(TT EE) by this factor, the rounding of text with six digits.
+#: |TE| may exceed sqrt(TT EE) by this factor, from rounding in text with six digits.
 _ROUNDING = 1 + 1e-5
 
 
 def _up_to(
     ell: Float[np.ndarray, " row"], values: np.ndarray, lmax: int, start: int
 ) -> Float[np.ndarray, "... ell"]:
-    """Values of a table at l = 0 ... lmax; 0 below its first row, which is at most l = `start`."""
+    """Return the values at l = 0 ... lmax; 0 below the first row, which is at most l = `start`."""
     if lmax < 0:
         raise ValueError(f"Argument `lmax` must not be negative, but is {lmax}.")
     if odd := int(np.sum(~(ell == np.round(ell)) | (ell < 0))):
@@ -187,12 +187,12 @@ def _up_to(
 
 
 def _name(word: str) -> str:
-    """The package's name of a column."""
+    """Return the package's name for a column."""
     return _NAMES.get(word.upper(), word.upper())
 
 
 def _located(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
-    """Numbers of the columns that are wanted."""
+    """Return the numbers of the columns wanted."""
     known = [_name(name) for name in names]
     if missing := [name for name in wanted if name not in known]:
         hint = f"; CAMB writes it to {_CAMB}" if missing == ["BB"] else ""
@@ -203,7 +203,7 @@ def _located(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
 def _text_order(
     file: str, header: list[list[str]], columns: int, format: str | None
 ) -> Sequence[str]:
-    """Names of the columns of a text file, from its header, `format` or its own name."""
+    """Return the column names of a text file, from its header, `format` or the file name."""
     named = [names for words in header if "TT" in (names := [_name(word) for word in words])]
     if named:
         words = named[-1]
@@ -232,14 +232,14 @@ def _text_order(
 
 
 def _fits_factor(name: str, found: str | None, given: str | None) -> float:
-    """Factor to uK_CMB^2 from the unit of a column or the argument that stands in for it."""
+    """Return the factor to uK_CMB^2 from the unit of a column, or from the argument `unit`."""
     stated = None if (found or "").lower() in ("", "unknown") else found
     if (units := [unit for unit in (given, stated) if unit is not None]) == []:
         raise UnfitError(f'column {name} has no unit; give `unit`, such as "uK_CMB^2".')
     factors = []
     for unit in units:
         try:
-            # A spectrum of the CMB in bare kelvins is one of thermodynamic temperature.
+            # Bare kelvins in a CMB spectrum mean thermodynamic temperature.
             definite = re.sub(r"K\^2$", "K_CMB^2", unit_name(unit))
             factors.append(unit_factor(definite, "uK_CMB^2"))
         except ValueError:
@@ -254,7 +254,7 @@ def _fits_factor(name: str, found: str | None, given: str | None) -> float:
 def _spectra_of_fits(
     path: Path, unit: str | None
 ) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, "4 row"]]:
-    """Multipoles of the rows of a table, and C_l of TT, EE, BB, TE [uK_CMB^2]."""
+    """Read the multipoles of a FITS table, and C_l of TT, EE, BB, TE [uK_CMB^2]."""
     with open_fits(path) as hdus:
         table = select_hdu(hdus, 1, TABLES)
         if stated := _D_ELL.search(repr(table.header)):
@@ -275,14 +275,14 @@ def _first(bad: np.ndarray) -> str:
 def read_spectra(
     path: str | Path, lmax: int, *, format: str | None = None, unit: str | None = None
 ) -> Float[np.ndarray, "4 ell"]:
-    """Power spectra C_l of TT, EE, BB, TE from a file [uK_CMB^2], l = 0 ... lmax.
+    """Read power spectra C_l of TT, EE, BB, TE from a file [uK_CMB^2], l = 0 ... lmax.
 
     * Text with l and D_l = l (l+1) C_l / 2 pi [uK^2]: the theory spectra of the Planck Legacy
-      Archive (L TT TE EE BB PP), and what CAMB writes (L TT EE BB TE). The header says which
-      column is which. Without one, CAMB's order is assumed for names that end in totCls.dat or
-      lensedCls.dat, and has to be given as `format` for others.
-    * FITS tables as HEALPix and healpy write them, with C_l, from l = 0 unless a column says
-      otherwise. Units are read from the header, the bare K^2 being one of K_CMB.
+      Archive (L TT TE EE BB PP), and the output of CAMB (L TT EE BB TE). The header names the
+      columns. Without one, CAMB's order is assumed for file names that end in totCls.dat or
+      lensedCls.dat; for others the order must be given as `format`.
+    * FITS tables with C_l as written by HEALPix and healpy, from l = 0 unless there is a column
+      of multipoles. Units are read from the header; a bare K^2 means K_CMB^2.
 
     Multipoles 0 and 1 are zero where the file does not have them.
 
@@ -290,15 +290,15 @@ def read_spectra(
     ----------
     path : text or FITS file
     lmax : largest multipole
-    format : "planck" or "camb", the order of columns of a text file without header
-    unit : unit of a FITS table without one, for example "uK_CMB^2" (`healpy.write_cl` writes
+    format : "planck" or "camb", the order of columns in a text file without a header
+    unit : unit of a FITS table that states none, for example "uK_CMB^2" (`healpy.write_cl` writes
         none unless asked to)
 
     Raises
     ------
     InputError
-        If the file lacks a spectrum or multipoles, says neither by itself nor by an argument what
-        its columns and units are, or has values that are not those of a Gaussian field.
+        If the file lacks a spectrum or multipoles, if neither file nor arguments state columns
+        and units, or if values are not finite, negative, or have |TE| > sqrt(TT EE).
     ValueError
         If `format` is unknown or lmax is negative.
     """
@@ -332,7 +332,7 @@ def read_spectra(
     return spectra
 
 
-#: Columns that hold b_l: HEALPix, Planck's T E B windows, HFI's and LFI's instrument models.
+#: Columns with b_l: HEALPix, Planck's T E B windows, instrument models of HFI and LFI.
 _WINDOWS = ("TEMPERATURE", "INTENSITY", "T", "NOMINAL", "BL")
 
 
@@ -353,17 +353,17 @@ def _window_of_fits(path: Path, hdu: int | str) -> Float[np.ndarray, " row"]:
 
 
 def read_beam(path: str | Path, lmax: int, *, hdu: int | str = 1) -> Float[np.ndarray, " ell"]:
-    """Window b_l of a beam from a file, l = 0 ... lmax, normalised to 1 at l = 0.
+    """Read the window b_l of a beam from a file, l = 0 ... lmax, normalised to 1 at l = 0.
 
-    The table must hold b_l, by which a_lm are multiplied, not its square.
+    The table must contain b_l, the factor on a_lm, not its square.
 
-    * Text with columns l and b_l (`read_text`), IPAC tables as of WMAP among it;
+    * Text with columns l and b_l (`read_text`), including IPAC tables such as those of WMAP;
       further columns are ignored.
-    * FITS tables from l = 0 on, of HEALPix or Planck: the first column named TEMPERATURE,
-      INTENSITY, T, NOMINAL or BL, so of a file with several that of the temperature.
+    * FITS tables from l = 0, of HEALPix or Planck: the first column named TEMPERATURE, INTENSITY,
+      T, NOMINAL or BL, which is the temperature window if there are several.
 
-    The normalisation takes out what a main beam misses in its far sidelobes (1 % at 30 GHz in
-    LFI_RIMO_R3.31).
+    The normalisation removes the power that a main beam misses in its far sidelobes (1 % at 30 GHz
+    in LFI_RIMO_R3.31).
 
     Parameters
     ----------
@@ -374,7 +374,7 @@ def read_beam(path: str | Path, lmax: int, *, hdu: int | str = 1) -> Float[np.nd
     Raises
     ------
     InputError
-        If the file has no such window, or not for all multipoles.
+        If the file has no such window, or lacks some multipoles.
     ValueError
         If lmax is negative.
     """

@@ -1,4 +1,4 @@
-"""Names of units as files and astropy write them, and factors between them."""
+"""Recognise units as files and astropy spell them, and convert between them."""
 
 import re
 from typing import Any
@@ -25,10 +25,11 @@ _JANSKY = re.compile(
 
 
 def unit_name(text: str) -> str:
-    """The package's name for a unit as FITS headers and astropy spell it ("mK,thermodynamic").
+    """Return the package's name for a unit spelt as in FITS headers, e.g. "mK,thermodynamic".
 
-    A name of `jaxsky.bandpass.UNITS`, with "^2" for a square; "" for a pure number; "K", "mK",
-    "uK" or "nK" where the text does not say whether antenna or thermodynamic; else astropy's name.
+    This is a name in `jaxsky.bandpass.UNITS`, with "^2" for a square; "" for a pure number; "K",
+    "mK", "uK" or "nK" if the text does not say whether the temperature is antenna or thermodynamic;
+    otherwise astropy's name.
     """
     if text.strip().lower() in _DIMENSIONLESS:
         return ""
@@ -48,7 +49,7 @@ def unit_name(text: str) -> str:
 
 
 def is_ambiguous(name: str) -> bool:
-    """True for kelvins that may be antenna or thermodynamic temperature."""
+    """Return whether a unit is in kelvins that may be antenna or thermodynamic temperature."""
     return name.removesuffix("^2") in ("K", "mK", "uK", "nK")
 
 
@@ -59,14 +60,14 @@ def unit_factor(
     at: Numeric | Bandpass | u.Quantity | None = None,
     nu_ref: float | None = None,
 ) -> float:
-    """Factor by which values in one unit become values in another.
+    """Return the factor that converts values from one unit to another.
 
     Parameters
     ----------
-    source, target : names of units, in any spelling `unit_name` takes; squares ("K_CMB^2",
-        covariances) convert with the square of the factor
-    at : frequency [GHz] or band, needed between K_RJ, K_CMB and MJy/sr; in a band the factor is
-        that of `Bandpass.conversion`
+    source, target : names of units, in any spelling that `unit_name` accepts; squares ("K_CMB^2",
+        for covariances) convert with the square of the factor
+    at : frequency [GHz] or band, needed between K_RJ, K_CMB and MJy/sr; for a band the factor is
+        `Bandpass.conversion`
     nu_ref : frequency at which a band's MJy/sr is quoted [GHz], needed for that unit
 
     Examples
@@ -108,11 +109,11 @@ def from_quantity(
     at: Numeric | Bandpass | u.Quantity | None = None,
     nu_ref: float | None = None,
 ) -> np.ndarray:
-    """An astropy Quantity as a bare array in a unit of the package, in double precision.
+    """Convert an astropy Quantity to a bare array in a given unit, in double precision.
 
-    The unit of the result is "uK_RJ", "K_CMB", "MJy/sr", "GHz", "arcmin", "K", ...; for `at` and
-    `nu_ref` see `unit_factor`. Units are taken by name, so those of `pysm3.units` (uK_RJ, K_CMB)
-    work as well as astropy's.
+    `unit` is "uK_RJ", "K_CMB", "MJy/sr", "GHz", "arcmin", "K", ...; for `at` and `nu_ref` see
+    `unit_factor`. Units are recognised by name, so those of `pysm3.units` (uK_RJ, K_CMB) work as
+    well as astropy's.
 
     Examples
     --------

@@ -75,26 +75,20 @@ class Noise(NamedTuple):
         """True if it is a number for each band and Stokes parameter times a map."""
         return self.sigma is not None and self.sigma.shape[-1] == 1
 
-    def band_weights(self) -> Float[np.ndarray, "stokes band"]:
-        """1 / sigma^2 where the noise is separable, without the factor of the pixel."""
-        assert self.sigma is not None
-        return (1 / self.sigma[..., 0] ** 2).T
-
     def pixel_weights(self, pixels: slice | np.ndarray) -> Float[np.ndarray, " pix"] | float:
         """1 / pixel_sigma^2 in some of the pixels."""
         if self.pixel_sigma is None:
             return 1.0
         return 1 / np.asarray(self.pixel_sigma[pixels], float) ** 2
 
-    def weights(self, pixels: slice | np.ndarray) -> Float[np.ndarray, "stokes band #pix"]:
+    def weights(self, pixels: slice | np.ndarray) -> Float[np.ndarray, "band stokes #pix"]:
         """Inverse variances, or the diagonal of inverse covariances; 0 where masked."""
         if self.covariance is not None:
             (QQ, UU), determinant = self._elements(pixels)[:2]
-            return np.stack([UU, QQ]) / determinant
+            return np.stack([UU / determinant, QQ / determinant], axis=1)
         assert self.sigma is not None
-        sigma = self.sigma if self.sigma.shape[-1] == 1 else self.sigma[..., pixels]
-        weights = (1 / np.asarray(sigma, float) ** 2).swapaxes(0, 1)
-        return weights * self.pixel_weights(pixels)
+        sigma = self.sigma if self.separable else self.sigma[..., pixels]
+        return 1 / np.asarray(sigma, float) ** 2 * self.pixel_weights(pixels)
 
     def cross(self, pixels: slice | np.ndarray) -> Float[np.ndarray, "band pix"] | None:
         """Element QU of the inverse covariances; None if Q and U are independent."""
@@ -105,23 +99,19 @@ class Noise(NamedTuple):
 
     def heavy(
         self, used: Bool[np.ndarray, " pix"], squares: Float[np.ndarray, "band component"]
-    ) -> Bool[np.ndarray, " band"]:
-        """Bands that carry weight, from the pixels used and the squares of the laws."""
-        weights = np.zeros(len(squares))
-        for part in chunks(used.size):
-            weights += (self.weights(part) * used[part]).sum(axis=(0, 2))
-        share = weights[:, None] * squares
-        return (share >= LEAST_SHARE * share.sum(axis=0)).any(axis=1)
+    ) -> tuple[Bool[np.ndarray, " band"], int]:
+        """Bands that carry weight, and the number of data in them.
 
-    def number(
-        self, used: Bool[np.ndarray, " pix"], bands: Bool[np.ndarray, " band"], stokes: int
-    ) -> int:
-        """Number of data in some bands and the pixels used."""
-        if self.separable:
-            return int(used.sum()) * int(bands.sum()) * stokes
-        if self.covariance is not None:
-            return 2 * int(np.isfinite(self.covariance[bands, 0, 0]).sum())
-        return int(np.isfinite(self.sigma[bands]).sum())  # type: ignore[index]
+        From the pixels used and the squares of the laws.
+        """
+        weights, counts = np.zeros((2, len(squares)))
+        for part in chunks(used.size):
+            own = self.weights(part) * used[part]
+            weights += own.sum(axis=(1, 2))
+            counts += np.count_nonzero(own, axis=(1, 2))
+        share = weights[:, None] * squares
+        heavy = (share >= LEAST_SHARE * share.sum(axis=0)).any(axis=1)
+        return heavy, int(counts[heavy].sum())
 
     def _elements(self, pixels):
         assert self.covariance is not None
@@ -265,7 +255,7 @@ def used_pixels(noise: Noise, npix: int, components: int) -> np.ndarray:
         if noise.separable:
             used[part] = noise.pixel_weights(part) > 0
             continue
-        seen = (noise.weights(part) > 0).sum(axis=1)
+        seen = (noise.weights(part) > 0).sum(axis=0)
         used[part] = seen.any(axis=0)
         few += int(np.sum(used[part] & (seen < components).any(axis=0)))
     if few:
@@ -284,7 +274,7 @@ def _refuse(data: np.ndarray, noise: Noise) -> None:
     for part in chunks(data.shape[-1]):
         values = data[..., part]
         wrong = ~np.isfinite(values) | (values < UNSEEN)
-        bad += int(np.sum(wrong & (noise.weights(part) > 0).swapaxes(0, 1)))
+        bad += int(np.sum(wrong & (noise.weights(part) > 0)))
     raise ValueError(
         f"Argument `data` has {bad} values that are not finite (or UNSEEN) in pixels that are "
         "used; mask them with an infinite `noise`."
@@ -332,7 +322,7 @@ def compressed(
 ) -> Pixels:
     """As many vectors in place of the pixels of a cell as there are rows; exact."""
     covariance = band_covariance(data, noise, cells, used, layout)
-    weights = layout.rows(noise.band_weights().T[..., None])
+    weights = layout.rows(1 / np.asarray(noise.sigma) ** 2)
     if all(np.array_equal(weights[0], w) for w in weights[1:]):
         covariance, weights = covariance.sum(axis=1, keepdims=True), weights[:1]
     root = jnp.swapaxes(square_root(jnp.asarray(covariance)), -1, -2)
@@ -349,7 +339,6 @@ def pixel_rows(
     weights = noise.weights(pixels)
     if weights.shape[-1] > 1 or not used.all():
         weights = np.where(used, weights, 1.0)
-    weights = weights.swapaxes(0, 1)
     values = np.where(used & (weights > 0), np.asarray(data[..., pixels], float), 0.0)
     cross = noise.cross(pixels) if layout.joint else None
     cross = None if cross is None else np.where(used, cross, 0.0)[None]

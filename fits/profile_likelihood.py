@@ -282,8 +282,7 @@ def spectral_likelihood(
         (),
     )
     matrix = _check_matrices(like)[:, : len(data), :components]
-    heavy = noise.heavy(used, np.mean(matrix**2, axis=0))
-    number = noise.number(used, heavy, data.shape[1])
+    heavy, number = noise.heavy(used, np.mean(matrix**2, axis=0))
     rows = [len(data) * len(layout.groups[0]) for layout in like.layout]
     fewer = cells.number * max(rows) < used.sum()
     if compress and not noise.separable:

@@ -135,7 +135,7 @@ def component_maps(
         solved, squares, *variances = map(np.asarray, _separated(matrix, pixels, errors))
         amplitude[:, own, part] = layout.maps(solved)
         square[part] += squares
-        count[part] += (noise.weights(part) > 0)[own].sum(axis=(0, 1)) - len(names) * len(own)
+        count[part] += (noise.weights(part) > 0)[:, own].sum(axis=(0, 1)) - len(names) * len(own)
         if not errors:
             continue
         inverse, single = variances

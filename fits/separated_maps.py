@@ -71,7 +71,8 @@ def _separated(matrix, pixels, errors):
     """
 
     def separated(m, p):
-        found = systems.explained(m, p)
+        solved, rest, weighted = systems.fitted(m, p)
+        found = solved, jnp.sum(rest * weighted, axis=(0, 1))
         if not errors:
             return found
         single = [systems.inverse_gram(column[:, None], p)[:, 0, 0] for column in m.T]

@@ -162,14 +162,6 @@ def residuals(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Arra
     return jnp.concatenate([first, second], axis=1)
 
 
-def explained(
-    mixing: Float[Array, "row unknown"], pixels: Pixels
-) -> tuple[Float[Array, "group unknown pix"], Float[Array, " pix"]]:
-    """Amplitudes, and chi^2 of each pixel."""
-    amplitudes, rest, weighted = _parts(mixing, pixels)
-    return amplitudes, jnp.sum(rest * weighted, axis=(0, 1))
-
-
 class Derivatives(NamedTuple):
     """-ln L and its derivatives in the parameters that a mixing matrix depends on.
 
@@ -221,8 +213,8 @@ def derivatives(
     )
 
 
-def _parts(mixing, pixels):
-    """Amplitudes, residuals and weighted residuals."""
+def fitted(mixing: Float[Array, "row unknown"], pixels: Pixels) -> tuple[Array, Array, Array]:
+    """Amplitudes (group, unknown, pix), and residuals without and with weight (group, row, pix)."""
     amplitudes = solve(mixing, pixels)
     rest = pixels.data - _model(mixing, amplitudes)
     return amplitudes, rest, _weighted(pixels, rest)
@@ -234,12 +226,12 @@ def least_chi2(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Arr
 
     Formed from the residuals, so nothing cancels where signals are far above the noise.
     """
-    _, rest, weighted = _parts(mixing, pixels)
+    _, rest, weighted = fitted(mixing, pixels)
     return jnp.sum(rest * weighted)
 
 
 def _chi2_jvp(primals, tangents):
-    amplitudes, rest, weighted = _parts(*primals)
+    amplitudes, rest, weighted = fitted(*primals)
 
     def linear(mixing, pixels):
         """With the derivative of chi^2, in which amplitudes count as constant."""

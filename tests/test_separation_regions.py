@@ -94,6 +94,7 @@ def test_intersections_of_regions_compressed_pixel_by_pixel_and_sparse(monkeypat
         for other in fits[1:]:
             np.testing.assert_allclose(other.best_fit[name], fits[0].best_fit[name], rtol=1e-7)
             np.testing.assert_allclose(other.sigma[name], fits[0].sigma[name], rtol=1e-5)
+    assert 0.5 < abs(fits[0].correlation("dust.T_dust[2]", "dust.beta_dust[0]")) < 1
     # Regions 0 and 1 of T_dust have no pixel, or only masked ones.
     assert np.isnan(fits[0].best_fit["dust.T_dust"]).tolist() == [True, True, False]
     maps = component_maps(like, fits[0].best_fit, data, given)

@@ -23,7 +23,7 @@ from jaxsky.programs import keep_programs
 
 #: Parameters of glibc's mallopt: M_ARENA_MAX, M_MMAP_THRESHOLD.
 MALLOC = {-8: 1, -3: 8 * 2**20}
-#: The experiment file that has all keys, with comments.
+#: The experiment file with all keys, commented.
 TEMPLATE = "experiment"
 #: What `jaxsky simulate` may be restricted to.
 ONLY = ("noise", "signal", "foregrounds", "cmb")
@@ -59,7 +59,7 @@ def _options(
 
 
 def _experiments(incomplete: str = "") -> list[str]:
-    """The experiments of `jaxsky init` that begin so."""
+    """Return the experiments of `jaxsky init` whose names begin with these letters."""
     return sorted(p.stem for p in DEFAULTS.glob("*.toml") if p.stem.startswith(incomplete))
 
 
@@ -111,7 +111,7 @@ def _simulate(
 
 
 def _analysis(name: str) -> Callable[..., None]:
-    """A command with the options of all that work on maps."""
+    """Return a command with the options shared by those that work on maps."""
 
     def command(
         settings_file: SettingsPath = None,
@@ -174,11 +174,11 @@ app.add_typer(data_commands, name="data")
 
 
 def _return_memory() -> None:
-    """Have memory returned when it is freed.
+    """Make glibc return freed memory to the system.
 
-    JAX computes in threads, and glibc gives each a heap that keeps what was freed in it, maps of
-    up to 32 MiB among it: a third of all memory in use. So there is one heap for all threads,
-    and large arrays are outside.
+    JAX computes in threads, and glibc gives each a heap that keeps freed memory, including maps of
+    up to 32 MiB: a third of all memory in use. So all threads share one heap, and large arrays are
+    allocated outside it.
     """
     with contextlib.suppress(OSError, AttributeError):  # other systems have other ways
         mallopt = ctypes.CDLL(None).mallopt
@@ -187,7 +187,7 @@ def _return_memory() -> None:
 
 
 def main() -> None:
-    """Run the command line: double precision on, mistakes as one sentence and exit code 2."""
+    """Run the command line in double precision; an error is one sentence and exit code 2."""
     _return_memory()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # what a terminal's encoding lacks is replaced

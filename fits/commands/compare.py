@@ -1,4 +1,4 @@
-"""`jaxsky compare`: observed maps against the model, from settings to a report and its pictures."""
+"""`jaxsky compare`: compare observed maps with the model; numbers, a table, warnings, pictures."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,22 +23,22 @@ from fits.results import probability, with_error
 from jaxsky.harmonics import average_pixels
 from jaxsky.settings import Experiment
 
-#: A comparison with a smaller probability is pointed out.
+#: Comparisons with a smaller probability get a warning.
 UNLIKELY = 0.01
 OBSERVED, MODEL, FOREGROUNDS, NOISE = plots.COLORS[1], plots.COLORS[2], plots.COLORS[0], "0.55"
 UNIT = plots.UNITS["uK_RJ"]
 POWER = rf"$D_\ell$ [{UNIT}$^2$]"
 MULTIPOLE = r"multipole $\ell$"
-#: Panels beside each other.
+#: Panels per row.
 COLUMNS = 3
 #: Label, C_l of EE and BB, and style.
 Curve = tuple[str, np.ndarray, dict[str, Any]]
-#: Patches in a picture: name, those shown, and what x and y are: a fit, and EE (0) or BB (1).
+#: Patches in a picture: name, which are shown, and x and y, each a fit and EE (0) or BB (1).
 Series = tuple[str, np.ndarray, tuple[PatchFits, int], tuple[PatchFits, int]]
 
 
 def _numbers(comparison: Comparison, patches: PatchComparison | None) -> dict[str, Any]:
-    """All numbers: `pixels` by band, region and Stokes parameter, `spectra` by band, `patches`."""
+    """Return `pixels` by band, region and Stokes parameter, `spectra` by band, and `patches`."""
     pixels: dict[str, Any] = {}
     for (band, region, stokes), s in comparison.scatters.items():
         numbers = s._asdict() | {"slope_pte": s.slope_pte}
@@ -65,7 +65,7 @@ def _numbers(comparison: Comparison, patches: PatchComparison | None) -> dict[st
 
 
 def _table(comparison: Comparison) -> ResultTable:
-    """Slopes, correlations and probabilities."""
+    """Return the table of slopes, correlations and probabilities."""
     header = ("band", "region", "", "slope", "r", "rms", "exp.", "PTE", "EE", "BB")
     spectra = {s.band: s for s in comparison.spectra}
     rows: list[Row] = []
@@ -88,7 +88,7 @@ def _table(comparison: Comparison) -> ResultTable:
 
 
 def comparison_warnings(comparison: Comparison, settings: Experiment) -> list[str]:
-    """What a user should know before using the numbers, a sentence each."""
+    """Return warnings to users of the numbers, one sentence each."""
     sentences = settings.leaks()
     if not comparison.spectra:
         missing = int((~comparison.prepared.used).sum())
@@ -120,7 +120,7 @@ def comparison_warnings(comparison: Comparison, settings: Experiment) -> list[st
 def plot_scatter(
     path: Path, comparison: Comparison, region: str, bands: Sequence[str], title: str
 ) -> None:
-    """Observed against modelled pixels of a region: a row for Q, one for U (the paper's fig. 5)."""
+    """Draw observed against modelled pixels of a region, Q above U (the paper's fig. 5)."""
     names, pixels = list(comparison.prepared.bands), comparison.regions[region]
     rows, columns = 2 * -(-len(bands) // COLUMNS), min(len(bands), COLUMNS)
     size = 2.4 * columns, 2.35 * rows + 0.6
@@ -156,15 +156,15 @@ def _draw_scatter(axes: Axes, scatter: Scatter, x: np.ndarray, y: np.ndarray) ->
 def plot_model_maps(
     path: Path, comparison: Comparison, stokes: str, bands: Sequence[str], nside: int, title: str
 ) -> None:
-    """Observed maps beside the model, in one scale of colours (the paper's fig. 6).
+    """Draw observed maps next to the model, on the same colour scale (the paper's fig. 6).
 
-    A row for each band, two columns for each of `stokes`, "Q", "U" or "QU"; in pixels of `nside`.
+    One row per band, two columns per letter of `stokes`, "Q", "U" or "QU"; in pixels of `nside`.
     """
     names, rows = list(comparison.prepared.bands), []
     region = "full" if "full" in comparison.regions else next(iter(comparison.regions))
     weights = jnp.asarray(comparison.prepared.used[None], float)
     share = np.asarray(average_pixels(weights, nside))[0]
-    # Half of a pixel is used, or half as much as in the fullest where a mask is finer than that.
+    # Shown if used more than half as much as the fullest pixel: a mask may have finer gaps.
     used = share > share.max() / 2
     for band in bands:
         observed, model = (
@@ -185,7 +185,7 @@ def plot_model_maps(
 
 
 def _draw_curves(axes: Axes, curves: Sequence[Curve], field: int, width: float) -> None:
-    """Spectra of EE (0) or BB (1) as D_l, both axes logarithmic."""
+    """Draw spectra of EE (0) or BB (1) as D_l, on logarithmic axes."""
     for name, spectra, style in curves:
         axes.plot(*plots.with_powers(spectra[field]), label=name, **{"lw": width, **style})
     axes.set(xscale="log", yscale="log")
@@ -193,7 +193,7 @@ def _draw_curves(axes: Axes, curves: Sequence[Curve], field: int, width: float) 
 
 
 def plot_full_sky(path: Path, spectra: Sequence[BandSpectra], title: str) -> None:
-    """EE and BB of each band, observed and of the complete model (the paper's figs. 7 and 8)."""
+    """Draw EE and BB per band, observed and of the complete model (the paper's figs. 7 and 8)."""
     size = 7.2, 2.3 * len(spectra) + 0.8
     with plots.draw_panels(path, title, size, len(spectra), 2, sharex=True) as grid:
         for row, one in zip(grid, spectra, strict=True):
@@ -226,7 +226,7 @@ def _draw_spectrum(axes: Axes, spectra: BandSpectra, index: int) -> None:
 
 
 def plot_leakage(path: Path, spectra: Sequence[BandSpectra], title: str) -> None:
-    """BB before and after leakage was subtracted, and noise (the paper's fig. 9)."""
+    """Draw BB before and after leakage is subtracted, and noise (the paper's fig. 9)."""
     with plots.draw_panels(path, title, (3.6 * len(spectra), 3.2), 1, len(spectra)) as grid:
         for axes, one in zip(grid[0], spectra, strict=True):
             assert one.uncorrected is not None  # as chosen by the caller
@@ -245,7 +245,7 @@ def plot_leakage(path: Path, spectra: Sequence[BandSpectra], title: str) -> None
 
 
 def _draw_patches(axes: Axes, series: Sequence[Series], what: str) -> None:
-    """A or alpha with errors, and the line of equals; the field of BICEP2 is a star."""
+    """Draw A or alpha with errors and the line of equality; the BICEP2 field is a star."""
     drawn, at = list[float](), ("A", "alpha").index(what)
     for (name, shown, *pair), color in zip(series, plots.COLORS, strict=False):
         star = np.array([patch == "BICEP2" for patch in pair[0][0].names])
@@ -271,7 +271,7 @@ def _draw_patches(axes: Axes, series: Sequence[Series], what: str) -> None:
 def _plot_patch_pairs(
     path: Path, series: Sequence[Series], x: str, y: str, heads: Sequence[str], title: str
 ) -> None:
-    """A on the left and alpha on the right."""
+    """Draw A on the left and alpha on the right."""
     symbols = {"A": rf"$A$ [{UNIT}$^2$]", "alpha": r"$\alpha$"}
     with plots.draw_panels(path, title, (7.2, 4.0), 1, 2) as panels:
         for axes, (what, symbol), head in zip(panels[0], symbols.items(), heads, strict=True):
@@ -282,7 +282,7 @@ def _plot_patch_pairs(
 
 
 def plot_patches(path: Path, patches: PatchComparison, title: str) -> None:
-    """A and alpha of the patches, model and observed (the paper's fig. 10)."""
+    """Draw A and alpha of the patches, observed against model (the paper's fig. 10)."""
     title = f"{title}\n{patches.band}: patches of 400 square degrees"
     series: list[Series] = [
         (name, patches.detected(i), (patches.model, i), (patches.observed, i))
@@ -297,7 +297,7 @@ def plot_patches(path: Path, patches: PatchComparison, title: str) -> None:
 
 
 def plot_template_patches(path: Path, fit: PatchFits, heads: Sequence[str], title: str) -> None:
-    """A and alpha of the patches of one map, BB against EE, each with its head."""
+    """Draw A and alpha of the patches of one map, BB against EE; `heads` are titles of panels."""
     series = [("EE and BB", np.all(fit.detected, axis=1), (fit, 0), (fit, 1))]
     _plot_patch_pairs(path, series, *FIELDS, heads, f"{title}\npatches of 400 square degrees")
 
@@ -305,7 +305,7 @@ def plot_template_patches(path: Path, fit: PatchFits, heads: Sequence[str], titl
 def _pictures(
     found: Comparison, settings: Experiment, patches: PatchComparison | None
 ) -> dict[str, tuple[Any, ...]]:
-    """Pictures of what there is; see `fits.commands.run.Report`."""
+    """Return the pictures that can be drawn, in the form of `fits.commands.run.Report`."""
     bands, title = list(found.prepared.bands), settings.title
     nside = min(settings.compare.panel_nside, settings.common.nside)
     drawn: dict[str, tuple[Any, ...]] = {

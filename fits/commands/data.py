@@ -1,4 +1,4 @@
-"""`jaxsky data`: official data products."""
+"""`jaxsky data`: list, download and check official data products."""
 
 from functools import partial
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`jaxsky fit`, from settings to a report: numbers, a table, warnings, pictures."""
+"""`jaxsky fit`: fit spectral parameters to maps; numbers, a table, warnings, pictures."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,9 +17,9 @@ from fits.results import FitResult, with_errors
 from fits.spectral_index import RegionFit, all_free, fit_regions, known_truth
 from jaxsky.settings import WORDS, Experiment
 
-#: A fit with a smaller probability to exceed its chi^2 is pointed out.
+#: Fits with a smaller probability to exceed their chi^2 get a warning.
 UNLIKELY = 0.01
-#: Chains, from which a stopped run resumes.
+#: Files of the chains, from which a stopped run resumes.
 CHAINS = "chain_*.npz"
 STOKES_COLORS = {"Q": COLORS[0], "U": COLORS[1], "QU": COLORS[6]}
 
@@ -46,7 +46,7 @@ def _result(fit: RegionFit, method: str) -> dict[str, Any]:
 def fit_numbers(
     settings: Experiment, fits: Sequence[RegionFit], truth: Mapping[str, float] | None
 ) -> dict[str, Any]:
-    """All numbers: `results` by region, then Stokes parameters, then method."""
+    """Return all numbers: `results` by region, then Stokes parameters, then method."""
     results: dict[str, Any] = {}
     for fit in fits:
         methods = {method: _result(fit, method) for method in fit.results}
@@ -55,7 +55,7 @@ def fit_numbers(
 
 
 def _table(fits: Sequence[RegionFit], truth: Mapping[str, float] | None) -> ResultTable:
-    """The best fits and 68 % intervals, and the truth if there is one."""
+    """Return the table of best fits and 68 % intervals, with the truth if it is known."""
     free = all_free(fits)
     rows: list[Row] = []
     for fit in fits:
@@ -71,7 +71,7 @@ def _table(fits: Sequence[RegionFit], truth: Mapping[str, float] | None) -> Resu
     if truth is not None:
         known = [f"{truth[name]:g}" if name in truth else "" for name in free]
         rows.append(("truth", "", "", *known, ""))
-    # Names without their component where that leaves them different; those of bands are whole.
+    # Omit the component where names stay unique without it; parameters of bands keep theirs.
     short = [n if n.split(".")[0] in WORDS else n.split(".", 1)[1] for n in free]
     heads = [s if short.count(s) == 1 else name for name, s in zip(free, short, strict=True)]
     header = ("region", "", "method", *heads, "chi2/dof")
@@ -80,7 +80,7 @@ def _table(fits: Sequence[RegionFit], truth: Mapping[str, float] | None) -> Resu
 
 
 def fit_warnings(inputs: Inputs, settings: Experiment, fits: Sequence[RegionFit]) -> list[str]:
-    """What a user should know before using the numbers, a sentence each, the gravest first."""
+    """Return warnings to users of the numbers, one sentence each."""
     sentences = [*settings.leaks(), *settings.left_out("fit")]
     if unknown := [name for name in inputs.templates if name not in inputs.template_noise]:
         sentences.append(unknown_noise(unknown))
@@ -123,9 +123,9 @@ def _by_region(fits: Sequence[RegionFit]) -> dict[str, list[RegionFit]]:
 def plot_grids(
     path: Path, fits: Sequence[RegionFit], truth: Mapping[str, float] | None, title: str
 ) -> bool:
-    """The probability on the grid, Q beside U, a row for each region: the paper's figure.
+    """Draw the probability on the grid, Q next to U, one row per region (the paper's fig. 11).
 
-    Returns False, without a picture, if no fit has a grid of two parameters.
+    Return False, without a picture, if no fit has a grid of two parameters.
     """
     with_grid = [f for f in fits if "grid" in f.results and len(f.results["grid"].free) == 2]
     if not with_grid:
@@ -149,9 +149,9 @@ def plot_grids(
 
 
 def _drawable(fits: Sequence[RegionFit], name: str) -> list[tuple[RegionFit, FitResult]]:
-    """Fits that have a parameter, with a finite error, and the result that says most of each.
+    """Return the fits with a finite error on a parameter, each with its most detailed result.
 
-    That is the result of a grid, of a chain or of another method.
+    That is the result of a grid, else of a chain, else of the first method.
     """
     found = []
     for fit in fits:
@@ -164,7 +164,7 @@ def _drawable(fits: Sequence[RegionFit], name: str) -> list[tuple[RegionFit, Fit
 
 
 def _limits(fits: Sequence[RegionFit], name: str) -> tuple[float, float] | None:
-    """Range of a parameter that shows all fits to four standard deviations."""
+    """Return the range of a parameter that shows all fits to four standard deviations."""
     drawn = [result for _, result in _drawable(fits, name)]
     ends = [r.best_fit[name] + away * r.sigma[name] for r in drawn for away in (-4, 4)]
     return (min(ends), max(ends)) if ends else None
@@ -190,7 +190,7 @@ def _draw_grid(axes: Axes, result: FitResult, truth: Mapping[str, float] | None)
 def plot_marginals(
     path: Path, fits: Sequence[RegionFit], truth: Mapping[str, float] | None, title: str
 ) -> None:
-    """Marginal probability of each parameter, for Q, U and both, with 68 % intervals."""
+    """Draw the marginal probability of each parameter, for Q, U and both, with 68 % intervals."""
     free, regions = all_free(fits), _by_region(fits)
     size = 3.4 * len(free), 0.9 + 2.2 * len(regions)
     with draw_panels(path, title, size, len(regions), len(free), sharex="col") as panels:
@@ -208,7 +208,7 @@ def plot_marginals(
 
 
 def _draw_marginal(axes: Axes, stokes: str, result: FitResult, name: str) -> None:
-    """A marginal distribution from a grid, a chain, or the Gaussian of another result."""
+    """Draw a marginal distribution from a grid or a chain, else a Gaussian with its error."""
     if "axes" in result.details:
         x, density = result.details["axes"][name], result.details["marginals"][name]
     elif "chain" in result.details:
@@ -227,9 +227,9 @@ def _draw_marginal(axes: Axes, stokes: str, result: FitResult, name: str) -> Non
 def plot_posterior(
     path: Path, fits: Sequence[RegionFit], truth: Mapping[str, float] | None, title: str
 ) -> bool:
-    """The posterior of the chains, a colour for each region, for the most Stokes parameters.
+    """Draw the posterior of the chains with the most Stokes parameters, one colour per region.
 
-    Returns False, without a picture, if no fit has a chain.
+    Return False, without a picture, if no fit has a chain.
     """
     with_chain = [f for f in fits if "mcmc" in f.results and "chain" in f.results["mcmc"].details]
     if not with_chain:
@@ -241,7 +241,7 @@ def plot_posterior(
     return True
 
 
-#: Pictures, each with what draws it.
+#: Pictures and the functions that draw them.
 PICTURES = {
     "grid.png": plot_grids,
     "marginals.png": plot_marginals,
@@ -254,7 +254,7 @@ def _work(settings: Experiment, command: Run) -> Report:
     regions = region_masks(settings, settings.fit.regions)
     inputs = inputs_of(settings)
     prepared = prepared_maps(settings, inputs)
-    inputs = inputs._replace(bands={})  # their maps have served
+    inputs = inputs._replace(bands={})  # frees their maps
     command.begin()
     fits = fit_regions(settings, prepared, regions, command.out, command.steps)
     truth = known_truth(inputs, fits)

@@ -38,17 +38,17 @@ from jaxsky.observation import ObservedBand
 from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 
-#: Spectra are taken in so many bands, if the settings name none.
+#: Number of bands whose spectra are taken if the settings name none.
 SHOWN = 5
-#: Primordial spectra, from the largest r on.
+#: Line styles of primordial spectra, from the largest r down.
 DASHES = ("-", "--", "-.", ":")
 LENSING = "#888888"
 
 
 class ForecastInputs(NamedTuple):
-    """What is forecast: foregrounds with one beam [arcmin] and one nside, and the bands.
+    """Input of a forecast: foregrounds with one beam [arcmin] and one nside, and the bands.
 
-    Spectra are taken of those that are shown, with the mask, 0 to 1, as the weight of each pixel.
+    Spectra are taken in the bands `shown`, with the mask, 0 to 1, as the weight of each pixel.
     """
 
     sky: Sky
@@ -60,12 +60,12 @@ class ForecastInputs(NamedTuple):
 
 
 class Forecast(NamedTuple):
-    """What a forecast finds; spectra C_l and band powers D_b are in uK_CMB^2.
+    """Results of a forecast; spectra C_l and band powers D_b are in uK_CMB^2.
 
-    By band there are the `powers` of EE and BB, power `laws` fitted to BB, and the r whose BB
-    equals the foregrounds, by range of multipoles. `tensors` (r = 1) and `lensed` are of TT, EE,
-    BB, TE; `parameters` are all those of the bands' covariance, `errors` come from the Fisher
-    matrix, and `without_foregrounds` is the error of r without any, None where r is not free.
+    Per band, `powers` are those of EE and BB, `laws` are power laws fitted to BB, and `equal_r` is
+    the r whose BB equals the foregrounds, by range of multipoles. `tensors` (r = 1) and `lensed`
+    are TT, EE, BB, TE; `parameters` are all those of the bands' covariance, `errors` come from the
+    Fisher matrix; `without_foregrounds` is the error on r without any, None where r is not free.
     """
 
     inputs: ForecastInputs
@@ -81,7 +81,7 @@ class Forecast(NamedTuple):
 
 
 def forecast_inputs(settings: Experiment) -> ForecastInputs:
-    """Read what the settings name, bring it to one resolution, and check that it can work."""
+    """Read templates, bands and mask, bring the templates to one resolution, and check them."""
     spec = settings.forecast
     if not settings.cmb.include:
         raise SettingsError("cmb.include: is false, but a forecast has a CMB.")
@@ -125,19 +125,19 @@ def forecast_inputs(settings: Experiment) -> ForecastInputs:
 
 
 def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
-    """Foreground B modes against primordial ones, and errors from the Fisher matrix.
+    """Compare foreground B modes with primordial ones, and find errors by the Fisher matrix.
 
     Parameters
     ----------
-    settings : what is forecast
-    progress : told of each step of the work
+    settings : the experiment
+    progress : receives each step of the work
 
     Raises
     ------
     RuntimeError
         Without double precision.
     jaxsky.io.InputError, KeyError, ValueError
-        For settings and files that cannot work; see `forecast_inputs` and
+        For settings and files that cannot be used; see `forecast_inputs` and
         `fits.fisher.fisher_errors`.
     """
     check_double("A forecast")
@@ -186,7 +186,7 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
 def _errors(
     settings: Experiment, model: ForecastModel, parameters: dict[str, float]
 ) -> tuple[Errors, float | None]:
-    """Errors of all that is free, and that of r without foregrounds."""
+    """Return errors on the free parameters, and the error on r without foregrounds or None."""
     spec = settings.forecast
     nuisance = [
         name
@@ -208,7 +208,7 @@ def _errors(
 
 
 def _numbers(found: Forecast, settings: Experiment) -> dict[str, Any]:
-    """All numbers, D_l in uK_CMB^2 unless their key says otherwise."""
+    """Return all numbers, D_l in uK_CMB^2 unless their key says otherwise."""
     errors, spectra, lmax = found.errors, found.spectra, settings.forecast.lmax
     results: dict[str, Any] = {
         "bands": list(found.inputs.bands),
@@ -245,7 +245,7 @@ def _numbers(found: Forecast, settings: Experiment) -> dict[str, Any]:
 
 
 def _tables(found: Forecast) -> list[ResultTable]:
-    """The foregrounds in bands, and the errors."""
+    """Return the tables of foregrounds per band and of errors."""
     bands, numbers, errors = list[Row](), list[Row](), found.errors
     for name, law in found.laws.items():
         equal = [f"{r:.3g}" for r in found.equal_r[name].values()]
@@ -265,7 +265,7 @@ def _tables(found: Forecast) -> list[ResultTable]:
 
 
 def forecast_warnings(found: Forecast) -> list[str]:
-    """What a user should know before using the numbers, a sentence each."""
+    """Return warnings to users of the numbers, one sentence each."""
     sentences = []
     errors, sky = found.errors, found.inputs.sky
     for name in errors.free:
@@ -286,7 +286,7 @@ def forecast_warnings(found: Forecast) -> list[str]:
 
 
 def plot_b_modes(path: Path, found: Forecast, settings: Experiment) -> None:
-    """BB of the foregrounds in some bands and their noise, against primordial BB."""
+    """Draw BB of foregrounds and noise in some bands, against primordial BB."""
     lmax = settings.forecast.lmax
     with plots.draw_panels(path, "", (plots.COLUMN, 3.9)) as panels:
         axes = panels[0, 0]
@@ -310,7 +310,7 @@ def plot_b_modes(path: Path, found: Forecast, settings: Experiment) -> None:
 
 
 def plot_errors(path: Path, found: Forecast) -> None:
-    """Values with errors, and how the errors are correlated, without foregrounds' spectra in l."""
+    """Draw values with errors and their correlations, but not of the foregrounds' spectra in l."""
     errors = found.errors
     laws = [name for name in errors.free if not name.startswith(("EE.", "BB."))]
     names = laws or errors.free
@@ -337,14 +337,14 @@ def plot_errors(path: Path, found: Forecast) -> None:
 
 
 def _symbol(name: str) -> tuple[str, str]:
-    """TeX for a parameter, and its unit."""
+    """Return TeX for a parameter, and for its unit."""
     symbol = {"r": "r", "A_lens": r"A_{\rm lens}"}.get(name) or plots.label(name)
     symbol, _, unit = symbol.partition(r"\ [")
     return symbol, rf"\ {unit.rstrip(']')}" if unit else ""
 
 
 def _value(errors: Errors, name: str) -> str:
-    """A parameter with its value and two digits of its error."""
+    """Return TeX for a parameter, its value, and two digits of its error."""
     value, sigma = errors.fiducial[name], errors.sigma[name]
     symbol, unit = _symbol(name)
     if not value and sigma < 0.01:

@@ -1,4 +1,4 @@
-"""`jaxsky paper`: all figures and tables of the paper in order, and the page that shows them."""
+"""`jaxsky paper`: remake the figures and tables of the paper, and a page that shows them."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,9 +17,9 @@ from jaxsky.io import write_text
 from jaxsky.programs import QUIET, Progress, forget_programs
 from jaxsky.settings import Experiment
 
-#: File of the settings and the figures that are made with them, from which a stopped run resumes.
+#: File of the settings and the figures made with them, from which a stopped run resumes.
 KEPT, FILE = "figures.json", TypeAdapter(tuple[dict[str, Any], list[PaperFigure]])
-#: Label of the table of the numbers of all figures.
+#: Label of the table of numbers from all figures.
 NUMBERS = "Numbers of the text"
 PAPER = (
     "Hervías-Caimapo, Bonaldi & Brown (2016), “A new model of the microwave polarized sky for CMB "
@@ -27,10 +27,10 @@ PAPER = (
 )
 #: Figures of observed maps.
 OBSERVED = {f"Figure {n}" for n in range(5, 12)}
-#: From what is shared between figures and the file of the picture, which is written whole, to a
-#: figure; raises `Impossible` where the settings do not allow the figure.
+#: Makes a figure from the sky that figures share and the path of its picture, an atomic write;
+#: raises `Impossible` where the settings do not allow the figure.
 Make = Callable[[PaperSky, Path], PaperFigure]
-#: In the order of the paper.
+#: Figures and tables in the order of the paper.
 STEPS: dict[str, Make] = {
     "Figure 1": figures_model.figure_templates,
     "Figure 2": figures_model.figure_spectra,
@@ -51,7 +51,7 @@ STEPS: dict[str, Make] = {
 
 
 def labels_of(words: Iterable[str], known: Iterable[str] = STEPS) -> list[str]:
-    """Labels of figures by number or label, in order; all without any."""
+    """Return labels of figures, in order, from numbers or labels; all if none are given."""
     labels, wanted = {label.lower(): label for label in known}, set()
     for word in words:
         name = " ".join(word.lower().split())
@@ -74,13 +74,12 @@ def make_figures(
     progress: Progress = QUIET,
     steps: Mapping[str, Make] = STEPS,
 ) -> list[PaperFigure]:
-    """Make the figures and tables that are missing, and `index.html`, which shows all there are.
+    """Make the missing figures and tables, and `index.html`, which shows all that exist.
 
-    `only` has numbers of figures or labels; `steps` is what makes each. With `overwrite` what
-    is wanted is made again; what else is in the folder is kept if it is of these settings, and
-    removed when the first new figure is there if not. `begin` is called when nothing is wrong with
-    what is wanted, before anything is written. The figures of the page are returned, those that
-    were there already among them.
+    `only` lists numbers or labels of figures; `steps` has the function that makes each. With
+    `overwrite`, the wanted figures are made again; others in the folder are kept if they were made
+    with these settings, and otherwise removed once the first new figure is there. `begin` is called
+    after the checks, before anything is written. Returns all figures of the page, new and old.
     """
     started = time.perf_counter()
     wanted = labels_of(only, steps)
@@ -111,7 +110,7 @@ def make_figures(
         _write_page(paper, out, figures, steps)
         if OBSERVED.isdisjoint(todo[done + 1 :]):
             paper.forget_bands()
-        # No two figures have programs in common, and what these hold adds up.
+        # Figures have no compiled programs in common, and the memory of these adds up.
         forget_programs()
     shown = _write_page(paper, out, figures, steps)
     write_log(out / CIRCUMSTANCES, settings, time.perf_counter() - started)
@@ -121,7 +120,7 @@ def make_figures(
 def _kept(
     out: Path, settings: dict[str, Any], overwrite: bool
 ) -> tuple[dict[str, PaperFigure], set[str]]:
-    """Figures of these settings that are in a folder, and the pictures of those of others."""
+    """Return the figures in a folder that have these settings, and pictures of other settings."""
     path = out / KEPT
     if not path.exists():
         return {}, set()
@@ -144,7 +143,7 @@ def _kept(
 def _write_page(
     paper: PaperSky, out: Path, figures: Mapping[str, PaperFigure], order: Iterable[str]
 ) -> list[PaperFigure]:
-    """Write the page of all figures in order and the table of their numbers; returns these."""
+    """Write the page of all figures in order and the table of their numbers; return these."""
     shown = [figures[label] for label in order if label in figures]
     rows: list[Row] = [(n.what, n.paper, n.ours, n.note, f.label) for f in shown for n in f.numbers]
     if rows:
@@ -164,13 +163,13 @@ def _write_page(
 
 
 def report_figures(settings: Experiment, command: Run, *, only: Sequence[str]) -> Report:
-    """Some figures, or all."""
+    """Make some figures, or all, and report what was written."""
     figures = make_figures(
         settings,
         command.out,
         only,
         overwrite=command.overwrite,
-        # What is replaced is seen to figure by figure.
+        # Old figures are replaced one by one.
         begin=lambda: command.steps.keep(command.log),
         progress=command.steps,
     )

@@ -1,4 +1,4 @@
-"""How results are shown, on the terminal and on a page, and what is said while they are made."""
+"""Show results on the terminal and on an HTML page, and the progress of a command."""
 
 import time
 from collections.abc import Sequence
@@ -18,11 +18,11 @@ import jaxsky
 from jaxsky import programs
 from jaxsky.io import write_text
 
-#: Everything is printed as it is: names, titles and paths may have brackets and colons.
+#: Everything is printed literally: names, titles and paths may contain brackets and colons.
 PLAIN: dict[str, Any] = {"markup": False, "emoji": False, "highlight": False}
 console = Console(stderr=True, **PLAIN)
-#: A step on a terminal that took longer leaves a line [s], and a long one in a log says so often
-#: how far it is.
+#: Duration above which a step leaves a line on a terminal, and interval of the progress of a long
+#: step in a log [s].
 NOTICED, OFTEN = 2.0, 60.0
 STYLE = """
 body { font: 17px/1.5 Georgia, "Times New Roman", serif; color: #222; background: #fff;
@@ -50,8 +50,8 @@ Row: TypeAlias = tuple[str, ...]
 class ResultTable(NamedTuple):
     """A table as text, for the terminal and for a page.
 
-    The first cell is the heading of its row, the first `words` columns hold words rather than
-    numbers. Behind an empty row begins a new section; a row that is cut short is its heading.
+    The first cell of a row is its heading; the first `words` columns are text, not numbers. An
+    empty row starts a new section; a row with fewer cells than the header is a heading.
     """
 
     header: Row
@@ -61,9 +61,9 @@ class ResultTable(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A part of a page: a picture, which is a file in its folder, or a table, or both.
+    """A part of a page with a picture (a file in the page's folder), a table, or both.
 
-    The note is what is to be known about it; before its first colon, if there is one, in bold.
+    `note` is a remark about it; the part before its first colon, if there is one, is in bold.
     """
 
     title: str
@@ -79,7 +79,7 @@ def warn(sentence: str) -> None:
 
 
 def print_tables(tables: Sequence[ResultTable], width: int | None = None) -> None:
-    """Print results on standard output, where it is too narrow for a number in longer lines."""
+    """Print tables on standard output, in lines wider than the terminal where numbers need it."""
     out = Console(width=width, **PLAIN)
     for table in tables:
         caption = table.caption or None
@@ -99,10 +99,10 @@ def print_written(paths: Sequence[Path]) -> None:
 
 
 class Steps(programs.Progress):
-    """The steps of a command: a line that moves on a terminal, elsewhere a line for each.
+    """Show the steps of a command: a progress bar on a terminal, otherwise one line per step.
 
-    With `keep`, they are in a file as well. A step that takes longer than two seconds leaves its
-    time on the terminal.
+    `keep` also writes them to a file. On a terminal, a step that takes longer than two seconds
+    leaves a line with its time.
     """
 
     def __init__(self) -> None:
@@ -122,7 +122,7 @@ class Steps(programs.Progress):
 
     @property
     def seconds(self) -> float:
-        """Since the command began."""
+        """Seconds since the command began."""
         return time.perf_counter() - self._started
 
     def __enter__(self) -> "Steps":
@@ -146,7 +146,7 @@ class Steps(programs.Progress):
             self._say(f"{self._message}: {done} of {of}")
 
     def keep(self, path: Path) -> None:
-        """Write the steps to a file, from now on and those that were."""
+        """Write the steps so far, and all later ones, to a file."""
         self._path = path
         path.write_text("".join(self._lines), encoding="utf-8")
 
@@ -160,7 +160,7 @@ class Steps(programs.Progress):
                 file.write(self._lines[-1])
 
     def _end(self) -> None:
-        """Leave a line on the terminal about a step that took long."""
+        """End a step; if it took long, print its time on a terminal."""
         taken = time.perf_counter() - self._begun
         if console.is_terminal and self._message and taken > NOTICED:
             console.print(f"{self._message}: {taken:.1f} s", soft_wrap=True)
@@ -168,12 +168,12 @@ class Steps(programs.Progress):
 
 
 def anchor(title: str) -> str:
-    """A title as an anchor of a page: what is before its colon."""
+    """Return the HTML anchor of a title: the part before its colon."""
     return escape(title.partition(":")[0].lower().replace(" ", "-"))
 
 
 def _cell(text: str) -> str:
-    """A cell of a table; one that begins with a number does not break."""
+    """Return a table cell as HTML; a short one that begins with a number does not wrap."""
     number = 0 < len(text) < 24 and text[0] in "0123456789-"
     return f'<td class="n">{escape(text)}</td>' if number else f"<td>{escape(text)}</td>"
 
@@ -207,9 +207,9 @@ def _section(section: Section) -> str:
 def write_page(
     path: Path, title: str, intro: Sequence[str], sections: Sequence[Section], end: str
 ) -> None:
-    """Write a page of sections, whole or not at all: intro, paragraphs; end, its last line.
+    """Write a static HTML page atomically: paragraphs `intro`, sections, and a last line `end`.
 
-    It is static, with nothing from outside its folder.
+    It loads nothing from outside its folder.
     """
     links = "\n".join(
         f'<li><a href="#{anchor(s.title)}">{escape(s.title)}</a></li>' for s in sections

@@ -1,7 +1,7 @@
-"""What all commands do: settings, folder, steps, the report of what was found, and how they end.
+"""Run any command: read its settings, guard its results folder, write its report, handle errors.
 
-A command is a function from its settings to a `Report`; the rest is here, once. It ends with an
-error as one sentence, its traceback in a file, or by Ctrl-C within seconds, whatever it is doing.
+A command is a function from its settings to a `Report`; all that commands share is here. An error
+is printed as one sentence, with its traceback in a file, and Ctrl-C ends any command in seconds.
 """
 
 import _thread
@@ -35,31 +35,31 @@ from fits.results import write_json, write_log
 from jaxsky.io.files import ALL, Folder, occupied
 from jaxsky.settings import Experiment, load, of_file
 
-#: Steps and their times, and the page that shows the results, in every folder.
+#: Files in every results folder: the steps with their times, and the page of results.
 LOG, PAGE = "log.txt", "index.html"
-#: What Ctrl-C says once everything is written.
+#: Words of Ctrl-C once everything is written.
 WRITTEN = "; all results are written"
 #: When, where and with what a command was run, next to its numbers.
 CIRCUMSTANCES = "log.json"
-#: Experiments that commands have without a file.
+#: Folder of the experiments that commands run by default.
 DEFAULTS = Path(__file__).parents[1] / "defaults"
-#: Where the traceback of an error is written, in the folder of the results.
+#: File in the results folder for the traceback of an error.
 ERROR_LOG = "error.log"
-#: Longest message of a library that is repeated.
+#: Messages of other libraries are cut to this many characters.
 LONGEST = 500
-#: Ctrl-C is repeated after this time [s], in case a callback has swallowed it; and after so many
-#: repetitions the process ends where it is.
+#: Ctrl-C is repeated after this time [s], in case a callback has swallowed it; after this many
+#: repetitions the process ends wherever it is.
 PATIENCE, REPETITIONS = 1.0, 3
-#: Time for a thread to take notice [s].
+#: Time for the watching thread to notice Ctrl-C [s].
 MOMENT = 0.1
 
 
 class Report(NamedTuple):
-    """What a command has found: said on the terminal, and shown on a page unless `page` is False.
+    """Results of a command, printed on the terminal and shown on a page unless `page` is False.
 
-    `numbers` go to the first file of the command's results, with description and warnings.
-    `pictures` are names of files, each with a function and what it takes after the path; it returns
-    False if there is nothing to draw. `written` are other files.
+    `numbers` go to the first of the command's result files, with description and warnings.
+    `pictures` maps file names to a function and its arguments after the path; the function returns
+    False if there is nothing to draw. `written` are other files that were written.
     """
 
     description: str
@@ -73,7 +73,7 @@ class Report(NamedTuple):
 
 
 class Run(NamedTuple):
-    """A command at work: what it may write, and to whom it says what it does."""
+    """A running command: its results folder, its options, and the steps that it reports."""
 
     out: Path
     resume: bool
@@ -85,12 +85,12 @@ class Run(NamedTuple):
 
     @property
     def log(self) -> Path:
-        """File of the steps and their times; one for each process that makes a part of results."""
+        """Log of the steps and their times; one per process that makes a part of the results."""
         first = self.part.start
         return self.out / (f"log_{first:05d}.txt" if first else LOG)
 
     def begin(self) -> None:
-        """Nothing is wrong with the input: what is to be replaced goes, and the log begins."""
+        """Remove results to be replaced and begin the log, once the input is known to be good."""
         if self.overwrite:
             self.folder.remove((*self.results, CIRCUMSTANCES))
             self.folder.narrow(self.part)  # others may make the rest
@@ -98,7 +98,7 @@ class Run(NamedTuple):
 
 
 class Command(NamedTuple):
-    """What a command is; its name is also that of the settings that it takes without a file.
+    """A command; its name is also that of its default experiment file.
 
     `work` calls `Run.begin` before it writes; `results` are patterns of all files but the logs.
     """
@@ -119,10 +119,10 @@ def run_command(
     maps: Path | None = None,
     part: range = ALL,
 ) -> None:
-    """Run a command with what the command line says; `resume` is None if it cannot be resumed.
+    """Run a command with the options of the command line; `resume` is None if it has no --resume.
 
-    `part` of the results is made, see `jaxsky.io.files.occupied`. All of them are replaced, so
-    nobody else may be making any then.
+    Only `part` of the results is made, see `jaxsky.io.files.occupied`; but `overwrite` replaces
+    all of them, so no other process may be making any.
     """
     path, values = settings_file or DEFAULTS / f"{command.name}.toml", list(values or ())
     if maps is not None:
@@ -160,7 +160,7 @@ def run_command(
 
 
 def _write(settings: Experiment, report: Report, command: Run) -> list[Path]:
-    """Write the numbers, a log, the pictures and the page of a report; all files there are."""
+    """Write the numbers, log, pictures and page of a report; return the paths of all files."""
     out, written = command.out, list[Path]()
     if report.numbers is not None:
         command.steps.step("drawing")
@@ -194,11 +194,11 @@ def results_folder(
     overwrite: bool,
     part: range = ALL,
 ) -> Iterator[Folder]:
-    """The folder of the results, in which no other command writes the same meanwhile.
+    """Guard the results folder, so that no other command writes the same results meanwhile.
 
-    It is made if it is not there, and removed again if nothing was written. What `results` says is
-    kept, replaced, or refused if it is to be neither; `resume` is None for commands that cannot be
-    resumed. `part` of the results is made, see `jaxsky.io.files.occupied`.
+    It is made if missing, and removed again if nothing was written. Existing files that match
+    `results` are an error unless `resume` or `overwrite` is set; `resume` is None for commands that
+    cannot be resumed. Only `part` of the results is made, see `jaxsky.io.files.occupied`.
     """
     if resume and overwrite:
         raise ValueError("--resume and --overwrite exclude each other.")
@@ -223,13 +223,13 @@ def results_folder(
             yield folder
         except Exception as error:
             if [path.name for path in out.glob("[!.]*")] == [LOG]:
-                (out / LOG).unlink()  # of nothing that would be in the folder
+                (out / LOG).unlink()  # nothing else was written
             keep_traceback(error, out / ERROR_LOG)
             raise
 
 
 def _raised_in(error: BaseException) -> tuple[str, bool]:
-    """Package in which an error came up, and whether its code has raised it, or what it called."""
+    """Return the package where an error arose, and True if its own code raised it."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
@@ -240,7 +240,7 @@ def _raised_in(error: BaseException) -> tuple[str, bool]:
 
 
 def _sentence(error: BaseException) -> tuple[str, bool]:
-    """What is wrong, on one line; and whether an error says itself which file, key or argument."""
+    """Return an error on one line, and True if it names the file, key or argument at fault."""
     from fits.results import FitError
 
     if isinstance(error, OSError) and error.filename and error.strerror:
@@ -248,7 +248,7 @@ def _sentence(error: BaseException) -> tuple[str, bool]:
     package, raised = _raised_in(error)
     kinds = (ValueError, KeyError, OSError, FitError)
     if raised and package in ("jaxsky", "fits") and isinstance(error, kinds):
-        # Of a dictionary, it is the key alone.
+        # The KeyError of a dictionary has the key alone.
         words = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
         if " " in words or not isinstance(error, KeyError):
             return words, True
@@ -270,7 +270,7 @@ def keep_traceback(error: Exception, path: Path) -> None:
 
 
 def print_error(error: Exception) -> None:
-    """Print an error as one sentence, and where its traceback is if that may be of use."""
+    """Print an error as one sentence, with the path of its traceback where that may help."""
     message, enough = _sentence(error)
     if not enough:
         notes = getattr(error, "__notes__", [])
@@ -284,13 +284,13 @@ def print_error(error: Exception) -> None:
 
 
 class _Interrupts:
-    """Whether Ctrl-C was pressed, whether the command has ended by it, and what is said then."""
+    """State of Ctrl-C: whether it was pressed, whether that was said, and in which words."""
 
     def __init__(self) -> None:
         self.pressed, self.seen, self.words = threading.Event(), threading.Event(), "Stopped."
 
     def watch(self, reader: socket.socket) -> None:
-        """Wait for Ctrl-C; then see to it that the process ends."""
+        """Wait for Ctrl-C, then make sure that the process ends."""
         while signal.SIGINT not in (received := reader.recv(64)):
             if not received:  # the command has ended
                 return
@@ -298,7 +298,7 @@ class _Interrupts:
         for _ in range(REPETITIONS):
             if not self.seen.wait(PATIENCE):
                 _thread.interrupt_main()
-        threading.Event().wait(PATIENCE)  # what remains is the end of the interpreter
+        threading.Event().wait(PATIENCE)  # time for the interpreter to exit
         self.say()
         console.show_cursor()
         os._exit(130)
@@ -310,7 +310,7 @@ class _Interrupts:
             console.print(self.words)
 
     def caused(self, error: BaseException) -> bool:
-        """Whether an error is Ctrl-C, or what typer or another library has made of it."""
+        """Return True if an error is Ctrl-C, or what typer or another library turned it into."""
         if not isinstance(error, Exception):
             return isinstance(error, KeyboardInterrupt) or getattr(error, "code", 0) == 130
         return self.pressed.wait(MOMENT)  # the thread may hear of it only now
@@ -320,24 +320,24 @@ _current = _Interrupts()
 
 
 def if_stopped(words: str) -> None:
-    """Have Ctrl-C say this from now on, behind "Stopped"."""
+    """Set the words that Ctrl-C prints after "Stopped" from now on."""
     _current.words = f"Stopped{words}."
 
 
 def _unraisable(error: "sys.UnraisableHookArgs") -> None:
-    """Keep the traceback of an interrupt to ourselves that was raised where none can be."""
+    """Print no traceback of a Ctrl-C that came where no exception can be raised."""
     if error.exc_type is not KeyboardInterrupt:
         sys.__unraisablehook__(error)
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Have the process end with exit code 130 within seconds after Ctrl-C.
+    """End the process with exit code 130 within seconds of Ctrl-C.
 
-    An interrupt is an exception in the main thread once that runs Python code, which it does not
-    while it waits for a computation or compiles, and an exception in a callback (of the garbage
-    collector, of JAX) is printed or becomes another one. So a thread hears of the signal, too.
-    Everything on disk is complete at any moment; what is stopped in this way can be resumed.
+    An interrupt becomes an exception only when the main thread runs Python code, not while it waits
+    for a computation or compiles; and in a callback (of the garbage collector, of JAX) exceptions
+    are printed or turned into others. So a second thread also watches for the signal.
+    Files on disk are complete at any moment, so that a run stopped in this way can be resumed.
     """
     global _current
     _current = interrupts = _Interrupts()
@@ -354,7 +354,7 @@ def interruptible() -> Iterator[None]:
         interrupts.say()
         sys.exit(130)
     finally:
-        # At the end of the interpreter nothing is left to stop, and nobody to catch an exception.
+        # While the interpreter exits, nothing is left to stop and nobody catches an exception.
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
         if not interrupts.pressed.is_set():
             signal.set_wakeup_fd(descriptor)

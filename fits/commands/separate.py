@@ -1,4 +1,4 @@
-"""`jaxsky separate`, from settings to a report: numbers, a table, warnings, maps, pictures."""
+"""`jaxsky separate`: separate components and measure r; numbers, maps, warnings, pictures."""
 
 from pathlib import Path
 from typing import Any
@@ -15,19 +15,19 @@ from jaxsky.components import parameter_declaration
 from jaxsky.io import write_maps
 from jaxsky.settings import Experiment
 
-#: Probabilities below this are worth a word.
+#: Probabilities below this get a warning.
 UNLIKELY = 1e-3
-#: As is E in B above this fraction of a power's standard deviation.
+#: E in B above this fraction of a band power's standard deviation gets a warning.
 LEAKED = 0.5
-#: Name, unit and values of a column of a map's file.
+#: Name, unit and values of a column of a map file.
 Column = tuple[str, str, np.ndarray]
-#: Bands whose residuals are drawn.
+#: Number of bands whose residuals are drawn.
 SHOWN = 4
 CLEANED, NOISE, RESIDUAL, LEFT, LENSING, TRUTH = (*plots.COLORS[:4], "0.5", plots.COLORS[3])
 
 
 def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
-    """All numbers; band powers are D_l of BB in uK_CMB^2."""
+    """Return all numbers; band powers are D_l of BB in uK_CMB^2."""
     fit, ratio, spectra = found.fit, found.tensors, found.spectra
     bands, truth, simulated = list(found.data.bands), found.data.truth or {}, found.simulated
     small = None
@@ -89,7 +89,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
 
 
 def _table(found: Separation) -> ResultTable:
-    """Parameters and r, with the truth if it is known."""
+    """Return the table of parameters and r, with the truth if it is known."""
     fit, truth, ratio = found.fit, found.data.truth or {}, found.tensors
     rows: list[Row] = []
     for name in fit.free:
@@ -112,7 +112,7 @@ def _table(found: Separation) -> ResultTable:
 
 
 def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
-    """What a user should know before using the numbers, a sentence each."""
+    """Return warnings to users of the numbers, one sentence each."""
     sentences = [*settings.leaks(), *settings.left_out("separate")]
     fit, ratio, simulated = found.fit, found.tensors, found.simulated
     sentences += [
@@ -156,7 +156,7 @@ def _stokes(name: str, unit: str, maps: np.ndarray) -> list[Column]:
 
 
 def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path]:
-    """Maps of components, residuals, and parameters that have regions."""
+    """Write maps of components, residuals, and parameters with regions; return the paths."""
     components, residuals = list[Column](), list[Column]()
     for name, maps in zip(found.components, found.maps, strict=True):
         unit, head = "uK_CMB" if name == "cmb" else "uK_RJ", name.upper()
@@ -198,7 +198,7 @@ def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path
 
 
 def plot_components(path: Path, found: Separation, settings: Experiment) -> None:
-    """Q and U of the components, a row for each."""
+    """Draw Q and U of the components, one row per component."""
     rows = []
     for name, maps in zip(found.components, found.maps[:, -2:], strict=True):
         component = found.like.mixing.sky[name]
@@ -210,7 +210,7 @@ def plot_components(path: Path, found: Separation, settings: Experiment) -> None
 
 
 def plot_residuals(path: Path, found: Separation, settings: Experiment) -> None:
-    """Data less components in a few bands, Q beside U."""
+    """Draw data minus components in a few bands, Q next to U."""
     names, rows, unit = list(found.data.bands), [], settings.separate.unit
     for name in plots.spread(names, SHOWN):
         maps = found.residuals[names.index(name), -2:]
@@ -220,9 +220,9 @@ def plot_residuals(path: Path, found: Separation, settings: Experiment) -> None:
 
 
 def plot_parameters(path: Path, found: Separation, settings: Experiment) -> bool:
-    """Maps of the parameters that have regions, their errors beside them.
+    """Draw maps of the parameters that have regions, with their errors next to them.
 
-    Returns False, without a picture, if none has.
+    Return False, without a picture, if no parameter has regions.
     """
     rows = []
     for name in found.fit.free:
@@ -241,7 +241,7 @@ def plot_parameters(path: Path, found: Separation, settings: Experiment) -> bool
 
 
 def plot_spectra(path: Path, found: Separation, settings: Experiment) -> None:
-    """BB of the cleaned CMB, its noise and residual foregrounds, against the model."""
+    """Draw BB of the cleaned CMB, its noise and residual foregrounds, against the model."""
     model, edges, ell = found.tensors.model, np.array(found.spectra.edges), found.spectra.centers
     signal = found.tensors.powers - model.additive
     error = np.sqrt(np.diagonal(found.tensors.covariance))
@@ -273,7 +273,7 @@ def plot_spectra(path: Path, found: Separation, settings: Experiment) -> None:
 
 
 def plot_ratio(path: Path, found: Separation, settings: Experiment) -> None:
-    """The posterior of the tensor-to-scalar ratio, and above it the estimate with its error."""
+    """Draw the posterior of the tensor-to-scalar ratio, the estimate with its error above it."""
     ratio = found.tensors
     r, sigma, grid, posterior = ratio.r, ratio.sigma, ratio.grid, ratio.posterior
     with plots.draw_panels(path, settings.title, (plots.COLUMN, 3.2), fontsize=8) as panels:
@@ -298,7 +298,7 @@ def plot_ratio(path: Path, found: Separation, settings: Experiment) -> None:
         plots.legend_below(axes, 2, fontsize=7)
 
 
-#: Pictures, each with what draws it; maps; and what a stopped run resumes from.
+#: Pictures and the functions that draw them; maps; files from which a stopped run resumes.
 PICTURES = {
     "components.png": plot_components,
     "residuals.png": plot_residuals,

@@ -1,4 +1,4 @@
-"""`jaxsky simulate`."""
+"""`jaxsky simulate`: simulate maps of the sky as an experiment observes it."""
 
 import statistics
 import time
@@ -16,14 +16,14 @@ from jaxsky.harmonics import analysis, power_spectrum
 from jaxsky.io import read_maps
 from jaxsky.settings import Experiment
 
-#: Bands shown on a sheet, and multipoles in its spectra.
+#: Number of bands on a sheet, and the highest multipole of its spectra.
 SHOWN, LMAX_SHOWN = 5, 1024
 #: Spectra are shown down to this fraction of the largest.
 DEPTH = 1e-7
 
 
 def _restricted(settings: Experiment, only: str) -> Experiment:
-    """Settings that include noise, signal, foregrounds or CMB only."""
+    """Return settings that include only noise, signal, foregrounds or CMB."""
     included = settings.included()
     foregrounds = [name for name in settings.sky.components if name in included]
     wanted = {"signal": [*foregrounds, "cmb"], "foregrounds": foregrounds}.get(only, [only])
@@ -35,7 +35,7 @@ def _restricted(settings: Experiment, only: str) -> Experiment:
 
 
 def make_realisations(settings: Experiment, command: Run, *, only: str | None) -> Report:
-    """Some realisations, of one thing only if that is asked for; kept or replaced map by map."""
+    """Simulate realisations, or `only` one part of them; maps are kept or replaced one by one."""
     indices = command.part
     if only is not None:
         settings = _restricted(settings, only)
@@ -71,7 +71,7 @@ def make_realisations(settings: Experiment, command: Run, *, only: str | None) -
 
 
 def _draw_sheet(path: Path, files: Mapping[str, Path], lmax: int, settings: Experiment) -> None:
-    """Q and U of some bands, from the files of their maps, and the spectra of their totals."""
+    """Draw Q and U of some bands, read from their files, and the spectra of their totals."""
     names, unit, spectra = spread(list(files), SHOWN), settings.simulate.unit, {}
     size, heights = (7.2, 1.75 * len(names) + 3.2), [1.0] * len(names) + [1.6]
     with draw_panels(
@@ -79,7 +79,7 @@ def _draw_sheet(path: Path, files: Mapping[str, Path], lmax: int, settings: Expe
     ) as panels:
         for row, name in zip(panels, names, strict=False):
             maps = np.asarray(read_maps(files[name], fields=["Q", "U"], missing=[]).maps)
-            # Without refinement: good to 1e-3 here, which no eye sees.
+            # Without refinement this is good to 1e-3, which no eye can see.
             largest = min(lmax, LMAX_SHOWN, 2 * healpy.npix2nside(maps.shape[-1]))
             spectra[name] = np.asarray(power_spectrum(analysis(jnp.asarray(maps), largest, 0)))
             for axes, values, which in zip(row, maps, "QU", strict=True):

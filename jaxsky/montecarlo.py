@@ -1,6 +1,6 @@
-"""Realisations of a simulation as files: in any order, in any number of processes, resumed.
+"""Simulate realisations into files, in any order and number of processes; runs can be resumed.
 
-A file says how its map was observed, in tables of bandpass, beam, noise, leakage and truth.
+Each file records how its map was observed, in tables of bandpass, beam, noise, leakage and truth.
 """
 
 import json
@@ -27,14 +27,14 @@ from jaxsky.settings import Experiment, circumstances
 from jaxsky.simulation import HarmonicSource, harmonic_sources, observe_bands, plan_terms
 
 LOG = "simulation.json"
-#: Settings that do not change what a realisation is.
+#: Settings that do not affect the maps.
 LAYOUT: Any = {"simulate": {"sheet"}}
-#: Tables of settings that simulations depend on.
+#: Settings and tables of settings that simulations depend on.
 CONTENT = {"seed", "sky", "bands", "cmb", "fixed", "truth", "simulate"}
 
 
 def paths(out: Path, names: tuple[str, ...], index: int) -> dict[str, Path]:
-    """The file of each band of a realisation."""
+    """Return the file of each band of a realisation."""
     return {name: out / f"sim_{index:05d}" / f"{name}.fits" for name in names}
 
 
@@ -49,10 +49,10 @@ def check_folder(
     overwrite: bool,
     indices: range | None = None,
 ) -> None:
-    """Whether realisations with these settings may be written to a folder.
+    """Raise ValueError unless realisations with these settings may be written to a folder.
 
-    Others of the same settings may be there: a Monte Carlo is split over processes so. Indices are
-    the numbers of the realisations, by default all.
+    Other realisations with the same settings may exist: this is how a Monte Carlo is split over
+    processes. `indices` are the numbers of the realisations, by default all.
     """
     log = out / LOG
     if overwrite:
@@ -80,16 +80,16 @@ def check_folder(
 
 
 def other_sky(settings: Experiment) -> list[str]:
-    """A warning about maps that were simulated with other settings than these.
+    """Return a warning if maps were simulated with different settings, else an empty list.
 
-    Without the log next to the folder of the maps nothing is known to be different.
+    Without the log next to the folder of the maps no difference is known.
     """
     if (maps := settings.common.maps) is None:
         return []
     now = _content(settings)
     try:
         was = json.loads((Path(settings.data_dir, maps).parent / LOG).read_text())["settings"]
-        for key in ("stokes", "unit", "components", "precision"):  # of what is written only
+        for key in ("stokes", "unit", "components", "precision"):  # these affect only the output
             was["simulate"].pop(key, None)
             now["simulate"].pop(key, None)
         changed = [name for name in now if name != "seed" and was.get(name) != now[name]]
@@ -103,7 +103,7 @@ def other_sky(settings: Experiment) -> list[str]:
 
 
 def _maps(out: Path, indices: range | None = None) -> Iterator[Path]:
-    """The maps of some realisations, by default all."""
+    """Yield the map files of some realisations, by default all."""
     for path in out.glob("sim_*/*.fits"):
         number = path.parent.name.removeprefix("sim_")
         if indices is None or (number.isdecimal() and int(number) in indices):
@@ -111,7 +111,7 @@ def _maps(out: Path, indices: range | None = None) -> Iterator[Path]:
 
 
 def _claim(out: Path, settings: Experiment, overwrite: bool) -> None:
-    """Make the folder and leave a log of what is in it, unless that is there."""
+    """Create the folder and write the log of its settings, unless it exists."""
     check_guards()
     out.mkdir(parents=True, exist_ok=True)
     with alone(out):
@@ -119,7 +119,7 @@ def _claim(out: Path, settings: Experiment, overwrite: bool) -> None:
             for path in (*_maps(out), *out.glob("sim_*.png"), *out.glob("log*.txt")):
                 path.unlink()
         elif (out / LOG).exists():
-            # Another process may have left it since the folder was checked.
+            # Another process may have written it since the folder was checked.
             check_folder(out, settings, resume=True, overwrite=False)
             return
         content = circumstances(settings) | {"settings": _content(settings)}
@@ -155,14 +155,14 @@ def _header(settings: Experiment, setup: SimulationInputs, name: str, index: int
 
 
 def _ascii(text: str) -> str:
-    """Text as FITS headers take it: one line of ASCII."""
+    """Convert text to one line of ASCII, as FITS headers require."""
     return " ".join(text.split()).encode("ascii", "replace").decode()
 
 
 def _columns(
     settings: Experiment, setup: SimulationInputs, name: str, maps: Mapping[str, Array]
 ) -> tuple[list[str], Float[np.ndarray, "column pix"]]:
-    """Names of the columns of a band's file, and the columns: the total first."""
+    """Return names and values of the columns of a band's file, the total first."""
     spec, total = settings.simulate, maps["total"]
     if (leaked := setup.leakage.get(name)) is not None:
         total = total.at[-2:].add(leaked)
@@ -196,18 +196,18 @@ def run(
     note: Callable[[str], None] = lambda message: None,
     begun: Callable[[], None] = lambda: None,
 ) -> Iterator[bool]:
-    """Simulate realisations into files, one for each band; files that are there are kept.
+    """Simulate realisations into files, one per band; existing files are kept.
 
-    For each file, in turn, whether it was written. A realisation depends on the seed and its number
-    only. The folder is touched when the first map is ready: what goes wrong before costs nothing.
-    Sources are removed from `setup` when they have served. `note` is called with sentences that a
-    user should know, `begun` when the folder has its log, and what was to be removed from it
-    (`overwrite`) is.
+    Yields for each file whether it was written. A realisation depends only on the seed and its
+    number. The folder is first changed when the first map is ready, so an earlier failure leaves it
+    untouched. Sources are removed from `setup` once used, if no other realisation needs them.
+    `note` is called with sentences for the user, `begun` once the folder has its log and the old
+    files have been removed (`overwrite`).
     """
     observation = setup.observation
     terms: Mapping[str, Terms | None] | None = None
     prepared: Mapping[str, HarmonicSource] | None = None
-    # Templates without random small scales, or with the same for all, are prepared once.
+    # Templates without small scales, or with the same for all realisations, are prepared once.
     random = setup.small_scales_seed is None and any(
         source.small_scales is not None for source in setup.sources.values()
     )
@@ -244,7 +244,7 @@ def run(
                     _claim(out, settings, overwrite)
                     begun()
                     claimed = True
-                # A file is written while the next band is made.
+                # Write this file while the next band is being made.
                 while writing:
                     writing.pop().result()
                     yield True
@@ -259,15 +259,15 @@ def run(
                     tables=observed_tables(observed_band(setup, name)),
                 )
                 writing.append(job)
-                del maps, columns  # or they would be there when those of the next band are made
+                del maps, columns  # or they would stay in memory while the next band is made
             while writing:
                 writing.pop().result()
                 yield True
 
 
-#: Whose maps have the tables.
+#: Marks the tables written by this module.
 CREATOR = "jaxsky"
-#: Columns of numbers in each.
+#: Numeric columns of each table.
 TABLES = {
     "BANDPASS": ("NU", "WEIGHT"),
     "BEAM": ("BEAM",),
@@ -281,11 +281,10 @@ TABLES = {
 class Observed(NamedTuple):
     """How a map was observed.
 
-    `beam` is the FWHM of a Gaussian [arcmin], or a table b_l. `noise` is a level [uK_RJ
-    arcmin] or the covariance of Q and U in each pixel [uK_RJ^2]; where it was smoothed with the map
-    it is None, and has a `spectrum` N_l [uK_RJ^2] if that is known. `leakage` is Q and U that
-    leaked from the intensity [uK_RJ], with the beam of the map; `truth` has spectral parameters by
-    dotted name.
+    `beam` is the FWHM of a Gaussian [arcmin], or a table b_l. `noise` is a level [uK_RJ arcmin]
+    or the covariance of Q and U in each pixel [uK_RJ^2]. If it was smoothed with the map, `noise`
+    is None and `spectrum` is N_l [uK_RJ^2], where known. `leakage` is Q and U leaked from the
+    intensity [uK_RJ], with the beam of the map; `truth` has spectral parameters by dotted name.
     """
 
     bandpass: Bandpass
@@ -297,7 +296,7 @@ class Observed(NamedTuple):
 
 
 def observed_band(setup: SimulationInputs, name: str) -> Observed:
-    """How a band is observed, as its maps are."""
+    """Return how the maps of a band are observed."""
     channel = setup.observation.channels[name]
     beam = channel.map_beam
     noise, spectrum = channel.noise, None
@@ -319,7 +318,7 @@ def observed_band(setup: SimulationInputs, name: str) -> Observed:
 
 
 def observed_tables(observed: Observed) -> list[pyfits.BinTableHDU]:
-    """Tables of a FITS file that `read_observed` reads back, exactly."""
+    """Return the tables of a FITS file that `read_observed` reads back exactly."""
     band = observed.bandpass
     rows: dict[str, list[Any]] = {"BANDPASS": [band.nu, band.weights]}
     if np.ndim(observed.beam):
@@ -352,7 +351,7 @@ def observed_tables(observed: Observed) -> list[pyfits.BinTableHDU]:
 
 
 def read_observed(path: Path) -> Observed | None:
-    """How the map in a file was observed; None if `observed_tables` did not write it."""
+    """Read how the map in a file was observed; None without `observed_tables`."""
     with open_fits(path) as hdus:
         tables = {hdu.name: hdu for hdu in hdus[1:]}
         if "BANDPASS" not in tables or tables["BANDPASS"].header.get("CREATOR") != CREATOR:

@@ -1,8 +1,8 @@
-"""Random numbers and their keys; white noise of maps: draws, covariances and estimates.
+"""Keys of random numbers, and white noise of maps: draw it, estimate it, build its covariance.
 
-A key comes from the seed, the number of a realisation, a kind and a name. Noise stays what it was
-written as until pixels are needed: a uniform level [u arcmin], u being the unit of the maps, or the
-covariance of the Stokes parameters in each pixel [u^2].
+A key follows from the seed, the number of a realisation, a kind and a name. Noise keeps the form in
+which it was given until pixels are needed: a uniform level [u arcmin], where u is the unit of the
+maps, or the covariance of the Stokes parameters in each pixel [u^2].
 """
 
 import math
@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from jaxsky.checks import Numeric, as_array, check_finite, check_seed, check_shape, is_concrete
 from jaxsky.harmonics import analysis, children, expand, power_spectrum
 
-#: Pixels that are checked at once.
+#: Pixels checked at once.
 PIECE = 1 << 20
 #: Columns of a covariance by their number, in the order of Planck's maps.
 COVARIANCE_COLUMNS: dict[int, tuple[str, ...]] = {
@@ -29,26 +29,26 @@ COVARIANCE_COLUMNS: dict[int, tuple[str, ...]] = {
 
 
 def realisation_key(seed: int, index: int = 0) -> Array:
-    """The key of a sky, from nothing but the seed and its number; number 0 is what is observed."""
+    """Return the key of a realisation, from the seed and its number; 0 is the observed sky."""
     check_seed("seed", seed)
     check_seed("index", index)
     return jax.random.fold_in(jax.random.key(seed), index)
 
 
 def stream(key: Array, kind: str, name: str = "") -> Array:
-    """The key of one kind of random numbers: the same whatever else is drawn, and in any order."""
+    """Return the key of one kind of random numbers, independent of what else is drawn and when."""
     return jax.random.fold_in(key, zlib.crc32(f"{kind} {name}".encode()))
 
 
 @partial(jax.jit, static_argnames=("shape", "dtype"))
 def normal(key: Array, shape: tuple[int, ...], dtype: Any) -> Float[Array, "..."]:
-    """Normal numbers, which are the same in any precision, but for rounding."""
+    """Draw normal numbers that are the same in any precision, except for rounding."""
     return jax.random.normal(key, shape, jnp.result_type(float)).astype(dtype)
 
 
 @partial(jax.jit, static_argnames=("stokes", "size", "dtype"))
 def stokes_noise(key: Array, stokes: int, size: int, dtype: Any) -> Float[Array, "stokes size"]:
-    """White noise of I, or Q and U, or I, Q and U, of which Q and U are the same in both."""
+    """Draw white noise of I, or Q, U, or I, Q, U; Q and U are the same with and without I."""
     white = normal(key, (stokes, size), dtype)
     return jnp.roll(white, 1, axis=0) if stokes == 3 else white
 
@@ -57,7 +57,7 @@ def stokes_noise(key: Array, stokes: int, size: int, dtype: Any) -> Float[Array,
 def uniform_covariance(
     noise: Numeric, nside: int, stokes: int = 2
 ) -> Float[Array, "stokes stokes pix"]:
-    """Covariance of each pixel for a level, the same for all Stokes parameters."""
+    """Return the covariance of each pixel for a level, the same for all Stokes parameters."""
     npix, pixel = healpy.nside2npix(nside), healpy.nside2resol(nside, arcmin=True)
     return jnp.eye(stokes)[..., None] * jnp.full(npix, (noise / pixel) ** 2)
 
@@ -65,14 +65,14 @@ def uniform_covariance(
 def pixel_covariance(
     noise: Numeric, nside: int, stokes: int = 2
 ) -> Float[Array, "stokes stokes pix"]:
-    """Covariance of each pixel for noise of either kind."""
+    """Return the covariance of each pixel for noise given as a level or as a covariance."""
     return jnp.asarray(noise) if jnp.ndim(noise) else uniform_covariance(noise, nside, stokes)
 
 
 def uniform_map(
     key: Array, noise: ArrayLike, nside: int, stokes: int = 2
 ) -> Float[Array, "stokes pix"]:
-    """White noise of a level: a draw from `uniform_covariance`, without that in memory."""
+    """Draw white noise of a level, as from `uniform_covariance` but without that in memory."""
     sigma = as_array("noise", noise) / float(healpy.nside2resol(nside, arcmin=True))
     return sigma * stokes_noise(key, stokes, healpy.nside2npix(nside), sigma.dtype)
 
@@ -81,7 +81,7 @@ def uniform_map(
 def uniform_alm(
     key: Array, noise: ArrayLike, lmax: int, stokes: int = 2
 ) -> Float[Array, "stokes alm"]:
-    """Packed coefficients of white noise of a level, N_l = noise^2 (in u rad) at all multipoles.
+    """Draw packed coefficients of white noise, N_l = noise^2 (in (u rad)^2) at all multipoles.
 
     Rows are I (1), E, B (2) or I, E, B (3); E and B have no modes at l < 2.
     """
@@ -95,10 +95,10 @@ def uniform_alm(
 
 
 def white_alm(key: Array, noise: Numeric, lmax: int) -> Float[Array, "2 alm"]:
-    """Coefficients E and B of noise of either kind; those of pixels in a tenth of the usual time.
+    """Draw coefficients E and B of noise given as a level or as a covariance of each pixel.
 
-    A level has independent multipoles, and takes no pixels. Pixels are drawn, and analysed without
-    refinement and multipoles beyond lmax: the mean spectrum is right to 1e-4.
+    A level needs no pixels. A covariance is drawn in pixels and analysed without iterations or
+    multipoles beyond lmax, ten times faster than usual; the mean spectrum is right to 1e-4.
     """
     if not jnp.ndim(noise):
         return uniform_alm(key, noise, lmax)
@@ -107,14 +107,14 @@ def white_alm(key: Array, noise: Numeric, lmax: int) -> Float[Array, "2 alm"]:
 
 @jax.jit
 def cholesky(covariance: Float[Array, "stokes stokes pix"]) -> Float[Array, "stokes stokes pix"]:
-    """Lower Cholesky factor of the covariance of each pixel, written out element by element."""
+    """Return the lower Cholesky factor of each pixel's covariance, unrolled over its elements."""
     n = len(covariance)
     lower = [[jnp.zeros_like(covariance[0, 0])] * n for _ in range(n)]
     for i in range(n):
         for j in range(i + 1):
             rest = covariance[i, j] - sum(lower[i][k] * lower[j][k] for k in range(j))
             if i == j:
-                # Rounding may leave a zero negative; its root has no derivative.
+                # Rounding may make a zero negative; and the root of zero has no derivative.
                 lower[i][j] = jnp.where(rest > 0, jnp.sqrt(jnp.where(rest > 0, rest, 1.0)), 0.0)
             else:
                 lower[i][j] = rest / jnp.where(lower[j][j] > 0, lower[j][j], 1.0)
@@ -123,7 +123,7 @@ def cholesky(covariance: Float[Array, "stokes stokes pix"]) -> Float[Array, "sto
 
 @partial(jax.jit, static_argnames="diagonal")
 def _correlated(covariance, white, diagonal):
-    """White noise times the Cholesky factor of each pixel, or its diagonal."""
+    """Multiply white noise by the Cholesky factor of each pixel, or by its diagonal."""
     lower = cholesky(covariance)
     terms = [[i] if diagonal else range(i + 1) for i in range(len(white))]
     return jnp.stack([sum(lower[i, j] * white[j] for j in js) for i, js in enumerate(terms)])
@@ -132,15 +132,15 @@ def _correlated(covariance, white, diagonal):
 def draw(
     key: Array, covariance: Float[Array, "stokes stokes pix"], *, diagonal: bool = False
 ) -> Float[Array, "stokes pix"]:
-    """A realisation L n of noise with a covariance in each pixel, independent between pixels.
+    """Draw noise L n with a given covariance in each pixel, independent between pixels.
 
-    L is the lower Cholesky factor, n white. The paper (Hervias-Caimapo, Bonaldi & Brown 2016)
-    takes the diagonal of L alone, as standard deviations. Those are what remains of each Stokes
-    parameter when the ones before it are known: the draws have no correlations, and where the
-    covariance has some, U is too quiet by the factor 1 - R^2 in variance, R being its multiple
-    correlation with I and Q; Q by that with I, and I not at all. `diagonal` draws as the paper.
+    L is the lower Cholesky factor, n white noise. The paper (Hervias-Caimapo, Bonaldi & Brown 2016)
+    uses only the diagonal of L, as standard deviations; `diagonal` does the same. These are the
+    scatter of each Stokes parameter given those before it, so the draws have no correlations. Where
+    the covariance has some, the variance of U is too small by the factor 1 - R^2, R being its
+    multiple correlation with I and Q; likewise for Q with I, while I is right.
     """
-    # Apart from the products: in one program XLA evaluates the normals anew in each of its rows.
+    # A program of its own: together with the products, XLA would redo the normals for each row.
     _, stokes, npix = covariance.shape
     white = stokes_noise(key, stokes, npix, covariance.dtype)
     return _correlated(covariance, white, diagonal)
@@ -149,10 +149,10 @@ def draw(
 def estimate_variance(
     maps: Float[Array, "stokes pix"], used: Bool[Array, " pix"]
 ) -> Float[Array, " stokes"]:
-    """Noise variance per pixel from the scatter inside groups of four neighbouring pixels.
+    """Estimate the noise variance per pixel from the scatter in groups of four neighbouring pixels.
 
-    What varies little over such a group cancels, which leaves the noise where the sky is smooth.
-    Groups count of which all four pixels (RING) are used.
+    A signal that is smooth over such a group cancels, which leaves the noise. Only groups of which
+    all four pixels (RING) are used count.
     """
     nside = healpy.npix2nside(maps.shape[-1])
     whole = children(used, nside // 2).all(axis=-1)
@@ -167,7 +167,7 @@ def estimate_variance(
 def knee_spectrum(
     white: Numeric, ell_knee: Numeric, slope: Numeric, lmax: int
 ) -> Float[Array, " ell"]:
-    """Noise with a white level and excess at large scales, N_l = white [1 + (l/l_knee)^-slope].
+    """Return the spectrum of noise with excess at large scales, white [1 + (l/l_knee)^-slope].
 
     Zero at l < 2, where polarization has no modes.
     """
@@ -176,7 +176,7 @@ def knee_spectrum(
 
 
 def _deviance(theta, args):
-    """-2 ln L of white level, knee and slope (logarithms) for a measured spectrum from l = 2."""
+    """Return -2 ln L of the logarithms of white level, knee and slope, given C_l from l = 2."""
     measured, modes = args
     white, knee, slope = jnp.exp(theta)
     spectrum = knee_spectrum(white, knee, slope, measured.size + 1)[2:]
@@ -186,17 +186,17 @@ def _deviance(theta, args):
 def fit_knee(
     maps: Float[Array, "stokes pix"], used: Bool[Array, " pix"], lmax: int
 ) -> tuple[float, float, float]:
-    """White level, knee and slope (`knee_spectrum`) of the noise of Q, U maps, up to lmax.
+    """Fit white level, knee and slope (`knee_spectrum`) of the noise of Q, U maps, up to lmax.
 
-    The most probable values given the spectrum (EE + BB)/2 of the masked maps divided by the
-    fraction of the sky, whose values are taken as independent between multipoles. Whatever the
-    sky itself shows in these pixels (RING) counts as noise.
+    Returns the maximum-likelihood values for the spectrum (EE + BB)/2 of the masked maps, divided
+    by the sky fraction and taken as independent between multipoles. Any sky signal in these pixels
+    (RING) counts as noise.
     """
     fraction = float(np.mean(used))
     if not fraction:
         raise ValueError("Estimating the noise needs pixels, but none is left.")
     spectra = power_spectrum(analysis(jnp.where(used, maps, 0.0), lmax))
-    import optimistix as optx  # takes longer to import than many simulations take
+    import optimistix as optx  # slower to import than many simulations are to run
 
     measured = spectra.mean(axis=0)[2:] / fraction
     modes = 2 * (2 * jnp.arange(2, lmax + 1) + 1) * fraction
@@ -214,7 +214,7 @@ def fit_knee(
 
 
 def rms_covariance(rms: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:
-    """Covariance of each pixel from maps of the rms, without correlations."""
+    """Return the covariance of each pixel from maps of the rms, without correlations."""
     rms = as_array("rms", rms)
     check_shape("rms", rms, rms.ndim == 2, "have shape (stokes, pix)")
     check_finite("rms", rms)
@@ -226,10 +226,10 @@ def rms_covariance(rms: Float[Array, "stokes pix"]) -> Float[Array, "stokes stok
 def hits_covariance(
     sigma0: ArrayLike, hits: Float[Array, " pix"], stokes: int = 2
 ) -> Float[Array, "stokes stokes pix"]:
-    """Covariance of each pixel from the number of observations, sigma_0^2 / hits.
+    """Return the covariance of each pixel from the number of observations, sigma_0^2 / hits.
 
-    The noise of one observation, sigma_0, is a number or one for each Stokes parameter; those of
-    WMAP's polarization differ a little from those of its intensity.
+    The noise of one observation, sigma_0, is one number or one per Stokes parameter; for WMAP the
+    values for polarization and intensity differ slightly.
     """
     sigma0, hits = _each(sigma0, stokes), as_array("hits", hits)
     check_shape("hits", hits, hits.ndim == 1, "have shape (pix,)")
@@ -242,10 +242,10 @@ def hits_covariance(
 def weights_covariance(
     sigma0: ArrayLike, weights: Float[Array, "3 pix"]
 ) -> Float[Array, "2 2 pix"]:
-    """Covariance of Q and U in each pixel from weights QQ, QU, UU: sigma_0^2 times their inverse.
+    """Return the covariance of Q, U per pixel: sigma_0^2 times the inverse of weights QQ, QU, UU.
 
-    WMAP's maps have such weights, which like numbers of observations grow with time (Jarosik et
-    al. 2011). A pixel whose weights have no inverse gets no finite covariance.
+    WMAP's maps have such weights, which like hit counts grow with observing time (Jarosik et al.
+    2011). A pixel whose weights have no inverse gets a covariance that is not finite.
     """
     sigma0, weights = _each(sigma0, 2), as_array("weights", weights)
     check_shape("weights", weights, weights.shape[:-1] == (3,), "have shape (3, pix)")
@@ -255,7 +255,7 @@ def weights_covariance(
 
 
 def _each(sigma0: ArrayLike, stokes: int) -> Float[Array, " stokes"]:
-    """The noise of one observation in each Stokes parameter."""
+    """Return the noise of one observation in each Stokes parameter."""
     sigma0 = as_array("sigma0", sigma0)
     good = sigma0.shape in ((), (stokes,))
     check_shape("sigma0", sigma0, good, f"be a number or have shape ({stokes},)")
@@ -270,7 +270,7 @@ def _diagonal(variance: Float[Array, "stokes pix"]) -> Float[Array, "stokes stok
 def covariance_from_columns(
     columns: Float[Array, "column pix"],
 ) -> Float[Array, "stokes stokes pix"]:
-    """Covariance of each pixel from its elements in `COVARIANCE_COLUMNS`, in that order."""
+    """Return the covariance of each pixel from its elements, in order of `COVARIANCE_COLUMNS`."""
     columns = as_array("columns", columns)
     good = columns.ndim == 2 and len(columns) in COVARIANCE_COLUMNS
     check_shape("columns", columns, good, "have shape (3, pix) or (6, pix)")
@@ -281,16 +281,16 @@ def covariance_from_columns(
 
 @jax.jit
 def _number_indefinite(covariance: Float[Array, "stokes stokes pix"]) -> Int[Array, ""]:
-    """The number of pixels whose covariance is not positive definite."""
+    """Count the pixels whose covariance is not positive definite."""
     # A root of a negative number is NaN, and NaN is not positive; each pixel is read once.
     pivots = [row[s] for s, row in enumerate(cholesky(covariance.astype(float)))]
     return jnp.sum(~reduce(jnp.logical_and, [(p > 0) & jnp.isfinite(p) for p in pivots]))
 
 
 def check_covariance(name: str, covariance: Float[Array, "stokes stokes pix"]) -> None:
-    """Raise ValueError if the covariance of a pixel is not positive definite; says of how many.
+    """Raise ValueError if the covariance of any pixel is not positive definite, and count them.
 
-    Only the lower triangle is looked at, as in `draw`. Traced arrays pass.
+    Only the lower triangle is read, as in `draw`. Traced arrays pass unchecked.
     """
     good = covariance.ndim == 3 and covariance.shape[0] == covariance.shape[1]
     check_shape(name, covariance, good, "have shape (stokes, stokes, pix)")

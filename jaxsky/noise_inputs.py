@@ -1,4 +1,4 @@
-"""The noise that settings state, read: a level or a covariance of each pixel, where it is known."""
+"""Read the noise named in the settings: a level, or a covariance of each pixel where known."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from jaxsky.settings import (
     at_key,
 )
 
-#: Noise outside of this range, relative to the rms of its map, is a mistake unless it is meant.
+#: Noise outside this range, relative to the rms of its map, is refused unless confirmed.
 PLAUSIBLE = (1e-6, 10.0)
 
 
@@ -46,14 +46,15 @@ def read_noise(
     maps: Float[Array, "stokes pix"] | None = None,
     used: Bool[np.ndarray, " pix"] | None = None,
 ) -> tuple[Array | float, Bool[np.ndarray, " pix"]]:
-    """Noise of a map, and where it is known (not without hits).
+    """Return the noise of a map, and where it is known (not in pixels without hits).
 
-    It is a level [uK_RJ arcmin] where the settings give a number, else the covariance of each pixel
-    [uK_RJ^2], 0 where it is not known.
+    The noise is a level [uK_RJ arcmin] if the settings give a number, else the covariance of each
+    pixel [uK_RJ^2], 0 where it is unknown.
 
-    The map that has the noise is `at` a frequency [GHz] or in a band. Its `unit` is that of level,
-    rms and sigma0 unless the noise has its own; `own` is its file, in which columns may be; against
-    the rms of its `maps` [uK_RJ] in `used` pixels the noise is checked. `where` is the key.
+    `at` is the frequency [GHz] or band of the map. Level, rms and sigma0 are in the map's `unit`
+    unless the noise has its own; `own` is the map's file, which may contain columns of noise. The
+    noise is checked against the rms of `maps` [uK_RJ] in `used` pixels. `where` is the settings
+    key.
     """
     unit = noise.unit or unit
     found: Array | float
@@ -96,7 +97,7 @@ def _check_plausible(where, noise, maps, inside, factor, unit):
 
 
 def _covariance(folder, noise, at, nside, stokes, where, unit, own):
-    """See `read_noise`; with any values where the covariance is not known."""
+    """Return a covariance as in `read_noise`, with arbitrary values where it is not known."""
     n, npix = len(stokes), 12 * nside**2
     kind = next(
         k for k in ("rms", "covariance", "hits", "weights") if getattr(noise, k) is not None
@@ -110,7 +111,7 @@ def _covariance(folder, noise, at, nside, stokes, where, unit, own):
         raise SettingsError(f"{where}: nside is {found.nside}, but that of the map is {nside}.")
     given, known = found.unit, np.asarray(found.mask)
     maps = narrow(found.maps)
-    del found  # as large as all else
+    del found  # as large as everything else
     if kind == "rms":
         _check_number(f"{where}.fields", len(maps), stokes)
         rms = maps[-n:] * float(unit_factor(given, "uK_RJ", at))
@@ -138,9 +139,9 @@ def _covariance(folder, noise, at, nside, stokes, where, unit, own):
 def _read_columns(
     folder: Path, spec: NoiseColumns, own: MapKeys | None, kind: str, where: str
 ) -> Maps:
-    """Columns about the noise, with the Stokes parameters that their place in the settings says.
+    """Read the columns of noise, with Stokes parameters as implied by the kind of noise.
 
-    Those without a file are in that of the map.
+    Without a file of their own, they are read from that of the map.
     """
     said = spec.model_dump(exclude={"sigma0"}, exclude_none=True)
     if kind in ("hits", "weights"):
@@ -173,6 +174,6 @@ def _read_columns(
 
 
 def _check_number(where: str, number: int, stokes: str) -> None:
-    """Refuse other numbers than one for all, one for each, or one for I, too."""
+    """Refuse a number of values other than one, one per Stokes parameter, or three."""
     if number not in (1, len(stokes), 3):
         raise SettingsError(f"{where}: one or {len(stokes)} are needed, not {number}.")

@@ -1,4 +1,4 @@
-"""What is observed, and how: components and bands with their beams, pixels, instruments."""
+"""The inputs of a simulation: components, bands with beams and noise, pixels, and instruments."""
 
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from jaxsky.components import Component
 from jaxsky.public import packaged
 from jaxsky.small_scales import SmallScales
 
-#: Types of numbers by the name of their precision.
+#: Floating-point types by the name of their precision.
 DTYPES: dict[str, type[np.floating]] = {"double": np.float64, "single": np.float32}
 
 
@@ -26,9 +26,9 @@ class Source(eqx.Module):
     Parameters
     ----------
     component : template and law; Q, U, or I, Q, U
-    fwhm : own beam of the template [arcmin]
-    small_scales : how the template is continued below its beam; None leaves it as it is
-    correlated_with : name of a source whose small scales are drawn together with these
+    fwhm : beam of the template [arcmin]
+    small_scales : how the template is continued to small scales; None leaves it unchanged
+    correlated_with : name of a source with which the small scales are correlated
     """
 
     component: Component
@@ -44,10 +44,10 @@ class ObservedBand(Printed, eqx.Module):
     ----------
     band : the bandpass
     beam : FWHM of a Gaussian [arcmin], or a table b_l
-    target : beam to which the observed map is smoothed; None leaves it as observed
+    target : beam to which the observed map is smoothed [arcmin]; None leaves it as observed
     noise : uniform level [uK_RJ arcmin], covariance of each pixel [uK_RJ^2], shape
         (stokes, stokes, pix), or None
-    diagonal : noise with the diagonal of the Cholesky factor only (`noise.draw`)
+    diagonal : draw noise with the diagonal of the Cholesky factor only (`noise.draw`)
     """
 
     band: Bandpass
@@ -70,7 +70,7 @@ class ObservedBand(Printed, eqx.Module):
 
     @property
     def map_beam(self) -> Float[Array, ""] | Float[Array, " ell"] | float:
-        """Beam of the observed map: the target, or the own one."""
+        """Beam of the observed map: the target if there is one, else the band's own."""
         return self.beam if self.target is None else self.target
 
 
@@ -85,12 +85,12 @@ class Observation(eqx.Module):
     finest : beam to which small scales are made [arcmin], at most the finest one observed
     lmax : largest multipole of the sky in the maps, by default 2 nside
     precision : "double" or "single", in which the maps are computed; single takes half the memory
-        and rounds to 1e-7 of the rms of a map
+        and rounds to 1e-7 of a map's rms
 
     Raises
     ------
     ValueError
-        If there is no channel, or `stokes` or `precision` is neither.
+        If there is no channel, or `stokes` or `precision` is unknown.
     """
 
     channels: dict[str, ObservedBand]
@@ -113,7 +113,7 @@ class Observation(eqx.Module):
 
     @property
     def dtype(self) -> type[np.floating]:
-        """Type of the numbers in maps and coefficients."""
+        """Floating-point type of maps and coefficients."""
         return DTYPES[self.precision]
 
     @property
@@ -123,7 +123,7 @@ class Observation(eqx.Module):
 
 
 def check_sources(sources: Mapping[str, Source], observation: Observation) -> None:
-    """Raise ValueError unless an experiment can observe components together."""
+    """Raise ValueError unless the components can be observed together."""
     for name, source in sources.items():
         rows, wanted = len(source.component.template), observation.stokes
         if rows != len(wanted):
@@ -151,14 +151,14 @@ def check_sources(sources: Mapping[str, Source], observation: Observation) -> No
 
 
 class Instrument(Printed, dict[str, ObservedBand]):
-    """Channels by name, which print as a table."""
+    """The channels of an instrument by name, which print as a table."""
 
     def __init__(self, title: str, channels: Mapping[str, ObservedBand]) -> None:
         super().__init__(channels)
         self.title = title
 
     def bands(self) -> dict[str, Bandpass]:
-        """The bandpasses by name."""
+        """Return the bandpasses by name."""
         return {name: channel.band for name, channel in self.items()}
 
     def summary(self):
@@ -174,22 +174,22 @@ def load_instrument(
     target: Array | float | None = None,
     samples: int = 51,
 ) -> Instrument:
-    """The channels of an instrument by name, as `Observation` takes them.
+    """Return the channels of an instrument by name, as `Observation` takes them.
 
-    Each has a top-hat band, a Gaussian beam and white noise of Q and U [uK_RJ arcmin], with the
-    figures of `instruments.toml`, where the source of every one is given.
+    Each has a top-hat band, a Gaussian beam and white noise of Q and U [uK_RJ arcmin]. The numbers
+    are from `instruments.toml`, which gives the source of each.
 
     Parameters
     ----------
     name : "planck", "wmap", "core" or "litebird"
-    channels : names of those that are wanted, in this order; by default all
-    target : common beam of the maps [arcmin]; None leaves each its own
-    samples : of each band; see `Bandpass.top_hat`
+    channels : names of the channels wanted, in this order; by default all
+    target : common beam of the maps [arcmin]; None keeps the beam of each
+    samples : number of samples per band; see `Bandpass.top_hat`
 
     Raises
     ------
     KeyError
-        If a name is unknown; lists the known ones.
+        If a name is unknown; the message lists the known ones.
     TypeError
         If `channels` is a string.
 
@@ -218,9 +218,9 @@ def load_instrument(
 def band_tables(
     name: str, channels: Sequence[str] | None = None, folder: Path = Path()
 ) -> list[dict[str, Any]]:
-    """Bands of an instrument, all or some, as tables of an experiment file.
+    """Return all or some bands of an instrument as tables of an experiment file.
 
-    Its name is that of a preset, or of a file with a list `bands`, relative to `folder`.
+    `name` is that of a preset, or of a file with a list `bands`, relative to `folder`.
     """
     presets, path = packaged("instruments.toml"), folder / name
     if name in presets:

@@ -1,4 +1,4 @@
-"""What the archives hold, from `products.toml`; what of it is kept here, and checks of that."""
+"""The catalogue of public data products (`products.toml`), and checks of downloaded files."""
 
 import json
 import os
@@ -20,11 +20,11 @@ from jaxsky.public import packaged
 
 
 class Product(NamedTuple):
-    """A file of an archive; None stands for what is not known, or not there.
+    """A file of an archive; None stands for what is unknown or does not apply.
 
-    `addresses` go best first; `size` is in bytes, or `about` in MB where only that is known;
-    `hash` is "sha256:..." or "md5:..."; `columns` are those that the first table has, at least;
-    `lmax` is the last multipole of a table of spectra.
+    `addresses` are in order of preference; `size` is in bytes, `about` in MB where only that is
+    known; `hash` is "sha256:..." or "md5:..."; `columns` must be in the first table; `lmax` is the
+    last multipole of a table of spectra.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Product(NamedTuple):
 
 
 class ProductSet(NamedTuple):
-    """Names of files that belong together: what one analysis takes."""
+    """Names of files that belong together because one analysis needs them all."""
 
     title: str
     files: tuple[str, ...]
@@ -50,14 +50,14 @@ class ProductSet(NamedTuple):
 
 @cache
 def product_sets() -> dict[str, ProductSet]:
-    """All sets by name."""
+    """Return all sets by name."""
     sets = packaged("products.toml")["sets"].items()
     return {name: ProductSet(entry["title"], tuple(entry["files"])) for name, entry in sets}
 
 
 @cache
 def catalogue() -> dict[str, Product]:
-    """All products by the name of their file."""
+    """Return all products by file name."""
     found, table = {}, packaged("products.toml")
     for group, common in table["groups"].items():
         shared = {key: value for key, value in common.items() if key != "files"}
@@ -71,7 +71,7 @@ def catalogue() -> dict[str, Product]:
 
 
 def find(words: Sequence[str] = ()) -> list[Product]:
-    """Products by name, group, or a part of either, or by the name of a set; all without any."""
+    """Find products by name, group, part of either, or set; without words, return all."""
     products = list(catalogue().values())
     if not words:
         return products
@@ -92,12 +92,12 @@ def find(words: Sequence[str] = ()) -> list[Product]:
 
 
 def in_words(size: float) -> str:
-    """A number of bytes with its unit."""
+    """Format a number of bytes with a unit."""
     return decimal(int(size), precision=int(size >= 1e9))
 
 
 def total_size(products: Sequence[Product]) -> str:
-    """The size of products together, in words; "about" unless that of each is known exactly."""
+    """Return the total size of products in words, "about" unless each is known exactly."""
     sizes = [p.size if p.size or p.about is None else 1e6 * p.about for p in products]
     known = sum(size for size in sizes if size is not None)
     size = in_words(known)
@@ -106,18 +106,18 @@ def total_size(products: Sequence[Product]) -> str:
     return size if all(p.size is not None for p in products) else f"about {size}"
 
 
-#: Hashes of files that the catalogue has none of, as they were when they were fetched.
+#: File with the hashes that downloads had, for products without a hash in the catalogue.
 CHECKSUMS = "checksums.json"
 _HASH = re.compile(r"(sha256|md5):[0-9a-f]+")
 _MOVE = "move it away to go on without the hashes in it."
 
 
 class DownloadError(ValueError):
-    """A file that could not be had; one sentence."""
+    """A file that could not be downloaded; one sentence."""
 
 
 def checksums(folder: Path) -> dict[str, str]:
-    """Hashes by name, as they were recorded; raises InputError if the record is damaged."""
+    """Return the recorded hashes by name; raise InputError if the record is damaged."""
     path = folder / CHECKSUMS
     try:
         known = json.loads(path.read_text())
@@ -131,19 +131,19 @@ def checksums(folder: Path) -> dict[str, str]:
 
 
 def recorded(product: Product, folder: Path) -> Product:
-    """A product as it was fetched: one that was taken as it came has its own hash, and any size."""
+    """Return a product with its recorded hash; if that is not the catalogue's, of any size."""
     known = checksums(folder).get(product.name, product.hash)
     return product._replace(hash=known, size=product.size if known == product.hash else None)
 
 
 def _hash_like(other: str, path: Path) -> str:
-    """The hash of a file by the algorithm of another hash."""
+    """Return the hash of a file, by the algorithm of another hash."""
     algorithm = other.partition(":")[0]
     return f"{algorithm}:{pooch.file_hash(str(path), alg=algorithm)}"
 
 
 def remember(product: Product, folder: Path, path: Path) -> None:
-    """Record the hash of the file that came for a product."""
+    """Record the hash of a product's downloaded file."""
     found = _hash_like(product.hash or "sha256:", path)
     with locked(folder / f".{CHECKSUMS}.lock"):
         known = checksums(folder) | {product.name: found}
@@ -153,7 +153,7 @@ def remember(product: Product, folder: Path, path: Path) -> None:
 
 
 def verify(product: Product, folder: Path) -> str:
-    """Check a product's file in a folder; returns in words what was checked."""
+    """Check a product's file in a folder; return in words what was checked."""
     path = folder / product.name
     if not path.is_file():
         raise InputError(f"{path}: is not there; fetch it with `jaxsky data fetch`.")
@@ -161,10 +161,10 @@ def verify(product: Product, folder: Path) -> str:
 
 
 def check_product(product: Product, path: Path, hint: str = "") -> list[str]:
-    """Check that a file is complete and what the catalogue says; returns what was checked.
+    """Check that a file is complete and as the catalogue says; return what was checked.
 
-    Of tables headers and ends are read only; all of the file if there is a hash. `hint` says what
-    may be done about another size or hash.
+    Only the headers and ends of FITS tables are read, unless there is a hash to check. `hint` is
+    advice for a different size or hash.
     """
     structure, size = _check_structure(product, path), path.stat().st_size
     if product.size not in (None, size):
@@ -186,7 +186,7 @@ def _check_structure(product: Product, path: Path) -> list[str]:
         if not start.startswith((b"SIMPLE", b"\x1f\x8b")):
             raise InputError(f"{path}: is no FITS file, it begins with {shown!r}.")
         with open_fits(path) as hdus:
-            # At the last byte of each table or image astropy notices a cut.
+            # Reading the last row of each table or image makes astropy notice a truncated file.
             for hdu in hdus:
                 if isinstance(hdu, pyfits.BinTableHDU):
                     if len(hdu.columns):
@@ -214,7 +214,7 @@ def _check_maps(table: HealpixTable, product: Product) -> None:
         raise UnfitError(f"nside is {table.nside}, but {product.nside} is expected.")
     for name in product.columns:
         text = table.unit(table.index(name))
-        # Hits and covariances have units of their own.
+        # Hits and covariances have other units.
         other = name.upper() in ("N_OBS", "HITS") or name.endswith("_COV")
         if product.unit is None or other or text is None:
             continue

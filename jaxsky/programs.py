@@ -1,7 +1,7 @@
-"""Long work: its compiled programs, kept on disk by JAX's own cache, and what it says of itself.
+"""Keep compiled programs on disk, in JAX's own cache; the interface for reporting progress.
 
-Compilation takes longer than most commands compute. Programs with a transform are not kept, see
-`jaxsky.harmonics.transforms`.
+Compilation takes longer than the computations of most commands. Programs with a transform are not
+kept, see `jaxsky.harmonics.transforms`.
 """
 
 import contextlib
@@ -20,24 +20,24 @@ from jax._src import compilation_cache, lru_cache
 
 
 class Progress:
-    """Told what is being done and how far it is; this one keeps it to itself."""
+    """Receives progress reports; this base class ignores them."""
 
     def step(self, message: str) -> None:
-        """Begin a step; the one before it is done."""
+        """Begin a step, which ends the one before."""
 
     def advance(self, done: int, of: int) -> None:
-        """Say how much of the step is done."""
+        """Report how much of the step is done."""
 
 
 QUIET = Progress()
 
 
-#: Most that is kept [bytes], and how many kinds of processor and versions of JAX it is kept for.
+#: Largest size of the cache [bytes], and number of (JAX version, processor) pairs in it.
 LARGEST, KINDS = 2**30, 4
 
 
 class _Cache(lru_cache.LRUCache):
-    """JAX's cache, with entries that appear complete or not at all."""
+    """JAX's cache with atomic writes."""
 
     def put(self, key: str, value: bytes) -> None:
         final = Path(self._path) / f"{key}-cache"
@@ -45,14 +45,14 @@ class _Cache(lru_cache.LRUCache):
         try:
             part.write_bytes(value)
             part.replace(final)
-        except OSError:  # a full disk: it is done without
+        except OSError:  # for example a full disk: continue without caching
             with contextlib.suppress(OSError):
                 part.unlink(missing_ok=True)
 
 
 def program_folder(folder: Path) -> Path:
-    """The folder for programs of this version of JAX and this processor, within another one."""
-    # What the processor can do: a program for one may not run on another.
+    """Return the subfolder for programs of this version of JAX and this processor."""
+    # The processor's features matter: a program compiled for one may not run on another.
     processor = f"{platform.machine()} {platform.processor()}"
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -63,11 +63,11 @@ def program_folder(folder: Path) -> Path:
 
 
 def keep_programs(folder: Path) -> None:
-    """Keep compiled programs in a folder, and take those that are there.
+    """Keep compiled programs in a folder, and reuse those that are there.
 
-    JAX's own settings go first: with $JAX_ENABLE_COMPILATION_CACHE=0 nothing is kept, and with
-    $JAX_COMPILATION_CACHE_DIR it is there. A folder that cannot be written is done without. It is
-    that for all versions and processors; the oldest programs go when it is too large.
+    JAX's own settings take precedence: with $JAX_ENABLE_COMPILATION_CACHE=0 nothing is kept, and
+    $JAX_COMPILATION_CACHE_DIR replaces the folder. Without write permission nothing is kept. The
+    folder serves all versions and processors; its oldest programs are removed if it gets too large.
     """
     if not jax.config.jax_enable_compilation_cache:  # type: ignore[attr-defined]
         return
@@ -86,15 +86,15 @@ def keep_programs(folder: Path) -> None:
 
 
 def forget_programs() -> None:
-    """Forget all compiled programs of this process, and give their memory back to the system."""
+    """Forget all compiled programs of this process, and return their memory to the system."""
     jax.clear_caches()
     gc.collect()
-    with contextlib.suppress(OSError, AttributeError):  # of glibc: what lies between live pieces
+    with contextlib.suppress(OSError, AttributeError):  # glibc only: free memory inside the heap
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def _prune(folder: Path) -> None:
-    """Remove the oldest programs, and all of the kinds that were not used for longest."""
+    """Remove the oldest programs, and all programs of the least recently used kinds."""
 
     def newest_first(paths: Iterable[Path]) -> list[Path]:
         return sorted(paths, key=lambda path: path.stat().st_mtime, reverse=True)

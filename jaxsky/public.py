@@ -1,9 +1,9 @@
-"""What users see: names that are imported when they are asked for, and take bare numbers.
+"""The public surface: names imported on first use, and functions that refuse values with units.
 
-JAX and numpy drop the unit of an astropy quantity without a word. Importing this module, as the
-two packages do before all else, has every function and method whose name has no underscore
-checked, in the manner of beartype and jaxtyping: what carries a unit is refused by the argument's
-name, and no function can be forgotten.
+JAX and numpy silently drop the unit of an astropy quantity. Importing this module, as the two
+packages do before anything else, wraps every function and method whose name has no leading
+underscore, as beartype and jaxtyping do: an argument with a unit is refused by name, and no
+function can be forgotten.
 """
 
 import ast
@@ -24,14 +24,14 @@ import numpy as np
 F = TypeVar("F", bound=Callable[..., Any])
 
 PACKAGES = ("jaxsky", "fits")
-#: Looked at first, for it is quick: types that carry no unit.
+#: Types that never carry a unit; checked first, because that is quick.
 PLAIN = frozenset({bool, int, float, str, type(None), np.ndarray, np.float64, np.int64})
 
 
 def exported(package: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
-    """`__all__`, `__getattr__` and `__dir__` of a package, as its block for type checkers says.
+    """Return `__all__`, `__getattr__` and `__dir__` of a package, from its block for type checkers.
 
-    The imports under `if TYPE_CHECKING:`, which Python passes over, are made one name at a time.
+    The imports under `if TYPE_CHECKING:`, which Python skips, are made one name at a time.
     """
     module: Any = sys.modules[package]
     tree = ast.parse(module.__spec__.loader.get_source(package))
@@ -69,7 +69,7 @@ def refuse_unit(name: str, value: object) -> None:
     elif isinstance(value, list | tuple):
         for entry in value:
             refuse_unit(name, entry)
-    # A number or an array of astropy, unyt or pint.
+    # A number or an array from astropy, unyt or pint.
     elif any(hasattr(value, word) for word in ("__array__", "value", "magnitude")):
         unit = getattr(value, "unit", getattr(value, "units", None))
         if unit is not None:
@@ -80,7 +80,7 @@ def refuse_unit(name: str, value: object) -> None:
 
 
 def takes_quantities(function: F) -> F:
-    """Mark a public function that converts quantities, or refuses them, by itself."""
+    """Mark a public function that converts or refuses quantities itself."""
     function.__dict__["takes_quantities"] = True
     return function
 
@@ -102,10 +102,7 @@ def _guarded(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _guard(holder: ModuleType | type) -> None:
-    """Guard what a module, or one of its classes, defines itself under a name without underscore.
-
-    Of classes the constructor, too.
-    """
+    """Guard the public functions that a module or class defines, constructors included."""
     of_module = isinstance(holder, ModuleType)
     for name, member in list(vars(holder).items()):
         public = not name.startswith("_") or name in ("__init__", "__call__")
@@ -114,7 +111,7 @@ def _guard(holder: ModuleType | type) -> None:
         if not public or foreign or not callable(function):
             continue
         if inspect.isclass(function):
-            # Settings, of pydantic, have types of their own.
+            # Pydantic models of settings check types themselves.
             typed = issubclass(function, BaseException) or hasattr(function, "model_fields")
             if of_module and not typed:
                 _guard(function)
@@ -131,7 +128,7 @@ class _Loader(SourceFileLoader):
 
 
 class _Finder:
-    """Finds the modules of the packages as Python does, and guards them once they are executed."""
+    """Finds modules of the packages as Python does, and guards them once executed."""
 
     @staticmethod
     def find_spec(name: str, path: Any, target: Any = None) -> ModuleSpec | None:

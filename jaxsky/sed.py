@@ -1,9 +1,9 @@
-"""Spectral laws, one function an equation.
+"""Spectral laws, one function per equation.
 
-Each law is the antenna temperature (Rayleigh-Jeans, K_RJ) at `nu` relative to that at `nu_ref`,
-so it is exactly 1 at `nu_ref`. All arguments are floats or arrays and broadcast against each
-other, all are differentiable, and none is treated specially at any value. Frequencies are in
-GHz, temperatures in K. "The paper" is Hervias-Caimapo, Bonaldi & Brown (2016, MNRAS 462, 2063).
+Each law but `cmb_derivative` is the antenna temperature (Rayleigh-Jeans, K_RJ) at `nu` relative to
+that at `nu_ref`, so exactly 1 there. Arguments are floats or arrays, broadcast against each other
+and can be differentiated; no value is treated as a special case. Frequencies are in GHz,
+temperatures in K. "The paper" is Hervias-Caimapo, Bonaldi & Brown (2016, MNRAS 462, 2063).
 """
 
 from typing import Final
@@ -17,12 +17,12 @@ from jaxsky.checks import Numeric
 #: h/k [K/GHz], CODATA 2018 (both exact in the SI).
 H_OVER_K: Final = 6.62607015e-34 / 1.380649e-23 * 1e9
 
-#: CMB temperature [K], Fixsen (2009), the value of the paper. `astropy` has 2.7255.
+#: CMB temperature [K], Fixsen (2009), as in the paper; astropy has 2.7255.
 T_CMB: Final = 2.72548
 
 
 def _log_body(nu, beta_dust, T_dust, nu_pivot):
-    """ln of (nu/nu_pivot)^(beta+1) / (e^x - 1), x = h nu / k T; finite where e^x overflows."""
+    """Return ln of (nu/nu_pivot)^(beta+1) / (e^x - 1), x = h nu / k T; safe where e^x overflows."""
     x = H_OVER_K * nu / T_dust
     return (beta_dust + 1) * jnp.log(nu / nu_pivot) - (x + jnp.log(-jnp.expm1(-x)))
 
@@ -40,10 +40,10 @@ def power_law(nu: Numeric, beta_syn: Numeric, nu_ref: Numeric) -> Float[Array, "
 def curved_power_law(
     nu: Numeric, beta_syn: Numeric, curvature: Numeric, nu_piv: Numeric, nu_ref: Numeric
 ) -> Float[Array, "..."]:
-    """Power law with running index, (nu/nu_ref)^(-beta_syn + C ln(nu/nu_piv)).
+    """Power law with a running index, (nu/nu_ref)^(-beta_syn + C ln(nu/nu_piv)).
 
-    The paper's section on curved synchrotron; the logarithm is the natural one. beta_syn is the
-    index at the pivot nu_piv; a positive C flattens the spectrum with rising frequency.
+    From the paper's section on curved synchrotron; ln is the natural logarithm. A positive C
+    flattens the spectrum with rising frequency. At nu_piv the exponent is -beta_syn.
     """
     return jnp.exp((-beta_syn + curvature * jnp.log(nu / nu_piv)) * jnp.log(nu / nu_ref))
 
@@ -53,7 +53,7 @@ def modified_blackbody(
     nu: Numeric, beta_dust: Numeric, T_dust: Numeric, nu_ref: Numeric
 ) -> Float[Array, "..."]:
     """Modified black body nu^(beta+1) / (e^{h nu / k T} - 1), the paper's eq. 1."""
-    # The pivot cancels between the two; at nu_ref it keeps both logarithms small.
+    # The pivot cancels; setting it to nu_ref keeps both logarithms small.
     return jnp.exp(
         _log_body(nu, beta_dust, T_dust, nu_ref) - _log_body(nu_ref, beta_dust, T_dust, nu_ref)
     )
@@ -68,11 +68,11 @@ def modified_blackbodies(
     nu_ref: Numeric,
     nu_pivot: Numeric = 3000.0,
 ) -> Float[Array, "..."]:
-    """Sum of modified black bodies, normalised once, on the sum, at nu_ref.
+    """Sum of modified black bodies; the sum is normalised at nu_ref, not its terms.
 
     Sum_i E_i (nu/nu_pivot)^(beta_i+1) / (e^{h nu / k T_i} - 1), the paper's eq. 4. The pivot is
-    that of Meisner & Finkbeiner (2015), whose f_i q_i the relative amplitudes E_i stand for.
-    Model 8 of Finkbeiner et al. (1999) has beta 1.67 and 2.70, T 9.4 and 16.2 K, E 0.49 and 1.
+    that of Meisner & Finkbeiner (2015); the relative amplitudes E_i are their f_i q_i. Model 8 of
+    Finkbeiner et al. (1999) has beta 1.67 and 2.70, T 9.4 and 16.2 K, E 0.49 and 1.
     """
     top: Numeric = 0.0
     bottom: Numeric = 0.0
@@ -101,7 +101,7 @@ def ame_log_parabola(
 def cmb_derivative(nu: Numeric, T_cmb: Numeric = T_CMB) -> Float[Array, "..."]:
     """Antenna temperature per thermodynamic temperature, x^2 e^x / (e^x - 1)^2 [K_RJ/K_CMB].
 
-    Written as (x / (2 sinh(x/2)))^2 with e^{-x}, which neither overflows nor cancels.
+    Written as (x / (2 sinh(x/2)))^2 in terms of e^{-x}, to avoid overflow and cancellation.
     """
     x = H_OVER_K * nu / T_cmb
     return jnp.square(x * jnp.exp(-x / 2) / -jnp.expm1(-x))

@@ -1,11 +1,11 @@
-"""Observing the sky with an experiment: the paper's procedure as a function of its parameters.
+"""Simulate observations of the sky: the paper's procedure as a function of its parameters.
 
-Components are brought into harmonic space once, ready to be seen in any band: templates get their
-small scales; a component whose law is the same everywhere is transformed once for all bands, one
-whose parameters are maps a few times (`interpolation.choose_terms`). Every component is then scaled
-to a band, all are brought to the band's beam and added up in harmonic space, and noise is added;
-bands are made one by one. With fixed keys the maps are differentiable in all numbers: spectral
-parameters, slopes and amplitudes of small scales, beams, band centres.
+Components are first taken to harmonic space, for use in any band: templates get their small
+scales; a component whose law is the same everywhere is transformed once for all bands, one whose
+parameters are maps a few times (`interpolation.choose_terms`). For each band in turn, components
+are scaled to the band, smoothed to its beam and summed in harmonic space, and noise is added. With
+fixed keys the maps are differentiable in all numbers: spectral parameters, slopes and amplitudes of
+small scales, beams, band centres.
 """
 
 import math
@@ -37,19 +37,19 @@ from jaxsky.noise import draw, stream, uniform_alm, uniform_map
 from jaxsky.observation import Observation, ObservedBand, Source, check_sources
 from jaxsky.small_scales import continue_templates
 
-#: Error of the varying laws, relative to the maps of a band.
+#: Error allowed from laws that vary over the sky, relative to the maps of a band.
 TOLERANCE = 1e-7
-#: Most Jacobi steps of an analysis; below nside 128, where the quadrature is worse, one more.
+#: Most Jacobi steps per analysis; one more below nside 128, where the quadrature is worse.
 STEPS = 2
 
 
 class HarmonicSource(NamedTuple):
-    """A component in harmonic space, ready to be seen in any band.
+    """A component in harmonic space, ready to be observed in any band.
 
-    Coefficients are those of the template times each term of its law, with its beam, `fwhm`
-    [arcmin]; `weights` are those of the terms in each band. Where bands are averaged one by one
-    there are no weights, but the law, with parameters at the resolution of the observation, and the
-    template. At `repaired` multipoles the matrix of correlated small scales was repaired.
+    `alms` are the coefficients of the template times each term of its law, with the template's
+    beam, `fwhm` [arcmin]; `weights` are those of the terms in each band. Where bands are averaged
+    one by one, `component` (the law with parameters at the observation's resolution) and `template`
+    replace them. At `repaired` multipoles the matrix of correlated small scales was repaired.
     """
 
     alms: tuple[Float[Array, "stokes alm"], ...]
@@ -63,7 +63,7 @@ class HarmonicSource(NamedTuple):
 def _continued(
     key: Array, sources: Mapping[str, Source], observation: Observation
 ) -> dict[str, tuple[Float[Array, "2 alm"], Int[Array, ""]]]:
-    """Coefficients of the sources that have small scales, without beam, and how many repaired."""
+    """Return coefficients of sources with small scales, without beam, and repaired multipoles."""
     leaders = {
         name: source.correlated_with or name
         for name, source in sources.items()
@@ -90,7 +90,7 @@ def _continued(
 
 
 def _at(component: Component, nside: int) -> Component:
-    """A component whose parameters that are maps have the resolution of the observation."""
+    """Return a component with its parameter maps at the resolution of the observation."""
 
     def bring(leaf):
         if leaf.ndim != 1 or leaf.shape[-1] == healpy.nside2npix(nside):
@@ -102,7 +102,7 @@ def _at(component: Component, nside: int) -> Component:
 
 
 def _law(component: Component) -> Component:
-    """A component without the pixels of its template."""
+    """Return a component without the pixels of its template."""
     return jax.tree.map(
         lambda leaf: np.zeros((len(leaf), 0), leaf.dtype) if leaf.ndim == 2 else leaf, component
     )
@@ -111,11 +111,11 @@ def _law(component: Component) -> Component:
 def plan_terms(
     sources: Mapping[str, Source], observation: Observation, tolerance: float = TOLERANCE
 ) -> dict[str, Terms | None]:
-    """Terms of each source for `harmonic_sources`, chosen from values that are not being traced.
+    """Choose the terms of each source for `harmonic_sources`, from values that are not traced.
 
     The tolerance is the error of varying laws relative to the maps of a band.
     """
-    # Terms are for the ranges of the maps as they are used.
+    # Terms depend on the ranges of the parameter maps at the resolution at which they are used.
     components = {n: _at(source.component, observation.nside) for n, source in sources.items()}
     if any(leaf.ndim == 1 for leaf in jax.tree.leaves(components)):
         importance = _importance(components, stack_bands(observation.bands))
@@ -131,9 +131,9 @@ def plan_terms(
 def _importance(
     components: dict[str, Component], samples: Samples
 ) -> dict[str, Float[Array, " band"]]:
-    """The rms of each template relative to all that is seen in each band.
+    """Return the rms of each template relative to the total rms in each band.
 
-    By its law in each band at the mean of its parameters.
+    The total uses each law at the mean of its parameters.
     """
     rms, levels = {}, {}
     for name, component in components.items():
@@ -145,11 +145,11 @@ def _importance(
 
 
 def _iterations(size: float, nside: int, beam: Array | float) -> int:
-    """Jacobi steps for a term that adds so much to the maps, for an error below `TOLERANCE`.
+    """Return the Jacobi steps for an error below `TOLERANCE` from a term of a given relative size.
 
-    Without steps a spectrum like that of the Galaxy is wrong by some 3e-5 of the map at nside
-    256 and a beam of 2 pixels, in proportion to the pixel, and to what the beam leaves of the
-    multipoles where the quadrature is bad. Each step gains at least a factor of 20.
+    Without steps a spectrum like the Galaxy's is wrong by some 3e-5 of the map at nside 256 with a
+    beam of 2 pixels. The error scales with the pixel size and with what the beam leaves of the
+    multipoles where the quadrature is poor. Each step gains at least a factor of 20.
     """
     pixels = float(beam) / healpy.nside2resol(nside, arcmin=True) if is_concrete(beam) else 0.0
     error = 3e-5 * (256 / nside) * (2 / max(pixels, 1.0)) ** 2 * size
@@ -165,11 +165,11 @@ def harmonic_sources(
     *,
     release: bool = False,
 ) -> dict[str, HarmonicSource]:
-    """Sources with their small scales, which the key is for, in harmonic space.
+    """Add small scales to the sources and take them to harmonic space.
 
-    Terms are those of `plan_terms`, by default made here; None for a source averages its bands one
-    by one, as is necessary where its parameters that are maps are being traced. `release` takes
-    each source out of `sources`, a dict, when it has served, to free its memory.
+    The key is for the small scales. `terms` come from `plan_terms`, by default called here; None
+    for a source averages its bands one by one, which is necessary if its parameter maps are being
+    traced. `release` removes each source from `sources`, a dict, once used, to free its memory.
     """
     check_sources(sources, observation)
     terms = plan_terms(sources, observation) if terms is None else terms
@@ -185,7 +185,7 @@ def harmonic_sources(
             (alm, repaired), fwhm = continued[name], 0.0
         else:
             template = sources[name].component.template.astype(dtype)
-            # With the steps that its pixels need at the beam observed.
+            # As many steps as its pixels need at the observed beam.
             steps = _iterations(1.0, healpy.npix2nside(template.shape[-1]), finest)
             alm = low_multipoles(template, lmax, steps)
         alm = alm.astype(dtype)
@@ -205,7 +205,7 @@ def harmonic_sources(
             steps = _iterations(size, nside, finest)
             alms.append(_term_alm(template, component, chosen.coefs(i), lmax, steps))
             if is_concrete(alms[-1]):
-                # JAX would make the maps of all terms ahead of their analysis.
+                # Otherwise JAX would make the maps of all terms before analysing any.
                 alms[-1].block_until_ready()
         weights = term_weights(component, observation.bands, chosen)
         result[name] = HarmonicSource(tuple(alms), weights, None, None, fwhm, repaired)
@@ -220,12 +220,12 @@ def _term_alm(
     lmax: int,
     steps: int,
 ) -> Float[Array, "stokes alm"]:
-    """Coefficients of a template times a term of the law; in one program the product is no map."""
+    """Analyse a template times a term of the law, in one program to avoid storing the product."""
     return analysis(template * term(component, coefs).astype(template.dtype), lmax, steps)
 
 
 class _Part(NamedTuple):
-    """What one component adds to a band: coefficients, their weights, and a window for all."""
+    """The contribution of a component to a band: coefficients, their weights, and one window."""
 
     alms: tuple[Float[Array, "stokes alm"], ...]
     weights: Float[Array, " term"] | tuple[Float[Array, ""] | float, ...]
@@ -234,7 +234,7 @@ class _Part(NamedTuple):
 
 @jax.jit
 def _summed(parts: tuple[_Part, ...]) -> Float[Array, "stokes alm"]:
-    """The sum of the parts, in one pass and the precision of the coefficients."""
+    """Sum the parts in one pass, in the precision of the coefficients."""
     dtype = parts[0].alms[0].dtype
     return sum(
         expand(window.astype(dtype))
@@ -246,7 +246,7 @@ def _summed(parts: tuple[_Part, ...]) -> Float[Array, "stokes alm"]:
 def _noise(
     key: Array, channel: ObservedBand, observation: Observation
 ) -> _Part | Float[Array, "stokes pix"] | None:
-    """Noise of a channel in harmonic space or as a map, whichever it is simpler in."""
+    """Draw the noise of a channel, in harmonic space or as a map, whichever is simpler."""
     if channel.noise is None:
         return None
     noise = jnp.asarray(channel.noise, observation.dtype)
@@ -270,11 +270,11 @@ def observe_bands(
     components: bool = False,
     names: Sequence[str] | None = None,
 ) -> Iterator[tuple[str, dict[str, Float[Array, "stokes pix"]]]]:
-    """Names of the channels and their maps [uK_RJ] in turn, so that only one is in memory.
+    """Yield the name and maps [uK_RJ] of each channel in turn, so that only one is in memory.
 
-    The key is for CMB and noise. Spectra of the CMB are TT, EE, BB, TE [uK_CMB^2] up to 2 nside at
-    least. There is the "total", and with `components` the map of each of these, of "cmb" and
-    "noise". What the channels show does not depend on which are asked for (`names`, default all).
+    The key is for CMB and noise. `cmb` has the spectra TT, EE, BB, TE [uK_CMB^2] up to at least the
+    observation's lmax. The maps are the "total" and, with `components`, each component, "cmb" and
+    "noise". Maps do not depend on which channels are asked for (`names`, by default all).
     """
     nside, lmax, stokes = observation.nside, observation.lmax, observation.stokes
     if taken := {"cmb", "noise", "total"} & set(prepared):
@@ -314,7 +314,7 @@ def _maps(
     nside: int,
     components: bool,
 ) -> dict[str, Float[Array, "stokes pix"]]:
-    """The total of a band, and its components if they are wanted."""
+    """Return the total of a band, and its components on request."""
     maps: dict[str, Array] = {}
     total: Array | float = 0.0
     if components:
@@ -335,11 +335,11 @@ def _seen(
     lmax: int,
     name: str,
 ) -> _Part:
-    """A component in a band."""
+    """Return the contribution of a component to a band."""
     window = beam_ratio(channel.map_beam, source.fwhm, lmax, f"component {name!r}")
     if source.weights is not None:
         return _Part(source.alms, source.weights[index], window)
-    # Kept where there are no weights.
+    # Both are set where there are no weights.
     assert source.component is not None
     assert source.template is not None
     law = band_sed(source.component, channel.band, None)
@@ -355,21 +355,21 @@ def simulate(
     *,
     terms: Mapping[str, Terms | None] | None = None,
 ) -> Float[Array, "band stokes pix"]:
-    """Simulated maps of all channels [uK_RJ]: `harmonic_sources` and `observe_bands` in one.
+    """Simulate the maps of all channels [uK_RJ]: `harmonic_sources`, then `observe_bands`.
 
-    Differentiable in sources and observation with a fixed key.
+    With a fixed key, differentiable in sources and observation.
 
     Parameters
     ----------
-    key : of jax.random
+    key : key of jax.random
     sources, observation : what is observed, and how
-    cmb : spectra TT, EE, BB, TE [uK_CMB^2], or None
+    cmb : spectra TT, EE, BB, TE [uK_CMB^2], or None for no CMB
     terms : see `harmonic_sources`
 
     Raises
     ------
     ValueError
-        If a beam is finer than that of a component without small scales.
+        If a beam is finer than that of a component without small scales, or inputs do not match.
     """
     prepared = harmonic_sources(key, sources, observation, terms)
     seen = observe_bands(key, prepared, observation, cmb)

@@ -1,4 +1,4 @@
-"""The sky as a sum of components, its observation in bands, and its parameters by dotted name."""
+"""The sky as a sum of components: observe it in bands, get and set its parameters by name."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -42,7 +42,7 @@ class Sky(Printed, eqx.Module):
     components: dict[str, Component]
 
     def __init__(self, components: Mapping[str, Component]) -> None:
-        # JAX sorts dictionaries when it takes them apart; sorted here, the order is one everywhere.
+        # JAX sorts dictionaries when it flattens them; sorted here, the order is always the same.
         self.components = {name: components[name] for name in sorted(components)}
         if not self.components:
             raise ValueError("Argument `components` must have at least one component.")
@@ -80,7 +80,7 @@ class Sky(Printed, eqx.Module):
 
 
 def interpolation_nodes(sky: Sky, bands: Sequence[Bandpass], tolerance: float) -> tuple[Nodes, ...]:
-    """Node counts for each component, as `observe` chooses them and takes them."""
+    """Choose node counts for each component as `observe` does, for its argument `nodes`."""
     return tuple(choose_nodes(c, tuple(bands), tolerance) for c in sky.components.values())
 
 
@@ -102,7 +102,7 @@ def _check_bands(bands: object) -> tuple[Bandpass, ...]:
 def _emission(
     component: Component, bands: tuple[Bandpass, ...], nodes: Nodes
 ) -> list[Float[Array, "stokes pix"]]:
-    """What a component shows in each band."""
+    """Return the emission of a component in each band."""
     maps = []
     for band in bands:
         sed = band_sed(component, band, nodes)
@@ -110,14 +110,14 @@ def _emission(
             # Costly laws are evaluated once for all Stokes parameters, ...
             maps.append(component.template * sed)
         else:
-            # ... cheap ones once a row: XLA fuses each row into one pass over memory.
+            # ... cheap ones once per row: XLA fuses each row into one pass over memory.
             maps.append(jnp.stack([row * sed for row in component.template]))
     return maps
 
 
 @partial(jax.jit, static_argnames=("plan", "apart"))
 def _observe(sky, bands, plan, apart):
-    """The maps of all components together, or of each by itself."""
+    """Return the maps of all components together, or of each separately."""
     emissions = {
         name: _emission(component, bands, nodes)
         for (name, component), nodes in zip(sky.components.items(), plan, strict=True)
@@ -134,7 +134,7 @@ def observe(
     tolerance: float = 1e-10,
     nodes: tuple[Nodes, ...] | None = None,
 ) -> Float[Array, "band stokes pix"]:
-    """The sky seen through a list of bands, the paper's eq. 8.
+    """Observe the sky through a list of bands, the paper's eq. 8.
 
     Parameters
     ----------
@@ -142,9 +142,9 @@ def observe(
     bands : list of bands
     tolerance : relative error of the band-averaged laws where parameters are maps; 0 sums
         directly over the bands in every pixel. Inside jit, where the range of the maps is not
-        known beforehand, a fixed number of nodes is tried and checked as the program runs; if
-        it does not reach the tolerance, the direct sum is made.
-    nodes : from `interpolation_nodes`, instead of a tolerance: not checked again
+        known beforehand, a fixed number of nodes is used and checked as the program runs; if
+        they do not reach the tolerance, the direct sum is used.
+    nodes : from `interpolation_nodes`, instead of a tolerance; not checked again
 
     Returns
     -------
@@ -153,7 +153,7 @@ def observe(
     Raises
     ------
     TypeError, ValueError
-        If `bands` does not hold at least one Bandpass, and nothing else.
+        If `bands` is not a list of at least one Bandpass.
     """
     bands = _check_bands(bands)
     return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance), False)
@@ -162,7 +162,7 @@ def observe(
 def observe_band(
     sky: Sky, band: Bandpass, *, tolerance: float = 1e-10
 ) -> Float[Array, "stokes pix"]:
-    """The sky seen through one band [uK_RJ]; see `observe`."""
+    """Observe the sky through one band [uK_RJ]; see `observe`."""
     return observe(sky, [band], tolerance=tolerance)[0]
 
 
@@ -173,14 +173,14 @@ def observe_components(
     tolerance: float = 1e-10,
     nodes: tuple[Nodes, ...] | None = None,
 ) -> dict[str, Float[Array, "band stokes pix"]]:
-    """Each component by itself, as `observe` sees it [uK_RJ]."""
+    """Observe each component separately [uK_RJ]; see `observe`."""
     bands = _check_bands(bands)
     return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance), True)
 
 
-# Parameters by name. A sky is a tree of arrays, so the names are read off the tree: the component,
-# the field and, for fields that are tuples, the position ("dust.T_dust.1"). A name with ".offset"
-# behind it stands for a number added to that parameter, which is how a map is shifted as a whole.
+# Parameters by name. A sky is a tree of arrays, and names follow from the tree: the component,
+# the field and, for fields that are tuples, the position ("dust.T_dust.1"). A name that ends in
+# ".offset" stands for a value added to that parameter, for example to shift a whole map.
 
 OFFSET = ".offset"
 
@@ -192,17 +192,17 @@ def _flatten(sky: Sky) -> tuple[dict[str, Array], "jax.tree_util.PyTreeDef"]:
 
 
 def parameter_names(sky: Sky) -> tuple[str, ...]:
-    """Names of all parameters of a sky, amplitudes among them."""
+    """Return the names of all parameters of a sky, including amplitudes."""
     return tuple(_flatten(sky)[0])
 
 
 def unknown_parameter(name: str, known: Iterable[str]) -> KeyError:
-    """The error that an unknown parameter name is answered with."""
+    """Return the error for an unknown parameter name."""
     return KeyError(f"Unknown parameter {name!r}; known parameters are {', '.join(known)}.")
 
 
 def get_parameters(sky: Sky, names: Iterable[str]) -> dict[str, Array]:
-    """Values by name.
+    """Return parameter values by name.
 
     Raises
     ------
@@ -217,26 +217,26 @@ def get_parameters(sky: Sky, names: Iterable[str]) -> dict[str, Array]:
 
 
 def check_parameter(sky: Sky, target: str, name: str, value: Array) -> None:
-    """Raise ValueError if a concrete value, called `name`, is none that a parameter may have."""
+    """Raise ValueError if a concrete value, called `name`, is not allowed for a parameter."""
     component, field = target.split(".")[:2]
     check_value(name, value, declared(type(sky[component]), field))
 
 
 def set_parameters(sky: Sky, params: Mapping[str, ArrayLike]) -> Sky:
-    """A sky with some parameters replaced, or shifted for names that end in ".offset".
+    """Return a sky with some parameters replaced, or shifted for names that end in ".offset".
 
     Parameters
     ----------
-    sky : the sky to start from, which stays as it is
-    params : values by name: numbers, or maps of the sky's pixels
+    sky : the sky to start from, which is not changed
+    params : values by name: numbers, or maps with the sky's pixels
 
     Raises
     ------
     KeyError
         If a name is unknown; the message lists the known ones.
     ValueError
-        If a value is neither a number nor a map of the sky's pixels (amplitudes: of their shape),
-        is not finite, or none that the component takes.
+        If a value has the wrong shape (for amplitudes that of the sky, else a number or a map
+        with the sky's pixels), is not finite, or is refused by the component.
 
     Examples
     --------

@@ -1,13 +1,13 @@
-"""Small scales added to templates: the paper's extrapolation of their spectra, as a pure function.
+"""Add small scales to templates by extrapolating their spectra, as in the paper.
 
-A template knows the sky up to the join, the upper end of the range over which a power law is
-fitted to its spectrum. Beyond, the sky is taken to follow the power law. The template is taken
-from its own beam to the target's up to the join; further on it keeps the beam it has, and is
-brought down where it exceeds the power law: the paper's templates are noise there, and the law
-comes first also where a template is only curved. What is missing is filled with a
-Gaussian realisation times a modulation, the normalised polarized intensity, so that the mean
-spectrum of the sum is the power law: at each multipole the injected power is the extrapolation
-less that of the template, never negative.
+A template is trusted up to the join, the upper end of the range over which a power law is fitted
+to its spectrum; beyond it, the sky is assumed to follow the power law. Up to the join the
+template's beam is divided out. Beyond, the beam stays, and the template is scaled down where it
+exceeds the power law: the paper's templates are noise there, and the law takes precedence also
+where a template's spectrum is merely curved. What is missing is filled with a Gaussian realisation
+times a modulation, the normalised polarized intensity, so that the mean spectrum of the sum is the
+power law: at each multipole the injected power is the extrapolation minus that of the template,
+never negative.
 """
 
 from collections.abc import Sequence
@@ -49,10 +49,10 @@ class SmallScales(eqx.Module):
     Parameters
     ----------
     EE, BB : ranges of l over which the power laws are fitted; their upper ends are the joins
-    slope : of the laws of E and B, instead of those fitted; a number serves both
+    slope : slopes of the laws of E and B, instead of the fitted ones; one number serves both
     tilt : added to the slopes; negative is steeper. The pivot is the join.
-    amplitude : of the injected map, relative to that which makes the mean spectrum continuous
-    modulation_fwhm : beam by which the polarized intensity is smoothed to modulate [arcmin]
+    amplitude : of the injected map; 1 makes the mean spectrum continuous
+    modulation_fwhm : beam with which the modulating polarized intensity is smoothed [arcmin]
 
     Raises
     ------
@@ -102,17 +102,17 @@ class PowerLaw(NamedTuple):
     pivot: int
 
     def __call__(self, lmax: int) -> Float[Array, " ell"]:
-        """C_l of l = 0 ... lmax, zero below l = 2."""
+        """Return C_l for l = 0 ... lmax, zero below l = 2."""
         ell = jnp.arange(lmax + 1)
         log = jnp.log(jnp.maximum(ell, 1) / self.pivot)
         return jnp.where(ell < 2, 0.0, jnp.exp(self.log_amplitude + self.slope * log))
 
 
 def fit_power_law(spectrum: Float[Array, " ell"], lmin: int, lmax: int) -> PowerLaw:
-    """Straight line through log C_l against log l by least squares, every l counting alike.
+    """Fit a straight line to log C_l against log l by least squares, with equal weight for each l.
 
-    The paper's fit, from lmin to lmax, both included; lmax is the pivot of the result. Its errors
-    come from the scatter about the line.
+    This is the paper's fit, from lmin to lmax, both included; lmax is the pivot of the result. The
+    errors follow from the scatter about the line.
     """
     if not 2 <= lmin <= lmax - 3 or lmax >= len(spectrum):
         raise ValueError(
@@ -127,12 +127,12 @@ def fit_power_law(spectrum: Float[Array, " ell"], lmin: int, lmax: int) -> Power
 
 
 class Extrapolation(NamedTuple):
-    """The spectra E, B of a template and of what continues it, without the target's beam.
+    """The EE and BB spectra of a template and of its continuation, without any beam.
 
-    `measured` are the template's divided by those of its beam, up to its own lmax, and `laws` the
-    power laws fitted to them; `target` are those with the slope asked for, and `injected` the
-    spectra of what is added. `transfer` are the factors of the template's coefficients by which
-    its own beam is taken out.
+    `measured` are the template's spectra divided by its squared beam, up to its own lmax, `laws`
+    the power laws fitted to them, `target` those with the slope and tilt asked for, and `injected`
+    the spectra of the small scales. `transfer` are factors on the template's coefficients that
+    take out its beam up to the joins and scale it down to the law beyond.
     """
 
     measured: Float[Array, "2 ell_in"]
@@ -145,13 +145,13 @@ class Extrapolation(NamedTuple):
 def extrapolate(
     alm: Float[Array, "2 alm"], own: ArrayLike, small: SmallScales, lmax: int
 ) -> Extrapolation:
-    """Spectra of a template and of the small scales that continue it up to `lmax`.
+    """Compute the spectra of a template and of the small scales that continue it up to `lmax`.
 
     `alm` are its packed coefficients E, B as far as they are known, `own` its beam [arcmin].
     """
     known = lmax_of(alm)
     beam = gaussian_beam(own, known)
-    # Beyond the joins its own beam is not taken out: there may be nothing left of it.
+    # Beyond the joins the beam is not divided out: it may leave no signal there.
     seen, power = beam > NEGLIGIBLE, power_spectrum(alm)
     measured = jnp.where(seen, power / jnp.where(seen, beam, 1.0) ** 2, 0.0)
     ell = jnp.arange(known + 1)
@@ -166,7 +166,7 @@ def extrapolate(
         excess = kept / jnp.where(allowed > 0, allowed, 1.0)
         beyond = 1 / beam[join] / jnp.sqrt(jnp.maximum(excess, 1.0))
         transfer.append(jnp.where(ell <= join, 1 / jnp.where(ell <= join, beam, 1.0), beyond))
-        # Where the template is brought down to the law, nothing is missing: exactly, not nearly.
+        # Where the template is scaled down to the law, exactly nothing is missing.
         there.append(jnp.where(excess >= 1, allowed, kept))
     both = min(known, lmax) + 1
     missing = jnp.stack(target).at[:, :both].add(-jnp.stack(there)[:, :both])
@@ -178,15 +178,14 @@ def extrapolate(
 
 
 def _root(values: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Square root of what is positive, else 0; there, its derivative is 0 as well."""
+    """Return the square root of positive values, else 0 (with derivative 0)."""
     return jnp.where(values > 0, jnp.sqrt(jnp.where(values > 0, values, 1.0)), 0.0)
 
 
 def modulation(maps: Float[Array, "2 pix"], fwhm: ArrayLike, nside: int) -> Float[Array, " pix"]:
-    """Polarized intensity of Q, U, smoothed by a beam [arcmin] and divided by its mean.
+    """Return the polarized intensity of Q, U, smoothed by a beam [arcmin] and divided by its mean.
 
-    Unlike Q over its mean, the paper's "normalised version of the template", it does not change
-    sign.
+    Unlike Q over its mean, the paper's "normalised version of the template", it never changes sign.
     """
     intensity = _root(jnp.sum(maps**2, axis=0))
     window = shortened(gaussian_beam(fwhm, 2 * healpy.npix2nside(maps.shape[-1])))
@@ -198,15 +197,16 @@ def _correlated_parts(
     parts: Sequence[Extrapolation],
     ranges: Sequence[tuple[int, int]],
 ) -> tuple[Float[Array, "field alm"], Float[Array, "field field ell"]]:
-    """What is added to several templates that are to stay as correlated as they are.
+    """Continue several templates so that they stay as correlated as they are.
 
-    Each cross-spectrum is extrapolated with the coefficient of correlation that it has over the
-    range of the fits. Where one template is still known and another is not, the other gets a
-    part proportional to the first: of T_ij / T_ii times its coefficients, T being the spectra
-    wanted, as much as is known of i (in power) and missing of j (in amplitude).
+    Each cross-spectrum is extrapolated with its correlation coefficient over the range of the fits.
+    Where template i is still known and j is not, j gets a part proportional to i: T_ij / T_ii times
+    the coefficients of i, where T are the target spectra, multiplied by the fraction known of i (in
+    power) and missing of j (in amplitude).
 
-    Of `alms`, the coefficients that stay, without their beams, with the spectra in `parts` and one
-    range of fit a field. Returns those parts, and the spectra of what is missing, to be drawn.
+    `alms` are the coefficients that are kept, without beams, `parts` their spectra, and `ranges`
+    the range of the fit of each field. Returns the proportional parts, and the spectra of what is
+    still missing, to be drawn.
     """
     lmin, lmax = max(r[0] for r in ranges), min(r[1] for r in ranges)
     if lmin > lmax:
@@ -232,7 +232,7 @@ def _correlated_parts(
     added = jnp.stack([sum(expand(borrowed[j, i]) * alms[i] for i in range(n)) for j in range(n)])
     mixing = borrowed + jnp.eye(n)[..., None]
     missing = wanted - jnp.einsum("ijl,jkl,mkl->iml", mixing, kept, mixing)
-    # What rounding leaves where nothing is missing would have any correlation.
+    # Rounding residuals where nothing is missing would have arbitrary correlations.
     there = beyond & (jnp.einsum("iil->il", missing) > NEGLIGIBLE * auto)
     return added, jnp.where(there[:, None] & there, missing, 0.0)
 
@@ -240,8 +240,8 @@ def _correlated_parts(
 class Continued(NamedTuple):
     """Templates with their small scales.
 
-    Their packed coefficients E, B without any beam, the spectra that they follow, and the number of
-    multipoles at which the matrix of spectra had to be repaired.
+    `alms` are packed coefficients E, B without any beam, `parts` the spectra that they follow, and
+    `repaired` the number of multipoles at which the matrix of spectra had to be repaired.
     """
 
     alms: list[Float[Array, "2 alm"]]
@@ -257,18 +257,18 @@ def continue_templates(
     nside: int,
     lmax: int | None = None,
 ) -> Continued:
-    """Templates (Q, U) continued to small scales, correlated with each other if there are several.
+    """Continue templates (Q, U) to small scales, correlated with each other if there are several.
 
-    With one key the result is differentiable in slopes, tilts, amplitudes, beams and maps. Of
-    a single template E and B are independent; several keep their coefficients of correlation,
-    E with B and template with template (the paper's dust and AME, after Brown & Battye 2011),
-    and are modulated by the mean of their modulations; where one is known to higher multipoles
-    than another, it is correlated with what is known. The spectra are divided by the mean
-    square of the modulation, so that those of the modulated maps are the extrapolated ones.
+    With a fixed key the result is differentiable in slopes, tilts, amplitudes, beams and maps. The
+    small scales of E and B of a single template are independent. Several templates keep their
+    correlation coefficients, E with B and template with template (the paper's dust and AME, after
+    Brown & Battye 2011), and share the mean of their modulations; where one is known to higher
+    multipoles than another, the other is correlated with it there. The spectra are divided by the
+    mean square of the modulation, so that the modulated maps have the extrapolated spectra.
 
-    `own` are the beams of the templates [arcmin]; `nside` is that at which the small scales are
+    `own` are the beams of the templates [arcmin], `nside` the resolution at which small scales are
     modulated, `lmax` the largest multipole of the result, by default 2 nside. With another nside
-    or lmax a key gives other small scales.
+    or lmax a key gives different small scales.
     """
     lmax = 2 * nside if lmax is None else lmax
     parts, stay, gains = [], [], []
@@ -278,7 +278,7 @@ def continue_templates(
                 "Small scales are added to maps of shape (2, pix), Q and U, not of shape "
                 f"{jnp.shape(each)}."
             )
-        # As far as its pixels and its beam let it through.
+        # Up to the multipole that its pixels and beam resolve.
         window = shortened(gaussian_beam(beam, 2 * healpy.npix2nside(each.shape[-1])))
         alm = analysis(each, window.size - 1)
         parts.append(extrapolate(alm, beam, how, lmax))
@@ -289,14 +289,14 @@ def continue_templates(
     else:
         ranges = [r for how in small for r in (how.EE, how.BB)]
         borrowed, matrix = _correlated_parts(jnp.concatenate(stay), parts, ranges)
-    # One for all: two that differ would make the maps less correlated than the fields.
+    # The same for all: different modulations would make the maps less correlated than the fields.
     gain = sum(gains) / len(gains)
     matrix, repaired = repair(matrix / jnp.mean(gain**2))
     drawn = gaussian_fields(key, matrix)
     result = []
     for i, (template, how) in enumerate(zip(stay, small, strict=True)):
         added = analysis(gain * synthesis(drawn[2 * i : 2 * i + 2], nside), lmax)
-        # 0 below half the join, 1 from the join on: below, the template stays as it is.
+        # Rises from 0 at half the join to 1 at the join; below that the template is unchanged.
         at = jnp.arange(lmax + 1) / jnp.asarray((how.EE[1], how.BB[1]))[:, None]
         added = expand(jnp.sin(jnp.pi / 2 * jnp.clip(2 * at - 1, 0, 1)) ** 2) * added
         result.append(template + how.amplitude * (added + borrowed[2 * i : 2 * i + 2]))

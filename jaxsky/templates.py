@@ -1,11 +1,11 @@
-"""Templates from published maps, as the paper makes them, and components with published laws.
+"""Make templates from published maps as in the paper, and components with published laws.
 
-Its synchrotron is Commander's Q and U at 30 GHz, brought from 40 arcmin at nside 256 to 1 degree
-at nside 512; its dust the one at 353 GHz, at 10 arcmin as it comes; the index of its dust that
-at 7.5 arcmin, smoothed to 3 degrees against noise; that of its synchrotron the map of Giardino et
-al. (2002) at 10 degrees and radio frequencies, steepened as the spectrum of GALPROP steepens from
-there to 20-30 GHz. AME polarized along the dust is `AME.from_dust_angles`, and `correlation` is
-how the paper compares the two.
+The paper's synchrotron is Commander's Q and U at 30 GHz, taken from 40 arcmin at nside 256 to
+1 degree at nside 512; its dust is Commander's at 353 GHz, unchanged at 10 arcmin. Its dust index is
+the map at 7.5 arcmin, smoothed to 3 degrees to reduce noise; its synchrotron index the map of
+Giardino et al. (2002) at 10 degrees and radio frequencies, steepened like the GALPROP spectrum from
+there to 20-30 GHz. `AME.from_dust_angles` makes AME polarized along the dust, and `correlation`
+compares the two as the paper does.
 """
 
 import math
@@ -26,19 +26,19 @@ from jaxsky.public import packaged
 
 #: First and last frequency of an interval [GHz].
 Interval: TypeAlias = tuple[ArrayLike, ArrayLike] | Float[Array, "2"]
-#: Intervals of the paper's steepening [GHz]: that of Giardino's map, and that of the model.
+#: Intervals of the paper's steepening [GHz]: that of Giardino's map, and that of the sky model.
 LOW, HIGH = (0.49, 2.12), (20.0, 30.0)
-#: Jacobi steps of the analysis, more than elsewhere: templates are made once. Each gains a factor
+#: Jacobi steps per analysis, more than elsewhere as templates are made once. Each gains a factor
 #: of 20; with these a band-limited map is right to 4e-7 of its rms in every pixel.
 ITERATIONS = 4
-#: A smoothed mask below this is too far from used pixels: a FWHM inside the edge of a hole.
+#: Where a smoothed mask is below this, used pixels are too far away: one FWHM into a hole.
 LEAST_WEIGHT = 0.01
-#: Variance left without a block, in roundings of that of all pixels, that is none.
+#: Variance without a block that counts as zero, in rounding errors of that of all pixels.
 ROUNDINGS = 1e3
 
 
 def _healpix(name: str, values: ArrayLike, rows: tuple[int, ...] = ()) -> tuple[Array, int]:
-    """A map, or several in as many rows as allowed, checked, and the nside."""
+    """Check a map, or several in an allowed number of rows, and return it with its nside."""
     array = as_array(name, values)
     npix = array.shape[-1] if array.ndim else 0
     nside = math.isqrt(npix // 12)
@@ -58,11 +58,11 @@ def _check_nside(nside: int) -> None:
 def polarization_template(
     maps: ArrayLike, own_fwhm: Numeric, fwhm: Numeric, nside: int
 ) -> Float[Array, "stokes pix"]:
-    """Q, U or I, Q, U at another resolution, without the artefacts of their pixels.
+    """Change the resolution of Q, U or I, Q, U without pixel artefacts.
 
     The paper upgrades its synchrotron from nside 256 to 512 pixel by pixel and then smooths it from
-    `own_fwhm`, 40 arcmin, to `fwhm`, 60. Here both are one transform up to 2 nside, of the coarser
-    of both resolutions. Differentiable in the maps, shape (stokes, pix), and the widths [arcmin].
+    `own_fwhm`, 40 arcmin, to `fwhm`, 60. Here both are one transform, up to 2 nside of the coarser
+    resolution. Differentiable in the maps, shape (stokes, pix), and the widths [arcmin].
     """
     maps, nside_in = _healpix("maps", maps, rows=(2, 3))
     check_finite("maps", maps)
@@ -78,11 +78,11 @@ def dust_index(
     nside: int,
     mask: Bool[np.ndarray, " pix"] | None = None,
 ) -> Float[Array, " pix"]:
-    """A noisy map of spectral indices, smoothed: beta_dust of the paper from 7.5' to 3 degrees.
+    """Smooth a noisy map of spectral indices, as the paper does beta_dust from 7.5' to 3 degrees.
 
     With a mask, True in used pixels, the result is their mean under the beam, smooth(mask beta) /
-    smooth(mask). It holds the values at the pixel centres, and is not cut at a multipole that the
-    new pixels resolve. Widths in arcmin.
+    smooth(mask). It is sampled at the new pixel centres, not band-limited to what the new pixels
+    resolve. Widths are in arcmin.
     """
     beta, nside_in = _healpix("beta", beta)
     _check_nside(nside)
@@ -108,10 +108,10 @@ def dust_index(
 def steepening(
     nu: ArrayLike, temperature: ArrayLike, low: Interval = LOW, high: Interval = HIGH
 ) -> Float[Array, ""]:
-    """By how much a spectrum T ~ nu^-beta is steeper in one interval of frequency than in another.
+    """Return how much steeper a spectrum T ~ nu^-beta is in one frequency interval than in another.
 
-    beta = -ln(T_2/T_1) / ln(nu_2/nu_1) between the ends of each interval, where T is
-    interpolated in ln T against ln nu; high minus low is returned. The paper finds 0.13 for
+    beta = -ln(T_2/T_1) / ln(nu_2/nu_1) between the ends of each interval, with ln T interpolated
+    against ln nu; the result is beta of `high` minus beta of `low`. The paper finds 0.13 for
     GALPROP's synchrotron. Frequencies in GHz, strictly increasing; differentiable in all arguments.
     """
     nu, temperature = as_array("nu", nu), as_array("temperature", temperature)
@@ -153,13 +153,12 @@ class Correlation(NamedTuple):
 
 
 def correlation(x: ArrayLike, y: ArrayLike, blocks: ArrayLike | None = None) -> Correlation:
-    """Pearson's correlation of two maps, with its error from a jackknife over blocks.
+    """Return Pearson's correlation of two maps, with its error from a jackknife over blocks.
 
-    The error is that of leaving one of B blocks out after another, [(B - 1)/B sum_b (r_b -
-    mean r)^2]^(1/2), from the sums over each block. Differentiable in the maps, shape (pix,).
-    `blocks` are labels of pixels, by default one for each. That takes neighbours as independent,
-    which they are not on a smooth sky: blocks wider than its structures (`fits.superpixels`) give
-    the honest, larger error.
+    Leaving out one of B blocks at a time gives the error [(B - 1)/B sum_b (r_b - mean r)^2]^(1/2).
+    Differentiable in the maps, shape (pix,). `blocks` labels the block of each pixel; by default
+    each pixel is its own. That treats neighbours as independent, which they are not on a smooth
+    sky: blocks wider than its structures (`fits.superpixels`) give the realistic, larger error.
     """
     x, y = as_array("x", x), as_array("y", y)
     labels = np.arange(x.size) if blocks is None else np.asarray(blocks)
@@ -181,8 +180,8 @@ def correlation(x: ArrayLike, y: ArrayLike, blocks: ArrayLike | None = None) -> 
 
 @partial(jax.jit, static_argnames="number")
 def _jackknife(x: Array, y: Array, labels: Array, number: int) -> tuple[Array, Array, Array]:
-    """Correlation, its error, and the least relative variance that is left without a block."""
-    # A constant map is exactly zero without its first value, not without its mean.
+    """Return correlation, its error, and the least relative variance left without a block."""
+    # A constant map minus its first value is exactly zero; minus its mean it may not be.
     x, y = x - x[0], y - y[0]
     x, y = x - x.mean(), y - y.mean()
     terms = jnp.stack([jnp.ones_like(x), x, y, x * x, y * y, x * y], axis=-1)
@@ -204,17 +203,17 @@ def _jackknife(x: Array, y: Array, labels: Array, number: int) -> tuple[Array, A
 
 
 def from_pysm_beta(beta: ArrayLike) -> Float[Array, "..."]:
-    """beta_syn of this package, T ~ nu^-beta_syn, from PySM's T ~ nu^beta."""
+    """Convert PySM's index, T ~ nu^beta, to beta_syn of this package, T ~ nu^-beta_syn."""
     return -as_array("beta", beta)
 
 
 def preset(name: str, amplitude: ArrayLike, **maps: ArrayLike) -> Component:
-    """A component with the law and the constants of a preset.
+    """Make a component with the law and the constants of a preset.
 
     Parameters
     ----------
-    name : "baseline_dust" and "baseline_synchrotron" are the paper's, "d0", "d1", "s0", "s1" and
-        "s3" PySM's
+    name : "baseline_dust" or "baseline_synchrotron" of the paper, or "d0", "d1", "s0", "s1" or
+        "s3" of PySM
     amplitude : template [uK_RJ] at the preset's reference frequency (353 GHz for dust, 23 GHz
         for PySM's synchrotron, 30 GHz for the paper's), shape (stokes, pix); PySM's I templates
         refer to other frequencies and have to be scaled first

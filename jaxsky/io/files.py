@@ -1,6 +1,6 @@
-"""Files: what is wrong with those that are read, how others are written whole, and folders.
+"""Check input files, write output files atomically, cache arrays, and lock folders of results.
 
-One process works in a folder of results, or several, each on a part of its own.
+Several processes may share a folder of results if each works on its own part.
 """
 
 import errno
@@ -22,20 +22,20 @@ import platformdirs
 
 
 class InputError(ValueError):
-    """A file that cannot be used, as it is or as it was asked for; one sentence with the names."""
+    """A file that cannot be used, or not as asked; one sentence that names file and value."""
 
 
 class MissingFileError(InputError):
-    """A file that is not there."""
+    """A file that does not exist."""
 
 
 class UnfitError(Exception):
-    """What is wrong with a file that is being read; see `in_file`."""
+    """A problem with the file being read, without its name; see `in_file`."""
 
 
 @contextmanager
 def in_file(where: Path | str) -> Iterator[None]:
-    """Say what is wrong with a file as an InputError that names it, or its part."""
+    """Turn an UnfitError into an InputError that names the file, or a part of it."""
     try:
         yield
     except UnfitError as error:
@@ -43,7 +43,7 @@ def in_file(where: Path | str) -> Iterator[None]:
 
 
 def check_file(path: Path) -> None:
-    """Raise InputError unless a path is a file that can be read; says what else it is."""
+    """Raise InputError unless a path is a readable file; the message says what it is instead."""
     try:
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -62,20 +62,20 @@ def check_file(path: Path) -> None:
         raise InputError(f"{path}: cannot be read (no permission).")
 
 
-#: How names of files begin that are not complete; the number of their process follows.
+#: Prefix of the names of incomplete files, followed by the id of the process that writes them.
 PARTIAL = ".partial-"
-#: Called before anything is written; an exception of theirs keeps it from being written.
+#: Functions called before anything is written; if one raises, nothing is written.
 guards: list[Callable[[], None]] = []
 
 
 def check_guards() -> None:
-    """Raise what keeps this process from writing, as that its folder was removed."""
+    """Raise if something forbids writing, for example if the folder was removed."""
     for guard in guards:
         guard()
 
 
 def is_fits(path: Path) -> bool:
-    """True for a FITS file, compressed or not; raises InputError if there is no file."""
+    """Return whether a file is FITS, compressed or not; raise InputError if there is no file."""
     check_file(path)
     with path.open("rb") as stream:
         return stream.read(6).startswith((b"SIMPLE", b"\x1f\x8b"))
@@ -83,10 +83,10 @@ def is_fits(path: Path) -> bool:
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A place beside a file to write to; it takes the file's place unless there is an error.
+    """Write a file atomically: yield a temporary path next to it, which replaces it on success.
 
-    What is there survives a process that is killed and a full disk. Data are on the disk before
-    they get their name, as some file systems tell only then that there was no room.
+    An existing file survives a killed process and a full disk. Data are flushed to disk before the
+    file is renamed, as some file systems report only then that there was no room.
     """
     beside = path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
     check_guards()
@@ -107,7 +107,7 @@ def whole(path: Path) -> Iterator[Path]:
 
 
 def _reason(error: OSError) -> str:
-    """The system's own words; libraries put theirs on top."""
+    """Return the operating system's message, which libraries wrap in their own."""
     first: BaseException | None = error
     while first is not None:
         if isinstance(first, OSError) and first.strerror:
@@ -117,23 +117,23 @@ def _reason(error: OSError) -> str:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file whole."""
+    """Write a text file atomically."""
     with whole(path) as beside:
         beside.write_text(text)
 
 
-#: Locked for moments only, while it is seen who works in a folder.
+#: File locked only briefly, while the list of processes in a folder is read or changed.
 GATE = ".lock"
-#: How the name of a file begins that a process keeps locked as long as it works in a folder.
+#: Prefix of the file that a process keeps locked as long as it works in a folder.
 OWNER = ".running"
-#: The part of a process that shares its folder with no other.
+#: The part of a process that does not share its folder.
 ALL = range(sys.maxsize)
-#: How a file system says that it has no locks.
+#: Errors by which a file system says that it has no locks.
 NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EPROTONOSUPPORT}
 
 
 def cache_folder() -> Path:
-    """What can be had again is kept here: $JAXSKY_CACHE, or the platform's folder for caches."""
+    """Return the folder for files that can be made again: $JAXSKY_CACHE or the system's cache."""
     given = os.environ.get("JAXSKY_CACHE")
     return Path(given or platformdirs.user_cache_path("jaxsky")).expanduser().absolute()
 
@@ -141,9 +141,10 @@ def cache_folder() -> Path:
 def kept(
     kind: str, mark: object, shape: tuple[int, ...], make: Callable[[], np.ndarray]
 ) -> np.ndarray:
-    """An array that takes long to make, from a folder of the cache if it was made before.
+    """Return an array that is slow to make, from the cache if it was made before.
 
-    `mark` is all that it depends on; it is made if it is not there, damaged or of another shape.
+    `mark` contains everything it depends on. It is made again if the cached file is missing,
+    damaged or has another shape.
     """
     name = hashlib.sha256(repr(mark).encode()).hexdigest()
     path = cache_folder() / kind / f"{name}.npy"
@@ -152,7 +153,7 @@ def kept(
         if found.shape == shape:
             return found
     made = make()
-    with suppress(OSError):  # it can be had again
+    with suppress(OSError):  # caching is optional
         path.parent.mkdir(parents=True, exist_ok=True)
         with whole(path) as beside, beside.open("wb") as file:
             np.save(file, made)
@@ -160,7 +161,7 @@ def kept(
 
 
 class Owner(NamedTuple):
-    """A process that works in a folder, as the name of its file says; started in ns."""
+    """A process that works on a part of a folder; `started` is in ns since 1970."""
 
     pid: int
     started: int
@@ -170,29 +171,29 @@ class Owner(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of its file."""
+        """Name of the process's file."""
         return "-".join((OWNER, *map(str, self)))
 
     @classmethod
     def named(cls, name: str) -> "Owner":
-        """The process with this name of a file."""
+        """Return the process that a file name describes."""
         _, pid, started, first, stop, host = name.split("-", 5)
         return cls(int(pid), int(started), int(first), int(stop), host)
 
     def __str__(self) -> str:
-        """Process and start time."""
+        """Return process id, host if it is another one, and start time."""
         when = datetime.fromtimestamp(self.started / 1e9).isoformat(" ", "seconds")
         where = "" if self.host == socket.gethostname() else f" on {self.host}"
         return f"process {self.pid}{where}, started {when}"
 
 
 def _lock(path: Path) -> filelock.BaseFileLock:
-    # The operating system releases it when a process dies; filelock's other kind would stay.
+    # The operating system releases such a lock when a process dies; filelock's soft lock stays.
     return filelock.FileLock(path, timeout=0, fallback_to_soft=False)
 
 
 def _acquire(lock: filelock.BaseFileLock, timeout: float = 0) -> bool:
-    """Lock a file; False if the file system has no locks."""
+    """Acquire a lock; return False if the file system has no locks."""
     try:
         lock.acquire(timeout)
         return True
@@ -206,9 +207,9 @@ def _acquire(lock: filelock.BaseFileLock, timeout: float = 0) -> bool:
 def locked(
     path: Path, timeout: float = -1, waiting: Callable[[], None] = lambda: None
 ) -> Iterator[bool]:
-    """Hold a lock; False where the file system has none.
+    """Hold a lock; yield False where the file system has none.
 
-    `timeout` is in seconds, -1 for ever; `waiting` is called if another process has the lock.
+    `timeout` is in seconds, -1 to wait forever; `waiting` is called if another process has it.
     """
     lock = _lock(path)
     try:
@@ -224,10 +225,7 @@ def locked(
 
 @contextmanager
 def alone(out: Path) -> Iterator[bool]:
-    """Whoever is in here is alone with the list of a folder's processes; for moments only.
-
-    False where the file system has no locks.
-    """
+    """Lock the list of a folder's processes, briefly; yield False without file locks."""
     with locked(out / GATE, 60) as held:
         try:
             yield held
@@ -237,7 +235,7 @@ def alone(out: Path) -> Iterator[bool]:
 
 
 def _owners(out: Path) -> Iterator[Owner]:
-    """Who works in a folder; files of processes that have died are removed."""
+    """Yield the processes that work in a folder, and remove the files of those that have died."""
     for path in out.glob(f"{OWNER}-*"):
         lock = _lock(path)
         try:
@@ -278,7 +276,7 @@ class Folder:
         try:
             yield
         except (OSError, ValueError):
-            self.check()  # the reason of all errors, if there is none any more
+            self.check()  # if the folder was removed, that is the reason for the error
             raise
         finally:
             guards.remove(self.check)
@@ -289,7 +287,7 @@ class Folder:
             lock.release()
 
     def check(self) -> None:
-        """Raise FileNotFoundError if the folder was removed, or is another one now."""
+        """Raise FileNotFoundError if the folder was removed or replaced."""
         if not self._place.exists():
             raise FileNotFoundError(
                 f"{self.path}: was removed while the command worked in it; the rest of its "
@@ -297,21 +295,21 @@ class Folder:
             )
 
     def narrow(self, part: range) -> None:
-        """Go on with a smaller part only."""
+        """Reduce the part that this process works on."""
         with alone(self.path):
             before = self._place
             self._owner = self._owner._replace(first=part.start, stop=part.stop)
             before.rename(self._place)
 
     def remove(self, patterns: Sequence[str]) -> None:
-        """Remove files by patterns of their names."""
+        """Remove the files whose names match any of the patterns."""
         self.check()
         for pattern in patterns:
             for path in self.path.glob(pattern):
                 path.unlink(missing_ok=True)
 
     def clean(self) -> None:
-        """Remove incomplete files of processes that have died."""
+        """Remove incomplete files left by processes that have died."""
         with alone(self.path) as locked:
             if not locked:
                 return
@@ -323,9 +321,9 @@ class Folder:
 
 @contextmanager
 def occupied(out: Path, part: range = ALL) -> Iterator[Folder]:
-    """Work in a folder, which is made if it is not there, and left as it was if that fails.
+    """Work in a folder, which is created if missing, and then removed again if it stays empty.
 
-    Processes share it only if the parts of the results that they make differ.
+    Several processes may share it if they make different parts of the results.
     """
     missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
@@ -339,4 +337,4 @@ def occupied(out: Path, part: range = ALL) -> Iterator[Folder]:
     finally:
         for made in missing:
             with suppress(OSError):
-                made.rmdir()  # unless there is something in it
+                made.rmdir()  # fails unless the folder is empty

@@ -1,4 +1,4 @@
-"""HEALPix maps and masks: read into the package's conventions, maps written in full."""
+"""Read HEALPix maps and masks into the package's conventions, and write maps."""
 
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,7 +21,7 @@ from jaxsky.public import takes_quantities
 
 
 def _blocks(where: str, names: Sequence[str], kinds: Sequence[str | None]) -> list[list[int]]:
-    """Rows that turn together when the coordinates change: (Q, U) pairs, and single scalars."""
+    """Group rows that rotate together when coordinates change: (Q, U) pairs, single scalars."""
     found: list[list[int]] = []
     row = 0
     while row < len(kinds):
@@ -37,9 +37,9 @@ def _blocks(where: str, names: Sequence[str], kinds: Sequence[str | None]) -> li
 
 
 def _turned(block: np.ndarray, rotator: healpy.Rotator) -> np.ndarray:
-    """A scalar (1, pix) or Q and U (2, pix), turned in harmonic space."""
+    """Rotate a scalar (1, pix) or Q and U (2, pix) in harmonic space."""
     nside = healpy.npix2nside(block.shape[-1])
-    # Ring weights and eight iterations reach 1e-7 up to here; nothing does at 3 nside.
+    # Ring weights and eight iterations reach 1e-7 up to this lmax; no number does at 3 nside.
     lmax = 5 * nside // 2
     weights = nside > 1 and healpy.isnsideok(nside, nest=True)
     maps = block[0] if len(block) == 1 else [np.zeros_like(block[0]), *block]
@@ -49,16 +49,16 @@ def _turned(block: np.ndarray, rotator: healpy.Rotator) -> np.ndarray:
 
 
 def tangents(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    """Unit vectors to the south and the east, shape (2, 3, pix)."""
+    """Return unit vectors towards south and east, shape (2, 3, pix)."""
     south = [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)]
     return np.array([south, [-np.sin(phi), np.cos(phi), np.zeros_like(phi)]])
 
 
 def _interpolated(block: np.ndarray, rotator: healpy.Rotator) -> np.ndarray:
-    """A scalar (1, pix) or Q and U (2, pix), turned by interpolation between pixels.
+    """Rotate a scalar (1, pix) or Q and U (2, pix) by interpolation between pixels.
 
-    Q and U turn fast about the poles, so it is the tensor Q (ss - ee) + U (se + es) of the
-    directions south and east that is interpolated, by its Cartesian components.
+    Q and U vary fast near the poles, so the Cartesian components of the tensor
+    Q (ss - ee) + U (se + es) are interpolated instead, s and e pointing south and east.
     """
     directions = healpy.pix2ang(healpy.npix2nside(block.shape[-1]), np.arange(block.shape[-1]))
     source = rotator.I(*directions)
@@ -81,11 +81,11 @@ def _to_galactic(
     blocks: Sequence[list[int]],
     coordinates: str,
 ) -> tuple[Float[np.ndarray, "field pix"], Bool[np.ndarray, " pix"]]:
-    """Maps turned to Galactic coordinates, Q and U as the spin-2 field they are.
+    """Rotate maps and mask to Galactic coordinates, with Q and U as a spin-2 field.
 
-    Complete maps are turned in harmonic space, which is exact for a sky without structure above
-    l = 2.5 nside and cuts what is above. A map with pixels missing has no spherical harmonics:
-    it is interpolated between the four nearest pixels, and pixels next to missing ones are lost.
+    Complete maps are rotated in harmonic space, which is exact for a sky without structure above
+    l = 2.5 nside and cuts what is above. Incomplete maps are interpolated between the four
+    nearest pixels, and pixels next to missing ones are lost.
     """
     rotator = healpy.Rotator(coord=[coordinates, "G"])
     turn = _turned if mask.all() else _interpolated
@@ -100,9 +100,9 @@ def _to_galactic(
 class Maps:
     """Maps in the package's conventions: RING, Galactic, COSMO sign of U, float64.
 
-    They are 0 where `mask` is False, for not every field has a value there. `unit` is as
-    `unit_name` has it. `stokes` of each column are those given, or as its name says for certain:
-    one, two of a covariance, "" for none, None where it is not known.
+    All maps are 0 where `mask` is False, even if only one lacks a value there. `unit` is in the
+    spelling of `unit_name`. `stokes` of each column is as given, or as its name certainly says: one
+    letter, two for a covariance, "" for no Stokes parameter, None if unknown.
     """
 
     maps: Float[np.ndarray, "field pix"]
@@ -120,7 +120,7 @@ class Maps:
     def to(
         self, unit: str, at: Numeric | Bandpass | None = None, nu_ref: float | None = None
     ) -> "Maps":
-        """The maps in another unit; `at` and `nu_ref` as in `unit_factor`."""
+        """Return the maps in another unit; `at` and `nu_ref` as in `unit_factor`."""
         factor = unit_factor(self.unit, unit, at, nu_ref)
         return replace(self, maps=self.maps * factor, unit=unit_name(unit))
 
@@ -139,48 +139,48 @@ def read_maps(
     missing: float | Iterable[float] | None = None,
     zeros_are_data: bool = False,
 ) -> Maps:
-    """HEALPix maps of FITS files, in RING order, Galactic coordinates, COSMO sign of U.
+    """Read HEALPix maps from FITS files in RING order, Galactic coordinates, COSMO sign of U.
 
-    Unit, ordering, coordinates and polarization convention are read from the header; an argument
-    stands in where the header is silent, and must agree with it where it is not. NESTED maps are
+    Unit, ordering, coordinates and polarization convention are read from the header. An argument
+    supplies what the header does not state, and must agree with what it does. NESTED maps are
     reordered, U (and its covariances IU, QU) of an IAU file changes sign, and maps in Celestial
-    or Ecliptic coordinates are turned, Q and U together as a spin-2 field (covariances cannot
-    be). Partial maps with explicit pixel numbers are read as well.
+    or Ecliptic coordinates are rotated, Q and U together as a spin-2 field (covariances cannot
+    be rotated). Partial maps with explicit pixel numbers can be read as well.
 
-    Which Stokes parameter a column holds is taken from its name where that is one of Planck's,
-    WMAP's, healpy's and the like (`jaxsky.io.columns`). Files with other names have to be told,
-    by `stokes`, if they have the IAU sign or are not Galactic.
+    The Stokes parameter of a column follows from its name if that is one used by Planck, WMAP,
+    healpy and the like (`jaxsky.io.columns`). For other names it must be given as `stokes` if the
+    file has the IAU sign or is not in Galactic coordinates.
 
-    Pixels without a value are those that are not listed, UNSEEN, NaN, infinite, the header's
-    BAD_DATA, and TNULL in columns of integers. Files in which other numbers seem to mark them
+    Pixels have no value if they are not listed, UNSEEN, NaN, infinite, equal to the header's
+    BAD_DATA, or to TNULL in columns of integers. Files in which other numbers seem to mark them
     (an extreme such as -999 that is repeated and far from the rest; exact zeros in all columns of
     a brightness in more than 30 % of the pixels) are refused until `missing` says what they are.
 
     Parameters
     ----------
-    path : FITS file; or several, whose columns are one field, such as Q and U in a file each
-    fields : columns by name or number; default the first columns named as I, Q and U (I_STOKES,
-        TEMPERATURE, Q_POLARISATION, U_ML, ...), or the only column. Of several files or HDUs one
+    path : FITS file, or several whose columns belong together, such as Q and U in separate files
+    fields : columns by name or number; by default the first columns named as I, Q and U (I_STOKES,
+        TEMPERATURE, Q_POLARISATION, U_ML, ...), or the only column. For several files or HDUs one
         that all have, or one for each.
-    hdu : number or name of the table; or several, as many as files, or of one file
-    unit : unit of the columns, for example "mK_CMB"; the bare "K" and "mK" of some headers do
-        not say which temperature is meant, so there it must be given ("K" for a map of dust
-        temperatures, "" for a pure number)
-    nside : resolution that is expected
+    hdu : number or name of the table; or a list of them, one per file, or all in one file
+    unit : unit of the columns, for example "mK_CMB". It must be given if the header has a bare
+        "K" or "mK", which does not say which temperature is meant ("K" for a map of dust
+        temperatures, "" for a pure number).
+    nside : expected resolution
     ordering : "RING" or "NESTED"
     coordinates : "G", "C" or "E" (Galactic, Celestial, Ecliptic)
-    polarization : "COSMO" or "IAU"; COSMO, HEALPix's own, where nothing is said
-    stokes : Stokes parameters of the columns in their order, "QU", "IQU", "I", or of covariances
-        "QQ QU UU"; "I" or, of all columns, "" for what has none, such as hits. Must agree with
-        names that are certain.
-    missing : number or numbers that mark missing pixels, zero among them; [] if all are data
-    zeros_are_data : do not ask about exact zeros, as of a correction that is zero where there
-        is nothing to correct
+    polarization : "COSMO" or "IAU"; COSMO, the HEALPix convention, if nothing states it
+    stokes : Stokes parameters of the columns in order, "QU", "IQU", "I", or for covariances
+        "QQ QU UU"; for a column without one, such as hits, "I", or "" for all columns. Must agree
+        with names that are certain.
+    missing : number or numbers that mark missing pixels, possibly zero; [] if all values are data
+    zeros_are_data : accept exact zeros, for example in a correction that is zero where there is
+        nothing to correct
 
     Raises
     ------
     InputError
-        If a file is no such map, or something that maps cannot be used without is said neither by
+        If a file is not such a map, or if something needed to use the maps is stated neither by
         header nor argument, or differently by both or by several files.
     ValueError
         If `unit` is unknown.
@@ -195,7 +195,7 @@ def read_maps(
     mark_missing(columns, missing, zeros_are_data)
     maps = np.empty((len(names), first.values.size))
     for row in range(len(names)):
-        maps[row] = columns.pop(0).values  # and given back: maps may be large
+        maps[row] = columns.pop(0).values  # frees their memory: maps may be large
     mask = np.asarray(np.isfinite(maps).all(axis=0))
     if not mask.any():
         raise InputError(f"{where}: no pixel has values in {', '.join(names)}.")
@@ -219,21 +219,19 @@ def write_maps(
     single: bool = False,
     tables: Sequence[pyfits.BinTableHDU] = (),
 ) -> None:
-    """Maps as a HEALPix table in a FITS file, with a header that leaves nothing open.
-
-    The file is written beside its place and moved there when it is complete.
+    """Write maps as a HEALPix table in a FITS file, with a complete header; the write is atomic.
 
     Parameters
     ----------
     path : FITS file
     maps : RING, Galactic, COSMO, shape (field, pix) or (pix,)
     names : names of the columns
-    unit : unit of all maps or of each, as `unit_name` takes them; "" for pure numbers
+    unit : unit of all maps or of each, in any spelling `unit_name` accepts; "" for pure numbers
     mask : True in used pixels, shape (pix,); the others are written as UNSEEN
-    overwrite : replace a file that is there
+    overwrite : replace an existing file
     extra_header : further header keywords and their values, or values and comments
     single : write single precision instead of double
-    tables : what else is in the file, after the maps
+    tables : further tables of the file, after the maps
 
     Raises
     ------
@@ -293,7 +291,7 @@ def write_maps(
 
 
 def _read_npz(path: Path, field: str | int | None, ordering: str | None) -> np.ndarray:
-    """The values of a mask in an archive, in RING order."""
+    """Read the values of a mask from an .npz archive, in RING order."""
     order = spelled("ordering", ordering or "RING")
     check_file(path)
     try:
@@ -323,20 +321,20 @@ def read_mask(
     nside: int | None = None,
     ordering: str | None = None,
 ) -> Bool[np.ndarray, " pix"]:
-    """A mask from a FITS file or an .npz archive.
+    """Read a mask from a FITS file or an .npz archive.
 
-    Pixels without a value are not used: those that a partial map does not list, UNSEEN, NaN,
-    BAD_DATA and TNULL of the header.
+    Pixels without a value are not used: those that a partial map does not list, and those that
+    are UNSEEN, NaN, or equal to the header's BAD_DATA or TNULL.
 
     Parameters
     ----------
     path : FITS file or .npz archive
-    field : column of the table or array of the archive, for example "GAL040"; may be left out
-        where there is only one, or an I column (the WMAP masks)
+    field : column of the table or array of the archive, for example "GAL040"; may be omitted
+        if there is only one, or an I column (the WMAP masks)
     hdu : number or name of the FITS table
-    nside : resolution that is expected
-    ordering : "RING" or "NESTED" where the header does not say; an archive is RING unless it is
-        given. A FITS mask without coordinates is taken to be Galactic.
+    nside : expected resolution
+    ordering : "RING" or "NESTED" if the header does not say; archives are RING by default. A
+        FITS mask without coordinates is taken to be Galactic.
 
     Returns
     -------
@@ -345,8 +343,8 @@ def read_mask(
     Raises
     ------
     InputError
-        If the file has no such mask, or it has values other than 0 and 1 (read an apodized mask
-        with `read_maps`), the wrong nside, or leaves no pixel.
+        If the file has no such mask, or the mask has values other than 0 and 1 (read an apodized
+        mask with `read_maps`), the wrong nside, or no used pixel.
     """
     path = Path(path)
     frame, others = "G", []
@@ -376,7 +374,7 @@ def read_mask(
             raise UnfitError(f"the mask leaves no pixel{hint}.")
     if frame == "G":
         return mask
-    # As it is at the pixel centers of the Galactic frame.
+    # Look the mask up at the pixel centers of the Galactic frame.
     directions = healpy.pix2ang(found, np.arange(mask.size))
     return mask[healpy.ang2pix(found, *healpy.Rotator(coord=["G", frame])(*directions))]
 
@@ -384,7 +382,7 @@ def read_mask(
 def degrade_mask(
     mask: Bool[np.ndarray, " pix"], nside: int, threshold: float = 0.5
 ) -> Bool[np.ndarray, " pix"]:
-    """A mask in RING order at lower resolution: pixels of which at least a fraction is used."""
+    """Degrade a mask in RING order: keep pixels of which at least a fraction is used."""
     found = healpy.npix2nside(np.size(mask))
     if not healpy.isnsideok(found, nest=True):
         raise ValueError(f"Argument `mask` must have nside 1, 2, 4, ..., but has nside {found}.")

@@ -1,4 +1,4 @@
-"""FITS tables with their errors, and the HEALPix facts in their headers."""
+"""Open FITS tables with clear errors, and read HEALPix columns and header keywords."""
 
 import gzip
 import warnings
@@ -17,8 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsky.io.files import InputError, UnfitError, check_file, in_file
 
-#: What a header says of maps, by the argument that stands in for it: keywords, and spellings in
-#: upper case -> the package's.
+#: Properties of maps by argument: header keywords, and spellings in upper case -> the package's.
 _SAID = {
     "ordering": (("ORDERING",), {"RING": "RING", "NESTED": "NESTED", "NEST": "NESTED"}),
     "coordinates": (
@@ -31,9 +30,9 @@ _SAID = {
     ),
     "polarization": (("POLCCONV",), {"COSMO": "COSMO", "IAU": "IAU"}),
 }
-#: Names of the column of pixel numbers in a table with explicit indexing, the usual ones first.
+#: Names for the column of pixel numbers in a table with explicit indexing, the usual ones first.
 PIXELS = ("PIXEL", "PIX", "PIXELS", "IPIX", "PIXNUM", "PIXEL_NUMBER", "HPX_PIX", "HEALPIX_PIX")
-#: Formats of columns with real numbers, and what others hold.
+#: Formats of columns with real numbers, and the contents of others.
 NUMBERS = tuple("BIJKED")
 KINDS = {
     "L": "logical values",
@@ -43,18 +42,18 @@ KINDS = {
     **dict.fromkeys("PQ", "arrays of different lengths"),
 }
 LARGEST_NSIDE = 8192
-#: Binary tables, and those of text.
+#: Binary tables and ASCII tables.
 TABLES = (pyfits.BinTableHDU, pyfits.TableHDU)
 
-#: What only files raise that are cut short or no FITS files at all.
+#: Errors raised only for truncated files and files that are not FITS.
 _DAMAGE = (EOFError, zlib.error, gzip.BadGzipFile, AstropyUserWarning)
-#: What astropy raises at these, and at others that it cannot make sense of.
+#: Errors that astropy raises for these, and for anything else it cannot interpret.
 _PUZZLED = (OSError, ValueError, TypeError, LookupError, AttributeError, pyfits.VerifyError)
 
 
 @contextmanager
 def open_fits(path: Path) -> Iterator[pyfits.HDUList]:
-    """An open FITS file; what is found wrong with it while it is open is an InputError."""
+    """Open a FITS file; problems found while it is open become an InputError."""
     check_file(path)
     damaged = f"{path}: not a FITS file, or a truncated one"
     with in_file(path), warnings.catch_warnings():
@@ -79,7 +78,7 @@ def open_fits(path: Path) -> Iterator[pyfits.HDUList]:
 
 @contextmanager
 def open_table(path: Path, hdu: int | str) -> Iterator["HealpixTable"]:
-    """A HEALPix table in a FITS file; see `open_fits`."""
+    """Open a HEALPix table in a FITS file; see `open_fits`."""
     with open_fits(path) as hdus:
         table, where = select_hdu(hdus, hdu), f"{path}, HDU {hdu!r}"
         with in_file(where):
@@ -91,7 +90,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _is_cut(path: Path, hdus: pyfits.HDUList) -> bool:
-    """True if a file ends before the data that its headers announce."""
+    """Return whether a file ends before the data that its headers announce."""
     try:
         ends = [info["datLoc"] + info["datSpan"] for hdu in hdus if (info := hdu.fileinfo())]
         with path.open("rb") as plain:
@@ -103,7 +102,7 @@ def _is_cut(path: Path, hdus: pyfits.HDUList) -> bool:
 
 
 def _number(text: str) -> float:
-    """A number as headers have it, exponents with D included; NaN if it is none."""
+    """Parse a number as in headers, also with exponents D; NaN if it is not a number."""
     try:
         return float(text.strip("'\" ").upper().replace("D", "E"))
     except ValueError:
@@ -113,7 +112,7 @@ def _number(text: str) -> float:
 def equals(
     values: Float[np.ndarray, " pix"], number: float, rtol: float
 ) -> Bool[np.ndarray, " pix"]:
-    """Where values are a number, to a relative difference; zero is exact."""
+    """Return where values equal a number to a relative tolerance; zero must be exact."""
     apart = rtol * abs(number)
     return (values >= number - apart) & (values <= number + apart)
 
@@ -121,10 +120,10 @@ def equals(
 def select_hdu(
     hdus: pyfits.HDUList, hdu: int | str, kinds: Any = pyfits.BinTableHDU
 ) -> pyfits.BinTableHDU:
-    """The table `hdu` (number or name) of an open file, binary unless `kinds` are `TABLES`."""
+    """Return the table `hdu` (number or name) of an open file; a binary one by default."""
     try:
         if isinstance(hdu, bool):
-            raise KeyError(hdu)  # True is no 1
+            raise KeyError(hdu)  # True is not taken for 1
         found = hdus[hdu]
     except (IndexError, KeyError):
         names = ", ".join(f"{i} ({h.name})" for i, h in enumerate(hdus))
@@ -138,7 +137,7 @@ def select_hdu(
 
 
 def spelled(argument: str, given: str) -> str:
-    """The package's spelling of an argument about maps."""
+    """Return the package's spelling of an argument about maps."""
     spellings = _SAID[argument][1]
     if (found := spellings.get(str(given).upper())) is None:
         choices = ", ".join(dict.fromkeys(spellings.values()))
@@ -148,12 +147,12 @@ def spelled(argument: str, given: str) -> str:
 
 @lru_cache(maxsize=1)
 def _nested(nside: int) -> Int[np.ndarray, " pix"]:
-    """NESTED numbers of the pixels in RING order; the files of an analysis often share them."""
+    """Return NESTED pixel numbers in RING order; cached, as files often share an nside."""
     return healpy.ring2nest(nside, np.arange(healpy.nside2npix(nside))).astype(np.int32)
 
 
 def in_ring(values: Float[np.ndarray, " pix"], ordering: str) -> Float[np.ndarray, " pix"]:
-    """Values of an ordering, in RING order."""
+    """Reorder values from an ordering to RING."""
     if ordering == "RING":
         return values
     nside = healpy.npix2nside(values.size)
@@ -167,7 +166,7 @@ class HealpixTable:
 
     def __init__(self, where: str, table: pyfits.BinTableHDU, primary: pyfits.Header) -> None:
         self.where, self._table, self._primary = where, table, primary
-        # Before the data are read: astropy copies the columns of a closed file that its HDU holds.
+        # Before the data are read: otherwise astropy copies all columns when the file is closed.
         names = self._table.columns.names
         #: The letter of each column's format.
         self._kinds = [f.lstrip("0123456789")[:1] for f in map(str, self._table.columns.formats)]
@@ -182,7 +181,7 @@ class HealpixTable:
         self._pixels = None if listed is None else self._check_pixels(listed)
 
     def keyword(self, *names: str) -> str | None:
-        """The first of these header keywords that is there, in upper case; None if none is."""
+        """Return the first of these header keywords that is set, in upper case, or None."""
         for name in names:
             for header in (self._table.header, self._primary):
                 if text := str(header.get(name, "")).strip():
@@ -190,7 +189,7 @@ class HealpixTable:
         return None
 
     def _listed(self) -> int | None:
-        """The column of pixel numbers, by which the rows go; None if they go in order."""
+        """Return the column of pixel numbers; None if the rows are in pixel order."""
         named = [self.names.index(n) for p in PIXELS for n in self.names if n.upper() == p]
         scheme = self.keyword("INDXSCHM")
         explicit = scheme == "EXPLICIT" or (named and scheme != "IMPLICIT")
@@ -226,7 +225,7 @@ class HealpixTable:
         return nside
 
     def _check_pixels(self, column: int) -> Int[np.ndarray, " row"]:
-        """The numbers of the pixels, each of them one of the sky and there once."""
+        """Return the pixel numbers, after checking that they are valid and unique."""
         stored, npix = self._stored(column), healpy.nside2npix(self.nside)
         where = f"column {self.names[column]}"
         with np.errstate(invalid="ignore"):
@@ -241,7 +240,7 @@ class HealpixTable:
         return pixels
 
     def index(self, field: int | str) -> int:
-        """Number of a column given by name (in any case, if that is clear) or number."""
+        """Return the number of a column given by name (in any case, if unambiguous) or number."""
         if isinstance(field, str):
             same = [i for i, name in enumerate(self.names) if name == field]
             same = same or [i for i, n in enumerate(self.names) if n.upper() == field.upper()]
@@ -254,11 +253,11 @@ class HealpixTable:
         raise UnfitError(f"no column {field!r}; it has {', '.join(self.names)}.")
 
     def unit(self, index: int) -> str | None:
-        """TUNIT of a column; None if it is missing or blank."""
+        """Return TUNIT of a column; None if it is missing or blank."""
         return str(self._table.header.get(f"TUNIT{index + 1}", "")).strip() or None
 
     def _stored(self, index: int, dtype: type | None = None) -> np.ndarray:
-        """A copy of a column of numbers, one after the other, as it is or of a type."""
+        """Return a flat copy of a column of numbers, in its own or another type."""
         kind, name = self._kinds[index], self.names[index]
         if kind not in NUMBERS:
             raise UnfitError(f"column {name} holds {KINDS.get(kind, kind)}, not real numbers.")
@@ -269,7 +268,7 @@ class HealpixTable:
         return np.array(found, dtype=dtype).ravel()
 
     def lowest(self, index: int) -> float | None:
-        """What the lowest integer stands for that a column can store; None for other types."""
+        """Return the value of the lowest integer a column can store; None for other types."""
         if self._kinds[index] not in "IJK":
             return None
         raw = self._table.data.view(np.ndarray)
@@ -280,10 +279,10 @@ class HealpixTable:
     def values(
         self, index: int, ordering: str, *, logical: bool = False
     ) -> Float[np.ndarray, " pix"]:
-        """A column over the full sky in RING order, float64; `ordering` is that of the file.
+        """Return a column over the full sky in RING order, float64; `ordering` is the file's.
 
-        NaN where it has no value: pixels that are not listed, UNSEEN, BAD_DATA and TNULL of the
-        header, NaN and infinity. If `logical`, columns of true and false are 1 and 0.
+        It is NaN where there is no value: pixels that are not listed, UNSEEN, the header's BAD_DATA
+        and TNULL, NaN and infinity. If `logical`, columns of true and false become 1 and 0.
         """
         if logical and self._kinds[index] == "L":
             column = np.array(self._table.data.field(index), dtype=np.float64).ravel()
@@ -299,7 +298,7 @@ class HealpixTable:
         return in_ring(column, ordering)
 
     def _real(self, index: int) -> Float[np.ndarray, " row"]:
-        """A column of real numbers, NaN where it has none."""
+        """Return a column of real numbers, NaN where it has no value."""
         column = self._stored(index, np.float64)
         bad = ~np.isfinite(column) | equals(column, healpy.UNSEEN, 1e-5)
         if (text := self.keyword("BAD_DATA")) not in (None, "UNSEEN", "NAN"):
@@ -308,8 +307,8 @@ class HealpixTable:
             bad |= equals(column, stated, 1e-5)
         key = f"TNULL{index + 1}"
         if text := str(self._table.header.get(key, "")).strip():
-            # It is a stored integer, before it is scaled. What is not an integer has none by the
-            # standard, but says what it means.
+            # TNULL is a stored integer, before scaling. By the standard only integer columns have
+            # one, but in others its meaning is clear.
             if not (null := _number(text)).is_integer():
                 raise UnfitError(f"{key} is {text}, which is not a whole number.")
             raw = self._table.data.view(np.ndarray)
@@ -320,9 +319,9 @@ class HealpixTable:
         return column
 
     def state(self, argument: str, given: str | None, default: str | None = None) -> str:
-        """What the header says, or the argument, which must not contradict it.
+        """Return a property of the maps from the header or the argument, which must agree.
 
-        Unless there is a default, it is an error if neither says anything.
+        If neither states it, the default is returned; without one that is an error.
         """
         keywords, spellings = _SAID[argument]
         choices = ", ".join(dict.fromkeys(spellings.values()))

@@ -76,7 +76,7 @@ def discard(part: Path) -> None:
 
 
 def _transfer(address: str, part: Path, size: int | None, report: Report) -> None:
-    """Download a file of a known size (or None), resuming from a partial file if there is one."""
+    """Download a file (`size` in bytes, if known), resuming from a partial file if there is one."""
     state = _state(part)
     if state is not None and state.address == address:
         have = part.stat().st_size

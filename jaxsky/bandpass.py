@@ -58,8 +58,8 @@ class Bandpass(Printed, eqx.Module):
     TypeError
         If an argument carries a unit or is not numeric.
     ValueError
-        For a wrong shape or convention, frequencies that are not finite, positive and increasing
-        or above 1e6 GHz, weights that are not finite, or an integral that is not positive.
+        For a wrong shape or convention, values that are not finite, frequencies that are not
+        positive and increasing or exceed 1e6 GHz, or an integral that is not positive.
 
     Examples
     --------

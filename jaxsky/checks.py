@@ -46,7 +46,7 @@ def listed(words: Iterable[str]) -> str:
 
 
 def check_shape(name: str, array: Array | np.ndarray, good: bool, form: str) -> None:
-    """Raise ValueError, which states the required form, unless `good`."""
+    """Raise ValueError, stating the form that an array must have, unless `good`."""
     if not good:
         raise ValueError(f"Argument `{name}` must {form}, but has shape {array.shape}.")
 

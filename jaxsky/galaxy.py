@@ -150,7 +150,7 @@ def magnetic_field(
 
 
 def _sine_and_cosine(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Return sine and cosine to a few roundings, ten times faster than XLA's separate functions.
+    """Return sine and cosine to a few roundings, several times faster than XLA's scalar code.
 
     Sums the series at an eighth of the angle and doubles it three times, with 1 - cos for cos.
     """

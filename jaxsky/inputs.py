@@ -144,8 +144,9 @@ def read_sky(
 ) -> tuple[dict[str, Template], str]:
     """Read the components named `names` (default: all) as templates [uK_RJ], in order.
 
-    Also returns a sentence about them. Templates from files are the last two or three columns, as
-    `dtype`; parameters that are maps are always double. `galaxy` is the embedded model, if made.
+    Also returns a sentence that describes them. Templates from files are the last two or three
+    columns, in precision `dtype`; parameters that are maps are always in double precision.
+    `galaxy` is the embedded model, if it has been made already.
     """
     tables, folder = settings.sky.components, Path(settings.data_dir)
     wanted = [name for name in tables if names is None or name in names]

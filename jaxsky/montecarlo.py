@@ -351,7 +351,7 @@ def observed_tables(observed: Observed) -> list[pyfits.BinTableHDU]:
 
 
 def read_observed(path: Path) -> Observed | None:
-    """Read how the map in a file was observed; None without `observed_tables`."""
+    """Read how the map in a file was observed; None if it has no `observed_tables`."""
     with open_fits(path) as hdus:
         tables = {hdu.name: hdu for hdu in hdus[1:]}
         if "BANDPASS" not in tables or tables["BANDPASS"].header.get("CREATOR") != CREATOR:

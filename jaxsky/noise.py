@@ -114,7 +114,7 @@ def cholesky(covariance: Float[Array, "stokes stokes pix"]) -> Float[Array, "sto
         for j in range(i + 1):
             rest = covariance[i, j] - sum(lower[i][k] * lower[j][k] for k in range(j))
             if i == j:
-                # Rounding may make a zero negative; and the root of zero has no derivative.
+                # Rounding may make a zero negative, and the root of zero has no derivative.
                 lower[i][j] = jnp.where(rest > 0, jnp.sqrt(jnp.where(rest > 0, rest, 1.0)), 0.0)
             else:
                 lower[i][j] = rest / jnp.where(lower[j][j] > 0, lower[j][j], 1.0)

@@ -102,7 +102,7 @@ class Observation(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True, init=False)
 
     def __post_init__(self) -> None:
-        # JAX sorts dictionaries when it takes them apart.
+        # JAX sorts dictionaries when it flattens them, so `names` keeps the order.
         self.channels, self.names = dict(self.channels), tuple(self.channels)
         if self.lmax is None:
             self.lmax = 2 * self.nside

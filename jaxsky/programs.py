@@ -1,4 +1,4 @@
-"""Keep compiled programs on disk, in JAX's own cache; the interface for reporting progress.
+"""Keep compiled programs on disk through JAX's own cache, and define how progress is reported.
 
 Compilation takes longer than the computations of most commands. Programs with a transform are not
 kept, see `jaxsky.harmonics.transforms`.

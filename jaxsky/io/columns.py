@@ -111,9 +111,10 @@ def sentinels(
 ) -> list[tuple[float, int]]:
     """Find values that look like marks of missing pixels, and count their pixels.
 
-    A mark is an extreme value, farther from the next value than that is from the others' median,
-    which is repeated, huge or usual (-999, -32768, ...; `lowest`; on request zero). Usual numbers
-    that occur twice also count where nearer, unless all others are whole. NaN: known to be missing.
+    A mark is an extreme value that is repeated, huge or usual (-999, -32768, ...; `lowest`; zero
+    on request), and farther from the next value than that is from the median of the others. Usual
+    numbers that occur more than once also count where they are nearer, unless all other values are
+    whole numbers. `values` are NaN where they are known to be missing.
     """
     known = np.isfinite(values)
     rest = values if known.all() else values[known]

@@ -298,7 +298,7 @@ def read_spectra(
     ------
     InputError
         If the file lacks a spectrum or multipoles, if neither file nor arguments state columns
-        and units, or if values are not finite, negative, or have |TE| > sqrt(TT EE).
+        and units, or if values are negative or not finite, or |TE| exceeds sqrt(TT EE).
     ValueError
         If `format` is unknown or lmax is negative.
     """

@@ -101,8 +101,8 @@ class Maps:
     """Maps in the package's conventions: RING, Galactic, COSMO sign of U, float64.
 
     All maps are 0 where `mask` is False, even if only one lacks a value there. `unit` is in the
-    spelling of `unit_name`. `stokes` of each column is as given, or as its name certainly says: one
-    letter, two for a covariance, "" for no Stokes parameter, None if unknown.
+    spelling of `unit_name`. `stokes` of each column is as given, or as its name implies for sure:
+    one letter, two for a covariance, "" for no Stokes parameter, None if unknown.
     """
 
     maps: Float[np.ndarray, "field pix"]
@@ -171,8 +171,8 @@ def read_maps(
     coordinates : "G", "C" or "E" (Galactic, Celestial, Ecliptic)
     polarization : "COSMO" or "IAU"; COSMO, the HEALPix convention, if nothing states it
     stokes : Stokes parameters of the columns in order, "QU", "IQU", "I", or for covariances
-        "QQ QU UU"; for a column without one, such as hits, "I", or "" for all columns. Must agree
-        with names that are certain.
+        "QQ QU UU". A column without one, such as hits, may be called "I"; "" says that no column
+        has one. Must agree with names that are certain.
     missing : number or numbers that mark missing pixels, possibly zero; [] if all values are data
     zeros_are_data : accept exact zeros, for example in a correction that is zero where there is
         nothing to correct

@@ -1,8 +1,8 @@
-"""Observed maps against the model of foregrounds, CMB and noise: the paper's section 4.
+"""Compare observed maps with the model of foregrounds, CMB and noise: the paper's section 4.
 
-Pixel by pixel: the slope of the observed maps against the model, with an honest error. How far
-from the model maps may be by chance is seen in simulated noise and CMB. Spectra EE and BB of the
-full sky likewise, against those of the complete model.
+In pixels: the slope of the observed maps against the model, with the error from noise and CMB.
+Simulations of these show how far from the model maps may be by chance. Full-sky spectra EE and BB
+are compared in the same way with those of the complete model.
 """
 
 import itertools
@@ -33,17 +33,17 @@ from jaxsky.harmonics import power_spectrum
 from jaxsky.programs import QUIET
 from jaxsky.settings import Experiment, SettingsError
 
-#: What is compared, and which of Q and U counts in it.
+#: Combinations of Stokes parameters, and the weights of Q and U in each.
 STOKES, COUNTED = ("Q", "U", "QU"), np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
-#: A slope and a correlation take a few pixels.
+#: Fewest pixels for a slope and a correlation.
 LEAST_PIXELS = 10
 
 
 class ComparisonRealisations(NamedTuple):
-    """Of each realisation, what is compared with the data.
+    """Statistics of each realisation, for comparison with those of the data.
 
-    chi^2 of the residual maps and the sum of their squares [uK_RJ^2], for Q, U and both; C_l of EE
-    and BB of the complete model of foregrounds, CMB, and noise, and of the noise alone [uK_RJ^2].
+    `chi2` of noise and CMB, and the sum of their squares [uK_RJ^2], for Q, U and both; C_l of EE
+    and BB [uK_RJ^2], `spectra` of foregrounds, CMB and noise together, and those of noise alone.
     """
 
     chi2: Float[np.ndarray, "sim band region 3"]
@@ -55,11 +55,11 @@ class ComparisonRealisations(NamedTuple):
 class Scatter(NamedTuple):
     """Observed against modelled pixels of a band, in one region.
 
-    The slope is that of the observed maps on the model, weighted by 1/sigma^2, through the origin,
-    and its error that of noise and CMB together, correlated as they are between pixels; Pearson's
-    `correlation`; the rms of observed - model, and that `expected` of noise and CMB [uK_RJ]; chi2
-    with the sigma of the noise, and the probability that noise and CMB alone give a larger one,
-    from simulations: never below `floor`, one in their number.
+    `slope` is that of the observed maps on the model through the origin, weighted by 1/sigma^2;
+    its `error` allows for noise and CMB, and their correlations between pixels. `correlation` is
+    Pearson's; `rms` is that of observed - model, and `expected` that of noise and CMB [uK_RJ].
+    `chi2` takes the sigma of the noise, and `pte` is the probability that noise and CMB alone give
+    a larger one: from n simulations, and so never below `floor`, 1 / (n + 1).
     """
 
     pixels: int
@@ -74,25 +74,25 @@ class Scatter(NamedTuple):
 
     @property
     def pte_text(self) -> str:
-        """The probability in words, an upper limit where no realisation exceeds the maps."""
+        """The probability as text, an upper limit where no realisation exceeds the maps."""
         if self.pte > self.floor:
             return probability(self.pte)
         return f"<{probability(self.floor)}"
 
     @property
     def slope_pte(self) -> float:
-        """Probability of a slope as far from 1 in either direction."""
+        """Probability of a slope at least as far from 1, in either direction."""
         return float(2 * scipy.stats.norm.sf(abs(self.slope - 1) / self.error))
 
 
 class BandSpectra(NamedTuple):
     """EE and BB of one band; C_l in uK_RJ^2 at all multipoles, D_l in bins.
 
-    `uncorrected` is the observed map's before leakage was subtracted, or None, and so with its bins
-    and probability. `complete` is the model's foregrounds and one realisation of CMB and noise,
-    `noise` the mean of realisations, the paper's N_l, and `error` its Delta C_l, sqrt(2 / (2l+1))
-    (C_l^CMB + N_l). `mean` and `std` are those of realisations of the complete model, among which
-    chi2 and its probability are those of the observed bins (`hotelling`), for EE and BB.
+    `uncorrected`, with its bins and probability, is from the map before leakage was subtracted,
+    or None. `complete` is the model's foregrounds plus one realisation of CMB and noise, `noise`
+    the mean over realisations, the paper's N_l, and `error` its Delta C_l, sqrt(2 / (2l+1))
+    (C_l^CMB + N_l). `mean` and `std` are those of realisations of the complete model; `chi2` and
+    `pte` compare the observed bins with these realisations (`hotelling`), for EE and BB.
     """
 
     band: str
@@ -135,7 +135,7 @@ Scatters: TypeAlias = dict[tuple[str, str, str], Scatter]
 class Comparison(NamedTuple):
     """Observed maps, the model of foregrounds in each band [uK_RJ], and how they compare.
 
-    `regions` are the pixels of each that are used; there are no `spectra` if pixels are missing.
+    `regions` are the used pixels of each region; `spectra` is empty if pixels are missing.
     """
 
     prepared: CommonMaps
@@ -148,7 +148,7 @@ class Comparison(NamedTuple):
 def check_comparison(
     settings: Experiment, prepared: CommonMaps, regions: Mapping[str, Bool[np.ndarray, " pix"]]
 ) -> None:
-    """Refuse at once what `compare` and `compare_patches` would find out late."""
+    """Check settings of `compare` and `compare_patches` before the long computation."""
     how = settings.compare
     for name, inside in regions.items():
         if (inside & prepared.used).sum() < LEAST_PIXELS:
@@ -193,11 +193,11 @@ def compare(
 
     Parameters
     ----------
-    settings : how; the parameters of the model are those of the prepared sky
+    settings : the experiment; the parameters of the model are those of the prepared sky
     prepared : templates and maps at the common resolution
     regions : pixels of each region
-    simulations : file that keeps realisations; those that it has are not made again
-    report : called with the number of realisations done, and that of all
+    simulations : file of realisations; those that it contains are not made again
+    report : called with the number of realisations done, and of all
 
     Raises
     ------
@@ -234,7 +234,7 @@ def simulated_fluctuations(
     lmax: int,
     *kept: Any,
 ) -> ComparisonRealisations:
-    """Noise and CMB on top of the model's foregrounds; `kept` is for `kept_realisations`."""
+    """Simulate noise and CMB on top of the foregrounds; `kept` is for `kept_realisations`."""
     foregrounds = polarization_alms(model, lmax)
     inside = jnp.asarray(np.stack(list(regions.values())))
 
@@ -254,20 +254,20 @@ def simulated_fluctuations(
 def _sums_of_squares(
     maps: Float[Array, "band stokes pix"], regions: Bool[Array, "region pix"]
 ) -> Float[Array, "band region 3"]:
-    """Sum over the pixels of each region of the squares of Q, of U and of both."""
+    """Return the sums over the pixels of each region of the squares of Q, U and both."""
     return jnp.einsum("bsp,rp,ts->brt", maps**2, regions.astype(maps.dtype), COUNTED)
 
 
 def _slopes(
     prepared: CommonMaps, model: Float[Array, "band stokes pix"], inside: Bool[Array, "region pix"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes and their errors, shape (band, region, 3).
+    """Return slopes and their errors, shape (band, region, 3).
 
-    m^T W d / m^T W m, whose error follows from the covariance C of what the maps d hold besides
-    the model m: m^T W C W m / (m^T W m)^2.
+    The slope of the maps d on the model m is m^T W d / m^T W m; with C the covariance of noise and
+    CMB in the maps, its variance is m^T W C W m / (m^T W m)^2.
     """
     weighted = jnp.where(jnp.isfinite(prepared.sigma), model / prepared.sigma**2, 0.0)
-    # A row for each region, of Q, of U and of both.
+    # One row per region for each of Q, U and both.
     rows = jnp.einsum("bsp,rp,ts->brtsp", weighted, inside.astype(model.dtype), COUNTED)
     shape = rows.shape[:3]
     total = prepared.fluctuations.covariance(rows.reshape(shape[0], -1, *rows.shape[3:]))
@@ -282,7 +282,7 @@ def compare_pixels(
     regions: Mapping[str, Bool[np.ndarray, " pix"]],
     simulated: ComparisonRealisations,
 ) -> Scatters:
-    """The observed maps against the model, in each region, for Q, U and both."""
+    """Compare the observed maps with the model in each region, for Q, U and both."""
     inside = jnp.asarray(np.stack(list(regions.values())))
     slopes, errors = _slopes(prepared, model, inside)
     residual = prepared.data - model
@@ -316,10 +316,10 @@ def compare_spectra(
     simulated: ComparisonRealisations,
     width: int,
 ) -> list[BandSpectra]:
-    """Spectra of the observed maps against those of the complete model.
+    """Compare spectra of the observed maps with those of the complete model.
 
-    They are those of the full sky, which the paper takes: no mode of E shows as B there. `width`
-    counts the multipoles in a bin.
+    They are of the full sky, as in the paper: no E modes leak into B there. `width` is the number
+    of multipoles per bin.
     """
     if missing := int(np.sum(~prepared.used)):
         raise ValueError(
@@ -370,7 +370,7 @@ def compare_spectra(
 
 
 def _binned(spectra: Float[np.ndarray, "... ell"], edges: tuple[int, ...]) -> np.ndarray:
-    """Mean D_l = l (l+1) C_l / 2 pi of each bin."""
+    """Return the mean D_l = l (l+1) C_l / 2 pi of each bin."""
     ell = np.arange(spectra.shape[-1])
     scaled = ell * (ell + 1) / (2 * np.pi) * spectra
     means = [scaled[..., a:b].mean(axis=-1) for a, b in itertools.pairwise(edges)]
@@ -380,5 +380,5 @@ def _binned(spectra: Float[np.ndarray, "... ell"], edges: tuple[int, ...]) -> np
 def _tested(
     binned: Float[np.ndarray, "2 bin"], simulated: Float[np.ndarray, "sim 2 bin"]
 ) -> Float[np.ndarray, "2 2"]:
-    """chi^2 of EE and BB among simulations, and the probabilities to exceed them."""
+    """Return chi^2 of EE and BB against simulations, and the probabilities to exceed them."""
     return np.array([hotelling(binned[i], simulated[:, i]) for i in (0, 1)]).T

@@ -1,22 +1,22 @@
-"""Errors on spectral parameters and r from many bands: the Fisher matrix of Gaussian fields.
+"""Forecast errors on spectral parameters and r from many bands, by a Fisher matrix.
 
-And spectra of foregrounds, which it starts from, with the r that they equal.
+Also the spectra of foregrounds, on which it is based, and the r that equals them.
 
 E and B of the bands are Gaussian fields with the covariance
 
     C_l^ij = sum_cc' s_c^i s_c'^j C_l^cc' + delta_ij N_l^i / (b_l^i)^2,
 
-s_c^i the law of component c in band i (that of the CMB is 1 in uK_CMB), and C_l^cc' the spectra of
-components: power laws in l with one correlation coefficient for each pair, and r times those of
-tensors beside the lensed scalars. Then F_ab = f_sky sum_l (2 l + 1) / 2 Tr(C^-1 dC_a C^-1 dC_b)
+with s_c^i the law of component c in band i (1 for the CMB, in uK_CMB), and C_l^cc' the spectra of
+components: power laws in l with one correlation coefficient per pair, and for the CMB lensed
+scalars plus r times tensors. Then F_ab = f_sky sum_l (2 l + 1) / 2 Tr(C^-1 dC_a C^-1 dC_b)
 (Tegmark, Taylor & Heavens 1997, eq. 15), summed over E and B.
 
-r is hardly correlated with the laws: what a small error of these leaves of the foregrounds is of
-second order in it. That their laws vary over the sky is not in this model.
+r is hardly correlated with the laws: the power of foregrounds left by a small error in a law is of
+second order in that error. Variation of the laws over the sky is not in this model.
 
-F is built from derivatives of the laws s and of the spectra C^cc' apart, in an orthonormal basis
-of the laws. Products of whole matrices would lose what matters: foregrounds have up to 1e8 times
-the variance of the noise, and what tells parameters apart is the difference.
+F is built from separate derivatives of the laws s and of the spectra C^cc', in an orthonormal basis
+of the laws. Products of whole matrices would lose precision: foregrounds have up to 1e8 times the
+variance of the noise, and small differences tell the parameters apart.
 """
 
 import itertools
@@ -40,22 +40,22 @@ from jaxsky.observation import ObservedBand
 from jaxsky.sky import unknown_parameter
 
 #: Combinations of parameters that change the data by less than this, relative to each parameter
-#: by itself, are not told apart.
+#: alone, count as degenerate.
 LEAST_CHANGE = 1e-9
 #: Parameters with less than this share of such a combination are not part of it.
 LEAST_SHARE = 0.01
-#: What rounding adds to eigenvalues of correlations.
+#: Rounding error of the eigenvalues of correlations.
 ROUNDING = 1e-12
-#: Bins whose middle is up to this multipole are taken for the bump of reionisation.
+#: Bins whose middle is up to this multipole count as the reionisation bump.
 REIONISATION = 10
 
 
 class ForecastModel(eqx.Module):
-    """What the covariance of bands depends on next to its parameters.
+    """All that the covariance of bands depends on besides its parameters.
 
-    `mixing` is that of foregrounds of amplitude 1 in one pixel (`unit_sky`), in uK_CMB, `weights`
-    are b_l over the noise [1 / (uK_CMB rad)], `tensors` (for r = 1) and lensed `scalars` C_l
-    [uK_CMB^2] of the fields, "EE", "BB" or both, and `sky_fraction` counts modes.
+    `mixing` is that of foregrounds of amplitude 1 in one pixel (`unit_sky`), in uK_CMB; `weights`
+    are b_l over the noise [1 / (uK_CMB rad)]; `tensors` (for r = 1) and lensed `scalars` are C_l
+    [uK_CMB^2] of the fields, "EE", "BB" or both; and `sky_fraction` scales the number of modes.
     """
 
     mixing: Mixing
@@ -73,10 +73,10 @@ class ForecastModel(eqx.Module):
 
 
 class Errors(NamedTuple):
-    """Errors of a forecast of the free parameters about their fiducial values.
+    """Forecast errors on the free parameters about their fiducial values.
 
-    The covariance, in the order of `free`, has the priors in it, and so has `sigma`, the standard
-    deviation of each parameter, all others free; `known` is that were all others known.
+    The covariance, in the order of `free`, includes the priors, and so does `sigma`, the standard
+    deviation of each parameter with all others free; `known` is that with all others known.
     """
 
     free: tuple[str, ...]
@@ -87,13 +87,13 @@ class Errors(NamedTuple):
     priors: dict[str, float]
 
     def correlation(self, first: str, second: str) -> float:
-        """Correlation coefficient of two parameters."""
+        """Return the correlation coefficient of two parameters."""
         i, j = self.free.index(first), self.free.index(second)
         return float(self.covariance[i, j] / (self.sigma[first] * self.sigma[second]))
 
 
 def _correlations(params: Mapping[str, Any], field: str, components: Sequence[str]) -> list[list]:
-    """The matrix of correlation coefficients of components, as rows."""
+    """Return the matrix of correlation coefficients of components, as rows."""
     rows: list[list[Any]] = [[1.0] * len(components) for _ in components]
     for (i, first), (j, second) in itertools.combinations(enumerate(components), 2):
         rows[i][j] = rows[j][i] = params[f"{field}.{first}.{second}.correlation"]
@@ -103,9 +103,9 @@ def _correlations(params: Mapping[str, Any], field: str, components: Sequence[st
 def fiducial(
     sky: Sky, foregrounds: Mapping[str, float], r: float, A_lens: float
 ) -> dict[str, float]:
-    """All parameters of the covariance by name, with their values.
+    """Return all parameters of the covariance by name, with their values.
 
-    `foregrounds` are those of their spectra: "BB.dust.amplitude" (D_l at l = 80, uK_RJ^2 at the
+    `foregrounds` are the parameters of spectra: "BB.dust.amplitude" (D_l at l = 80, uK_RJ^2 at the
     reference frequency), "BB.dust.slope" (of C_l), and for each pair of components
     "BB.dust.synchrotron.correlation". `A_lens` is the fraction of the lensing BB that is left.
     """
@@ -128,7 +128,7 @@ def fiducial(
 
 
 def _laws(params: Mapping[str, Array], model: ForecastModel) -> Float[Array, "band component"]:
-    """What each component shows in each band [uK_CMB], the CMB last."""
+    """Return each component of unit amplitude in each band [uK_CMB], the CMB last."""
     sky = model.mixing.laws(params)
     polarized = jnp.stack([one.template[-1, 0] for one in sky.components.values()])
     return jnp.pad(model.mixing.one(params) * polarized, ((0, 0), (0, 1)), constant_values=1.0)
@@ -137,7 +137,7 @@ def _laws(params: Mapping[str, Array], model: ForecastModel) -> Float[Array, "ba
 def _spectra(
     params: Mapping[str, Array], model: ForecastModel
 ) -> Float[Array, "field ell component component"]:
-    """Spectra C_l of the components [uK_RJ^2], that of the CMB last [uK_CMB^2]."""
+    """Return the spectra C_l of the components [uK_RJ^2], the CMB last [uK_CMB^2]."""
     names, found = list(model.sky), []
     for field, tensors, scalars in zip(model.fields, model.tensors, model.scalars, strict=True):
         roots = []
@@ -154,12 +154,12 @@ def _spectra(
 
 
 def _columns(weights, modes, spectra, d_spectra, laws, d_laws):
-    """Numbers for each parameter whose products are its share of F, at one l of one field.
+    """Return a vector per parameter; their inner products are F at one l of one field.
 
-    With G the laws over the noise, G = Q R, the covariance over the noise is 1 + G B G^T, which
-    is M = 1 + R B R^T in the basis Q and 1 outside of it. The derivatives have a part inside, and
-    one that connects inside and outside, twice. The CMB is the last column of G, so that R keeps
-    it apart from foregrounds of far more power.
+    With G = Q R the laws over the noise and B the spectra, the covariance over the noise is
+    1 + G B G^T, which is M = 1 + R B R^T in the basis Q and 1 outside it. Derivatives have a part
+    inside, and one that connects inside and outside, twice. The CMB is the last column of G, so
+    that R keeps it apart from foregrounds of far more power.
     """
     Q, R = jnp.linalg.qr(weights[:, None] * laws)
     d_laws = weights[:, None] * d_laws
@@ -182,7 +182,7 @@ def _columns(weights, modes, spectra, d_spectra, laws, d_laws):
 def _root(
     params: Mapping[str, Array], model: ForecastModel, free: tuple[str, ...]
 ) -> Float[Array, "par par"]:
-    """A triangular root of the Fisher matrix, F = root^T root."""
+    """Return a triangular root of the Fisher matrix, F = root^T root."""
 
     def parts(theta):
         values = {**params, **dict(zip(free, theta, strict=True))}
@@ -203,7 +203,7 @@ def fisher_errors(
     free: Sequence[str],
     priors: Mapping[str, float] | None = None,
 ) -> Errors:
-    """Errors on free parameters, all others of `params` held.
+    """Return errors on free parameters, with all others in `params` fixed.
 
     Parameters
     ----------
@@ -219,8 +219,8 @@ def fisher_errors(
     KeyError
         For a name that does not exist; lists the known ones.
     ValueError
-        For a prior of a parameter that is not free, spectra that no sky has, and parameters that
-        the data do not tell apart, with their names.
+        For a prior of a parameter that is not free, spectra that no sky can have, and degenerate
+        parameters, which it names.
     """
     check_double("A Fisher matrix")
     free, priors = tuple(free), dict(priors or {})
@@ -274,9 +274,9 @@ class BandLaw(NamedTuple):
 def foreground_powers(
     sky: Sky, bands: Mapping[str, Bandpass], spectra: MaskedSpectra
 ) -> dict[str, Float[np.ndarray, "2 bin"]]:
-    """Band powers D_b of EE and BB of a sky as each band sees it [uK_CMB^2].
+    """Return band powers D_b of EE and BB of a sky in each band [uK_CMB^2].
 
-    All foregrounds have the beam that is in the window of `spectra`.
+    All foregrounds must have the beam that the window of `spectra` contains.
     """
     return {
         name: band_powers(spectra, observe_band(sky, band) * band.conversion("uK_RJ", "uK_CMB"))
@@ -285,9 +285,9 @@ def foreground_powers(
 
 
 def noise_weights(band: ObservedBand, lmax: int) -> Float[np.ndarray, " ell"]:
-    """Beam over noise of Q and U of a band, b_l / sqrt(N_l) [1 / uK_CMB].
+    """Return the beam over the noise of Q and U in a band, b_l / sqrt(N_l) [1 / (uK_CMB rad)].
 
-    Its inverse square is the noise; where that varies, pixels count by their weights.
+    Its inverse square is the noise; where that varies, its inverse variance is averaged.
     """
     noise = np.asarray(band.noise)
     level = noise * np.radians(1 / 60)
@@ -299,12 +299,12 @@ def noise_weights(band: ObservedBand, lmax: int) -> Float[np.ndarray, " ell"]:
 
 
 def _modes(spectra: MaskedSpectra) -> Float[np.ndarray, " bin"]:
-    """Number of multipoles in each bin, each counted 2 l + 1 times."""
+    """Return the number of modes in each bin, 2 l + 1 per multipole."""
     return np.diff(np.square(spectra.edges)).astype(float)
 
 
 def _inside(spectra: MaskedSpectra, fit: tuple[int, int], what: str) -> np.ndarray:
-    """True for the bins that are within the multipoles of a fit."""
+    """Return True for the bins within the multipoles of a fit, or raise if they are too few."""
     edges = np.array(spectra.edges)
     inside = (edges[:-1] >= fit[0]) & (edges[1:] - 1 <= fit[1])
     if inside.sum() < 3:
@@ -318,9 +318,9 @@ def _inside(spectra: MaskedSpectra, fit: tuple[int, int], what: str) -> np.ndarr
 def fit_law(
     spectra: MaskedSpectra, powers: Float[np.ndarray, " bin"], fit: tuple[int, int], what: str
 ) -> BandLaw:
-    """A straight line through log D_b against log l, bins counted as they have modes.
+    """Fit a straight line to log D_b against log l, with bins weighted by their number of modes.
 
-    `fit` has the first and last multipole of the bins that are fitted; messages name `what` it is.
+    `fit` is the first and last multipole of the bins that are fitted; `what` is named in messages.
     """
     inside = _inside(spectra, fit, what)
     D, ell = powers[inside], spectra.centers[inside]
@@ -341,7 +341,7 @@ def band_correlation(
     second: Float[np.ndarray, " bin"],
     fit: tuple[int, int],
 ) -> float:
-    """Mean correlation coefficient of two fields: that of the bins, counted as they have modes."""
+    """Return the mean correlation coefficient of two fields, bins weighted by number of modes."""
     inside = _inside(spectra, fit, "correlated components")
     coefficients = cross[inside] / np.sqrt(first[inside] * second[inside])
     return float(np.average(coefficients, weights=_modes(spectra)[inside]))
@@ -350,9 +350,9 @@ def band_correlation(
 def foreground_laws(
     sky: Sky, spectra: MaskedSpectra, fields: Sequence[str], fit: tuple[int, int]
 ) -> dict[str, float]:
-    """Power laws of the components' spectra and the correlation of each pair, by their names.
+    """Return the power laws of the components' spectra and the correlation of each pair, by name.
 
-    Those are the names of `fiducial`.
+    The names are those of `fiducial`.
     """
     maps = {name: sky[name].amplitude for name in sky}
     auto = {name: band_powers(spectra, values) for name, values in maps.items()}
@@ -377,10 +377,10 @@ def equal_r(
     law: BandLaw,
     tensors: Float[np.ndarray, "4 ell"],
 ) -> dict[str, float]:
-    """The r whose primordial BB equals a band's foregrounds, at l = 80 and at reionisation.
+    """Return the r whose primordial BB equals a band's foregrounds, at l = 80 and at reionisation.
 
-    At l = 80 the foregrounds are those of the power law; at reionisation the band powers of the
-    lowest bins against those that tensors have in them. `tensors` are C_l of TT, EE, BB, TE for
+    At l = 80 the foregrounds are those of the power law; at reionisation, the band powers of the
+    lowest bins are compared with those of tensors. `tensors` are C_l of TT, EE, BB, TE for
     r = 1 [uK_CMB^2], up to `spectra.lmax` and 80; `law` was fitted to BB.
     """
     primordial = PIVOT * (PIVOT + 1) / (2 * np.pi) * tensors[2, PIVOT]

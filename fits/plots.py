@@ -1,4 +1,4 @@
-"""What all pictures share: style, panels, titles, symbols, maps and spectra."""
+"""Draw what all pictures share: style, panels, titles, symbols, maps and spectra."""
 
 import re
 import textwrap
@@ -37,7 +37,7 @@ COLUMN = 3.5
 #: Height of a map in it, with its title [inch].
 MAP_HEIGHT = 1.85
 UNITS = {"uK_RJ": r"$\mu{\rm K}_{\rm RJ}$", "uK_CMB": r"$\mu{\rm K}_{\rm CMB}$"}
-#: What parameters of bands are called, and their unit.
+#: Symbols of parameters of bands, and their units.
 BAND_SYMBOLS = {
     "gain": ("g", ""),
     "shift": (r"\Delta\nu/\nu", ""),
@@ -47,21 +47,21 @@ BAND_SYMBOLS = {
 
 
 def plain(text: str) -> str:
-    """Text that is drawn as it is: between its dollar signs there is no formula.
+    """Return a text that is drawn literally: dollar signs do not enclose a formula.
 
-    Behind a thin space, as labels that begin with an underscore are left out of legends.
+    A thin space goes before an underscore, since legends omit labels that begin with one.
     """
     return ("\N{THIN SPACE}" if text.startswith("_") else "") + text.replace("$", r"\$")
 
 
 def in_formula(text: str) -> str:
-    """A name as upright letters of a formula, drawn as it is."""
+    """Return a name as upright letters of a formula, drawn literally."""
     escaped = re.sub(r"([$%#&_{} ])", r"\\\1", re.sub(r"[\\^~]", "?", text))
     return rf"{{\rm {escaped}}}"
 
 
 def label(name: str) -> str:
-    """TeX for a parameter's name, without dollar signs."""
+    """Return TeX for a parameter's name, without dollar signs."""
     if region := re.fullmatch(r"(.+)(\[\d+\])", name):
         return rf"{label(region[1])}\ {region[2]}"
     parts = name.split(".")
@@ -78,7 +78,7 @@ def label(name: str) -> str:
 
 
 def draw_title(figure: plt.Figure, title: str, fontsize: float = 9, **options: Any) -> None:
-    """Write a title above a figure as it is, in its width; three lines at most, then it is cut."""
+    """Write a title literally above a figure; each of its lines is wrapped to three at most."""
     # A letter is some 0.55 times as wide as high, in points of 1/72 inch.
     letters = int(figure.get_figwidth() * 72 / (0.55 * fontsize))
     lines = [textwrap.fill(line, letters, max_lines=3) for line in title.splitlines()]
@@ -86,7 +86,7 @@ def draw_title(figure: plt.Figure, title: str, fontsize: float = 9, **options: A
 
 
 def save(figure: plt.Figure, path: Path) -> None:
-    """Write a figure as PNG, whole, and close it."""
+    """Write a figure as PNG, atomically, and close it."""
     # A constrained layout fits already; cropping would draw it once more.
     box = None if figure.get_layout_engine() is not None else "tight"
     with (
@@ -108,7 +108,7 @@ def draw_panels(
     fontsize: float = 9,
     **options: Any,
 ) -> Iterator[np.ndarray]:
-    """Panels to draw on, an array (rows, columns) of axes; at the end they are written to a file.
+    """Yield panels to draw on, an array (rows, columns) of axes, and write them to a file.
 
     `size` is width and height [inch], `fontsize` that of the title above all panels, which may be
     empty; `options` are those of `matplotlib.pyplot.subplots`.
@@ -124,20 +124,20 @@ def draw_panels(
 
 
 def legend_below(axes: Axes, columns: int = 4, **options: Any) -> None:
-    """A legend of what is drawn in one panel, below all of them."""
+    """Draw the legend of one panel below all panels."""
     handles, labels = axes.get_legend_handles_labels()
     options = {"loc": "outside lower center", "ncols": columns, "frameon": False, **options}
     axes.figure.legend(handles, labels, **options)
 
 
 def spread(names: Sequence[str], count: int) -> list[str]:
-    """A few names, the first and the last among them, evenly spread."""
+    """Return a few names, evenly spread from the first to the last."""
     at = np.unique(np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int))
     return [names[i] for i in at]
 
 
 def color_limit(values: np.ndarray, quantile: float = 0.99) -> float:
-    """End of a scale of colours about zero: nearly all values are within."""
+    """Return the end of a colour scale about zero that contains nearly all values."""
     known = np.abs(values[np.isfinite(values)])
     return (float(np.quantile(known, quantile)) if known.size else 0.0) or 1.0
 
@@ -150,10 +150,10 @@ def _image(
     middle: float | None = None,
     **options: Any,
 ) -> None:
-    """Values and a bar of colours: about zero, linear to a tenth of the limit, then logarithmic.
+    """Draw values and a colour bar: linear up to a tenth of the limit, then logarithmic.
 
-    So the Galactic plane and high latitudes show in one picture. With a middle, linear throughout
-    about it. The limit is rounded to one digit.
+    So both the Galactic plane and high latitudes show in one picture. With a middle, the scale is
+    linear about it. The limit is rounded to one digit.
     """
     limit, center = float(f"{limit:.1g}"), middle or 0.0
     norm: mpl.colors.Normalize = mpl.colors.AsinhNorm(limit / 10, -limit, limit)
@@ -175,7 +175,7 @@ def draw_map(
     label: str,
     middle: float | None = None,
 ) -> None:
-    """A map of the full sky in Galactic coordinates, centred on l = 0, l growing to the left.
+    """Draw a map of the full sky in Galactic coordinates, centred on l = 0, l growing leftwards.
 
     With a middle, the colours are linear about it.
     """
@@ -188,7 +188,7 @@ def draw_map(
 
 
 class MapPanel(NamedTuple):
-    """A map with its title and what `draw_map` takes; nearly all values are within the limit."""
+    """A map with its title and the arguments of `draw_map`; by default the limit fits the map."""
 
     title: str
     values: Float[np.ndarray, " pix"]
@@ -204,7 +204,7 @@ def stokes_panels(
     unit: str,
     middle: float | None = None,
 ) -> list[MapPanel]:
-    """Q beside U."""
+    """Return panels of Q and U."""
     return [
         MapPanel(plain(f"{name}: {stokes}"), values, f"{stokes} [{UNITS[unit]}]", middle, limit)
         for values, stokes in zip(maps, "QU", strict=True)
@@ -212,7 +212,7 @@ def stokes_panels(
 
 
 def plot_maps(path: Path, rows: Sequence[Sequence[MapPanel]], title: str = "") -> None:
-    """Maps of the sky in rows and columns."""
+    """Draw maps of the sky in rows and columns."""
     columns = len(rows[0])
     size = columns * COLUMN, len(rows) * MAP_HEIGHT + (0.4 if title else 0.0)
     with draw_panels(path, title, size, len(rows), columns) as panels:
@@ -230,10 +230,10 @@ def draw_patch(
     limit: float,
     label: str,
 ) -> None:
-    """A square patch of the sky about (l, b), all in degrees; gnomonic, l growing to the left.
+    """Draw a square patch of the sky about (l, b), in degrees; gnomonic, l growing leftwards.
 
-    Unlike those of `draw_map`, its colours are linear, and where its pixels are finer than those
-    of the map, values are interpolated between them.
+    Unlike in `draw_map`, colours are linear, and where pixels of the picture are finer than those
+    of the map, values are interpolated.
     """
     nside, values, xsize = healpy.npix2nside(values.size), np.asarray(values), 300
     step = size * 60 / xsize  # arcmin
@@ -251,7 +251,7 @@ def draw_patch(
 
 
 def with_powers(spectrum: Float[np.ndarray, " ell"]) -> tuple[np.ndarray, np.ndarray]:
-    """Multipoles from 2 on, and D_l = l (l+1) C_l / 2 pi."""
+    """Return multipoles from 2 on, and D_l = l (l+1) C_l / 2 pi."""
     ell = np.arange(2, len(spectrum))
     return ell, ell * (ell + 1) / (2 * np.pi) * spectrum[2:]
 
@@ -259,7 +259,7 @@ def with_powers(spectrum: Float[np.ndarray, " ell"]) -> tuple[np.ndarray, np.nda
 def round_numbers(axis: Axis, digits: Sequence[float] = (1, 2, 5)) -> None:
     """Label a logarithmic axis with round numbers, those with the given first digits.
 
-    By default, labels run into each other where there is less than a decade.
+    Matplotlib's own labels run into each other where there is less than a decade.
     """
     axis.set_major_locator(mpl.ticker.LogLocator(subs=digits))
     axis.set_major_formatter("{x:g}")
@@ -267,7 +267,7 @@ def round_numbers(axis: Axis, digits: Sequence[float] = (1, 2, 5)) -> None:
 
 
 def label_b_modes(axes: Axes, first: float, last: float, columns: int) -> None:
-    """Axes of BB as D_l in uK_CMB^2 between two multipoles, and a legend below."""
+    """Label axes of BB as D_l in uK_CMB^2 between two multipoles, and draw a legend below."""
     axes.set(yscale="log", xlim=(first, last), xlabel=r"multipole $\ell$")
     axes.set_ylabel(rf"$\ell(\ell+1)C_\ell^{{BB}}/2\pi$ [{UNITS['uK_CMB']}$^2$]")
     axes.yaxis.set_major_locator(mpl.ticker.LogLocator(numticks=20))
@@ -277,7 +277,7 @@ def label_b_modes(axes: Axes, first: float, last: float, columns: int) -> None:
 def draw_spectra(
     axes: Axes, spectra: Mapping[str, Float[np.ndarray, " ell"]], unit: str, **options: Any
 ) -> None:
-    """Spectra as D_l = l (l+1) C_l / 2 pi against l, both logarithmic; one colour each."""
+    """Draw spectra as D_l = l (l+1) C_l / 2 pi against l, both logarithmic; one colour each."""
     for (name, spectrum), color in zip(spectra.items(), COLORS, strict=False):
         axes.plot(*with_powers(spectrum), label=plain(name), **{"color": color, **options})
     axes.set(xscale="log", yscale="log")
@@ -289,7 +289,7 @@ def draw_spectra(
 def plot_chains(
     path: Path, results: Mapping[str, FitResult], truth: Mapping[str, float] | None, title: str
 ) -> None:
-    """The posterior of chains of the same parameters by what they are of, a colour for each."""
+    """Draw the posteriors of chains with the same parameters, by label, one colour each."""
     from getdist import plots  # slow to import
 
     samples = [result.to_getdist(plain(name), label) for name, result in results.items()]

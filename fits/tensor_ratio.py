@@ -1,12 +1,12 @@
-"""Covariance of band powers on part of the sky, and the tensor-to-scalar ratio r from them.
+"""The tensor-to-scalar ratio r from BB band powers on part of the sky, and their covariance.
 
-A disc does not mix orders m about its middle, so what it does to harmonics can be said exactly.
+The covariance is exact for a mask like a disc, which does not mix orders m about its centre.
 
 Band powers of BB of a cleaned CMB map are modelled as r T + A_lens L + N: tensors, lensing, and
-what noise and residual foregrounds add. The estimate solves T^T C^-1 (D - r T - A_lens L - N) = 0
-with C the covariance of the powers in the model itself, at that r. It is linear in the powers, so
-it is unbiased where errors from measured powers would pull it down, and at full sky it is the
-maximum of the exact likelihood.
+the noise and residual foregrounds. The estimate solves T^T C^-1 (D - r T - A_lens L - N) = 0 with C
+the covariance that the model itself gives at that r. This is linear in the powers, so that r is
+unbiased, where errors from measured powers would bias it low; and on the full sky it maximises the
+exact likelihood.
 """
 
 from typing import NamedTuple
@@ -23,32 +23,31 @@ from fits.pseudo_cl import MaskedSpectra, derivative_factors, pure_factors
 from jaxsky.checks import check_shape
 from jaxsky.harmonics import alm_to_healpy, analysis, lmax_of
 
-#: Steps of the search, and the change in standard deviations at which it ends.
+#: Most iterations for r, and the change in standard deviations at which they end.
 STEPS, CLOSE = 50, 1e-6
-#: The posterior is tabulated up to so many standard deviations above the larger of r and 0.
+#: The posterior is tabulated up to this many standard deviations above max(r, 0), at this many
+#: points.
 WIDTHS, POINTS = 8.0, 2001
-
-
-#: Part of a mask's variance that may depend on longitude about its middle for it to be a disc.
+#: Fraction of a mask's power that may depend on longitude about its axis if it is symmetric.
 ASYMMETRY = 1e-3
-#: Part of a symmetric mask's largest value that counts as nothing.
+#: Fraction of a symmetric mask's largest value below which it counts as zero.
 NOTHING = 1e-5
-#: Orders m of harmonics that are held at a time.
+#: Orders m of harmonics in memory at a time.
 CHUNK = 32
 
 
 def covariance_terms(
     spectra: MaskedSpectra, fields: Float[np.ndarray, "field 2 ell"]
 ) -> Float[np.ndarray, "field field 2 bin 2 bin"]:
-    """Half the covariance of band powers of independent Gaussian fields, for each pair of them.
+    """Return half the covariance of band powers of independent Gaussian fields, per pair of them.
 
     `fields` are their spectra EE, BB, window included, up to `spectra.lmax` at least.
 
-    The covariance of the sum of fields with p_i times the spectra is 2 sum_ij p_i p_j terms[i, j].
-    Exact for symmetric masks (`zonal`). For others pseudo-spectra are correlated as modes of the
-    squared mask, and the spectra taken to vary little over the width of the mask's own spectrum
-    (Efstathiou 2004; Challinor & Chon 2005): good to some 10 % but for purified B, whose errors in
-    the lowest bands, of the size of the mask, are up to 50 % larger.
+    The covariance of a sum of fields with p_i times these spectra is 2 sum_ij p_i p_j terms[i, j].
+    It is exact for symmetric masks (`zonal`). For others, pseudo-spectra are correlated like modes
+    of the squared mask, and the spectra are assumed to vary little over the width of the mask's own
+    (Efstathiou 2004; Challinor & Chon 2005): good to some 10 %, except for purified B, whose errors
+    in the lowest bands, at the scale of the mask, are up to 50 % larger.
     """
     given = np.asarray(fields, float)[..., : spectra.lmax + 1]
     reach = min(2 * spectra.lmax, 2 * healpy.npix2nside(spectra.mask.size))
@@ -65,7 +64,7 @@ def covariance_terms(
 def _narrow_products(
     spectra: MaskedSpectra, given: Float[np.ndarray, "field 2 ell"]
 ) -> Float[np.ndarray, "field field 2 ell 2 ell"]:
-    """`zonal_products` of any mask, for spectra that vary little over the width of its own."""
+    """Return `zonal_products` of any mask, if spectra vary little over the width of its own."""
     # What leaks from E adds to the variance of B.
     total = spectra.mixing.sum(axis=(1, 3))
     seen = np.einsum("ijlm,xjm->xil", spectra.mixing, given) / np.where(total > 0, total, 1.0)
@@ -76,9 +75,9 @@ def _narrow_products(
 
 
 def zonal(alm: Float[np.ndarray, " alm"]) -> Float[np.ndarray, " ell"] | None:
-    """Coefficients a_l0 of a mask about its own middle, or None if it depends on longitude, too."""
+    """Return a_l0 of a mask about its own axis, or None if it is not symmetric about that."""
     lmax = lmax_of(alm)
-    # The middle is where the dipole points to; a mask without one has none.
+    # The axis is that of the dipole, or of the coordinates for a mask without one.
     x, y, z = -alm[lmax + 1], alm[lmax + 2], alm[1]
     if np.hypot(np.hypot(x, y), z) < 1e-6 * abs(alm[0]):
         x, y, z = 0.0, 0.0, 1.0
@@ -92,10 +91,10 @@ def zonal(alm: Float[np.ndarray, " alm"]) -> Float[np.ndarray, " ell"] | None:
 def ring_functions(
     spin: int, lmax: int, theta: Float[np.ndarray, " ring"], orders: Int[np.ndarray, " m"]
 ) -> Float[np.ndarray, "2 m ell ring"]:
-    """How harmonics depend on colatitude, in ducc0's signs; sums of squares integrate to 1.
+    """Return harmonics over colatitude, in ducc0's signs; their sums of squares integrate to 1.
 
-    The maps of E = 1 are the first times exp(i m phi), and i times the second. Those of spin 0
-    have the first only.
+    The two maps of E = 1 are the first and i times the second, times exp(i m phi). Spin 0 has the
+    first only.
     """
     values = np.zeros((2, orders.size, lmax + 1, theta.size))
     starts = np.arange(orders.size) * (lmax + 1)
@@ -117,13 +116,13 @@ def zonal_products(
     fields: Float[np.ndarray, "field 2 ell"],
     factors: Float[np.ndarray, "3 ell"] | None = None,
 ) -> Float[np.ndarray, "field field 2 ell 2 ell"]:
-    """Half the covariance of pseudo-spectra EE, BB with a symmetric mask, for pairs of fields.
+    """Return half the covariance of pseudo-spectra EE, BB in a symmetric mask, per pair of fields.
 
-    Such a mask does not mix orders m. With K_m from the E and B of the sky to those of the masked
-    map, G = K C K^T is their covariance at one order, and that of pseudo-spectra sum_m 2 G^2 /
-    ((2 l + 1) (2 l' + 1)). Nothing is neglected but power beyond the last multipole. `mask` has
-    a_l0 of the mask and of its derivatives, as maps of spin 0, 1, 2, `fields` the spectra EE, BB of
-    each, and `factors` those of the three terms of purified B, None to leave it as it is.
+    Such a mask does not mix orders m. If K_m turns the E and B of the sky into those of the masked
+    map, their covariance at one order is G = K C K^T, and that of pseudo-spectra is sum_m 2 G^2 /
+    ((2 l + 1) (2 l' + 1)). Only power beyond the last multipole is neglected. `mask` has a_l0 of
+    the mask and of its derivatives, as maps of spin 0, 1, 2; `fields` are the spectra EE, BB of
+    each field; `factors` are those of the three terms of purified B, None without purification.
     """
     lmax, reach = fields.shape[-1] - 1, mask.shape[1] - 1
     nodes = (2 * lmax + reach) // 2 + 1
@@ -146,7 +145,7 @@ def zonal_products(
             seen[1, 1] += twice * second * ring_functions(0, lmax, theta, orders)[0]
         low = max(int(orders[0]), 2)
         sky, seen = (np.moveaxis(x[..., low:, :], 2, 0) for x in (sky, seen * weight))
-        count = np.where(orders == 0, 1.0, 2.0)  # those of -m are alike
+        count = np.where(orders == 0, 1.0, 2.0)  # orders -m add the same
         sums[:, :, :, low:, :, low:] += _squares(sky, seen, count, fields[..., low:])
     degrees = 2 * np.arange(lmax + 1) + 1
     return sums / (degrees[:, None, None] * degrees)
@@ -154,7 +153,7 @@ def zonal_products(
 
 @jax.jit
 def _squares(sky, seen, count, fields):
-    """Products of the covariances of harmonics, summed over orders, for each pair of fields."""
+    """Sum products of the harmonics' covariances over orders, for each pair of fields."""
 
     def add(total, of_order):
         sky, seen, count = of_order
@@ -169,7 +168,7 @@ def _squares(sky, seen, count, fields):
 class PowerModel(NamedTuple):
     """Band powers D_b of BB [uK_CMB^2] and their covariance, as functions of r.
 
-    `tensors` are those of r = 1, `lensing` has A_lens in it, `additive` are noise and residuals,
+    `tensors` are those of r = 1, `lensing` includes A_lens, `additive` is noise and residuals,
     and the covariance is sum_xy p_x p_y terms[x, y] with p = (r, 1).
     """
 
@@ -179,11 +178,11 @@ class PowerModel(NamedTuple):
     terms: Float[np.ndarray, "2 2 bin bin"]
 
     def mean(self, r: float) -> Float[np.ndarray, " bin"]:
-        """Band powers."""
+        """Return the mean band powers."""
         return r * self.tensors + self.lensing + self.additive
 
     def covariance(self, r: float) -> Float[np.ndarray, "bin bin"]:
-        """Their covariance; that of r = 0 for a negative one."""
+        """Return the covariance of the band powers, for negative r that of r = 0."""
         p = np.array([max(r, 0.0), 1.0])
         return np.einsum("x,y,xybc->bc", p, p, self.terms)
 
@@ -191,11 +190,11 @@ class PowerModel(NamedTuple):
 class TensorFit(NamedTuple):
     """The tensor-to-scalar ratio; see `fit_tensors`.
 
-    The estimate may be negative. Its standard deviation has cosmic variance of tensors and lensing,
-    noise, and residuals as far as the model has them. Below `upper_95` lie 95 % of the posterior,
-    which is given on a grid of r >= 0 with the largest value 1. The probability is that to exceed
-    chi2 of the powers, which were fitted with noise and residuals in them; their covariance is that
-    at r, and r changes by weights @ powers.
+    The estimate may be negative. `sigma` includes cosmic variance of tensors and lensing, noise,
+    and residuals as far as the model has them. 95 % of the posterior lies below `upper_95`; it is
+    given on a grid of r >= 0, with the largest value 1. `probability` is that of exceeding `chi2`.
+    `powers`, which were fitted, include noise and residuals; their covariance is that at r, and
+    added powers change r by weights @ powers.
     """
 
     r: float
@@ -212,7 +211,7 @@ class TensorFit(NamedTuple):
     weights: Float[np.ndarray, " bin"]
 
     def shift(self, powers: Float[np.ndarray, " bin"]) -> float:
-        """By how much r would be off if these powers were in BB and not in the model."""
+        """Return the bias of r if these powers were in BB and not in the model."""
         return float(self.weights @ powers)
 
 
@@ -227,7 +226,7 @@ def power_model(
     A_lens: float = 1.0,
     simulated: Float[np.ndarray, "sim bin"] | None = None,
 ) -> PowerModel:
-    """The mean and covariance of the band powers of BB.
+    """Return the model of the band powers of BB, their mean and covariance.
 
     Parameters
     ----------
@@ -236,11 +235,11 @@ def power_model(
     lensed, tensors : C_l of TT, EE, BB, TE: lensed scalars, and tensors of r = 1 [uK_CMB^2]; up
         to `spectra.lmax` at least
     additive : band powers that noise and residuals add on average
-    noise : their C_l in the map, window included, for the covariance
+    noise : C_l of noise and residuals in the map, window included, for the covariance
     A_lens : fraction of the lensing B modes in the map
     simulated : band powers of simulations with r = 0. The standard deviations of the analytic
-        covariance are scaled to theirs: it is exact for masks that do not depend on longitude
-        and for uniform noise only
+        covariance are scaled to theirs, since it is exact only for symmetric masks and for
+        uniform noise
     """
     lmax, bins = spectra.lmax, len(spectra.edges) - 1
     for name, given in {"lensed": lensed, "tensors": tensors}.items():
@@ -270,16 +269,16 @@ def power_model(
 
 
 def fit_tensors(model: PowerModel, powers: Float[np.ndarray, " bin"]) -> TensorFit:
-    """The tensor-to-scalar ratio of band powers.
+    """Estimate the tensor-to-scalar ratio from band powers.
 
-    The posterior takes each power as the mean of nu squares of Gaussian modes, -2 ln L =
+    The posterior takes each power as the mean square of nu_b Gaussian modes, -2 ln L =
     sum_b nu_b [x - ln x] with x the power over the model's (Hamimeche & Lewis 2008), and nu_b from
-    the variance at r = 0. At full sky that is exact.
+    the variance at r = 0. On the full sky that is exact.
 
     Parameters
     ----------
     model : from `power_model`
-    powers : band powers D_b of BB, noise and residuals in them [uK_CMB^2]
+    powers : band powers D_b of BB, including noise and residuals [uK_CMB^2]
     """
     powers = np.asarray(powers, float)
     if powers.shape != model.tensors.shape or not np.isfinite(powers).all():
@@ -316,7 +315,7 @@ def fit_tensors(model: PowerModel, powers: Float[np.ndarray, " bin"]) -> TensorF
 
 
 def _posterior(model: PowerModel, powers: np.ndarray, upper: float) -> tuple[np.ndarray, ...]:
-    """Values of r from 0 on, and the posterior with a flat prior, largest value 1."""
+    """Return values of r from 0 to `upper`, and the posterior with a flat prior, at most 1."""
     grid = np.linspace(0.0, upper, POINTS)
     mean = model.mean(0.0) + grid[:, None] * model.tensors
     modes = 2 * model.mean(0.0) ** 2 / np.diagonal(model.covariance(0.0))

@@ -1,4 +1,4 @@
-"""Figures of the model against observed maps: pixels, maps, spectra, patches, spectral indices."""
+"""The paper's figures of observed maps against the model: pixels, spectra, patches, indices."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,17 +17,17 @@ from fits.spectral_index import fit_regions, known_truth
 from jaxsky.checks import listed
 from jaxsky.settings import SettingsError
 
-#: Spectra by experiment: figure, bands, and that of which the paper gives the largest error.
+#: Spectra by experiment: figure, bands, and the band whose largest error the paper gives.
 FULL_SKY = {
     "Planck": ("Figure 7", ("30", "44", "70", "353"), "70"),
     "WMAP": ("Figure 8", ("K", "Ka", "Q", "V", "W"), "V"),
 }
-#: Bands of the paper's figures 5 and 6, and 11.
+#: Bands of the paper's figures 5 and 6, and of figure 11.
 SHOWN, FITTED = ("30", "44", "70", "353", "K", "W"), ("44", "70")
 
 
 def _chosen(comparison: Comparison) -> list[str]:
-    """The bands of the paper; all that there are if one of those is missing."""
+    """Return the bands of the paper, or all bands if one of those is missing."""
     bands = list(comparison.prepared.bands)
     return list(SHOWN) if set(SHOWN) <= set(bands) else bands
 
@@ -40,7 +40,7 @@ def _beam(paper: PaperSky) -> str:
 def _here(
     paper: PaperSky, nside: str, bands: Sequence[str], wanted: Sequence[str], *more: str
 ) -> str:
-    """What of the comparison is not as in the paper, in a sentence; or nothing."""
+    """Return a sentence on how the comparison differs from the paper's, "" if it does not."""
     others = f"the bands are {listed(bands)}" if set(wanted) - set(bands) else ""
     wide = paper.settings.common.fwhm != 60
     beam = f"maps are {_beam(paper)} (the paper: to 60 arcmin)" if wide else ""

@@ -1,4 +1,4 @@
-"""Figures of the model: templates, indices, AME, small scales, B modes, and a sky seen by COrE."""
+"""The paper's figures of the model: templates, indices, AME, small scales, B modes, and COrE."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -38,11 +38,11 @@ from jaxsky.simulation import HarmonicSource, harmonic_sources, observe_bands, p
 from jaxsky.small_scales import DUST, SYNCHROTRON, Continued
 from jaxsky.templates import correlation, polarization_template, preset, steepening
 
-#: Blocks of the honest jackknife: pixels of 15 degrees.
+#: nside of blocks for a jackknife that allows for correlated pixels: 15 degrees.
 NSIDE_BLOCKS = 4
 #: The paper's ranges of the fits of power laws.
 RANGES = {"synchrotron": SYNCHROTRON, "dust": DUST}
-#: By how much the steeper spectrum is steeper; the paper does not say.
+#: Change of slope for the steeper spectrum, which the paper does not give.
 TILT = -1.0
 #: Sizes of the patches of figures 13 and 14 [deg].
 SIZE_CORE, SIZE = 30.0, 5.0
@@ -87,7 +87,7 @@ def figure_indices(paper: PaperSky, picture: Path) -> PaperFigure:
 
 
 def _steepening(by: float | None) -> Number:
-    """How much steeper beta_syn was made, and what a published curved law would say."""
+    """Return how much steeper beta_syn was made, next to the value of a published curved law."""
     curved, text = preset("s3", np.zeros((2, 12)), beta_syn=3.0), TEXTS["Figure 3"]
     nu = jnp.geomspace(0.4, 40.0, 200)
     said = filled(text["steepening"], curved=float(steepening(nu, curved.sed(nu))))
@@ -119,7 +119,7 @@ def figure_ame(paper: PaperSky, picture: Path) -> PaperFigure:
 
 
 def figure_spectra(paper: PaperSky, picture: Path) -> PaperFigure:
-    """Figure 2: EE of both templates, of what continues them, and of both together."""
+    """Figure 2: EE of both templates, of their power laws, and with small scales added."""
     fwhm, numbers = paper.settings.paper.fwhm, []
     with plots.draw_panels(picture, "", (plots.COLUMN, 5.2), 2, sharex=True) as panels:
         for axes, name in zip(panels[:, 0], RANGES, strict=True):
@@ -153,7 +153,7 @@ def figure_spectra(paper: PaperSky, picture: Path) -> PaperFigure:
 
 
 def _ranges(paper: PaperSky) -> str:
-    """What is to be said about the ranges of the fits."""
+    """Return a sentence on the ranges of the fits."""
     texts = TEXTS["Figure 2"]["ranges"]
     layers, wanted = [paper.template(name) for name in RANGES], paper.settings.paper
     used = [(one.small_scales.EE, one.small_scales.BB) for one in layers]
@@ -168,7 +168,7 @@ def _ranges(paper: PaperSky) -> str:
 def _disc(
     values: Float[np.ndarray, " pix"], center: tuple[float, float], size: float
 ) -> Float[np.ndarray, " inside"]:
-    """The pixels in a disc about (l, b), `size` wide, all in degrees."""
+    """Return the pixels in a disc about (l, b) of diameter `size`, all in degrees."""
     nside, vector = healpy.npix2nside(values.size), healpy.ang2vec(*center, lonlat=True)
     return values[healpy.query_disc(nside, vector, np.radians(size / 2))]
 
@@ -179,7 +179,7 @@ def _draw_patches(
     center: tuple[float, float],
     size: float,
 ) -> None:
-    """Four square patches of the sky: title, map, limit of the colours and unit of each."""
+    """Draw four square patches of the sky; `panels` has map, colour limit and unit by title."""
     with plots.draw_panels(path, "", (5.4, 4.4), 2, 2) as grid:
         for axes, (title, (values, limit, unit)) in zip(grid.flat, panels.items(), strict=True):
             plots.draw_patch(axes, values, center, size, limit, plots.UNITS[unit])
@@ -188,7 +188,7 @@ def _draw_patches(
 
 
 def figure_randomised(paper: PaperSky, picture: Path) -> PaperFigure:
-    """Figure 14: a patch of the synchrotron, its small scales, and two others."""
+    """Figure 14: a patch of synchrotron without small scales, and with three versions of them."""
     layer, nside = paper.template("synchrotron"), paper.nside_fine
     fwhm, center = paper.settings.paper.fwhm, paper.settings.paper.center
     # Made one after the other: each takes as much memory as all the rest of the figure.
@@ -214,7 +214,7 @@ def figure_randomised(paper: PaperSky, picture: Path) -> PaperFigure:
 
 
 def forecast_settings(paper: PaperSky) -> Experiment:
-    """Those of a forecast with COrE and the sky of the figures."""
+    """Return the settings of a forecast for COrE with the sky of the figures."""
     settings, lmax = paper.settings, LMAX
     sky = settings.sky
     if sky.embedded is not None:
@@ -253,7 +253,7 @@ def figure_b_modes(paper: PaperSky, picture: Path) -> PaperFigure:
 
 
 def core_observation(paper: PaperSky) -> Observation:
-    """Three of COrE's bands; beams are COrE's, or that of the small scales if it is wider."""
+    """Return three bands of COrE with its beams, or that of the small scales if it is wider."""
     fwhm = paper.settings.paper.fwhm
     channels = {
         name: ObservedBand(one.band, max(float(one.beam), fwhm), noise=one.noise)
@@ -263,7 +263,7 @@ def core_observation(paper: PaperSky) -> Observation:
 
 
 def prepared_templates(paper: PaperSky, observation: Observation) -> dict[str, HarmonicSource]:
-    """Both foregrounds; where their laws are constant, with the small scales that there are."""
+    """Prepare both foregrounds, from the shared small scales if the laws of both are constant."""
     given = {name: Source(*paper.template(name)) for name in PAPER_FWHM}
     terms = plan_terms(given, observation)
     constant = {name: one for name, one in terms.items() if one is not None and not one.counts}
@@ -306,7 +306,7 @@ def figure_patch(paper: PaperSky, picture: Path) -> PaperFigure:
 
 
 def _brightest(band: str, inside: Mapping[str, Float[np.ndarray, " inside"]]) -> Number:
-    """What dominates a band in the patch, by its rms, mean included."""
+    """Return what dominates a band in the patch, by its rms including the mean."""
     rms = {which: float(np.sqrt(np.mean(values**2))) for which, values in inside.items()}
     parts = [which for which in rms if which not in ("total", "noise")]
     order = sorted(parts, key=rms.__getitem__, reverse=True)

@@ -1,4 +1,4 @@
-"""The sky of the figures: templates, AME, maps of indices, made when needed; and their words."""
+"""The sky of the paper's figures: templates, AME, index maps, made when needed; and its texts."""
 
 import dataclasses
 import re
@@ -46,40 +46,40 @@ from jaxsky.settings import (
 from jaxsky.small_scales import Continued, SmallScales, continue_templates
 from jaxsky.templates import dust_index, from_pysm_beta, polarization_template, steepening
 
-#: Titles, captions, what differs from the paper, and numbers of its text, by label.
+#: Titles, captions, differences from the paper, and numbers from its text, by label.
 TEXTS: dict[str, Any] = tomllib.loads(
     Path(__file__).with_name("paper.toml").read_text(encoding="utf-8")
 )
 WORDS = TEXTS["sky"]
 #: Beams of the paper's templates [arcmin].
 PAPER_FWHM = {"dust": 10.0, "synchrotron": 60.0}
-#: Reference frequency of the AME [GHz], its resolution [arcmin] and nside, and those of its
-#: correlation with the dust.
+#: Reference frequency [GHz] and resolution [arcmin] of the AME; nside of its correlation with the
+#: dust, of random indices, and of the embedded model next to templates from files.
 NU_AME, AME_FWHM, NSIDE = 23.0, 60.0, 64
-#: Fits of power laws end at this times nside; pixels resolve twice nside.
+#: Fits of power laws end at this times nside; pixels resolve l = 2 nside.
 KNOWN = 15 / 8
-#: A map resolves beams of 1.5 pixels, and of 1.45 still well.
+#: Width in pixels of the narrowest beam that a map resolves well.
 PIXELS = 1.45
 #: Resolution of the paper's maps of indices [arcmin].
 FWHM = {"beta_dust": 180.0, "beta_syn": 600.0}
-#: Names as they are shown.
+#: Names in texts.
 SYMBOLS = {"beta_dust": "β_dust", "beta_syn": "β_syn"}
-#: What a map has that is drawn: the paper's mean; its scatter, of which the paper gives that of
-#: the synchrotron only; and the exponent of its spectrum.
+#: Statistics of random index maps: the paper's mean; the scatter, which the paper gives only for
+#: synchrotron; and the exponent of the spectrum.
 MEAN = {"beta_dust": 1.53, "beta_syn": 2.9}
 SCATTER = {"beta_dust": 0.04, "beta_syn": 0.1}
 SLOPE = -2.0
-#: Pixels of an index, its resolution [arcmin], by how much it was made steeper (None if it was
-#: drawn), and where it is from, as a part of a sentence.
+#: Map of an index, its resolution [arcmin], by how much it was made steeper (None if it is
+#: random), and its origin, as part of a sentence.
 Index: TypeAlias = tuple[Float[Array, " pix"], float, float | None, str]
 
 
 class Impossible(ValueError):
-    """A figure that the settings do not allow, and why in one sentence: the others go on."""
+    """Raised, with the reason, for a figure that the settings do not allow; others are made."""
 
 
 class Number(NamedTuple):
-    """A number of the paper's text next to ours, and what is to be known about it."""
+    """A number from the paper's text next to ours, with a remark."""
 
     what: str
     ours: str
@@ -88,9 +88,9 @@ class Number(NamedTuple):
 
 
 class PaperFigure(NamedTuple):
-    """A figure or a table, by the paper's number ("Figure 1"), and the seconds that it took.
+    """A figure or table with the paper's label ("Figure 1"), and the seconds that it took.
 
-    The note of its section is on what differs from the paper, whose text gives the numbers.
+    The note of its section says what differs from the paper; `numbers` are from the paper's text.
     """
 
     label: str
@@ -100,17 +100,17 @@ class PaperFigure(NamedTuple):
 
 
 def filled(text: str, **words: Any) -> str:
-    """A text of `paper.toml` on one line, its words in braces filled in."""
+    """Return a text of `paper.toml` on one line, with the fields in braces filled in."""
     return " ".join(text.format_map(words).split())
 
 
 def picture_of(label: str) -> str:
-    """Name of the picture of a figure."""
+    """Return the file name of the picture of a figure."""
     return re.sub(r"\d+", lambda n: f"{int(n[0]):02d}", label.lower().replace(" ", "_")) + ".png"
 
 
 class Layer(NamedTuple):
-    """A `Source` of dust or synchrotron: of the paper's beam [arcmin] if its map has that."""
+    """Dust or synchrotron as a `Source`, with the paper's beam [arcmin] or its map's if wider."""
 
     component: Dust | Synchrotron
     fwhm: float
@@ -128,7 +128,7 @@ class Layer(NamedTuple):
 
 
 class PaperSky:
-    """What is shared by the figures of one set of settings."""
+    """Data shared by the figures of one experiment, made when first needed."""
 
     def __init__(self, settings: Experiment) -> None:
         self.settings = settings
@@ -139,7 +139,7 @@ class PaperSky:
         self.continued = cache(self.with_small_scales)
 
     def forget_bands(self) -> None:
-        """Forget the maps of the bands, the largest of all that is kept."""
+        """Free the maps of the bands, the largest data that are kept."""
         for name in ("inputs", "comparison"):
             vars(self).pop(name, None)
 
@@ -159,7 +159,7 @@ class PaperSky:
 
     @property
     def description(self) -> str:
-        """What the sky is, in a sentence."""
+        """Description of the sky in a sentence."""
         if self.embedded:
             return filled(WORDS["model"])
         tables = self.settings.sky.components.items()
@@ -168,7 +168,7 @@ class PaperSky:
 
     @property
     def differs(self) -> str:
-        """The part of a line that says what the sky is, for a figure that shows it."""
+        """Clause that says what the sky is, for a figure that shows it."""
         embedded = self.settings.sky.embedded
         if self.embedded and embedded is not None:
             return filled(WORDS["differs"]["model"], nside=embedded.nside)
@@ -180,7 +180,7 @@ class PaperSky:
 
     @property
     def maps_differ(self) -> str:
-        """The same for a figure that shows observed maps."""
+        """The same clause for a figure that shows observed maps."""
         return filled(WORDS["differs"]["simulated"]) if self.simulated else self.differs
 
     def described(
@@ -192,10 +192,10 @@ class PaperSky:
         texts: str | None = None,
         **words: Any,
     ) -> PaperFigure:
-        """A figure with the texts of its label, filled in, and what the paper says of its numbers.
+        """Return a figure with the texts of its label and the paper's values of its numbers.
 
-        Texts may name these words, tables of the settings, and what this `sky` knows of itself;
-        other `texts` than those of the label are named by their heading in `paper.toml`.
+        Texts may refer to `words`, tables of the settings, and properties of this `sky`; `texts` is
+        their heading in `paper.toml` if that is not the label.
         """
         own, words = TEXTS[texts or label], {**dict(self.settings), "sky": self, **words}
         published, otherwise = own.get("published", {}), own.get("otherwise", "not given")
@@ -223,7 +223,7 @@ class PaperSky:
 
     @cached_property
     def comparison(self) -> Comparison:
-        """The maps against the model, at the common resolution."""
+        """Comparison of the maps with the model, at the common resolution."""
         masks = region_masks(self.settings, self.settings.compare.regions)
         return compare(self.settings, prepared_maps(self.settings, self.inputs), masks)
 
@@ -236,9 +236,9 @@ class PaperSky:
         return found[0]
 
     def _template(self, law: str) -> Layer:
-        """Q, U of dust or synchrotron at the resolution of the paper's, as far as its map has it.
+        """Return Q, U of dust or synchrotron at the paper's resolution, or its map's if coarser.
 
-        Ranges of power laws that are beyond the multipoles of the map keep their ratio of ends.
+        Ranges of power laws beyond the map's multipoles are lowered, their ratio of ends kept.
         """
         name, _ = self._spec(law)
         galaxy = None if self.settings.sky.embedded is None else self.galaxy
@@ -264,7 +264,7 @@ class PaperSky:
 
     @property
     def nside_fine(self) -> int:
-        """Pixels that resolve the beam of the small scales."""
+        """Nside that resolves the beam of the small scales."""
         nside = 8
         while PIXELS * healpy.nside2resol(nside, arcmin=True) > self.settings.paper.fwhm:
             nside *= 2
@@ -273,9 +273,9 @@ class PaperSky:
     def with_small_scales(
         self, name: str, tilt: float = 0.0, kind: str = "small scales"
     ) -> Continued:
-        """Dust or synchrotron with small scales, also tilted or drawn with keys of another kind.
+        """Return dust or synchrotron with small scales, tilted or of another random `kind`.
 
-        `continued` has those that are the same in all figures.
+        `continued` has those that all figures share.
         """
         layer = self.template(name)
         small = dataclasses.replace(layer.small_scales, tilt=float(layer.small_scales.tilt) + tilt)
@@ -283,9 +283,9 @@ class PaperSky:
         return continue_templates(key, [layer.maps], [layer.fwhm], [small], self.nside_fine)
 
     def ame(self) -> tuple[Float[Array, "2 pix"], Float[Array, "2 pix"], str, str]:
-        """Q, U of AME at 23 GHz and 1 degree, 1 % polarized along the dust, and those of the dust.
+        """Return Q, U of AME at 23 GHz and 1 degree, 1 % polarized along the dust, and of dust.
 
-        Then their resolution in words, and where the intensity is from, as a part of a sentence.
+        Then their resolution in words, and the origin of the intensity, as part of a sentence.
         """
         dust, spec = self.template("dust"), self.settings.paper.ame
         nu_ref, own, nside = NU_AME, 0.0, dust.nside
@@ -311,7 +311,7 @@ class PaperSky:
         resolution = f"a beam of {fwhm / 60:.3g}°"
         polarized = dust.maps
         if fwhm < PIXELS * pixel and intensity.size == polarized.shape[-1]:
-            # Pixels are as wide as the beam; cut where they end, bright structures would ring.
+            # Pixels are as wide as the beam; cut at their lmax, bright structures would ring.
             resolution = f"pixels of {pixel:.0f} arcmin"
         else:
             polarized = polarization_template(polarized, dust.fwhm, fwhm, nside)
@@ -320,7 +320,7 @@ class PaperSky:
         return ame.template * ame.sed(NU_AME), polarized, resolution, origin
 
     def index(self, name: str) -> Index:
-        """The map of beta_dust or beta_syn: of a file, of the template, or drawn."""
+        """Return the map of beta_dust or beta_syn: from a file, from the template, or random."""
         layer = self.template("dust" if name == "beta_dust" else "synchrotron")
         held, nside = getattr(layer.component, name), layer.nside
         spec: BeamedMap | None = getattr(self.settings.paper, name)
@@ -333,7 +333,7 @@ class PaperSky:
 
 
 def _drawn_index(key: Array, name: str, nside: int) -> Index:
-    """A Gaussian field with the mean and the scatter of the paper's map."""
+    """Return a Gaussian field with the mean and the scatter of the paper's map."""
     lmax, fwhm = 2 * nside, FWHM[name]
     ell = jnp.arange(lmax + 1)
     power = jnp.where(ell < 1, 0.0, jnp.maximum(ell, 1.0) ** SLOPE) * gaussian_beam(fwhm, lmax) ** 2
@@ -346,7 +346,7 @@ def _drawn_index(key: Array, name: str, nside: int) -> Index:
 
 
 def _read_index(folder: Path, name: str, spec: BeamedMap) -> Index:
-    """The index of a file, smoothed; that of the synchrotron made steeper, if so wished."""
+    """Read an index from a file and smooth it; beta_syn is made steeper if the settings say so."""
     pure = spec if spec.unit is not None else spec.model_copy(update={"unit": ""})
     where, found = f"paper.{name}", read(folder, pure, stokes="", zeros_are_data=True)
     own, by = spec.fwhm or 0.0, 0.0
@@ -365,7 +365,7 @@ def _read_index(folder: Path, name: str, spec: BeamedMap) -> Index:
 
 
 def _of_spectrum(folder: Path, file: str) -> float:
-    """By how much a spectrum in a file steepens: frequency [GHz] and antenna temperature."""
+    """Return how much a spectrum in a file steepens: frequency [GHz], antenna temperature."""
     key = "paper.beta_syn.steepening"
     try:
         nu, temperature = read_text(find_file(folder, file)).numbers([0, 1]).T

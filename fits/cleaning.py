@@ -1,7 +1,7 @@
-"""A component separation, from data to the cleaned CMB and the tensor-to-scalar ratio.
+"""Separate components: from data to the cleaned CMB and the tensor-to-scalar ratio.
 
-Smoothed noise is correlated between pixels, which the spectral likelihood does not know. So its
-errors are taken from simulations: foregrounds as they were found, with new noise. To first order
+Smoothed noise is correlated between pixels, which the spectral likelihood ignores. So errors are
+taken from simulations: the foregrounds that were found, with new noise. To first order
 the parameters move by -H^-1 times the gradient of -ln L; the components are then separated with
 those parameters, so that residual foregrounds appear with the noise that caused them.
 """
@@ -41,16 +41,16 @@ from jaxsky.noise import stream
 from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 
-#: Walkers of emcee, if they are enough.
+#: Fewest walkers of emcee.
 WALKERS = 32
-#: The posterior of more parameters is not sampled.
+#: Most parameters whose posterior is sampled.
 SAMPLED = 500
 
 
 class Response:
     """-H^-1 of a fit, with H the curvature of -log posterior.
 
-    `theta` is the best fit as a vector, with start values in regions without a pixel.
+    `theta` is the vector of the best fit, with start values in regions without a pixel.
     """
 
     def __init__(
@@ -68,9 +68,9 @@ class Response:
             raise ValueError("The best fit is no maximum of the posterior.")
 
     def moved(self, like: Likelihood, key: Array) -> Float[np.ndarray, " par"]:
-        """The best fit to the data of `like`, within the bounds of uniform priors.
+        """Return the best fit to the data of `like`, within the bounds of uniform priors.
 
-        The means of Gaussian priors are drawn anew, too, since they were measured like the data.
+        The means of Gaussian priors are drawn anew, too, since they are measurements like the data.
         """
         gradient = np.array(value_and_gradient(like, self.theta)[1])
         draws = np.asarray(jax.random.normal(key, gradient.shape))
@@ -88,11 +88,11 @@ def widened(
     hessian: Float[np.ndarray, "par par"],
     errors: Float[np.ndarray, "sim par"],
 ) -> FitResult:
-    """Samples of a posterior whose likelihood has wrong errors, stretched to the right ones.
+    """Stretch samples of a posterior whose likelihood has wrong errors to the right ones.
 
-    About the best fit by S L^-1, with L L^T = H^-1 and S S^T the covariance of the estimates: the
-    open-faced sandwich of Shaby (2014, J. Comput. Graph. Stat. 23, 853). With too few simulations
-    for the covariance, each parameter by the ratio of its standard deviations. `center` is the best
+    They are stretched about the best fit by S L^-1, with L L^T = H^-1 and S S^T the covariance of
+    the estimates: the open-faced sandwich of Shaby (2014, J. Comput. Graph. Stat. 23, 853); with
+    too few simulations, each parameter by its ratio of standard deviations. `center` is the best
     fit in the order of the samples, with the `hessian` of -log posterior there.
     """
     inverse = np.linalg.inv(hessian)
@@ -105,11 +105,11 @@ def widened(
 
 
 class SimulatedNoise(NamedTuple):
-    """Of each simulation, the parameters less the best fit, and band powers D_b of BB [uK_CMB^2].
+    """Parameters minus the best fit, and band powers D_b of BB [uK_CMB^2], per simulation.
 
-    Those are of the noise in the cleaned CMB, the foregrounds that are left with these parameters,
-    both together, the sum with a CMB without tensors, and that CMB without its B modes: E that
-    pixels and mask turn into B. `spectrum` is C_l of noise and foregrounds in the masked map.
+    The powers are of the noise in the cleaned CMB, the foregrounds left with these parameters, both
+    together, the sum with a CMB without tensors, and that CMB without its B modes: E that pixels
+    and mask turn into B. `spectrum` is C_l of noise and foregrounds in the masked map.
     """
 
     theta: Float[np.ndarray, "sim par"]
@@ -122,15 +122,15 @@ class SimulatedNoise(NamedTuple):
 
 
 class Separation(NamedTuple):
-    """What a separation finds; spectra are of the cleaned CMB [uK_CMB^2].
+    """Results of a separation; spectra are of the cleaned CMB [uK_CMB^2].
 
     `fit` has the most probable spectral parameters with the errors that the likelihood gives. It
     takes smoothed noise as independent between pixels, and multipoles of a masked sky as
     independent, so `sigma`, by name, and `covariance`, in the order of `fit.labels` and None for
-    too many parameters, are those of the simulations, but for multipoles of the full sky. `found`
-    are the components with all that is known of them, and `maps` they at one beam. `residuals` are
-    maps of the data less components, and `left` the band powers of the foregrounds that are left
-    in the CMB, None where they are not known.
+    too many parameters, come from simulations, except for multipoles of the full sky. `found`
+    are the components with their errors, and `maps` their maps at one beam. `residuals` are maps of
+    the data minus the components, and `left` the band powers of foregrounds left in the CMB, None
+    where these are not known.
     """
 
     data: PixelData | FullSkyData
@@ -149,16 +149,16 @@ class Separation(NamedTuple):
 
     @property
     def components(self) -> tuple[str, ...]:
-        """Their names, in order."""
+        """Names of the components, in order."""
         return tuple(self.like.mixing.sky)
 
     @property
     def degradation(self) -> float:
-        """Mean noise of the CMB over that of a sky without foregrounds."""
+        """Mean noise of the CMB relative to that of a sky without foregrounds."""
         return float(np.nanmean(self.found.degradation("cmb")))
 
     def of_pixel(self, name: str, values: Mapping[str, Any]) -> Float[np.ndarray, " pix"]:
-        """The map of a parameter with regions, from its values; NaN where masked."""
+        """Return the map of a parameter with regions, from its values; NaN where masked."""
         assert isinstance(self.data, PixelData)  # the one with regions
         labels = self.data.labels[name]
         return np.where(self.data.used, np.asarray(values[name])[labels], np.nan)
@@ -172,8 +172,8 @@ def separate_data(
 ) -> Separation:
     """Fit the laws, separate the components, and measure r.
 
-    `data` are from `fits.separated_data.separation_data`, and `out` is the folder that keeps
-    simulations and chains; what it holds is not made again.
+    `data` are from `fits.separated_data.separation_data`, and `out` is the folder for simulations
+    and chains; what it contains is not made again.
     """
     check_double("A separation")
     spec, priors = settings.separate, priors_of(settings, "separate")
@@ -181,7 +181,7 @@ def separate_data(
     with at_key("free"):
         like = data.likelihood(data.observed)
     fit = best_fit(like, priors=priors, throw=False)
-    # What no law describes is separated nevertheless, and said.
+    # Data that no law describes are separated nevertheless, with a warning.
     fit.checked(throw=fit.converged is not Convergence.misfit)
     response = Response(like, fit.best_fit, priors)
     progress.step("components")
@@ -195,7 +195,7 @@ def separate_data(
     highest = window.size - 1
     with at_key("cmb.cosmology"):
         tensors = tensor_spectra(highest, **settings.cmb.cosmology)
-    # Simulated and modelled, lensing is what the settings say.
+    # Lensing is that of the settings, in simulations and in the model.
     lensed = cmb_spectra(settings, highest, r=0.0)
     foregrounds = np.array(amplitude)
     foregrounds[row] = 0.0
@@ -249,7 +249,7 @@ def cleaned_cmb(
     params: Mapping[str, Array],
     observed: np.ndarray,
 ) -> Float[np.ndarray, "stokes pix"]:
-    """The map of the CMB in what is observed, with these parameters."""
+    """Return the map of the CMB in `observed`, separated with these parameters."""
     found, maps = data.components(like, params, observed, covariance=False)
     return maps[found.components.index("cmb")]
 
@@ -264,9 +264,9 @@ def simulated_noise(
     lensed: Float[np.ndarray, "4 ell"],
     *kept: Any,
 ) -> SimulatedNoise:
-    """Simulated noise on top of the foregrounds that were found; `kept` for `kept_realisations`.
+    """Simulate noise on top of the foregrounds found; `kept` is for `kept_realisations`.
 
-    `response` is what noise does to the best fit, `emission` the foregrounds in the bands, `window`
+    `response` is that of the best fit to noise, `emission` the foregrounds in the bands, `window`
     the beam of the maps, and `lensed` C_l of a CMB without tensors up to its end [uK_CMB^2].
     """
     best = like.named(jnp.asarray(response.theta))
@@ -290,7 +290,7 @@ def simulated_noise(
 def _spectra(
     settings: Experiment, mask: np.ndarray
 ) -> tuple[Float[np.ndarray, " ell"], MaskedSpectra]:
-    """The beam of the maps, and how their spectra are taken."""
+    """Return the beam of the maps, and the operator that takes their spectra."""
     how, nside, fwhm = settings.separate, settings.common.nside, settings.common.fwhm
     highest = 2 * nside
     window = np.asarray(gaussian_beam(fwhm, highest))
@@ -312,14 +312,14 @@ def _spectra(
 
 
 def _mark(settings: Experiment, data: PixelData | FullSkyData) -> str:
-    """What the simulations depend on."""
+    """Return a mark of all that the simulations depend on."""
     left_out = {"separate": {"nsims", "sampler", "nsteps"}}
     said = settings.model_dump_json(exclude=left_out)
     return f"{fingerprint((data.observed, data.mask))} {said}"
 
 
 def _errors(data, like, fit, simulated):
-    """Standard deviations by name, and the covariance."""
+    """Return standard deviations by name, and the covariance."""
     if data.exact:
         return fit.sigma, fit.covariance
     sigma = simulated.theta.std(axis=0, ddof=1)
@@ -333,7 +333,7 @@ def _errors(data, like, fit, simulated):
 
 
 def _chain(settings, data, like, fit, simulated, out, progress):
-    """Samples of the posterior; with the errors of the simulations if it is not exact."""
+    """Sample the posterior, with the errors of the simulations if it is not exact."""
     spec = settings.separate
     size = int(np.isfinite(np.asarray(like.flat(fit.best_fit))).sum())
     nwalkers = max(WALKERS, 2 * size + 2)

@@ -1,4 +1,4 @@
-"""Templates, maps and their noise at a common resolution, where they can be compared.
+"""Bring templates, maps and their noise to a common resolution, where they can be compared.
 
 There the noise of a band is a linear operator applied to white noise, and the CMB is synthesised
 from independent coefficients, one set for all bands. The inner products of rows with the data
@@ -41,14 +41,14 @@ from jaxsky.harmonics import (
 from jaxsky.noise import draw, pixel_covariance, stream, white_alm
 from jaxsky.settings import Experiment, at_key
 
-#: A pixel is used if no more than this fraction of what was smoothed or averaged was missing.
+#: Largest fraction of missing input, smoothed or averaged, in a pixel that is used.
 MISSING = 0.01
-#: Pixels whose products are added up at once; few enough to stay in cache.
+#: Pixels whose products are summed at once; few enough to stay in cache.
 CHUNK = 1 << 16
 
 
 class MapNoise(NamedTuple):
-    """Noise of Q and U of a map, which the preparation brings to the common resolution.
+    """Noise of Q and U of a map, with the preparation for the common resolution.
 
     `noise` is that of its own pixels, a level [uK_RJ arcmin] or the covariance of Q and U in each
     [uK_RJ^2]; `correlated` C_l of noise that is correlated between pixels, the same for E and B, in
@@ -60,9 +60,9 @@ class MapNoise(NamedTuple):
     correlated: Float[Array, " ell"] | None
 
     def covariance(self, rows: Float[Array, "row stokes pix"]) -> Float[np.ndarray, "row row"]:
-        """Covariance of the inner products of rows with the prepared noise.
+        """Return the covariance of the inner products of rows with the prepared noise.
 
-        The rows at the resolution of the noise are kept in its precision.
+        Rows at the resolution of the noise are stored in its precision.
         """
         count = len(rows)
         block = np.zeros((count, count))
@@ -84,7 +84,7 @@ class MapNoise(NamedTuple):
         return block + modes @ modes.T
 
     def alm(self, key: Array, name: str) -> Float[Array, "2 alm"]:
-        """Coefficients E and B of a realisation of smoothed noise, by the name of the map."""
+        """Return E and B of a realisation of smoothed noise; the map's name is in its key."""
         window = self.preparation.window
         assert window is not None  # there is a common beam
         white = white_alm(stream(key, "noise", name), self.noise, window.size - 1) * expand(window)
@@ -96,7 +96,7 @@ class MapNoise(NamedTuple):
         return white * expand(jnp.sqrt(spectrum))
 
     def realisation(self, key: Array, name: str) -> Float[Array, "stokes pix"]:
-        """Noise at the common resolution [uK_RJ]; its random numbers come from the name."""
+        """Return noise at the common resolution [uK_RJ], with random numbers by name."""
         nside = self.preparation.nside
         if self.preparation.window is not None:
             return synthesis(self.alm(key, name), nside)
@@ -107,7 +107,7 @@ class MapNoise(NamedTuple):
         return total + synthesis(self._correlated_alm(key, name), nside)
 
     def variance(self) -> Float[np.ndarray, "stokes pix"]:
-        """Variance in each pixel of the prepared map [uK_RJ^2]; see `Fluctuations.sigma`."""
+        """Return the variance in each prepared pixel [uK_RJ^2]; see `Fluctuations.sigma`."""
         if np.ndim(self.noise):
             pixels = jnp.asarray(self.noise)
             total = np.asarray(self.preparation.variance([pixels[s, s] for s in range(2)]))
@@ -118,15 +118,15 @@ class MapNoise(NamedTuple):
 
 
 class Fluctuations(eqx.Module):
-    """What Q, U maps in several bands hold besides the model: noise and CMB.
+    """Noise and CMB: what Q, U maps in several bands contain besides the model.
 
     Parameters
     ----------
-    preparations, noise, correlated : of each band; see `MapNoise`
+    preparations, noise, correlated : per band; see `MapNoise`
     cmb_spectra : C_l of EE and BB [uK_CMB^2], shape (2, ell); None without CMB
     cmb_windows : beam and pixel window of the prepared maps of each band, shape (band, ell)
     cmb_factors : uK_RJ per uK_CMB in each band, shape (band,)
-    names : of the bands; the random numbers of each come from its name
+    names : names of the bands, from which the random numbers of each are derived
     """
 
     preparations: tuple[Preparation, ...]
@@ -143,11 +143,11 @@ class Fluctuations(eqx.Module):
         each = map(MapNoise, self.preparations, self.noise, self.correlated)
         return dict(zip(self.names, each, strict=True))
 
-    # Not one program: XLA would hold the maps of all rows and bands at once.
+    # Not one program: XLA would keep the maps of all rows and bands in memory at once.
     def covariance(
         self, rows: Float[Array, "band row stokes pix"]
     ) -> Float[np.ndarray, "bandrow bandrow"]:
-        """Covariance of the inner products of rows with the fluctuations of each band."""
+        """Return the covariance of the inner products of rows with the fluctuations."""
         blocks = [one.covariance(own) for one, own in zip(self.noises.values(), rows, strict=True)]
         total = scipy.linalg.block_diag(*blocks)
         if self.cmb_spectra is None or self.cmb_windows is None:
@@ -162,14 +162,14 @@ class Fluctuations(eqx.Module):
         )
         return total + modes @ modes.T
 
-    # Not one program: in that XLA draws the normals anew for each row.
+    # Not one program: there XLA would draw the normals anew for each row.
     def noise_realisation(self, key: Array) -> Float[Array, "band stokes pix"]:
-        """Noise of all bands at the common resolution [uK_RJ]."""
+        """Return noise of all bands at the common resolution [uK_RJ]."""
         return jnp.stack([noise.realisation(key, name) for name, noise in self.noises.items()])
 
     @eqx.filter_jit
     def cmb_realisation(self, key: Array) -> Float[Array, "band stokes pix"]:
-        """The CMB in all bands at the common resolution [uK_RJ]; zero without CMB."""
+        """Return the CMB in all bands at the common resolution [uK_RJ]; zero without CMB."""
         nside = self.preparations[0].nside
         if self.cmb_spectra is None or self.cmb_windows is None:
             return jnp.zeros((len(self.preparations), 2, healpy.nside2npix(nside)))
@@ -180,17 +180,17 @@ class Fluctuations(eqx.Module):
         return jnp.stack([synthesis(alm * expand(window), nside) for window in seen])
 
     def cmb_power(self) -> Float[np.ndarray, "band 2 ell"]:
-        """Mean spectra EE and BB of the CMB in the maps of each band [uK_RJ^2]."""
+        """Return mean spectra EE and BB of the CMB in the maps of each band [uK_RJ^2]."""
         if self.cmb_spectra is None or self.cmb_windows is None:
             return np.zeros((len(self.preparations), 2, 1))
         seen = np.asarray(self.cmb_factors)[:, None] * np.asarray(self.cmb_windows)
         return seen[:, None] ** 2 * np.asarray(self.cmb_spectra)
 
     def sigma(self) -> Float[Array, "band stokes pix"]:
-        """Standard deviation of the noise in each pixel of the prepared maps [uK_RJ].
+        """Return the standard deviation of the noise in each prepared pixel [uK_RJ].
 
-        NaN where it cannot be had: next to steps of the noise by more than a factor of some
-        hundred, where the smoothed map of variances rings below zero.
+        NaN where it is unknown: next to steps of the noise by more than a factor of about 100,
+        where the smoothed map of variances rings below zero.
         """
         total = np.stack([noise.variance() for noise in self.noises.values()])
         return jnp.asarray(np.sqrt(np.where(total > 0, total, np.nan)))
@@ -200,7 +200,7 @@ class Fluctuations(eqx.Module):
 def _modes(
     rows: Float[Array, "row stokes pix"], spectra: Float[Array, "stokes ell"]
 ) -> Float[Array, "row mode"]:
-    """Rows as seen by independent modes of unit variance that have the spectra of E and B."""
+    """Project rows on independent modes of unit variance, with the spectra of E and B."""
     lmax = spectra.shape[-1] - 1
     root = jnp.sqrt(spectra)[:, alm_ell(lmax)]
     return jnp.stack([(root * adjoint_synthesis(row, lmax)).ravel() for row in rows])
@@ -209,10 +209,10 @@ def _modes(
 class CommonMaps(NamedTuple):
     """Templates and maps at the common resolution.
 
-    `sky` is None where there are no templates. `leakage` is what was subtracted from the data, by
-    band, and `sources` the nside of each template and map as they were given. `covariance_of` is
-    that of the fluctuations, which remembers what it was asked for last. `template_errors` is the
-    noise of the templates where it is known, None where there is none.
+    `sky` is None if there are no templates. `leakage` was subtracted from the data, by band;
+    `sources` is the nside of each template and map before preparation. `covariance_of` is that of
+    the fluctuations, and caches its last result. `template_errors` is the noise of the templates
+    where it is known, None if there is none.
     """
 
     sky: Sky | None
@@ -227,7 +227,7 @@ class CommonMaps(NamedTuple):
     template_errors: TemplateErrors | None
 
     def model(self) -> Float[Array, "band stokes pix"]:
-        """What the templates show in the bands [uK_RJ]."""
+        """Return the emission of the templates in the bands [uK_RJ]."""
         assert self.sky is not None  # there are templates
         return observe(self.sky, list(self.bands.values()))
 
@@ -239,14 +239,14 @@ class CommonMaps(NamedTuple):
         region: Bool[np.ndarray, " pix"] | None = None,
         kind: str = "exact",
     ) -> SkyLikelihood:
-        """The likelihood of the parameters in `start`; see `fits.template_likelihood.likelihood`.
+        """Return a likelihood of the parameters in `start`, see `template_likelihood.likelihood`.
 
         Parameters
         ----------
-        start : free parameters by name; where templates have noise, the errors that it causes are
-            those at these values
+        start : free parameters by name; errors from noise of the templates are those at these
+            values
         stokes : "Q", "U" or "QU"
-        region : pixels to use, of those that can be; default all
+        region : pixels to use, among those usable; default all
         kind : "exact", or "diagonal" for the paper's sum over pixels
         """
         if kind not in ("exact", "diagonal"):
@@ -267,13 +267,13 @@ class CommonMaps(NamedTuple):
     def pixel_noise(
         self, used: Bool[np.ndarray, " pix"], factors: Float[np.ndarray, " band"]
     ) -> Noise:
-        """Noise as spectral likelihoods take it, in units of which uK_RJ has `factors`."""
+        """Return the noise for spectral likelihoods, in a unit of which uK_RJ is `factors`."""
         sigma = np.asarray(self.sigma) * factors[:, None, None]
         return as_noise(np.where(used, sigma, np.inf), sigma.shape)
 
 
 def prepared_maps(settings: Experiment, inputs: Inputs) -> CommonMaps:
-    """Templates and maps at the resolution of the settings, whose key errors name."""
+    """Bring templates and maps to the resolution of the settings, named in errors."""
     with at_key("common"):
         return common_maps(inputs, settings.common.nside, settings.common.fwhm)
 
@@ -281,8 +281,8 @@ def prepared_maps(settings: Experiment, inputs: Inputs) -> CommonMaps:
 def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
     """Bring templates and maps to a common nside and, if fwhm > 0, a common beam.
 
-    With fwhm = 0 pixels are averaged and beams stay as they are. Otherwise, with fwhm in arcmin,
-    all maps are cut at one multipole, that to which the coarsest is good.
+    With fwhm = 0 pixels are averaged and beams unchanged. Otherwise, with fwhm in arcmin, all maps
+    are cut at one multipole, up to which the coarsest is good.
     """
     templates = {f"template {name!r}": t for name, t in inputs.templates.items()}
     bands = {f"band {name!r}": b for name, b in inputs.bands.items()}
@@ -317,7 +317,7 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
     }
 
     def brought(what: str, maps: Array) -> Array:
-        """Maps in double precision without holes, at the common resolution."""
+        """Bring maps to the common resolution in double precision, zero in holes."""
         maps, own = jnp.asarray(maps, float), kept[what]
         return operators[what](maps if own is None else maps * own)
 
@@ -327,15 +327,15 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         if band.leakage is not None
     }
     data = [
-        # Band by band: JAX would make what all of them need ahead of their transforms.
+        # Band by band: JAX would otherwise prepare the input of all transforms at once.
         (brought(f"band {name!r}", band.maps) - leakage.get(name, 0.0)).block_until_ready()
         for name, band in inputs.bands.items()
     ]
-    # Averaged pixels hold multipoles beyond those they resolve.
+    # Averaged pixels contain multipoles beyond those they resolve.
     reach = lmax if fwhm else 4 * nside
 
     def noise_of(what: str, noise: Numeric, spectrum: Float[Array, " ell"] | None) -> MapNoise:
-        """Noise of the pixels that are kept, and C_l of what is correlated between them."""
+        """Return noise of the pixels that are kept, and C_l of its correlated part."""
         operator, own = operators[what], kept[what]
         if own is not None:
             noise = pixel_covariance(noise, operator.nside_in) * own
@@ -371,7 +371,7 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
 def _cmb(
     inputs: Inputs, nside: int, fwhm: float, lmax: int
 ) -> tuple[Array | None, Array | None, Array]:
-    """What `Fluctuations` have of the CMB."""
+    """Return spectra, windows and factors of the CMB for `Fluctuations`."""
     bands = inputs.bands.values()
     factors = jnp.stack([band.bandpass.conversion("uK_CMB", "uK_RJ") for band in bands])
     if inputs.cmb is None:
@@ -383,7 +383,7 @@ def _cmb(
 
 
 def window_of(preparation: Preparation, lmax: int) -> Float[Array, " ell"]:
-    """What a preparation multiplies the multipoles of a map with."""
+    """Return the factors by which a preparation multiplies the multipoles of a map."""
     if preparation.window is not None:
         return preparation.window[: lmax + 1]
     pixels = pixel_window(preparation.nside, lmax) / pixel_window(preparation.nside_in, lmax)

@@ -1,9 +1,9 @@
-"""Maps and their noise, reduced to what the spectral likelihood needs of them.
+"""Compress maps and their noise for the spectral likelihood.
 
-Where noise is separable, a number for each band times a map, it depends on the data only through
-the covariance of bands D = sum_p d_p d_p^T / sigma_p^2 of each cell. Any few vectors with the same
-covariance give the same chi^2, exactly and at all parameters: the columns of a square root of D
-take the place of the pixels. Everything else is streamed over pixels, on disk if need be.
+Where noise is separable, a number per band times a map, the likelihood depends on the data only
+through the covariance of bands D = sum_p d_p d_p^T / sigma_p^2 of each cell. Any few vectors with
+the same covariance give the same chi^2, exactly and at all parameters: the columns of a square root
+of D replace the pixels. Everything else is streamed over pixels, from disk if need be.
 """
 
 from collections.abc import Iterator
@@ -25,13 +25,13 @@ PIECE, BLOCK = 1 << 15, 4096
 #: Ratios of sigma between bands that are constant to this accuracy make noise separable: smoothed
 #: maps of the variance of uniform noise ring by 1e-7.
 ROUNDING = 1e-6
-#: A band that has less than this share of the weight of any component has none.
+#: A band with less than this share of the weight of every component counts as weightless.
 LEAST_SHARE = 1e-6
 
 
 @jax.jit
 def square_root(matrix: Float[Array, "... row row"]) -> Float[Array, "... row row"]:
-    """R with R^T R = G for symmetric positive semi-definite G, singular ones included.
+    """Return R with R^T R = G for symmetric positive semi-definite G, even singular.
 
     Rows and columns are scaled to a unit diagonal first, so that maps in different units do not
     cost accuracy.
@@ -44,14 +44,14 @@ def square_root(matrix: Float[Array, "... row row"]) -> Float[Array, "... row ro
 
 
 def chunks(npix: int, size: int = PIECE) -> Iterator[slice]:
-    """Slices that cover the pixels."""
+    """Yield slices that cover the pixels."""
     for start in range(0, npix, size):
         yield slice(start, min(start + size, npix))
 
 
 @takes_quantities
 def bare(name: str, value: object) -> np.ndarray:
-    """A numeric array without a copy, in whatever precision it has."""
+    """Return a numeric array without a copy, in its own precision."""
     refuse_unit(name, value)
     array = np.asarray(value)
     if array.dtype.kind not in "fiu":
@@ -62,8 +62,8 @@ def bare(name: str, value: object) -> np.ndarray:
 class Noise(NamedTuple):
     """Gaussian noise, independent between pixels and bands; see `as_noise`.
 
-    There are standard deviations, with a factor on them in each pixel that is infinite where it is
-    masked, or covariances of Q and U instead.
+    It has standard deviations, times a factor in each pixel that is infinite where masked, or
+    covariances of Q and U instead.
     """
 
     sigma: Float[np.ndarray, "band stokes #pix"] | None
@@ -72,17 +72,17 @@ class Noise(NamedTuple):
 
     @property
     def separable(self) -> bool:
-        """True if it is a number for each band and Stokes parameter times a map."""
+        """True if it is a number per band and Stokes parameter times a map."""
         return self.sigma is not None and self.sigma.shape[-1] == 1
 
     def pixel_weights(self, pixels: slice | np.ndarray) -> Float[np.ndarray, " pix"] | float:
-        """1 / pixel_sigma^2 in some of the pixels."""
+        """Return 1 / pixel_sigma^2 in some of the pixels."""
         if self.pixel_sigma is None:
             return 1.0
         return 1 / np.asarray(self.pixel_sigma[pixels], float) ** 2
 
     def weights(self, pixels: slice | np.ndarray) -> Float[np.ndarray, "band stokes #pix"]:
-        """Inverse variances, or the diagonal of inverse covariances; 0 where masked."""
+        """Return inverse variances, or the diagonal of inverse covariances; 0 where masked."""
         if self.covariance is not None:
             (QQ, UU), determinant = self._elements(pixels)[:2]
             return np.stack([UU / determinant, QQ / determinant], axis=1)
@@ -91,7 +91,7 @@ class Noise(NamedTuple):
         return 1 / np.asarray(sigma, float) ** 2 * self.pixel_weights(pixels)
 
     def cross(self, pixels: slice | np.ndarray) -> Float[np.ndarray, "band pix"] | None:
-        """Element QU of the inverse covariances; None if Q and U are independent."""
+        """Return element QU of the inverse covariances; None if Q and U are independent."""
         if self.covariance is None:
             return None
         _, determinant, QU = self._elements(pixels)
@@ -100,9 +100,9 @@ class Noise(NamedTuple):
     def heavy(
         self, used: Bool[np.ndarray, " pix"], squares: Float[np.ndarray, "band component"]
     ) -> tuple[Bool[np.ndarray, " band"], int]:
-        """Bands that carry weight, and the number of data in them.
+        """Return the bands that carry weight, and the number of data in them.
 
-        From the pixels used and the squares of the laws.
+        `squares` are those of the laws.
         """
         weights, counts = np.zeros((2, len(squares)))
         for part in chunks(used.size):
@@ -128,7 +128,7 @@ def as_noise(
     shape: tuple[int, int, int],
     pixel_sigma: Numeric | None = None,
 ) -> Noise:
-    """Noise of data from standard deviations or covariances.
+    """Return the noise of data from standard deviations or covariances.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def as_noise(
     Returns
     -------
     The noise. Standard deviations whose ratios between bands and Stokes parameters are the same
-    in all pixels are recognised as such: it makes the likelihood independent of the pixels.
+    in all pixels are recognised: then the likelihood does not depend on the number of pixels.
     """
     if isinstance(noise, Noise):
         return noise
@@ -179,7 +179,7 @@ def _check_positive(name: str, sigma: np.ndarray) -> None:
 
 
 def _separated(sigma: np.ndarray) -> Noise | None:
-    """The noise as separable noise, if it is."""
+    """Return separable noise, or None if the noise is not separable."""
     first = sigma[0, 0]
     finite = np.isfinite(first)
     if not finite.any():
@@ -216,7 +216,7 @@ def _covariance(covariance: np.ndarray) -> Noise:
 class Layout(NamedTuple):
     """Stokes parameters, by position, that share a mixing matrix.
 
-    If `joint`, Q and U are in one system, their rows one after the other; else each has its own.
+    If `joint`, Q and U form one system, with the rows of Q before those of U; else one each.
     """
 
     joint: bool
@@ -228,19 +228,19 @@ class Layout(NamedTuple):
         return (self.stokes,) if self.joint else tuple((s,) for s in self.stokes)
 
     def rows(self, maps: np.ndarray) -> np.ndarray:
-        """Maps (band, stokes, pix) as (group, row, pix)."""
+        """Return maps (band, stokes, pix) as (group, row, pix)."""
         groups = [np.concatenate([maps[:, s] for s in group]) for group in self.groups]
         return np.stack(groups)
 
     def maps(self, rows: np.ndarray) -> np.ndarray:
-        """The inverse for these Stokes parameters: (row or unknown, stokes, pix)."""
+        """Return the inverse for these Stokes parameters: (row or unknown, stokes, pix)."""
         if self.joint:
             rows = rows.reshape(2, -1, rows.shape[-1])
         return rows.swapaxes(0, 1)
 
 
 def layouts(stokes: int, joint: bool) -> tuple[Layout, ...]:
-    """How the Stokes parameters are grouped; `joint` if Q and U depend on each other."""
+    """Return groups of the Stokes parameters; `joint` if Q and U depend on each other."""
     if not joint:
         return (Layout(False, tuple(range(stokes))),)
     polarized = Layout(True, (stokes - 2, stokes - 1))
@@ -248,7 +248,7 @@ def layouts(stokes: int, joint: bool) -> tuple[Layout, ...]:
 
 
 def used_pixels(noise: Noise, npix: int, components: int) -> np.ndarray:
-    """Pixels that are not masked."""
+    """Return True for pixels that are not masked."""
     used = np.zeros(npix, bool)
     few = 0
     for part in chunks(npix):
@@ -284,10 +284,10 @@ def _refuse(data: np.ndarray, noise: Noise) -> None:
 def band_covariance(
     data: np.ndarray, noise: Noise, cells: Cells, used: np.ndarray, layout: Layout
 ) -> Float[np.ndarray, "cell group row row"]:
-    """D = sum_p d_p d_p^T / sigma_p^2 over the pixels of each cell, in one pass.
+    """Return D = sum_p d_p d_p^T / sigma_p^2 over the pixels of each cell, in one pass.
 
     `data` are maps (band, stokes, pix), of any precision and on disk if need be; `noise` is
-    separable, and its part of the bands is not applied.
+    separable, and its factor per band is not applied.
     """
     groups = layout.groups
     size = len(data) * len(groups[0])
@@ -320,7 +320,7 @@ def band_covariance(
 def compressed(
     data: np.ndarray, noise: Noise, cells: Cells, used: np.ndarray, layout: Layout
 ) -> Pixels:
-    """As many vectors in place of the pixels of a cell as there are rows; exact."""
+    """Replace the pixels of each cell by as many vectors as there are rows; exact."""
     covariance = band_covariance(data, noise, cells, used, layout)
     weights = layout.rows(1 / np.asarray(noise.sigma) ** 2)
     if all(np.array_equal(weights[0], w) for w in weights[1:]):
@@ -332,9 +332,9 @@ def compressed(
 def pixel_rows(
     data: np.ndarray, noise: Noise, layout: Layout, pixels: slice | np.ndarray, used: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """What `Pixels` have of some pixels; those not used are zero and have unit weight.
+    """Return the fields of `Pixels` for some pixels; unused ones are zero with unit weight.
 
-    Where noise is the same in all pixels and all are used, the weights are those of a single one.
+    If noise is the same in all pixels and all are used, the weights are those of a single pixel.
     """
     weights = noise.weights(pixels)
     if weights.shape[-1] > 1 or not used.all():
@@ -348,9 +348,9 @@ def pixel_rows(
 def gathered(
     data: np.ndarray, noise: Noise, cells: Cells, used: np.ndarray, layout: Layout
 ) -> tuple[Pixels, Array | None]:
-    """The pixels in blocks, each of a single cell and filled up with zeros of unit weight.
+    """Return the pixels in blocks, each of a single cell and padded with zeros of unit weight.
 
-    With the cell of each block, None if they are in order.
+    Also the cell of each block, None if they are in order.
     """
     pixels = np.flatnonzero(used)
     own = np.zeros(len(pixels), np.int32) if cells.of_pixel is None else cells.of_pixel[pixels]

@@ -1,6 +1,6 @@
 """The paper's small patches of the sky: discs at high latitude, and the field of BICEP2.
 
-Their power laws, observed against those of the model, are the paper's figure 10.
+The power laws of observed maps there, against those of the model, are the paper's figure 10.
 """
 
 from typing import NamedTuple
@@ -27,9 +27,9 @@ BICEP2 = (50.0, -65.0, -50.0)
 
 
 def disc_centers(nside: int = 4, latitude: float = 45.0) -> Float[np.ndarray, "2 disc"]:
-    """Galactic longitude and latitude [deg] of pixels at |b| above a latitude.
+    """Return Galactic longitude and latitude [deg] of pixels at |b| above a latitude.
 
-    The paper has 48 discs there, and names the pixels of nside 8; 48 are those of nside 4, while
+    The paper has 48 discs there and says that they are pixels of nside 8; but nside 4 has 48, and
     nside 8 has 224.
     """
     lon, lat = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)
@@ -37,7 +37,7 @@ def disc_centers(nside: int = 4, latitude: float = 45.0) -> Float[np.ndarray, "2
 
 
 def _smoothed_disc(radius: float, fwhm: float, angle: np.ndarray) -> np.ndarray:
-    """A disc of ones smoothed by a Gaussian, at angles from its middle [deg]; closed form."""
+    """Return a disc smoothed by a Gaussian, at angles from its centre [deg]; closed form."""
     lmax = int(np.ceil(6.0 / np.radians(fwhm) * np.sqrt(8 * np.log(2))))
     ell = np.arange(lmax + 2)
     legendre = np.polynomial.legendre.legvander(np.array([np.cos(np.radians(radius))]), lmax + 2)[0]
@@ -52,9 +52,9 @@ def _smoothed_disc(radius: float, fwhm: float, angle: np.ndarray) -> np.ndarray:
 def disc_mask(
     nside: int, lon: float, lat: float, radius: float = RADIUS, fwhm: float = APODIZATION
 ) -> Float[np.ndarray, " pix"]:
-    """A disc about Galactic coordinates, smoothed by a Gaussian, all in degrees.
+    """Return a disc about Galactic coordinates, smoothed by a Gaussian, all in degrees.
 
-    What that leaves below 1e-5 is zero.
+    Values below 1e-5 are set to zero.
     """
     if not (np.isfinite(lon) and -90 <= lat <= 90):
         raise ValueError(
@@ -80,7 +80,7 @@ def disc_mask(
 
 
 def bicep2_mask(nside: int, fwhm: float = APODIZATION) -> Float[np.ndarray, " pix"]:
-    """The field of BICEP2 and Keck, smoothed as the discs are."""
+    """Return the field of BICEP2 and Keck, smoothed like the discs."""
     lon, lat = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)
     ra, dec = healpy.Rotator(coord=["G", "C"])(lon, lat, lonlat=True)
     half, south, north = BICEP2
@@ -90,7 +90,7 @@ def bicep2_mask(nside: int, fwhm: float = APODIZATION) -> Float[np.ndarray, " pi
 
 
 def paper_patches(nside: int) -> dict[str, Float[np.ndarray, " pix"]]:
-    """The paper's 48 discs at |b| > 45 deg, and the field of BICEP2, by name."""
+    """Return the paper's 48 discs at |b| > 45 deg, and the field of BICEP2, by name."""
     discs = {
         f"l {lon:.0f}, b {lat:.0f}": disc_mask(nside, lon, lat) for lon, lat in disc_centers().T
     }
@@ -100,8 +100,8 @@ def paper_patches(nside: int) -> dict[str, Float[np.ndarray, " pix"]]:
 class PatchComparison(NamedTuple):
     """A and alpha of the patches in one band.
 
-    Fits to the map, and to the model: foregrounds with a realisation of CMB and noise. `overlap` is
-    the fraction of modes that patches have in common.
+    Fits to the map, and to the model: foregrounds with one realisation of CMB and noise. `overlap`
+    is the fraction of modes that pairs of patches share.
     """
 
     band: str
@@ -110,14 +110,14 @@ class PatchComparison(NamedTuple):
     overlap: Float[np.ndarray, "patch patch"]
 
     def detected(self, index: int) -> np.ndarray:
-        """Patches that show EE (0) or BB (1) in both."""
+        """Return True for patches where EE (0) or BB (1) is detected in both."""
         return self.observed.detected[:, index] & self.model.detected[:, index]
 
     def ratio(self, index: int) -> tuple[float, float]:
-        """Mean logarithm of A observed over A of the model, as a factor, and its error.
+        """Return the geometric mean of A observed over A of the model, and its error.
 
-        The error is that of the scatter over the patches that show EE (0) or BB (1), with what
-        these have in common.
+        The error is from the scatter over patches where EE (0) or BB (1) is detected, with
+        allowance for their overlap.
         """
         both = self.detected(index)
         logs = np.log(self.observed.A[both, index] / self.model.A[both, index])
@@ -125,20 +125,20 @@ class PatchComparison(NamedTuple):
         return float(np.exp(mean)), float(np.exp(mean)) * error
 
     def _mean(self, values: np.ndarray, patches: np.ndarray) -> tuple[float, float]:
-        """Mean over patches, and its error; NaN for less than two."""
+        """Return the mean over patches, and its error; NaN for fewer than two."""
         if (count := len(values)) < 2:
             return float("nan"), float("nan")
         shared = self.overlap[np.ix_(patches, patches)].sum() / count
         return float(values.mean()), float(values.std(ddof=1) * np.sqrt(shared / count))
 
     def slope_difference(self, index: int) -> tuple[float, float]:
-        """Mean of alpha observed less alpha of the model, and its error, over the same patches."""
+        """Return the mean of alpha observed - alpha of the model, and its error, likewise."""
         both = self.detected(index)
         difference = (self.observed.alpha - self.model.alpha)[both, index]
         return self._mean(difference, both)
 
     def correlation(self, index: int) -> tuple[float, float]:
-        """Pearson's coefficient of log A and of alpha between map and model."""
+        """Return Pearson's coefficients of log A and of alpha between map and model."""
         both = self.detected(index)
         if both.sum() < 3:
             return float("nan"), float("nan")
@@ -153,12 +153,12 @@ class PatchComparison(NamedTuple):
 def _patch_noise(
     band: Band, prepared: CommonMaps, patches: PreparedPatches
 ) -> Float[np.ndarray, "patch 2 ell"]:
-    """Spectrum of the noise in the prepared maps, on each patch that of its own pixels."""
+    """Return the noise spectrum in the prepared maps on each patch, from its own pixels."""
     (preparation,), lmax = prepared.fluctuations.preparations, patches.spectra[0].lmax
     covariance = pixel_covariance(band.noise, preparation.nside_in)
     variance = average_pixels(jnp.stack([covariance[0, 0], covariance[1, 1]]), preparation.nside)
     weights = np.stack([one.mask**2 for one in patches.spectra])
-    # Q and U turn into each other on a patch, and E and B have the mean of both.
+    # Q and U mix on a patch, so that E and B have the mean of both.
     mean = np.asarray(variance).mean(axis=0) @ weights.T / weights.sum(axis=1)
     white = mean * healpy.nside2pixarea(preparation.nside_in)
     total = white[:, None] * np.asarray(window_of(preparation, lmax)) ** 2
@@ -168,7 +168,7 @@ def _patch_noise(
 
 
 def compare_patches(settings: Experiment, inputs: Inputs) -> PatchComparison:
-    """The paper's 48 discs and the field of BICEP2, in the band that the settings name."""
+    """Compare the paper's 48 discs and the field of BICEP2, in the band of the settings."""
     name, nside = str(settings.compare.patches), settings.compare.patches_nside
     fwhm = settings.common.fwhm
     band = inputs.bands[name]
@@ -177,11 +177,11 @@ def compare_patches(settings: Experiment, inputs: Inputs) -> PatchComparison:
     if not fwhm:  # averages of pixels, with the beam of the map
         window = window * pixel_window(nside, 2 * nside)
     patches = prepare_patches(paper_patches(nside), np.asarray(window))
-    # Correlations of the powers of a field that has all scales alike, 1 for a patch itself.
+    # Correlations of the powers of white noise on two patches; 1 on the diagonal.
     squares = np.stack([one.mask**2 for one in patches.spectra])
     squares /= np.linalg.norm(squares, axis=1, keepdims=True)
     noise = _patch_noise(band, prepared, patches)
-    # Realisations of their own, unlike those of what is observed.
+    # Not the realisations of the observed maps.
     key = stream(realisation_key(settings.seed), "patches")
     model = prepared.model()[0]
     fluctuations = prepared.fluctuations
@@ -195,7 +195,7 @@ def compare_patches(settings: Experiment, inputs: Inputs) -> PatchComparison:
 
 
 def template_patches(maps: Float[Array, "2 pix"], fwhm: float) -> PatchFits:
-    """The same patches in Q and U of a template, at its own beam, taken to be without noise."""
+    """Fit the same patches in Q and U of a template at its own beam, without noise."""
     nside = healpy.npix2nside(maps.shape[-1])
     patches = prepare_patches(paper_patches(nside), np.asarray(gaussian_beam(fwhm, 2 * nside)))
     return fit_patches(maps, patches)

@@ -1,4 +1,4 @@
-"""What an analysis starts from: templates and observed maps, from files or simulated."""
+"""Read or simulate the input of an analysis: templates and observed maps, with their noise."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -60,9 +60,9 @@ class Band(NamedTuple):
     """Observed Q and U [uK_RJ] of a band at the resolution of the map.
 
     `beam` is the FWHM of a Gaussian [arcmin] or a table b_l. `noise` is a level [uK_RJ arcmin] or
-    the covariance of Q and U in each pixel, `correlated` the spectrum of noise beyond that, if
-    there is any [uK_RJ^2].
-    `leakage` is in the maps, and subtracted where they are brought to a common resolution.
+    the covariance of Q and U in each pixel; `correlated` is the spectrum of additional noise, if
+    any [uK_RJ^2].
+    `leakage` is in the maps, and is subtracted when they are brought to a common resolution.
     """
 
     maps: Float[Array, "stokes pix"]
@@ -79,7 +79,7 @@ class TemplateNoise(NamedTuple):
 
     `noise` is that of the pixels of its map, a level [uK_RJ arcmin] or the covariance of Q and U in
     each [uK_RJ^2]; `correlated` the spectrum C_l of noise that is correlated between pixels
-    [uK_RJ^2]. `shared` says how many times the noise of a band, by name, is in the template, too.
+    [uK_RJ^2]. `shared` are factors by which the noise of bands, by name, is in the template, too.
     """
 
     noise: Numeric = 0.0
@@ -88,7 +88,7 @@ class TemplateNoise(NamedTuple):
 
     @property
     def own(self) -> bool:
-        """Whether there is noise that is not a band's."""
+        """True if there is noise that is not a band's."""
         return bool(np.ndim(self.noise)) or bool(self.noise) or self.correlated is not None
 
 
@@ -96,9 +96,9 @@ class Inputs(NamedTuple):
     """Templates and bands by name, and what is known about them.
 
     `cmb` gives spectra TT, EE, BB, TE of the CMB up to a multipole, None where there is no CMB.
-    `truth` holds the parameters of a simulated sky that are numbers, "r" among them; None where
-    maps are not simulated. `description` says what the maps are. Templates whose noise is not
-    known are missing in `template_noise`. `foregrounds` are those alone in simulated bands.
+    `truth` are the parameters of a simulated sky that are numbers, including "r"; None where maps
+    are not simulated. `description` says what the maps are. Templates whose noise is not known are
+    missing from `template_noise`. `foregrounds` are maps of simulated bands with nothing else.
     """
 
     templates: dict[str, Template]
@@ -117,10 +117,10 @@ def inputs_of(
     foregrounds: bool = False,
     galaxy: EmbeddedSky | None = None,
 ) -> Inputs:
-    """Templates of what is modelled, and maps: from files, or simulated where there is none.
+    """Read the templates of the model, and maps: from files, or simulated where there is none.
 
-    With the `foregrounds` alone, if that is asked for and all bands are simulated. `galaxy` is the
-    embedded model, if it is made already.
+    `foregrounds` adds maps of these alone, if all bands are simulated. `galaxy` is the embedded
+    model, if it has been made already.
     """
     folder = Path(settings.data_dir)
     if not settings.bands:
@@ -161,7 +161,7 @@ def inputs_of(
 
 
 def level_spectrum(level: float, fwhm: float, lmax: int) -> Float[Array, " ell"]:
-    """Spectrum of white noise of a level [uK_RJ arcmin], seen through a beam of fwhm [arcmin]."""
+    """Return the spectrum of white noise [uK_RJ arcmin] seen through a beam of fwhm [arcmin]."""
     white = (level * np.radians(1 / 60)) ** 2 * jnp.asarray(gaussian_beam(fwhm, lmax)) ** 2
     return white.at[:2].set(0.0)
 
@@ -169,7 +169,7 @@ def level_spectrum(level: float, fwhm: float, lmax: int) -> Float[Array, " ell"]
 def read_template_noise(
     folder: Path, name: str, spec: ComponentTable, template: Template
 ) -> TemplateNoise | None:
-    """The noise that the settings state of a template; None where they do not."""
+    """Read the noise of a template from the settings; None if they do not state it."""
     noise, where = spec.noise, f"sky.{name}.noise"
     if noise is None:
         return TemplateNoise() if spec.file is None else None  # the embedded maps are exact
@@ -200,7 +200,7 @@ def read_template_noise(
 
 
 def unknown_noise(names: Sequence[str]) -> str:
-    """A warning that nothing is said about the noise of templates, with the size of its effect."""
+    """Return a warning about templates without stated noise, with the size of the effect."""
     return (
         f"Nothing is said about the noise of the templates ({listed(names)}), which attenuates "
         "them and moves the indices. At about the level of Commander's maps, 34 uK_RJ arcmin for "
@@ -215,7 +215,7 @@ def unknown_noise(names: Sequence[str]) -> str:
 def _simulated(
     settings: Experiment, setup: SimulationInputs, foregrounds: bool
 ) -> tuple[dict[str, Band], dict[str, Array] | None]:
-    """Bands as the first realisation of `jaxsky simulate` has them, and their foregrounds."""
+    """Return the bands of the first realisation of `jaxsky simulate`, and their foregrounds."""
     observation, key = setup.observation, realisation_key(settings.seed)
     sky = harmonic_sources(setup.small_scales_key(key), setup.sources, observation)
     used = np.ones(healpy.nside2npix(observation.nside), bool)
@@ -237,7 +237,7 @@ def _simulated(
 def _noise_of(
     observed: Observed, nside: int, where: str
 ) -> tuple[Numeric, Float[Array, " ell"] | None]:
-    """White noise of a simulation, and the spectrum of what was smoothed."""
+    """Return the white noise of a simulation, or the spectrum of noise that was smoothed."""
     if observed.noise is not None:
         return observed.noise, None
     if observed.spectrum is None:
@@ -255,7 +255,7 @@ def _leakage_of(observed: Observed | None, used: Bool[np.ndarray, " pix"]) -> Le
 
 
 def _from_file(settings: Experiment, spec: BandTable) -> tuple[Band, Mapping[str, float] | None]:
-    """A band from its file, or from the folder of simulated maps, and the truth about its sky."""
+    """Read a band from its file, or from simulated maps, and the true parameters of its sky."""
     folder, where = Path(settings.data_dir), f"bands.{spec.name}"
     if spec.file is not None:
         observed = read_observed(find_file(folder, spec.files[0]))
@@ -269,13 +269,13 @@ def _from_file(settings: Experiment, spec: BandTable) -> tuple[Band, Mapping[str
         raise SettingsError(f"common.maps: {error}") from None
     if observed is None:
         raise SettingsError(f"common.maps: {name} was not written by jaxsky simulate.")
-    # What the file says is true of its map: it may have another beam than the band.
+    # The file describes its map, which may have another beam than the band.
     plain = BandTable(name=spec.name, file=name, fields=["Q", "U"])
     return read_band(folder, plain, observed), observed.truth
 
 
 def _check_beam(folder: Path, spec: BandTable, observed: Observed, where: str) -> None:
-    """Refuse a beam that is not that of the simulated map."""
+    """Refuse a beam that differs from that of the simulated map."""
     own = np.asarray(observed.beam)
     if spec.beam is not None:
         said, same = f"beam: {spec.beam}", False
@@ -294,9 +294,9 @@ def _check_beam(folder: Path, spec: BandTable, observed: Observed, where: str) -
 
 
 def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -> Band:
-    """Map, bandpass and noise of a band from the files that its settings name.
+    """Read map, bandpass and noise of a band from the files named in its settings.
 
-    What they do not say is that of the simulation which made the map, `observed`.
+    By default they are those of the simulation that made the map, `observed`.
     """
     where = f"bands.{spec.name}"
     if spec.bandpass is None and observed is not None:
@@ -330,7 +330,7 @@ def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -
 def _polarization(
     folder: Path, spec: MapKeys, bandpass: Bandpass, where: str, zeros_are_data: bool = False
 ) -> tuple[Array, Bool[np.ndarray, " pix"], str]:
-    """Q and U of a map [uK_RJ], where they are known, and the unit of its file."""
+    """Read Q and U of a map [uK_RJ], where they are known, and the unit of its file."""
     found = read(folder, spec, zeros_are_data=zeros_are_data)
     check_stokes(where, found, "QU")
     maps = narrow(found.maps[-2:] * uK_RJ_per(found.unit, bandpass, where))
@@ -338,7 +338,7 @@ def _polarization(
 
 
 def _estimated_noise(noise, maps, used):
-    """White noise and the spectrum of the rest, from the maps themselves."""
+    """Estimate white noise, and the spectrum of the rest, from the maps themselves."""
     nside, npix = healpy.npix2nside(maps.shape[-1]), maps.shape[-1]
     latitude = healpy.pix2ang(nside, np.arange(npix), lonlat=True)[1]
     quiet = used & (np.abs(latitude) >= noise.estimate_above)
@@ -353,9 +353,9 @@ def _estimated_noise(noise, maps, used):
 def prepare_component(
     component: Component, preparation: Preparation, kept: Bool[np.ndarray, " pix"] | None = None
 ) -> Component:
-    """A component with its amplitude, and parameters that are maps, at the common resolution.
+    """Bring a component's amplitude, and parameters that are maps, to the common resolution.
 
-    Pixels of the amplitude that are not kept are set to zero; by default all are.
+    Pixels of the amplitude that are not kept are set to zero; by default all are kept.
     """
 
     def brought(leaf):
@@ -371,7 +371,7 @@ def prepare_component(
 
 
 def modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
-    """The laws, on one pixel, or on all if parameters are maps; and where these are known."""
+    """Return laws, on one pixel, or on all if parameters are maps; and where these are known."""
     folder, nside = Path(settings.data_dir), settings.common.nside
     laws = {name: settings.sky.components[name] for name in settings.modelled()}
     given = laws.values()

@@ -1,6 +1,6 @@
-"""What a stopped run resumes from: chains of emcee and realisations, kept in files with a mark.
+"""Files from which a stopped run is resumed: chains of emcee, and realisations, with a mark.
 
-A file is whole at any moment, and refused if it is damaged or holds what was made of other data.
+Writes are atomic, and a file is refused if it is damaged or was made from other data.
 """
 
 import hashlib
@@ -23,18 +23,18 @@ from jaxsky.io import InputError, whole
 from jaxsky.noise import realisation_key, stream
 from jaxsky.programs import QUIET
 
-#: Files are written after so many seconds, and when a run is stopped.
+#: Interval at which files are written [s]; they also are when a run is stopped.
 SAVED_EVERY = 10.0
 #: Arrays of a chain in its file; the last two are numpy's random state.
 CHAIN = ("chain", "log_prob", "accepted", "random_keys", "random_rest")
-#: What a damaged archive raises besides: RuntimeError for one that seems encrypted or packed in
-#: a way that is not known.
+#: Further errors of a damaged archive: RuntimeError if it seems encrypted or compressed in an
+#: unknown way.
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, RuntimeError)
 Kind = TypeVar("Kind", bound=NamedTuple)
 
 
 def fingerprint(tree: Any) -> str:
-    """A hash of all arrays of a tree; functions, which work with them, are left out."""
+    """Return a hash of all arrays of a tree; functions are left out."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(tree):
         array = np.ascontiguousarray(leaf)
@@ -46,7 +46,7 @@ def fingerprint(tree: Any) -> str:
 
 
 def remembered(function: Callable[[Array], np.ndarray]) -> Callable[[Array], np.ndarray]:
-    """A function whose last result is kept for an array that comes again."""
+    """Return a function that caches its last result, for an equal array."""
     last: dict[str, np.ndarray] = {}
 
     def found(rows: Array) -> np.ndarray:
@@ -62,15 +62,15 @@ def remembered(function: Callable[[Array], np.ndarray]) -> Callable[[Array], np.
 class KeptChain(emcee.backends.Backend):
     """A chain of emcee in memory, written to its file every few seconds.
 
-    What the file holds is a state from which the chain goes on exactly as if it had not stopped; a
-    file with another mark, that of all that the chain depends on, is refused.
+    The file contains a state from which the chain is resumed exactly as if it had not stopped; a
+    file with another mark, which stands for all that the chain depends on, is refused.
     """
 
     def __init__(self, path: Path, mark: str = "", every: float = SAVED_EVERY) -> None:
         super().__init__()
         self.path, self.mark, self.every = path, mark, every
         self._written, self._due = 0, time.monotonic() + every
-        #: Steps that are complete, and with them acceptance and random state; replaced at once.
+        #: Number of complete steps, acceptance and random state; replaced together.
         self._state: tuple[int, np.ndarray, Any] | None = None
         held = _load(path, mark, CHAIN, "a chain", alike=2)
         if held is None:
@@ -81,14 +81,14 @@ class KeptChain(emcee.backends.Backend):
         self.iteration = self._written = len(self.chain)
 
     def save_step(self, state: emcee.State, accepted: np.ndarray) -> None:
-        """Keep a step, and write when it is time."""
+        """Keep a step, and write the file when it is due."""
         super().save_step(state, accepted)
         self._state = self.iteration, self.accepted.copy(), state.random_state
         if time.monotonic() > self._due:
             self.flush()
 
     def flush(self) -> None:
-        """Write the steps that the file does not have."""
+        """Write the file, if there are steps that it does not have."""
         if self._state is None or self._state[0] == self._written:
             return
         start, (steps, accepted, (_, keys, *rest)) = time.monotonic(), self._state
@@ -107,11 +107,11 @@ def kept_realisations(
     mark: str = "",
     report: Callable[[int, int], None] = QUIET.advance,
 ) -> Kind:
-    """Results of a function of a random key, stacked over realisations, as a NamedTuple.
+    """Return results of a function of a random key, stacked over realisations, as a NamedTuple.
 
-    A realisation depends on the seed and its own number only. What the file holds already is not
-    made again; one with another mark, that of all that the results depend on, is refused. `report`
-    is called with the number of realisations done, and that of all.
+    A realisation depends only on the seed and its own number. Those in the file are not made again;
+    a file with another mark, which stands for all that the results depend on, is refused. `report`
+    is called with the number of realisations done, and of all.
     """
     check_seed("seed", seed)
     names = kind._fields
@@ -124,7 +124,7 @@ def kept_realisations(
         return [np.asarray(x) for x in make(key)]
 
     def made(numbers: range) -> Iterator[list[np.ndarray]]:
-        """In order, by as many threads as there are processors."""
+        """Yield realisations in order, made by one thread per processor."""
         yield from map(one, numbers[:1])  # alone, so that each program is compiled once
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             yield from pool.map(one, numbers[1:])
@@ -154,9 +154,9 @@ def _save(path: Path, mark: str, arrays: Mapping[str, np.ndarray]) -> None:
 def _load(
     path: Path, mark: str, names: Sequence[str], what: str, alike: int | None = None
 ) -> list[np.ndarray] | None:
-    """The arrays of a file, all or the first of which are as long; None if it is not there.
+    """Load the arrays of a file, the first `alike` (or all) of equal length; None if there is none.
 
-    The error about another mark says `what` it holds.
+    `what` names its content in the error about another mark.
     """
     if not path.exists():
         return None

@@ -1,19 +1,19 @@
-"""What templates show in bands: the mixing matrix, and the noise that comes with them.
+"""The mixing matrix of components in bands, and the noise of templates.
 
-The matrix is what each component of unit amplitude shows in each band. Names of parameters are
+The matrix is the signal of each component of unit amplitude in each band. Names of parameters are
 those of the sky ("dust.beta_dust"), and of bands:
 
 * "shift.<band>": the band is moved by this fraction of its center; 0 if not given
 * "width.<band>": it is stretched about its center by this factor; 1
-* "gain.<band>": factor on what the band shows; 1
+* "gain.<band>": factor on the signal of the band; 1
 * "angle.<band>": rotation of its polarization, Q + iU times exp(2i angle) [deg]; 0
 
-With templates T = t + n the products with the data have the mean t^T W d, but those of templates
-with each other t^T W t + <n^T W n>: amplitudes come out too small, and indices are moved. The
-mean of the noise is known where its covariance is, and is subtracted (errors in variables; Fuller
-1987, Measurement Error Models, ch. 2). What is left, sum_j c_j T_k^T W n_j in a band where
-template j is seen with the coefficient c_j, is the same noise in all bands; its covariance joins
-that of the data, at the coefficients of the best fit.
+With templates T = t + n, products with the data have the mean t^T W d, but products of templates
+t^T W t + <n^T W n>: amplitudes come out too small, and indices are biased. The noise term is known
+from the covariance of the noise, and is subtracted (errors in variables; Fuller 1987, Measurement
+Error Models, ch. 2). The rest, sum_j c_j T_k^T W n_j in a band where template j has the coefficient
+c_j, is the same noise in all bands; its covariance is added to that of the data, at the
+coefficients of the best fit.
 """
 
 import dataclasses
@@ -37,36 +37,36 @@ if TYPE_CHECKING:
     from fits.common import MapNoise
     from fits.inputs import TemplateNoise
 
-#: parameter of a band -> its value if not given
+#: Parameters of a band, and their values if not given.
 NOMINAL = {"shift": 0.0, "width": 1.0, "gain": 1.0, "angle": 0.0}
-#: Fields that act on amplitudes, which are free in every pixel anyway.
+#: Fields that only change amplitudes, which are free in every pixel anyway.
 NOT_SPECTRAL = ("amplitude", "polarization_fraction", "nu_ref")
-#: Cells averaged over the bands at a time; above, laws are interpolated.
+#: Most cells averaged over the bands at a time; for more, laws are interpolated.
 CELLS = 512
 #: Relative error of interpolated laws.
 TOLERANCE = 1e-11
 
 
 def nominal(names: Iterable[str]) -> dict[str, float]:
-    """Values of parameters of bands that are as they should be, among some names."""
+    """Return the nominal values of the parameters of bands among some names."""
     words = {name: name.split(".")[0] for name in names}
     return {name: NOMINAL[word] for name, word in words.items() if word in NOMINAL}
 
 
 def spectral_names(sky: Sky) -> tuple[str, ...]:
-    """Names of the parameters of the laws: all but those that only scale amplitudes."""
+    """Return names of the parameters of the laws: all but those that only scale amplitudes."""
     return tuple(n for n in parameter_names(sky) if n.split(".")[1] not in NOT_SPECTRAL)
 
 
 def named_bands(bands: Mapping[str, Bandpass] | Sequence[Bandpass]) -> dict[str, Bandpass]:
-    """Bands with names; those of a list are called "0", "1", ..."""
+    """Return bands by name; those of a list are called "0", "1", ..."""
     if isinstance(bands, Mapping):
         return dict(bands)
     return {str(i): band for i, band in enumerate(bands)}
 
 
 def unit_sky(sky: Sky, stokes: int = 2, mask: Float[np.ndarray, " pix"] | None = None) -> Sky:
-    """The laws of a sky: amplitude 1 in one pixel, parameters that are maps at their mean.
+    """Return the laws of a sky: amplitude 1 in one pixel, and maps of parameters as their mean.
 
     The mean is weighted with the mask.
     """
@@ -82,15 +82,15 @@ def unit_sky(sky: Sky, stokes: int = 2, mask: Float[np.ndarray, " pix"] | None =
 class Mixing(eqx.Module):
     """Mixing matrices as a function of spectral parameters.
 
-    A band with data in K_CMB is calibrated on the CMB: shifted or stretched, it shows the CMB as
-    before. In K_RJ it is calibrated on a source of constant antenna temperature, unless `on_cmb`:
-    then its data in K_CMB were converted for the band that is neither shifted nor stretched.
+    A band with data in K_CMB is calibrated on the CMB: shifted or stretched, its CMB signal is the
+    same. In K_RJ it is calibrated on a source of constant antenna temperature, unless `on_cmb`:
+    then its data in K_CMB were converted with the nominal band, neither shifted nor stretched.
     """
 
     #: the laws, on a single pixel
     sky: Sky
     bandpasses: tuple[Bandpass, ...]
-    #: frequencies and weights of the bands while they are where they should be
+    #: frequencies and weights of the nominal bands
     samples: Samples
     names: tuple[str, ...] = eqx.field(static=True)
     unit: str = eqx.field(static=True)
@@ -100,26 +100,26 @@ class Mixing(eqx.Module):
     def of(
         cls, sky: Sky, bands: Mapping[str, Bandpass], unit: str, on_cmb: bool = False
     ) -> "Mixing":
-        """With bands by name."""
+        """Make it from bands by name."""
         seen = tuple(bands.values())
         return cls(sky, seen, stack_bands(seen), tuple(bands), unit, on_cmb)
 
     def band_parameters(self) -> tuple[str, ...]:
-        """Names of the parameters of the bands."""
+        """Return names of the parameters of the bands."""
         return tuple(f"{kind}.{band}" for kind in NOMINAL for band in self.names)
 
     def laws(self, params: Mapping[str, Numeric]) -> Sky:
-        """The sky with those of the parameters that are of its components."""
+        """Return the sky with those parameters that belong to its components."""
         own = {name: v for name, v in params.items() if name.split(".")[0] in self.sky}
         return set_parameters(self.sky, own)
 
     def of_bands(self, kind: str, params: Mapping[str, Numeric]) -> Float[Array, "band ..."]:
-        """Parameters of one kind in all bands."""
+        """Return the parameters of one kind in all bands."""
         given = [params.get(f"{kind}.{band}", NOMINAL[kind]) for band in self.names]
         return jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, given)))
 
     def moved(self, params: Mapping[str, Numeric]) -> tuple[Bandpass, ...]:
-        """The bands, those with parameters shifted and stretched; the same if there are none."""
+        """Return the bands, shifted and stretched; the same object if none has parameters."""
         bands = self.bandpasses
         for i, (name, band) in enumerate(zip(self.names, bands, strict=True)):
             if {f"width.{name}", f"shift.{name}"} & set(params):
@@ -134,7 +134,7 @@ class Mixing(eqx.Module):
     def factors(
         self, bands: tuple[Bandpass, ...], params: Mapping[str, Numeric]
     ) -> Float[Array, " band"]:
-        """What bands, moved as they are, show of 1 uK_RJ in the unit of the data."""
+        """Return the signal of 1 uK_RJ in bands, after any shift, in the unit of the data."""
         size, kind = parse_unit(self.unit)
         factor = 1e-6 / size * self.of_bands("gain", params)
 
@@ -148,7 +148,7 @@ class Mixing(eqx.Module):
         return factor
 
     def one(self, params: Mapping[str, Numeric]) -> Float[Array, "band component"]:
-        """The matrix for parameters that are numbers."""
+        """Return the matrix for parameters that are numbers."""
         bands = self.moved(params)
         samples = self._samples(bands)
         laws = [
@@ -158,7 +158,7 @@ class Mixing(eqx.Module):
         return jnp.stack(laws, axis=-1) * self.factors(bands, params)[:, None]
 
     def _interpolated(self, params, cells) -> Float[Array, "cell band component"]:
-        """The matrix in many cells; bands must not move."""
+        """Return the matrix in many cells; bands must not be shifted or stretched."""
         wide = jax.tree.map(lambda x: jnp.ones((2, cells)) if x.ndim == 2 else x, self.sky)
         columns = []
         for component in dataclasses.replace(self, sky=wide).laws(params).components.values():
@@ -171,7 +171,7 @@ class Mixing(eqx.Module):
     def __call__(
         self, params: Mapping[str, Float[Array, " cell"]], cells: int
     ) -> Float[Array, "cell band component"]:
-        """The matrices of cells with their own parameters; those not given keep their values."""
+        """Return matrices of cells with their own parameters; others keep their values."""
         params = dict(params)
         moving = any(name.split(".")[0] in ("shift", "width") for name in params)
         if cells > CELLS and not moving:
@@ -188,7 +188,7 @@ class Mixing(eqx.Module):
     def rotated(
         self, matrix: Float[Array, "cell band component"], params: Mapping[str, Array]
     ) -> Float[Array, "cell row unknown"]:
-        """The matrix for Q and U together: rows Q of all bands, then U; unknowns likewise."""
+        """Return a matrix for Q and U together: rows Q of all bands, then U; unknowns likewise."""
         angle = 2 * jnp.deg2rad(self.of_bands("angle", params))
         angle = angle.reshape(len(self.names), -1).T[..., None]
         cosine, sine = jnp.cos(angle) * matrix, jnp.sin(angle) * matrix
@@ -204,9 +204,9 @@ class TemplateErrors(NamedTuple):
     Attributes
     ----------
     covariances_of : covariance of the products of rows with each source, (source, row, row)
-    parts : of each source in each template, shape (template, source)
+    parts : factor of each source in each template, shape (template, source)
     of_band : 1 where a source is the noise of a band, shape (band, source)
-    variance : of each source in each pixel [uK_RJ^2], shape (source, stokes, pix)
+    variance : variance of each source in each pixel [uK_RJ^2], shape (source, stokes, pix)
     """
 
     covariances_of: Callable[[Float[Array, "row stokes pix"]], Float[np.ndarray, "source row row"]]
@@ -217,7 +217,7 @@ class TemplateErrors(NamedTuple):
     def mean_products(
         self, weights: Float[Array, "band stokes pix"]
     ) -> Float[np.ndarray, "band stokes row row"]:
-        """Means of what noise adds to the products of (data, templates, 1), as `gram` has them."""
+        """Return the mean that noise adds to products of (data, templates, 1), as in `gram`."""
         power = np.einsum("bsp,usp->bsu", weights, self.variance)
         bands, stokes, _ = power.shape
         size = len(self.parts) + 2
@@ -232,9 +232,9 @@ class TemplateErrors(NamedTuple):
         rows: Float[Array, "band row stokes pix"],
         coefficients: Float[np.ndarray, "band row template"],
     ) -> Float[np.ndarray, "bandrow bandrow"]:
-        """What noise of templates adds to the covariance of products of rows with residuals.
+        """Return what noise of templates adds to the covariance of rows times residuals.
 
-        `coefficients` are those of the templates in what each row is multiplied with.
+        `coefficients` are those of the templates in the residuals that each row multiplies.
         """
         flat = rows.reshape(-1, *rows.shape[2:])
         each = self.covariances_of(flat)
@@ -251,9 +251,9 @@ def template_errors(
     own: Mapping[str, "MapNoise"],
     bands: Mapping[str, "MapNoise"],
 ) -> TemplateErrors | None:
-    """Errors of templates from the noise that some have of their own, and that of all bands.
+    """Return errors of templates from their own noise and the noise of bands that they share.
 
-    None where there is neither.
+    None if there is neither.
     """
     shared = [noises[name].shared if name in noises else {} for name in names]
     which = [band for band in bands if any(band in one for one in shared)]
@@ -275,7 +275,7 @@ def template_errors(
 
 
 def check_signal(products: Float[np.ndarray, "band stokes template template"]) -> None:
-    """Raise ValueError where the noise of templates leaves none of their power, or less."""
+    """Raise ValueError if the noise of templates has all of their power, or more."""
     total = products.sum(axis=(0, 1))
     scale = np.sqrt(np.abs(np.diagonal(total)))
     if np.linalg.eigvalsh(total / scale / scale[:, None])[0] <= 0:

@@ -1,14 +1,14 @@
-"""Component separation of full-sky maps in multipoles, with a beam for each band.
+"""Component separation of full-sky maps in multipoles, with its own beam for each band.
 
-With b_l the beam and N_l the noise of a band, its coefficients without the beam are
+With b_l the beam and N_l the noise of a band, its beam-deconvolved coefficients are
 
     d_lm / b_l = A s_lm + n_lm / b_l,    of noise N_l / b_l^2
 
-(Tegmark & Efstathiou 1996, MNRAS 281, 1297), the same for all m. So a multipole is what a region
-with uniform noise is among pixels: its 2l + 1 coefficients enter the spectral likelihood only
-through their covariance of bands, and as many vectors as there are bands take their place,
-exactly. Nothing is smoothed, so each band keeps the resolution it has. A rotation of Q + iU by
-the angle of a band turns E + iB in the same way.
+(Tegmark & Efstathiou 1996, MNRAS 281, 1297), the same for all m. So a multipole is like a region
+of pixels with uniform noise: its 2l + 1 coefficients enter the spectral likelihood only through
+their covariance of bands, and are replaced exactly by as many vectors as there are bands. Nothing
+is smoothed, so each band keeps its resolution. A rotation of Q + iU by the angle of a band rotates
+E + iB in the same way.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ BEAM = 1e-5
 
 
 def white_spectrum(level: Numeric) -> Float[np.ndarray, "..."]:
-    """N_l [u^2 sr] of white noise of a level [u arcmin], u being the unit of the maps.
+    """Return N_l [u^2 sr] of white noise of a level [u arcmin], u being the unit of the maps.
 
     Examples
     --------
@@ -57,12 +57,12 @@ def white_spectrum(level: Numeric) -> Float[np.ndarray, "..."]:
 def harmonic_coefficients(
     maps: Sequence[Numeric] | Array | np.ndarray, lmax: int | None = None
 ) -> Float[np.ndarray, "band stokes alm"]:
-    """Packed coefficients of the maps of all bands, one band after the other.
+    """Return packed coefficients of the maps of all bands, computed band by band.
 
-    Of a map without multipoles above 2 nside they have an rms error of 1e-6 of their rms at
-    nside 16, and 1e-7 from nside 64 on; see `jaxsky.harmonics.analysis`. Power that a map has
-    above leaks into them, the most at 2 nside, where it is 1e-3 of it. White noise of pixels
-    remains white, N_l being its variance times the area of a pixel.
+    For a map without multipoles above 2 nside their rms error is 1e-6 of their rms at nside 16,
+    and 1e-7 from nside 64 on; see `jaxsky.harmonics.analysis`. Power of a map above 2 nside leaks
+    into them, most at 2 nside, where it is 1e-3 of that power. White noise of pixels remains white,
+    with N_l its variance times the area of a pixel.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def harmonic_coefficients(
 
 
 def _is_map(npix: int) -> bool:
-    """True for the pixels of an nside that is a power of 2."""
+    """Return True if this is the number of pixels of an nside that is a power of 2."""
     return healpy.isnpixok(npix) and healpy.isnsideok(healpy.npix2nside(npix), nest=True)
 
 
@@ -132,12 +132,12 @@ class Multipoles(NamedTuple):
 
     @property
     def sigma(self) -> Float[np.ndarray, "band stokes ell"]:
-        """Standard deviation of coefficients without their beam; infinite where left out."""
+        """Standard deviation of beam-deconvolved coefficients; infinite where left out."""
         with np.errstate(divide="ignore"):
             return 1 / np.sqrt(self.weights)
 
     def without_beams(self, alm: np.ndarray) -> Float[np.ndarray, "band stokes alm"]:
-        """Coefficients without their beam, up to lmax; zero below lmin."""
+        """Return beam-deconvolved coefficients up to lmax; zero below lmin."""
         short = np.asarray(resize(jnp.asarray(alm), self.inverse.shape[-1] - 1))
         rows = np.where(self.ell >= self.lmin, short * self.inverse[:, None, self.ell], 0.0)
         if not np.isfinite(rows).all():
@@ -147,7 +147,7 @@ class Multipoles(NamedTuple):
 
 
 def check_alm(alm: Numeric, bands: int) -> np.ndarray:
-    """Packed coefficients (band, stokes, alm), as they are."""
+    """Return packed coefficients (band, stokes, alm) unchanged, after checking their shape."""
     array = bare("alm", alm)
     shape = array.shape
     known = array.ndim == 3 and shape[0] == bands and shape[1] in (2, 3)
@@ -199,7 +199,7 @@ def multipoles_of(
     lmin: int,
     lmax: int | None,
 ) -> Multipoles:
-    """Checked beams and noise for coefficients."""
+    """Return beams and noise for coefficients, after checking them."""
     (bands, stokes), own = alm.shape[:2], lmax_of(alm)
     lmax = own if lmax is None else lmax
     if not 2 <= lmin <= lmax <= own:
@@ -224,10 +224,10 @@ def multipoles_of(
 
 
 def _compressed(rows: np.ndarray, multipoles: Multipoles, layout: Layout) -> Pixels:
-    """Vectors with the same covariance of bands as the coefficients of each multipole.
+    """Return vectors with the same covariance of bands as the coefficients of each multipole.
 
     They are the triangular factor of the coefficients (QR), so squares are not formed: signals 1e8
-    above the noise leave no trace in chi^2. `rows` are coefficients without beams.
+    above the noise leave no trace in chi^2. `rows` are beam-deconvolved coefficients.
     """
     lmin = multipoles.lmin
     weights = np.moveaxis(layout.rows(multipoles.weights[..., lmin:]), -1, 0)[..., None]
@@ -256,11 +256,11 @@ def harmonic_likelihood(
     lmin: int = 2,
     lmax: int | None = None,
 ) -> SpectralLikelihood:
-    """The spectral likelihood of full-sky maps that each have their own beam.
+    """Return the spectral likelihood of full-sky maps that each have their own beam.
 
     -2 ln L = sum_lm [d^T W d - (A^T W d)^T (A^T W A)^-1 (A^T W d)] with d = d_lm / b_l and
-    W = b_l^2 / N_l: that of Stompor et al. (2009, MNRAS 392, 216) with multipoles in the place of
-    pixels. Where the beam of a band is below 1e-5, it is left out.
+    W = b_l^2 / N_l: that of Stompor et al. (2009, MNRAS 392, 216) with multipoles for pixels. A
+    band is left out where its beam is below 1e-5.
 
     Parameters
     ----------
@@ -276,7 +276,7 @@ def harmonic_likelihood(
     beams : full widths at half maximum of Gaussian beams [arcmin], (band,), or tables b_l,
         (band, ell) from l = 0, with the window of the pixels if the maps have one
     unit : of the data, "uK_RJ", "K_CMB" or the like; amplitudes are uK in any case (CMB: uK_CMB)
-    lmin, lmax : smallest and largest multipole that is used; by default 2 and all there are
+    lmin, lmax : smallest and largest multipole that is used; by default 2 and that of `alm`
 
     Returns
     -------
@@ -325,9 +325,9 @@ def harmonic_likelihood(
 def masked_noise(
     prepared: CommonMaps, mask: Float[np.ndarray, " pix"], factors: Float[np.ndarray, " band"]
 ) -> Float[np.ndarray, "band 2 ell"]:
-    """N_l of masked maps: white as the beam of each band leaves it, and what is correlated.
+    """Return N_l of masked maps: smoothed white noise plus correlated noise.
 
-    The unit is that of which uK_RJ has `factors`.
+    They are in a unit of which uK_RJ is `factors`.
     """
     noises = prepared.fluctuations.noises.values()
     lmax = 2 * min(healpy.npix2nside(mask.size), *(n.preparation.nside_in for n in noises))

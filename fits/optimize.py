@@ -1,10 +1,10 @@
-"""The most probable parameters by gradient, with solvers of optimistix or Newton's method.
+"""Find the most probable parameters by gradient, with solvers of optimistix or Newton's method.
 
-Solvers of optimistix take the residuals, and so need nothing but their first derivatives: the
-default of template fits. Newton's method takes the exact second derivatives of each cell, in a
-program that the checks and the covariance need in any case: the default of spectral likelihoods,
-where a first fit, nearly all of it compilation, takes half the time of one with optimistix, and
-later ones the same few milliseconds. With hundreds of regions LBFGS and BFGS take a little longer,
+Solvers of optimistix take the residuals, and so need only their first derivatives: the default of
+template fits. Newton's method takes the exact second derivatives of each cell, in a program that
+the checks and the covariance need in any case: the default of spectral likelihoods, where a first
+fit, nearly all of it compilation, takes half the time of one with optimistix, and later ones the
+same few milliseconds. With hundreds of regions LBFGS and BFGS take a little longer,
 LevenbergMarquardt on normal equations twice as long, and Dogleg, which factorises the residuals of
 all cells together, fifty times. Levenberg and Marquardt's steps converge from farthest away.
 """
@@ -24,9 +24,9 @@ from fits.results import Convergence, FitResult, help_by_prior
 from fits.systems import Factor, degenerate, variances
 from jaxsky.checks import Numeric
 
-#: Steps of a search with a solver of optimistix and with Newton's method, by default.
+#: Most steps of a search with optimistix and with Newton's method, by default.
 MAX_STEPS, NEWTON_STEPS = 500, 100
-#: The optimum is reached this close to it, in standard deviations of a parameter.
+#: Distance from the optimum that counts as reached, in standard deviations of a parameter.
 REACHED = 1e-3
 
 
@@ -52,7 +52,7 @@ class Newton(NamedTuple):
     def minimise(
         self, posterior: Posterior, max_steps: int = NEWTON_STEPS
     ) -> tuple[Float[np.ndarray, " par"], int]:
-        """The optimum within bounds, and the number of steps to it."""
+        """Return the optimum within bounds, and the number of steps to it."""
         theta = posterior.start
         value, gradient = posterior.value(theta)
         damping, reach = 1e-4, posterior.reach()
@@ -99,13 +99,13 @@ class Newton(NamedTuple):
         return theta, max_steps
 
 
-#: What finds an optimum: by residuals, by a function alone, or by its derivatives.
+#: Solvers: on residuals, on a function alone, or on its derivatives.
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | Newton
 
 
 @jax.jit
 def _values(numbers, density, scale):
-    """Parameters from scaled numbers, with a uniform prior low + (high-low)(1+sin u)/2.
+    """Return parameters from scaled numbers u; in uniform priors low + (high-low)(1+sin u)/2.
 
     As in MINUIT: smooth, and flat at the edge, so that an optimum at the edge is a minimum in u.
     """
@@ -126,7 +126,7 @@ def _objective(numbers, args):
 
 
 def _sizes(posterior: Posterior) -> np.ndarray:
-    """Standard deviations at the start, in the numbers in which uniform priors have no bounds."""
+    """Return standard deviations at the start, in numbers where uniform priors have no bounds."""
     theta = posterior.start
     diagonal = posterior.curvature(theta, posterior.convex(theta)).diagonal()
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -136,7 +136,7 @@ def _sizes(posterior: Posterior) -> np.ndarray:
 
 
 def _searched(posterior: Posterior, solver: Solver, max_steps: int) -> tuple[np.ndarray, int]:
-    """What a solver of optimistix finds, and the number of its steps."""
+    """Return the optimum of a solver of optimistix, and the number of its steps."""
     least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
     for prior, own in posterior.priors:
         if least_squares and not isinstance(prior, Gaussian):
@@ -144,7 +144,7 @@ def _searched(posterior: Posterior, solver: Solver, max_steps: int) -> tuple[np.
                 f"Least squares takes uniform and Gaussian priors, not the {type(prior).__name__} "
                 f"of {posterior.names[int(np.argmax(own))]!r}."
             )
-    # Regions without a pixel are left out: some solvers do not bear what has no effect.
+    # Regions without a pixel are left out: some solvers fail on parameters without effect.
     density = posterior.density(posterior.start)
     present, bounded, low, high = map(np.asarray, density[3:])
     start = posterior.start[present]
@@ -164,7 +164,7 @@ def _searched(posterior: Posterior, solver: Solver, max_steps: int) -> tuple[np.
     solution, found = solve(jnp.asarray(u / scale))
     edges = posterior.edges(found)[present]
     if edges.any():
-        # The range is flat at its edge, so a step that reached it too early has stuck there.
+        # The map is flat at the edge of a range, so a step that got there too early is stuck.
         solution, found = solve(jnp.where(edges, 0.0, solution.value))
     return found, int(solution.stats["num_steps"])
 
@@ -178,7 +178,7 @@ def best_fit(
     max_steps: int | None = None,
     throw: bool = True,
 ) -> FitResult:
-    """The most probable parameters and their covariance.
+    """Find the most probable parameters and their covariance.
 
     Parameters
     ----------
@@ -206,12 +206,12 @@ def best_fit(
     Raises
     ------
     KeyError, TypeError, ValueError
-        For unknown parameters, start values outside their prior, something that is no solver, and
+        For unknown parameters, start values outside their prior, an object that is no solver, and
         priors that are neither uniform nor Gaussian with a least-squares solver.
     FitError
-        If it did not converge, unless throw=False; the result is in its `.result`. It has not
-        where the search stopped away from an optimum, its start included, where data and priors
-        do not determine a parameter, and where chi^2 is that of no fit (`fits.results`). The
+        If it did not converge, unless throw=False; the result is in its `.result`. That is so if
+        the search stopped away from an optimum, or at its start, if data and priors do not
+        determine a parameter, and if chi^2 is far too large for a fit (`fits.results`). The
         message says in how many regions and pixels, and which prior would help.
     """
     if not (solver is None or isinstance(solver, Solver)):
@@ -273,7 +273,7 @@ def best_fit(
 
 
 def _widened(matrix: np.ndarray, keep: np.ndarray, size: int) -> np.ndarray:
-    """A matrix of all parameters, NaN for those that were left out."""
+    """Return a matrix of all parameters, NaN for those that were left out."""
     wide = np.full((size, size), np.nan)
     wide[np.ix_(keep, keep)] = matrix
     return wide
@@ -287,7 +287,7 @@ def _errors(
     keep: np.ndarray,
     determined: bool,
 ) -> tuple[np.ndarray | None, np.ndarray]:
-    """Covariance, None for too many parameters, and standard deviations."""
+    """Return the covariance, None for too many parameters, and standard deviations."""
     size = len(posterior.present)
     sigma = np.full(size, np.nan)
     dense = isinstance(matrix, np.ndarray)
@@ -315,10 +315,10 @@ def _ended(
     unknown: list[str],
     far: np.ndarray,
 ) -> tuple[Convergence, str]:
-    """How a search ended, and in words; the gravest first.
+    """Return how a search ended, also in words; the most serious reason comes first.
 
-    An optimum is reached within `close` of it. `unknown` are labels of degenerate parameters, and
-    `far` those that are not at an optimum, nor at an edge of their prior.
+    A search within `close` of an optimum has reached it. `unknown` are labels of degenerate
+    parameters, and `far` is True for those neither at an optimum nor at an edge of their prior.
     """
 
     def which(bad: np.ndarray) -> str:

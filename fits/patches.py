@@ -1,11 +1,11 @@
-"""Power laws D_l = A (l/80)^(alpha + 2) of EE and BB on small patches of the sky, from maps.
+"""Fit power laws D_l = A (l/80)^(alpha + 2) to EE and BB on small patches of the sky.
 
 On a patch of 400 square degrees a band has the power of ten modes or fewer. Its error grows with
-the power itself, and errors taken from the measured one would favour whatever is low: here the
-variance follows the law. The equations that A and alpha solve are linear in the powers: their mean
-is zero at the true values, whatever the distribution of the powers (Wedderburn 1974). For one band
-without noise that is the likelihood of a chi^2-distributed power. Neighbouring bands of a small
-patch are correlated by -0.4; combinations without correlation take their place.
+the power itself, and errors from the measured power would favour low values, so the variance here
+follows the law. The equations that A and alpha solve are linear in the powers: their mean is zero
+at the true values, whatever the distribution of the powers (Wedderburn 1974). For one band without
+noise that is the likelihood of a chi^2-distributed power. Neighbouring bands of a small patch are
+correlated by -0.4, and are replaced by uncorrelated combinations.
 """
 
 import math
@@ -30,19 +30,19 @@ FLOOR = 0.3
 #: Mean and standard deviation of the Gaussian prior of alpha. Dust has -2.4 (Planck intermediate
 #: results 30, 2016).
 SLOPE = (-2.4, 3.0)
-#: An amplitude of fewer standard deviations than this is not called detected.
+#: Fewest standard deviations of an amplitude that counts as detected.
 DETECTION = 2.0
-#: Amplitudes that errors are taken from are not below this part of the rms of the bands.
+#: Least amplitude for errors, as a fraction of the rms of the bands.
 LEAST = 0.1
 
 
 class PatchFits(NamedTuple):
     """A and alpha of each patch, for EE and BB (in this order); from `fit_patches`.
 
-    The amplitude A = D_80, in the square of the maps' unit, may be negative where it is lost in
-    noise; alpha is the slope of C_l. Their `covariance` is that of a law of the prior's slope with
-    the amplitude that fits it best, and so are the `errors` of the band powers, of which noise is
-    subtracted. `detected` is A of at least twice its error; where it is not, alpha says little.
+    The amplitude A = D_80, in the square of the maps' unit, may be negative where noise dominates;
+    alpha is the slope of C_l. Their `covariance`, and the `errors` of the noise-subtracted band
+    powers, are those of the law with the prior's slope and its best amplitude. `detected` means
+    that A is more than twice its error; otherwise alpha says little.
     `pte` is the probability to exceed chi2 of the powers about the fit.
     """
 
@@ -70,10 +70,10 @@ def fit_patches(
     """Fit D_l = A (l/80)^(alpha + 2) to EE and BB of each patch.
 
     On simulated discs the mean A is 0.985 times the true one, alpha 0.1 of its standard deviation
-    above, and both scatter by 0.9 to 1.1 of their errors, without noise and with as much of it as
+    above, and both scatter by 0.9 to 1.1 of their errors, without noise and with as much noise as
     signal; alpha by less where its prior matters. Large-scale power leaks into the bands, and
-    errors count it as it is for the mean slope: if spectra go on to the largest scales with C_l ~
-    l^-2.8, they are 20 % too small, with l^-3.2 by half and more, unless `slope` says so.
+    errors count it as for the mean slope: if spectra continue to the largest scales as C_l ~
+    l^-2.8, errors are 20 % too small, with l^-3.2 by half and more, unless `slope` says so.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def _checked(name: str, maps: Float[Array, "2 pix"], patches: PreparedPatches) -
 def _noise_spectra(
     noise: float | np.ndarray | None, maps: Array, other: Array | None, patches: PreparedPatches
 ) -> Float[np.ndarray, "patch 2 ell"]:
-    """Spectra of the noise in the maps on each patch."""
+    """Return spectra of the noise in the maps on each patch."""
     lmax = patches.spectra[0].lmax
     shape = (len(patches.names), 2, lmax + 1)
     if noise is None:
@@ -146,7 +146,7 @@ def _fit_powers(
     cross: bool,
     slope: tuple[float, float],
 ) -> PatchFits:
-    """The fit to band powers from which the noise is subtracted."""
+    """Fit band powers from which the noise is subtracted."""
     first, (mean, spread) = patches.spectra[0], slope
     ell, ends = np.arange(first.lmax + 1), (first.edges[0], first.edges[-1] - 1)
     form, level = _covariance_terms(patches, noises, cross, mean)
@@ -158,7 +158,7 @@ def _fit_powers(
     windows = np.stack([one.windows for one in patches.spectra]) * _to_C(ell)
     means = windows @ np.asarray(_law(ell, ends, mean, mean))  # (p, i, b, of j)
     own = np.einsum("pibi->pib", means)
-    # A first amplitude, with the mean slope and the errors of signal without noise.
+    # A first amplitude, for the mean slope, with errors of the signal without noise.
     signal = np.stack([form[:, i, i, i] for i in (0, 1)], axis=1)
     weights = np.linalg.solve(signal, own[..., None])[..., 0]
     A = np.sum(weights * powers, axis=-1) / np.sum(weights * own, axis=-1)
@@ -187,7 +187,7 @@ def _fit_powers(
         np.asarray(x).reshape(*A.shape, *x.shape[1:]) for x in found
     )
     A, straight, model = A * scale[..., 0], straight * scale[..., 0], model * scale
-    # Errors are those of the mean slope, with the amplitude that fits best with it.
+    # Errors are those of the mean slope, with its best amplitude.
     errors, amplitudes = covariance(straight)
     d, slopes = seen * amplitudes[:, :2, None], slopes * amplitudes[:, :2, None]
     spreads = turn @ errors @ np.swapaxes(turn, -1, -2)
@@ -217,10 +217,10 @@ def _fit_powers(
 def _covariance_terms(
     patches: PreparedPatches, noises: np.ndarray, cross: bool, mean: float
 ) -> tuple[Float[np.ndarray, "patch 2 3 3 bin bin"], Float[np.ndarray, " patch"]]:
-    """Covariance of bands, EE and BB, as a quadratic form of the amplitudes of EE, BB and noise.
+    """Return the covariance of EE and BB as a quadratic form of amplitudes of EE, BB and noise.
 
-    The signal has the mean slope, the noise one spectrum for all patches with a level for each,
-    which is returned, too.
+    The signal has the mean slope; the noise has one spectrum for all patches, with a level per
+    patch, which is also returned.
     """
     first = patches.spectra[0]
     ell, ends = np.arange(first.lmax + 1), (first.edges[0], first.edges[-1] - 1)
@@ -230,7 +230,7 @@ def _covariance_terms(
     fields = np.array([[power, 0 * power], [0 * power, power], shape])
     of_shape = {i: covariance_terms(patches.spectra[i], fields) for i in set(patches.shapes)}
     terms = 2 * np.stack([np.einsum("xyibic->ixybc", of_shape[i]) for i in patches.shapes])
-    if cross:  # Noise meets the signal once in place of twice, and other noise.
+    if cross:  # Signal times noise counts once instead of twice, and noises differ.
         terms[:, :, 2] /= 2
         terms[:, :, :2, 2] /= 2
     return terms, level
@@ -241,7 +241,7 @@ def _to_C(ell: Int[np.ndarray, " ell"]) -> Float[np.ndarray, " ell"]:
 
 
 def _law(ell: ArrayLike, ends: tuple[int, int], mean: ArrayLike, alpha: ArrayLike) -> Array:
-    """D_l for A = 1; beyond the bins, where nothing is measured, it goes on with the mean slope."""
+    """Return D_l for A = 1; beyond the bins, where nothing is measured, it has the mean slope."""
     inside = jnp.clip(ell, *ends)
     return (inside / PIVOT) ** (alpha + 2) * (jnp.maximum(ell, 2) / inside) ** (mean + 2)
 
@@ -249,10 +249,10 @@ def _law(ell: ArrayLike, ends: tuple[int, int], mean: ArrayLike, alpha: ArrayLik
 def decorrelate(
     covariance: Float[np.ndarray, "... bin bin"], expected: Float[np.ndarray, "... bin"]
 ) -> Float[np.ndarray, "... bin bin"]:
-    """Symmetric combinations of bands without correlation, with the expected powers as they are.
+    """Return symmetric, uncorrelated combinations of bands that keep the expected powers.
 
-    The inverse root of the covariance, after Hamilton & Tegmark (2000). Bands are left alone where
-    it would have to be multiplied by negative numbers.
+    The inverse root of the covariance, after Hamilton & Tegmark (2000). Bands are left unchanged
+    where it would have to be multiplied by negative numbers.
     """
     values, vectors = np.linalg.eigh(covariance)
     root = (vectors / np.sqrt(values)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
@@ -277,7 +277,7 @@ def _variances(
     amplitudes: Float[np.ndarray, "patch x"],
     seen: Float[np.ndarray, "patch bin"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """nu, offset and width (`BandCombinations`) of one field, with all other amplitudes given.
+    """Return nu, offset and width (`BandCombinations`) of one field, given other amplitudes.
 
     `form` has the variances of d as a quadratic form of the amplitudes, those of the field first;
     d is `seen` for an amplitude of 1.
@@ -296,10 +296,10 @@ def _sandwich(
     covariance: Float[np.ndarray, "... bin bin"],
     spread: float,
 ) -> Float[np.ndarray, "... 2 2"]:
-    """Covariance of what solves G^T V^-1 (data - model) = 0, with a prior of the second number.
+    """Return the covariance of solutions of G^T V^-1 (data - model) = 0, with a prior on alpha.
 
-    G are derivatives of the model by the two numbers, V the variance that the equations were
-    weighted with, whatever the covariance of the data; `spread` is the prior's.
+    G are derivatives of the model by the two parameters, V the variance in the weights, whatever
+    the covariance of the data; `spread` is the width of the prior.
     """
     prior = np.diag([0, spread**-2])
     weights = np.swapaxes(derivatives / variance[..., None], -1, -2)
@@ -308,22 +308,22 @@ def _sandwich(
 
 
 def _model(theta, bands, slope, ends):
-    """d for A and for alpha in standard deviations of its prior."""
+    """Return d for A, and for alpha in standard deviations of its prior."""
     ell = jnp.arange(bands.laws.shape[-1])
     return theta[0] * (bands.laws @ _law(ell, ends, slope[0], slope[0] + slope[1] * theta[1]))
 
 
 @partial(jax.jit, static_argnames="ends")
 def minimise(bands: BandCombinations, slope: Array, ends: tuple[int, int]) -> tuple[Array, ...]:
-    """The fit to each row of bands, powers of order one, with the prior of alpha.
+    """Fit each row of bands, with powers of order one and the prior of alpha.
 
-    Returns A and alpha, the best A with the mean slope, d, its derivative by alpha for A = 1 and
-    the mean slope, and whether a minimum was found.
+    Return A and alpha, the best A for the mean slope, d, its derivative by alpha for A = 1 and the
+    mean slope, and whether a minimum was found.
     """
     solver: optx.AbstractMinimiser = optx.BFGS(1e-8, 1e-8)
 
     def deviance(theta, row):
-        """-2 ln of the quasi-likelihood, 2 int (d - data) / variance dd, and of the prior."""
+        """Return -2 ln of quasi-likelihood, 2 int (d - data) / variance dd, and prior."""
         power = _model(theta, row, slope, ends) + row.offset
         terms = jnp.log(power**2 + row.width**2) / 2
         terms = terms - (row.data + row.offset) / row.width * jnp.arctan(power / row.width)

@@ -1,8 +1,8 @@
-"""Priors, and likelihoods with them as functions of a vector of parameters, with derivatives.
+"""Priors, and posteriors as functions of a vector of parameters, with their derivatives.
 
 Parameters are numbers, or arrays with a value for each region. A cell, an intersection of regions,
-depends on a few of them only, so its second derivatives are a small matrix; those of all
-parameters are put together from them. A likelihood without regions is a single cell.
+depends on only a few of them, so its second derivatives are a small matrix; the matrix of all
+parameters is assembled from these. A likelihood without regions is a single cell.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from fits.systems import Derivatives, assembled
 from jaxsky.checks import Numeric, as_array
 from jaxsky.settings import Experiment
 
-#: Dense, or sparse for many parameters.
+#: Dense matrix, or sparse for many parameters.
 Matrix: TypeAlias = np.ndarray | scipy.sparse.csc_matrix
 #: A value this close to the edge of a uniform prior, in units of its width, is at the edge.
 EDGE = 1e-4
@@ -30,7 +30,7 @@ class Prior(eqx.Module):
     """Base class of priors on a parameter."""
 
     def log_density(self, value: Numeric) -> Array:
-        """Log-density up to a constant; -inf outside the range."""
+        """Return the log-density up to a constant; -inf outside the range."""
         raise TypeError(f"{type(self).__name__} must define `log_density`.")
 
 
@@ -89,7 +89,7 @@ class Gaussian(Prior):
 
 
 def priors_of(settings: Experiment, command: str) -> dict[str, Prior]:
-    """Priors of the free parameters of a command that have one."""
+    """Return the priors of the free parameters of a command."""
     priors: dict[str, Prior] = {}
     for name, one in settings.free_in(command).items():
         if one.uniform:
@@ -100,7 +100,7 @@ def priors_of(settings: Experiment, command: str) -> dict[str, Prior]:
 
 
 def check_priors(priors: Mapping[str, Prior] | None, free: Iterable[str]) -> dict[str, Prior]:
-    """The priors, once each is known to belong to a free parameter."""
+    """Return the priors, after checking that each belongs to a free parameter."""
     free = list(free)
     for name in priors or {}:
         if name not in free:
@@ -117,37 +117,37 @@ class Likelihood(eqx.Module):
     closed form.
     """
 
-    #: Values of the free parameters by name, and the number of data less that of amplitudes.
+    #: Start values of the free parameters by name; number of data minus number of amplitudes.
     start: dict[str, Array]
     values: Int[Array, ""] | int
-    #: Whether amplitudes are fitted in each pixel: then the inverse curvature alone is too small
-    #: for errors where signals are near the noise of a pixel.
+    #: Whether amplitudes are fitted in each pixel: then the inverse curvature alone
+    #: underestimates errors where signals are near the noise of a pixel.
     profiled: ClassVar[bool] = False
 
     def residuals(self, params: Mapping[str, Numeric]) -> Float[Array, " row"]:
-        """Residuals at values of any of the parameters by name; the others keep theirs."""
+        """Return residuals for parameters by name; others keep their values."""
         raise TypeError(f"{type(self).__name__} must define `residuals`.")
 
     def check(self, params: Mapping[str, Numeric]) -> dict[str, Array]:
-        """The free parameters as arrays, once they are known to be parameters."""
+        """Return the free parameters as arrays, after checking their names."""
         raise TypeError(f"{type(self).__name__} must define `check`.")
 
     def dof(self, free: int) -> int:
-        """Degrees of freedom of chi^2: data with weight, less amplitudes and free parameters."""
+        """Return the degrees of freedom: data with weight - amplitudes - free parameters."""
         return int(self.values) - free
 
     @property
     def free(self) -> tuple[str, ...]:
-        """Names of the free parameters, in the order of the vector of all."""
+        """Names of the free parameters, in the order of the vector."""
         return tuple(sorted(self.start))
 
     def at(self, start: Mapping[str, Numeric] | None) -> "Likelihood":
-        """With other start values; the same if there are none."""
+        """Return the likelihood with other start values; itself for None."""
         start = self.check(self.start if start is None else start)
         return dataclasses.replace(self, start=start)
 
     def flat(self, params: Mapping[str, Numeric]) -> Float[Array, " par"]:
-        """The vector of all free parameters; those not given are at their start."""
+        """Return the vector of all free parameters; those not given are at their start."""
         rows = [
             jnp.broadcast_to(params.get(name, self.start[name]), self.start[name].shape).ravel()
             for name in self.free
@@ -155,22 +155,22 @@ class Likelihood(eqx.Module):
         return jnp.concatenate(rows) if rows else jnp.zeros(0)
 
     def named(self, theta: Float[Array, " par"]) -> dict[str, Array]:
-        """The inverse of `flat`."""
+        """Return parameters by name from the vector, the inverse of `flat`."""
         ends = np.cumsum([self.start[name].size for name in self.free])
         parts = jnp.split(jnp.asarray(theta), ends[:-1]) if len(ends) else []
         shapes = [self.start[name].shape for name in self.free]
         return {n: p.reshape(s) for n, p, s in zip(self.free, parts, shapes, strict=True)}
 
     def cells(self) -> Int[Array | np.ndarray, "cell free"]:
-        """Position of each free parameter of each cell in the vector of all."""
+        """Return the position of each free parameter of each cell in the vector of all."""
         return np.arange(len(self.free))[None]
 
     def total(self, local: Float[Array, "cell free"]) -> Float[Array, ""]:
-        """-2 ln L for parameters of each cell."""
+        """Return -2 ln L for parameters of each cell."""
         return jnp.sum(self.residuals(self.named(local[0])) ** 2)
 
     def derivatives(self, local: Float[Array, "cell free"]) -> Derivatives:
-        """-ln L of each cell, and its derivatives in the parameters of the cell."""
+        """Return -ln L of each cell, and its derivatives in the parameters of the cell."""
 
         def gradient(theta):
             value, slope = jax.value_and_grad(lambda t: self.total(t[None]) / 2)(theta)
@@ -182,8 +182,8 @@ class Likelihood(eqx.Module):
 
 
 def chi2(like: Likelihood, params: Mapping[str, Numeric]) -> Float[Array, ""]:
-    """Sum of squares of the residuals: chi^2, or -2 log L up to a constant."""
-    # All of one type, or it would be compiled again for Python's numbers.
+    """Return the sum of squares of the residuals: chi^2, or -2 log L up to a constant."""
+    # All of one type, or Python numbers would be compiled again.
     values = {name: as_array(name, value).astype(float) for name, value in params.items()}
     return _chi2(like, values)
 
@@ -195,7 +195,7 @@ def _chi2(like, params):
 
 @jax.jit
 def value_and_gradient(like, theta):
-    """-ln L and its gradient."""
+    """Return -ln L and its gradient."""
     return jax.value_and_grad(lambda t: like.total(t[like.cells()]) / 2)(theta)
 
 
@@ -205,7 +205,7 @@ def _cell_derivatives(like, theta) -> Derivatives:
 
 
 def hessian(like: Likelihood, params: Mapping[str, Numeric]) -> Float[np.ndarray, "par par"]:
-    """Second derivatives of -ln L in all parameters, regions one after the other."""
+    """Return second derivatives of -ln L in all parameters, regions one after the other."""
     return _dense("hessian", like, params)
 
 
@@ -227,7 +227,7 @@ def _dense(which, like, params):
 
 @jax.jit
 def prior_terms(theta, priors):
-    """-log density of priors, first and second derivative, for rows (prior, where it holds)."""
+    """Return -log density of priors, given as (prior, where it applies), and two derivatives."""
     value = jnp.zeros(())
     first, second = jnp.zeros_like(theta), jnp.zeros_like(theta)
     for prior, where in priors:
@@ -241,8 +241,8 @@ def prior_terms(theta, priors):
 class Density(NamedTuple):
     """The posterior of the parameters of regions with pixels, for compiled programs.
 
-    `theta` is a vector of all parameters, and `present` the positions of these in it; `bounded` are
-    those with a uniform prior, from low to high, which are other numbers for those without.
+    `theta` is a vector of all parameters, and `present` the positions of these in it; `bounded` is
+    True for those with a uniform prior, from `low` to `high`; the others have dummies there.
     """
 
     like: Likelihood
@@ -254,28 +254,28 @@ class Density(NamedTuple):
     high: Float[Array, " par"]
 
     def full(self, values: Float[Array, " par"]) -> Float[Array, " all"]:
-        """The vector of all parameters."""
+        """Return the vector of all parameters."""
         return self.theta.at[self.present].set(values)
 
     def log_prob(self, values: Float[Array, " par"]) -> Float[Array, ""]:
-        """Log posterior of parameters within their uniform priors, without constants."""
+        """Return the log posterior within uniform priors, without constants."""
         theta = self.full(values)
         value = prior_terms(theta, self.priors)[0]
         return -self.like.total(theta[self.like.cells()]) / 2 - value
 
 
 class Posterior:
-    """-log posterior of the parameters that any cell has, within bounds.
+    """-log posterior as a function of the vector of parameters, within bounds.
 
-    `names` and `labels` of each parameter are its name, and name and region ("dust.beta_dust[3]");
-    `present` is true for regions with pixels; `low` and `high` are bounds, those of uniform priors,
-    and `priors` the others, with the parameters that they are for.
+    `names` has the name of each parameter, `labels` name and region ("dust.beta_dust[3]");
+    `present` is true for regions with pixels; `low` and `high` are bounds from uniform priors, and
+    `priors` are the other priors, with the parameters that they apply to.
     """
 
     def __init__(self, like: Likelihood, priors: Mapping[str, Prior] | None) -> None:
         self.like = like
         self.start = np.array(like.flat({}))
-        #: The last vector that derivatives were asked for, and what they are.
+        #: The last vector at which derivatives were computed, and these.
         self._last: tuple[bytes, Derivatives] | None = None
         self.owner = np.repeat(np.arange(len(like.free)), [like.start[n].size for n in like.free])
         self.names = tuple(like.free[i] for i in self.owner)
@@ -298,13 +298,13 @@ class Posterior:
                 )
 
     def named(self, theta: Float[np.ndarray, " par"]) -> dict[str, Any]:
-        """Values by name, numbers or arrays; NaN for regions without pixels."""
+        """Return values by name, numbers or arrays; NaN for regions without pixels."""
         shaped = self.like.named(jnp.asarray(np.where(self.present, theta, np.nan)))
         return {name: np.asarray(v) if v.ndim else float(v) for name, v in shaped.items()}
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Name, and region if it has several, of each parameter."""
+        """Name of each parameter, with its region if it has several."""
         start = self.like.start
         return tuple(
             f"{name}[{k}]" if start[name].ndim else name
@@ -313,7 +313,7 @@ class Posterior:
         )
 
     def where(self, bad: Bool[np.ndarray, " par"]) -> str:
-        """Names of parameters, with the regions and pixels that they are of."""
+        """Return names of parameters, with numbers of regions and pixels, for messages."""
         of_cell = np.zeros(len(self.index), int)
         if (of_pixel := getattr(self.like, "of_pixel", None)) is not None:
             of_pixel = np.asarray(of_pixel)
@@ -332,7 +332,7 @@ class Posterior:
         return ", ".join(named[:6]) + (f" and {len(named) - 6} more" if named[6:] else "")
 
     def density(self, theta: np.ndarray) -> Density:
-        """The same for compiled programs, with a vector of all parameters."""
+        """Return the posterior for compiled programs, with a vector of all parameters."""
         present = np.flatnonzero(self.present)
         low, high = self.low[present], self.high[present]
         bounded = np.isfinite(low)
@@ -340,7 +340,7 @@ class Posterior:
         return Density(self.like, self.priors, *map(jnp.asarray, (theta, present, *limits)))
 
     def derivatives(self, theta: np.ndarray) -> Derivatives:
-        """-ln L of each cell and its derivatives, as arrays of numpy; priors left out."""
+        """Return -ln L of each cell and its derivatives as numpy arrays, without priors."""
         key = theta.tobytes()
         if self._last is None or self._last[0] != key:
             found = _cell_derivatives(self.like, jnp.asarray(theta))
@@ -348,7 +348,7 @@ class Posterior:
         return self._last[1]
 
     def value(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
-        """The function and its gradient."""
+        """Return -log posterior and its gradient."""
         cells = self.derivatives(theta)
         value, gradient = float(np.sum(cells.value)), np.zeros(len(theta))
         np.add.at(gradient, self.index, cells.gradient)
@@ -360,7 +360,7 @@ class Posterior:
     def curvature(
         self, theta: np.ndarray, local: Array | np.ndarray, keep: np.ndarray | None = None
     ) -> Matrix:
-        """The matrix of all parameters, or those to keep, from those of the cells and priors."""
+        """Assemble the matrix of all parameters, or those to keep, from cells and priors."""
         diagonal = np.zeros(len(theta))
         if self.priors:
             diagonal = np.asarray(prior_terms(theta, self.priors)[2])
@@ -372,7 +372,7 @@ class Posterior:
         )
 
     def convex(self, theta: np.ndarray) -> np.ndarray:
-        """Second derivatives of each cell; Fisher matrices where these are not positive."""
+        """Return second derivatives of each cell, or its Fisher matrix if not positive."""
         exact = np.asarray(self.derivatives(theta).hessian)
         usable = np.isfinite(exact).all(axis=(1, 2))
         safe = np.where(usable[:, None, None], exact, 0)
@@ -383,7 +383,7 @@ class Posterior:
         return np.where(usable[:, None, None], exact, self.derivatives(theta).fisher)
 
     def reach(self) -> Float[np.ndarray, " par"]:
-        """The longest step of each parameter: beyond what its prior says lie other optima."""
+        """Return the longest step of each parameter: far beyond its prior lie other optima."""
         width = np.where(np.isfinite(self.high), self.high - self.low, np.inf) / 4
         for prior, where in self.priors:
             if isinstance(prior, Gaussian):
@@ -391,7 +391,7 @@ class Posterior:
         return width
 
     def edges(self, theta: np.ndarray) -> Bool[np.ndarray, " par"]:
-        """Parameters that lie at an edge of their uniform prior."""
+        """Return True for parameters that lie at an edge of their uniform prior."""
         near = np.minimum(np.abs(theta - self.low), np.abs(theta - self.high))
         width = np.where(np.isfinite(self.high), self.high - self.low, 0.0)
         return self.present & (near < EDGE * width)

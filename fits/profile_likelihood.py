@@ -1,4 +1,4 @@
-"""The spectral likelihood: laws of components, with their amplitudes profiled out.
+"""The spectral likelihood of component separation: laws, with amplitudes profiled out.
 
 With A (band, component) the band-averaged laws and any amplitudes in each pixel (Stompor et al.
 2009, MNRAS 392, 216),
@@ -6,8 +6,8 @@ With A (band, component) the band-averaged laws and any amplitudes in each pixel
     -2 ln L = sum_p [d^T N^-1 d - (A^T N^-1 d)^T (A^T N^-1 A)^-1 (A^T N^-1 d)].
 
 Parameters are numbers, or arrays with a value for each region of a map of labels; a cell is an
-intersection of regions. Where noise is separable and cells are large, a few vectors take the
-place of the pixels (`fits.compress`) and nothing depends on nside.
+intersection of regions. Where noise is separable and cells are large, a few vectors replace the
+pixels (`fits.compress`), and the cost does not depend on nside.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ from jaxsky.bandpass import parse_unit
 from jaxsky.checks import Numeric, as_array, check_double, check_finite, check_shape
 from jaxsky.sky import check_parameter, unknown_parameter
 
-#: Pixels that are treated at once.
+#: Pixels processed at once.
 PASS = 4096
 
 
@@ -51,7 +51,7 @@ class SpectralLikelihood(Likelihood):
     layout: tuple[Layout, ...] = eqx.field(static=True)
     #: Stokes parameters of the data
     stokes: str = eqx.field(static=True)
-    #: bands that add nothing to what the others tell, and are not counted
+    #: bands that carry no weight next to the others, and are not counted
     weightless: tuple[str, ...] = eqx.field(static=True)
 
     profiled = True
@@ -79,7 +79,7 @@ class SpectralLikelihood(Likelihood):
         for name, has_pixels in self.named(jnp.asarray(seen)).items():
             default = self.start[name]
             value = as_array(name, params.get(name, default))
-            # What fits return for regions without a pixel is not a number.
+            # Fits return NaN for regions without a pixel.
             result[name] = jnp.where(has_pixels, value, default)
             check_finite(name, result[name])
         return result
@@ -88,7 +88,7 @@ class SpectralLikelihood(Likelihood):
         return self.index
 
     def matrices(self, local: Float[Array, "cell free"]) -> tuple[Array, ...]:
-        """Mixing matrices (cell, row, unknown), for each of `layout`."""
+        """Return mixing matrices (cell, row, unknown), for each of `layout`."""
         values = {name: local[:, k] for k, name in enumerate(self.free)} | self.fixed
         matrix = self.mixing(values, len(local))
         return tuple(
@@ -96,7 +96,7 @@ class SpectralLikelihood(Likelihood):
         )
 
     def _mapped(self, function, matrices):
-        """A function of (matrices, pixels) in all blocks, for each of `layout`."""
+        """Apply a function of (matrices, pixels) to all blocks, for each of `layout`."""
         results = []
         for of_cell, pixels in zip(matrices, self.pixels, strict=True):
             blocks, *_, size = pixels.data.shape
@@ -118,12 +118,12 @@ class SpectralLikelihood(Likelihood):
         return jnp.arange(blocks) if self.block_cell is None else self.block_cell
 
     def total(self, local: Float[Array, "cell free"]) -> Float[Array, ""]:
-        """-2 ln L for parameters of each cell."""
+        """Return -2 ln L for parameters of each cell."""
         parts = self._mapped(systems.least_chi2, self.matrices(local))
         return sum((jnp.sum(part) for part in parts), jnp.zeros(()))
 
     def derivatives(self, local: Float[Array, "cell free"]) -> systems.Derivatives:
-        """-ln L of each cell, and its derivatives in the parameters of the cell."""
+        """Return -ln L of each cell, and its derivatives in the parameters of the cell."""
         units = jnp.eye(local.shape[1])
 
         def slope(function, x, unit):
@@ -153,7 +153,7 @@ class SpectralLikelihood(Likelihood):
 def _start_values(
     mixing: Mixing, start: Mapping[str, Numeric], labels: Mapping[str, np.ndarray]
 ) -> dict[str, Array]:
-    """Start values as arrays, one value for each region where there are labels."""
+    """Return start values as arrays, one value per region where there are labels."""
     spectral = spectral_names(mixing.sky)
     for name in (*start, *labels):
         if name not in (known := (*spectral, *mixing.band_parameters())):
@@ -196,7 +196,7 @@ def spectral_likelihood(
     unit: str = "uK_RJ",
     compress: bool | None = None,
 ) -> SpectralLikelihood:
-    """The likelihood of the spectral parameters named in `start`.
+    """Return the likelihood of the spectral parameters named in `start`.
 
     Parameters
     ----------
@@ -212,8 +212,8 @@ def spectral_likelihood(
     labels : maps of region numbers from 0 for parameters that vary, by name; start values are
         then arrays with one value for each region, or a number for all
     unit : of the data, "uK_RJ", "K_CMB" or the like; amplitudes are uK in any case (CMB: uK_CMB)
-    compress : whether vectors take the place of pixels, where noise is separable; by default
-        where they are fewer
+    compress : whether vectors replace pixels, which needs separable noise; by default if they are
+        fewer
 
     Returns
     -------
@@ -315,12 +315,12 @@ def _index(values: Mapping[str, Array], cells: Cells) -> Array:
 
 @jax.jit
 def matrices_at(like: SpectralLikelihood, params: Mapping[str, Array]) -> tuple[Array, ...]:
-    """Mixing matrices (cell, row, unknown) for parameters by name, for each of `layout`."""
+    """Return mixing matrices (cell, row, unknown) for parameters, for each of `layout`."""
     return like.matrices(like.flat(params)[like.index])
 
 
 def _check_matrices(like: SpectralLikelihood) -> np.ndarray:
-    """The matrices at the start values; ValueError if two components have the same law there."""
+    """Return the matrices at the start; ValueError if two components have the same law there."""
     given = np.asarray(matrices_at(like, {})[0])
     matrix = given / np.linalg.norm(given, axis=1, keepdims=True)
     if not np.isfinite(matrix).all():

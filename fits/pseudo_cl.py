@@ -1,8 +1,8 @@
-"""Spectra of polarization on part of the sky: MASTER pseudo-C_l with the mixing of E and B.
+"""Polarization spectra on part of the sky: MASTER pseudo-C_l with the mixing of E and B.
 
 A mask mixes multipoles, and E with B. The mean of the spectra of masked maps is a matrix times
-the spectra of the sky (Hivon et al. 2002; for polarization Brown, Castro & Taylor 2005); in bins
-that are wide against the mask's own resolution it can be inverted.
+the spectra of the sky (Hivon et al. 2002; for polarization Brown, Castro & Taylor 2005); it can be
+inverted in bins that are wide compared with the width of the mask's own spectrum.
 """
 
 import itertools
@@ -23,17 +23,17 @@ from jaxtyping import Array, Float
 from jaxsky.checks import Numeric, check_finite, is_concrete
 from jaxsky.harmonics import analysis, expand, lmax_of, power_spectrum, synthesis
 
-#: Multipole at which amplitudes are given: where primordial B modes of recombination peak.
+#: Multipole of amplitudes: that of the recombination peak of primordial B modes.
 PIVOT = 80
 #: Spectra are corrected for beams down to this window.
 LEAST_WINDOW = 0.05
-#: Fewest modes of a field in a bin that a mean power can be taken of.
+#: Fewest modes of a field in a bin for a mean power.
 LEAST_MODES = 4.0
 #: The paper's multipoles, 40 to 100, in four bins.
 EDGES = (40, 55, 70, 85, 101)
-#: Matrices of coupling that agree to this belong to the same mask, turned.
+#: Coupling matrices that agree to this belong to the same mask at another place.
 SAME = 2e-3
-#: Polarization has no multipoles below.
+#: Lowest multipole of polarization.
 LMIN = 2
 FIELDS = ("EE", "BB")
 
@@ -68,7 +68,7 @@ def bin_centers(edges: Sequence[int]) -> Float[np.ndarray, " bin"]:
 
 
 def bin_edges(lmin: int, lmax: int, width: int) -> tuple[int, ...]:
-    """Edges of bins from lmin to lmax inclusive, all of the width but the last, which is wider."""
+    """Return edges of bins of one width from lmin to lmax inclusive; the last may be wider."""
     count = max(1, (lmax + 1 - lmin) // width)
     return (*(lmin + width * i for i in range(count)), lmax + 1)
 
@@ -76,7 +76,7 @@ def bin_edges(lmin: int, lmax: int, width: int) -> tuple[int, ...]:
 def coupling_matrices(
     power: Float[np.ndarray, " ell"], lmax: int
 ) -> Float[np.ndarray, "2 ell ell"]:
-    """What a mask does to spectra: pseudo-EE = M[0] EE + M[1] BB, and with E and B exchanged.
+    """Return the effect of a mask: pseudo-EE = M[0] EE + M[1] BB, and with E and B exchanged.
 
     `power` is C_l of the mask, at best up to 2 lmax, with lmax that of the spectra.
     """
@@ -90,7 +90,7 @@ def coupling_matrices(
 
 
 def pure_factors(lmax: int) -> Float[np.ndarray, "3 ell"]:
-    """Factors of the three terms of a purified harmonic."""
+    """Return the factors of the three terms of a purified harmonic."""
     ell = np.maximum(np.arange(lmax + 1), 2.0)
     return np.stack(
         [
@@ -102,7 +102,7 @@ def pure_factors(lmax: int) -> Float[np.ndarray, "3 ell"]:
 
 
 def derivative_factors(count: int) -> Float[np.ndarray, "3 ell"]:
-    """sqrt((l + n)! / (l - n)!): a scalar's n-th derivative in harmonics of spin n = 0, 1, 2."""
+    """Return sqrt((l + n)! / (l - n)!), for n-th derivatives in harmonics of spin n = 0, 1, 2."""
     ell = np.arange(count, dtype=float)
     second = (ell - 1) * ell * (ell + 1) * (ell + 2)
     return np.stack([np.ones(count), np.sqrt(ell * (ell + 1)), np.sqrt(np.maximum(second, 0))])
@@ -111,11 +111,11 @@ def derivative_factors(count: int) -> Float[np.ndarray, "3 ell"]:
 def pure_coupling_matrices(
     power: Float[np.ndarray, " ell"], lmax: int
 ) -> Float[np.ndarray, "2 ell ell"]:
-    """`coupling_matrices` of a purified field (Smith 2006).
+    """Return `coupling_matrices` of a purified field (Smith 2006).
 
-    In place of the mask times a harmonic of spin 2 stands the second derivative of the mask times
-    a scalar harmonic, three terms with a Wigner symbol each. M[1] is zero but for rounding, where
-    all multipoles of the mask are given: that is what purifying is for.
+    The mask times a harmonic of spin 2 is replaced by the second derivative of the mask times a
+    scalar harmonic, three terms with a Wigner symbol each. M[1] is zero to rounding if all
+    multipoles of the mask are given: that is the purpose of purifying.
     """
     count = min(len(power), 2 * lmax + 1)
     weights = power[:count] * (2 * np.arange(count) + 1) / (4 * math.pi)
@@ -138,7 +138,7 @@ def pure_coupling_matrices(
 
 
 def _all_edges(edges: Sequence[int], lmax: int) -> np.ndarray:
-    """The bins, and as wide ones below and above, whose power is in the masked maps, too."""
+    """Return bins, and equally wide ones below and above, whose power the mask mixes in."""
     first, last = edges[1] - edges[0], edges[-1] - edges[-2]
     below = np.arange(edges[0], 2, -first)
     above = np.arange(edges[-1], lmax + 1, last)
@@ -153,7 +153,7 @@ def masked_spectra(
     window: Float[np.ndarray, " ell"] | None = None,
     pure: bool = False,
 ) -> MaskedSpectra:
-    """Prepare to take spectra on part of the sky.
+    """Prepare the operators that take spectra on part of the sky.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def masked_spectra(
     lmax : largest multipole whose power is taken into account, by default twice that of the bins,
         at most 2 nside
     window : window b_l of the maps (beam and pixels), by default 1
-    pure : purify B, so that E adds no variance to it; takes a mask with two derivatives
+    pure : purify B, so that E adds no variance to it; needs a mask with two derivatives
 
     Raises
     ------
@@ -229,13 +229,13 @@ def _check(mask: np.ndarray, edges: tuple[int, ...], lmax: int, window: np.ndarr
 
 
 def sky_fraction(mask: Float[np.ndarray, " pix"]) -> float:
-    """Fraction of the sky that has as many modes as there are within the mask."""
+    """Return the fraction of the sky that has as many modes as the mask leaves."""
     fourth = float(np.mean(mask**4))
     return float(np.mean(mask**2)) ** 2 / fourth if fourth else 0.0
 
 
 def _derivatives(alm: Float[Array, "1 alm"], nside: int) -> Float[np.ndarray, "4 pix"]:
-    """First and second derivative of a mask, as fields of spin 1 and 2."""
+    """Return first and second derivatives of a mask, as fields of spin 1 and 2."""
     rises = derivative_factors(lmax_of(alm) + 1)
     zero = jnp.zeros_like(alm[0])
     first, second = (jnp.stack([alm[0] * expand(jnp.asarray(rise)), zero]) for rise in rises[1:])
@@ -249,8 +249,8 @@ def _masked_alm(
     maps: Float[Array, "2 pix"],
     lmax: int,
 ) -> Float[Array, "2 alm"]:
-    """E and B of masked maps, B purified if the mask's derivatives are given."""
-    # Pixels that are not used may hold anything: a purified harmonic reaches a little beyond them.
+    """Return E and B of masked maps, with B purified if the mask's derivatives are given."""
+    # Unused pixels may contain anything, and a purified harmonic reaches a little beyond the mask.
     maps = jnp.where(mask > 0, maps, 0.0)
     E, B = analysis(mask * maps, lmax, 0)
     if derivatives is not None:
@@ -273,13 +273,13 @@ def band_powers(
     maps: Float[Array, "2 pix"],
     other: Float[Array, "2 pix"] | None = None,
 ) -> Float[np.ndarray, "2 bin"]:
-    """Band powers D_b = l (l + 1) C_l / 2 pi of EE and BB; the spectra of noise are in them.
+    """Return band powers D_b = l (l + 1) C_l / 2 pi of EE and BB, including noise.
 
     Parameters
     ----------
     spectra : from `masked_spectra`
     maps : Q and U, RING, values outside the mask do not matter
-    other : Q and U of another map, for cross-spectra, which noise of its own does not bias
+    other : Q and U of another map, for cross-spectra, which independent noise does not bias
 
     Raises
     ------
@@ -300,16 +300,15 @@ def band_powers(
 def mean_spectrum(
     mask: Float[Array, " pix"], maps: Float[Array, "2 pix"], lmax: int
 ) -> Float[Array, " ell"]:
-    """C_l of a masked map, the mean of EE and BB, over the mean square of the mask."""
+    """Return C_l of a masked map, the mean of EE and BB, over the mean square of the mask."""
     power = power_spectrum(analysis(mask * jnp.where(mask > 0, maps, 0.0), lmax, 0))
     return power.mean(axis=0) / jnp.mean(mask**2)
 
 
 class PreparedPatches(NamedTuple):
-    """Patches with all that does not depend on the maps; from `prepare_patches`.
+    """Patches with everything that does not depend on the maps; from `prepare_patches`.
 
-    `shapes` is the first patch with the same mask but for its place, and `window` is b_l of the
-    maps.
+    `shapes` is the index of the first patch of the same shape, and `window` is b_l of the maps.
     """
 
     names: tuple[str, ...]
@@ -326,7 +325,7 @@ def prepare_patches(
     lmax: int | None = None,
     pure: bool = False,
 ) -> PreparedPatches:
-    """Patches with all that does not depend on the maps, for any number of them.
+    """Prepare patches for the spectra of any number of maps.
 
     Parameters
     ----------
@@ -335,7 +334,7 @@ def prepare_patches(
     edges : first multipole of each bin, and the one after the last; three bins at least
     lmax : see `masked_spectra`
     pure : purify B, which makes its errors on the paper's discs 20 to 40 % smaller; of patches
-        that are no discs the errors that are returned for B are then up to a third too small
+        other than discs the errors returned for B are then up to a third too small
     """
     if len(edges) < 4:
         raise ValueError(
@@ -361,15 +360,15 @@ def prepare_patches(
 def polarization_alms(
     maps: Float[Array, "band stokes pix"], lmax: int
 ) -> Float[Array, "band 2 alm"]:
-    """Coefficients of E and B of each band; at 1.5 nside their spectra are good to 1e-3."""
+    """Return E and B of each band; at l = 1.5 nside their spectra are good to 1e-3."""
     return jnp.stack([analysis(band, lmax) for band in maps])
 
 
 def cosmic_error(power: Float[Array, "... ell"], signal: Numeric = 0.0) -> Float[Array, "... ell"]:
-    """Standard deviation of the full-sky spectrum of a random field, the paper's eq. 9.
+    """Return the standard deviation of the full-sky spectrum of a random field, the paper's eq. 9.
 
-    sqrt(2 / (2l+1)) C_l; where the field is added to a signal that does not vary, the chance
-    correlation of both, which the paper leaves out, adds to it: sqrt(2 / (2l+1) C_l (C_l + 2 F_l)).
+    It is sqrt(2 / (2l+1)) C_l; if the field is added to a fixed signal of spectrum F_l, their
+    chance correlation, which the paper leaves out, makes it sqrt(2 / (2l+1) C_l (C_l + 2 F_l)).
     """
     ell = jnp.arange(power.shape[-1])
     return jnp.sqrt(2 / (2 * ell + 1) * power * (power + 2 * signal))
@@ -378,10 +377,10 @@ def cosmic_error(power: Float[Array, "... ell"], signal: Numeric = 0.0) -> Float
 def hotelling(
     observed: Float[np.ndarray, " bin"], simulated: Float[np.ndarray, "sim bin"]
 ) -> tuple[float, float]:
-    """chi^2 of a measurement among simulations, and the probability to exceed it.
+    """Return chi^2 of a measurement against simulations, and the probability to exceed it.
 
-    Mean and covariance are those of the simulations, and so are uncertain; Hotelling's T^2, with
-    its F distribution, is exact for Gaussian simulations in any number.
+    Mean and covariance come from the simulations, and so are uncertain; Hotelling's T^2, with its F
+    distribution, is exact for any number of Gaussian simulations.
     """
     n, p = simulated.shape
     if n <= p:

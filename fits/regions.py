@@ -1,4 +1,4 @@
-"""Parts of the sky by name, masks with smooth edges, and regions of constant parameters.
+"""Regions of the sky by name, apodized masks, and regions of constant parameters.
 
 Regions are maps of labels 0, 1, ..., one for each parameter; cells are their intersections.
 """
@@ -31,14 +31,14 @@ COMPARISONS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": oper
 
 
 def region_masks(settings: Experiment, names: Sequence[str]) -> dict[str, Bool[np.ndarray, " pix"]]:
-    """Pixels of some regions at the common nside; see `region_mask`."""
+    """Return the pixels of some regions at the common nside; see `region_mask`."""
     return {name: region_mask(settings, name, settings.common.nside) for name in names}
 
 
 def region_mask(
     settings: Experiment, name: str, nside: int, *, coarser: bool = False
 ) -> Bool[np.ndarray, " pix"]:
-    """Pixels of a region that the common mask leaves; `coarser` masks are refused, or refined."""
+    """Return the pixels of a region inside the common mask; `coarser` allows coarser masks."""
     region, inside = settings.regions[name], np.ones(healpy.nside2npix(nside), bool)
     masks = {"common.mask": settings.common.mask}
     if isinstance(region, MapFile):
@@ -61,10 +61,10 @@ def region_mask(
 
 
 def common_holes(maps: Sequence[Bool[np.ndarray, " pix"]]) -> dict[int, np.ndarray]:
-    """Pixels that no map misses, at each nside of the maps; empty if none misses any.
+    """Return the pixels that all maps have, at each nside of the maps; empty without holes.
 
-    Smoothing spreads what surrounds a hole into it and the hole into what surrounds it, so all
-    maps, templates and data, get the same holes.
+    Smoothing spreads the surroundings of a hole into it, and the hole into its surroundings, so
+    all maps, templates and data, get the same holes.
     """
     if all(used.all() for used in maps):
         return {}
@@ -78,7 +78,7 @@ def common_holes(maps: Sequence[Bool[np.ndarray, " pix"]]) -> dict[int, np.ndarr
 
 
 def region_words(settings: Experiment, name: str) -> str:
-    """What a region is, after the word "in" of a sentence."""
+    """Return words for a region, to follow "in" in a sentence."""
     region = settings.regions[name]
     if isinstance(region, MapFile):
         return f"the mask {name}"
@@ -86,7 +86,7 @@ def region_words(settings: Experiment, name: str) -> str:
 
 
 def apodize(used: Bool[np.ndarray, " pix"], width: float) -> Float[np.ndarray, " pix"]:
-    """A mask that rises from 0 at its edge to 1 with two continuous derivatives.
+    """Return a mask that rises from 0 at its edge to 1 with two continuous derivatives.
 
     With x^2 = (1 - cos d) / (1 - cos w) of the distance d to the edge and the width w, the weight
     is x - sin(2 pi x) / 2 pi, the C2 of Grain, Tristram & Stompor (2009).
@@ -94,7 +94,7 @@ def apodize(used: Bool[np.ndarray, " pix"], width: float) -> Float[np.ndarray, "
     Parameters
     ----------
     used : True in used pixels, RING
-    width : over which the mask rises [deg]; 0 leaves it as it is
+    width : distance over which the mask rises [deg]; 0 leaves it unchanged
     """
     if not width or used.all():
         return used.astype(float)
@@ -104,7 +104,7 @@ def apodize(used: Bool[np.ndarray, " pix"], width: float) -> Float[np.ndarray, "
 
 
 def superpixels(nside_map: int, nside: int) -> Int[np.ndarray, " pix"]:
-    """Labels of a map's pixels (RING): the RING pixels of a coarser resolution they lie in.
+    """Return labels of a map's pixels (RING): the coarser RING pixels that they lie in.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def superpixels(nside_map: int, nside: int) -> Int[np.ndarray, " pix"]:
 
 
 def latitude_bands(nside_map: int, edges: Sequence[float]) -> Int[np.ndarray, " pix"]:
-    """Labels by absolute Galactic latitude: 0 below the first edge [deg], 1 below the second, ...
+    """Return labels by |b|: 0 below the first edge [deg], 1 below the second, ...
 
     Examples
     --------
@@ -150,14 +150,14 @@ def latitude_bands(nside_map: int, edges: Sequence[float]) -> Int[np.ndarray, " 
 def clusters(
     maps: Numeric, count: int, *, seed: int = 0, iterations: int = 30
 ) -> Int[np.ndarray, " pix"]:
-    """Labels of pixels that are alike in some maps, by k-means.
+    """Return labels of pixels with similar values in some maps, by k-means.
 
     Parameters
     ----------
-    maps : what pixels are compared by, shape (map, pix), each map scaled to its scatter; NaN or
+    maps : values to compare pixels by, shape (map, pix), each map scaled to its scatter; NaN or
         infinite where masked: such pixels get the label of the mean
     count : number of clusters
-    seed, iterations : of k-means; clusters that remain empty are left out
+    seed, iterations : those of k-means; empty clusters are left out
 
     Raises
     ------
@@ -185,7 +185,7 @@ def clusters(
 def _map(
     folder: Path, spec: MapKeys, nside: int, where: str, used: Bool[np.ndarray, " pix"]
 ) -> Float[np.ndarray, " pix"]:
-    """A map of one column at the resolution of the separation, with values where it is used."""
+    """Read a map of one column at the resolution of the separation; used pixels need values."""
     found = read(folder, spec, stokes="", zeros_are_data=True)
     values = one_column(found, nside, where, "common.nside")
     if empty := int(np.sum(used & ~np.asarray(found.mask))):
@@ -194,7 +194,7 @@ def _map(
 
 
 def parameter_labels(settings: Experiment, used: Bool[np.ndarray, " pix"]) -> dict[str, np.ndarray]:
-    """Regions of the free parameters of a separation that have them."""
+    """Return region labels of the free parameters of a separation that have regions."""
     labels = {}
     for name, parameter in settings.free_in("separate").items():
         if parameter.regions is None:
@@ -218,14 +218,14 @@ def _regions(
             raise SettingsError(f"{where}: labels must be whole numbers.")
         return np.where(used, values, 0).astype(int)
     assert regions.clusters is not None  # one of them is given
-    # Without maps, pixels are alike that lie close together.
+    # Without maps, pixels that lie close together form clusters.
     rows = [_map(folder, spec, nside, f"{where}.of", used) for spec in regions.of]
     maps = np.stack(rows) if rows else np.stack(healpy.pix2vec(nside, np.arange(used.size)))
     return clusters(np.where(used, maps, np.nan), regions.clusters, seed=settings.seed)
 
 
 def check_labels(name: str, labels: object, npix: int, used: np.ndarray) -> np.ndarray:
-    """Labels as integers of shape (pix,), 0 where a pixel is not used."""
+    """Return labels as integers of shape (pix,), 0 where a pixel is not used."""
     array = np.asarray(labels)
     if array.dtype.kind not in "iu":
         raise TypeError(f"Labels of {name!r} must be integers, but are {array.dtype}.")
@@ -242,7 +242,7 @@ class Cells(NamedTuple):
     """Intersections of regions: sets of pixels in which all parameters are constant.
 
     `of_pixel` is the cell of each pixel, -1 where not used, and None if there is a single cell.
-    `labels` are those of each parameter in each of the `number` of cells, by name.
+    `labels` are the regions of each parameter, by name, in each of `number` cells.
     """
 
     of_pixel: Int[np.ndarray, " pix"] | None
@@ -251,7 +251,7 @@ class Cells(NamedTuple):
 
 
 def intersections(labels: Mapping[str, Int[np.ndarray, " pix"]], used: np.ndarray) -> Cells:
-    """The intersections of the regions of several parameters, among used pixels."""
+    """Return the intersections of the regions of several parameters, among used pixels."""
     if not labels:
         return Cells(None, {}, 1)
     key = np.zeros(int(used.sum()), np.int64)

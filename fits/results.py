@@ -1,4 +1,4 @@
-"""What fits return: numbers by name, and how good they are; and how results are written."""
+"""Results of fits: numbers by name, how far to trust them, and how they are written."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -16,18 +16,18 @@ from jaxsky.settings import Experiment, circumstances
 if TYPE_CHECKING:
     from getdist import MCSamples
 
-#: A chi^2 above so many times the degrees of freedom, taken as `FEW` if they are fewer, is that of
-#: no fit. Real skies, with laws that vary, errors that are too small and bright planes, have
-#: some ten for each; a few missing values read as data have hundreds and more.
+#: A chi^2 above this multiple of the degrees of freedom (at least `FEW`) means that nothing was
+#: fitted. Real skies, with laws that vary, errors that are too small and bright planes, have some
+#: ten per degree of freedom; a few missing values read as data give hundreds and more.
 ASTRONOMICAL, FEW = 100.0, 100
-#: A parameter, or its error, that is so many times its start (1 if that is smaller) is lost.
+#: A parameter, or its error, above this multiple of its start (at least 1) has run away.
 LOST = 50.0
 
 
 def misfit(chi2: float, dof: int, expected: float = 1.0) -> str | None:
-    """What to say of a chi^2 that no statistics, but only wrong inputs explain; None if it is not.
+    """Return a message if chi^2 can only be explained by wrong input, else None.
 
-    `expected` is that of the right model per degree of freedom, if chi2 leaves out what is known.
+    `expected` is chi2 per degree of freedom of the right model, if chi2 omits known fluctuations.
     """
     if chi2 <= ASTRONOMICAL * expected * max(dof, FEW):
         return None
@@ -39,12 +39,12 @@ def misfit(chi2: float, dof: int, expected: float = 1.0) -> str | None:
 
 
 def help_by_prior(names: tuple[str, ...]) -> str:
-    """The end of a sentence on parameters that the data leave open."""
+    """Return the end of a sentence on parameters that the data do not constrain."""
     return f"a Gaussian prior on {' or '.join(names)} (mean, standard deviation) would help"
 
 
 class Convergence(Enum):
-    """How a fit ended, as a sentence; true exactly if its numbers can be relied on."""
+    """How a fit ended, as a sentence; true if its numbers can be relied on."""
 
     converged = "The fit converged."
     max_steps = "The search made all its steps without reaching an optimum."
@@ -63,7 +63,7 @@ class Convergence(Enum):
 
 
 class FitError(RuntimeError):
-    """A fit that did not reach what its numbers need; carries the result as `.result`."""
+    """Raised if a fit did not converge; carries the result as `.result`."""
 
     def __init__(self, message: str, result: "FitResult") -> None:
         super().__init__(message)
@@ -71,7 +71,7 @@ class FitError(RuntimeError):
 
 
 class FitResult(NamedTuple):
-    """Parameters of a fit by one method: numbers, or arrays with a value for each region.
+    """Parameters of a fit by one method: numbers, or arrays with one value per region.
 
     Attributes
     ----------
@@ -84,9 +84,9 @@ class FitResult(NamedTuple):
     covariance : of the estimates, shape (par, par); None for too many parameters
     chi2 : smallest value of -2 log L, priors left out; for the exact likelihood that of the
         template amplitudes
-    dof : number of data with weight less that of amplitudes and free parameters
+    dof : number of data with weight minus that of amplitudes and free parameters
     converged, message : how it ended, true if the numbers can be relied on, and in words
-    details : what only this method has
+    details : results that only this method has
     """
 
     method: str
@@ -113,7 +113,7 @@ class FitResult(NamedTuple):
         return as_html(self.summary())
 
     def summary(self) -> Summary:
-        """A heading, and values with errors; of several regions their medians."""
+        """Return a heading, and values with errors, or their medians over regions."""
         rows = []
         for name, value in self.best_fit.items():
             known = np.isfinite(value)
@@ -126,12 +126,12 @@ class FitResult(NamedTuple):
         return f"Fit by {self.method}, {state}", rows
 
     def of_row(self, values: Mapping[str, Any], label: str) -> Any:
-        """The entry of values by name that a row of the covariance is of."""
+        """Return the entry of values by name that belongs to a row of the covariance."""
         name, _, region = label.partition("[")
         return np.asarray(values[name])[..., int(region[:-1])] if region else values[name]
 
     def with_chain(self, chain: Float[np.ndarray, "step walker par"]) -> "FitResult":
-        """With these samples, and what follows from those that are not discarded."""
+        """Return the result with these samples, and errors from those not discarded."""
         flat = chain[self.details["discard"] :].reshape(-1, len(self.labels))
         low, high = map(self._named, np.percentile(flat, [15.865525, 84.134475], axis=0))
         return self._replace(
@@ -142,7 +142,7 @@ class FitResult(NamedTuple):
         )
 
     def _named(self, rows: Float[np.ndarray, " par"]) -> dict[str, Any]:
-        """Values by name from those of the rows of the covariance; NaN for other regions."""
+        """Return values by name from rows of the covariance; NaN for other regions."""
         values = {name: np.full(np.shape(value), np.nan) for name, value in self.best_fit.items()}
         for label, row in zip(self.labels, rows, strict=True):
             name, _, region = label.partition("[")
@@ -150,7 +150,7 @@ class FitResult(NamedTuple):
         return {name: v if v.ndim else float(v) for name, v in values.items()}
 
     def correlation(self, first: str, second: str) -> float:
-        """Correlation coefficient of two entries of `labels`."""
+        """Return the correlation coefficient of two entries of `labels`."""
         if self.covariance is None:
             raise ValueError("The covariance of so many parameters was not computed.")
         i, j = self.labels.index(first), self.labels.index(second)
@@ -158,7 +158,7 @@ class FitResult(NamedTuple):
         return float(self.covariance[i, j] / scale)
 
     def to_dict(self) -> dict[str, Any]:
-        """All numbers but the details by name, for files."""
+        """Return all numbers except the details by name, for files."""
         numbers = self._asdict() | {"converged": bool(self.converged)}
         del numbers["details"]
         return {"free": self.free} | numbers
@@ -166,11 +166,11 @@ class FitResult(NamedTuple):
     def to_getdist(
         self, title: str | None = None, symbol: Callable[[str], str] | None = None
     ) -> "MCSamples":
-        """The samples of a chain for getdist.
+        """Return the samples of a chain for getdist.
 
         Parameters
         ----------
-        title : what legends call them
+        title : name of the samples in legends
         symbol : TeX without dollar signs of an entry of `labels`; by default the entry itself
 
         Raises
@@ -195,11 +195,10 @@ class FitResult(NamedTuple):
     def judged(
         self, chi2: float, dof: int, start: Mapping[str, Numeric], expected: float = 1.0
     ) -> "FitResult":
-        """Itself, not converged if parameters ran away, or chi^2 is that of no fit.
+        """Return the result, not converged if parameters ran away or chi^2 is far too large.
 
-        A parameter ran away if it or its error is far from its start; offsets, which have units of
-        maps, never do. chi^2 and dof are of the data, or of what the likelihood compares, for
-        `misfit`.
+        A parameter ran away if it or its error is far from its start; offsets, in the unit of maps,
+        are exempt. chi^2 and dof, for `misfit`, are of the data, or of the likelihood's residuals.
         """
         ended, failures = self.converged, [] if self.converged else [self.message]
         for name, value in self.best_fit.items():
@@ -223,33 +222,33 @@ class FitResult(NamedTuple):
         return self._replace(converged=ended, message=" ".join(failures))
 
     def checked(self, throw: bool) -> "FitResult":
-        """Itself, if it converged or need not have."""
+        """Return the result; raise FitError if it did not converge and `throw` is set."""
         if throw and not self.converged:
             raise FitError(self.message, self)
         return self
 
 
 def _digits(size: float) -> int:
-    """Digits behind the point with which a positive number has two in all; 4 for others."""
+    """Return decimals that give a positive number two significant digits; 4 for others."""
     usable = np.isfinite(size) and size > 0
     return max(0, 1 - int(np.floor(np.log10(size)))) if usable else 4
 
 
 def two_digits(value: float) -> str:
-    """A number in two significant digits, without an exponent."""
+    """Return a number with two significant digits, without an exponent."""
     return f"{value:.{_digits(value)}f}"
 
 
 def with_error(value: float, error: float) -> str:
-    """A value with its standard error, both to two digits of the error."""
+    """Return a value with its standard error, both to two digits of the error."""
     digits = _digits(error)
     return f"{value:.{digits}f} \u00b1 {error:.{digits}f}"
 
 
 def with_errors(best: float, low: float, high: float) -> str:
-    """A value with its interval as differences, to two digits of the smaller one.
+    """Return a value with its interval as differences, to two digits of the smaller one.
 
-    Without an interval the value alone, and nothing where there is no value.
+    Without an interval the value alone, and an empty text if there is no value.
     """
     if not np.isfinite([low, high]).all():
         return f"{best:.4f}" if np.isfinite(best) else ""
@@ -258,14 +257,14 @@ def with_errors(best: float, low: float, high: float) -> str:
 
 
 def probability(value: float) -> str:
-    """A probability in two digits, or its order of magnitude."""
+    """Return a probability with two decimals, or its order of magnitude."""
     if value < 1e-99:
         return "<1e-99"
     return f"{value:.2f}" if value >= 0.01 else f"{value:.0e}"
 
 
 def _plain(value: Any) -> Any:
-    """Arrays as lists, and numbers that are not finite as None: what JSON has."""
+    """Return arrays as lists, and numbers that are not finite as None, for JSON."""
     if isinstance(value, dict):
         return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, Convergence):
@@ -278,12 +277,12 @@ def _plain(value: Any) -> Any:
 
 
 def write_json(path: Path, results: dict[str, Any]) -> None:
-    """Results of a run; arrays become lists, and what is not finite null."""
+    """Write results of a run; arrays become lists, and numbers that are not finite null."""
     write_text(path, json.dumps(_plain(results), indent=2, allow_nan=False) + "\n")
 
 
 def write_log(path: Path, settings: Experiment, seconds: float) -> None:
-    """When, where, how long, with which versions, settings and files a run was made."""
+    """Write when, where, how long, with which versions, settings and files a run was made."""
     said = settings.model_dump(mode="json", exclude_none=True)
     log = {**circumstances(settings), "seconds": round(seconds, 2), "settings": said}
     write_text(path, json.dumps(log, indent=2) + "\n")

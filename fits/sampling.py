@@ -1,8 +1,8 @@
-"""Samples of a posterior: emcee's ensemble, kept in a file, or the no-U-turn sampler of blackjax.
+"""Sample a posterior with emcee's ensemble, kept in a file, or blackjax's no-U-turn sampler.
 
-The no-U-turn sampler (Hoffman & Gelman 2014, JMLR 15, 1593) follows the gradient, so it takes a
-few evaluations for a sample that does not depend on the last one, however many parameters there
-are. It moves in the numbers of `fits.unbounded`, in which walkers start, too.
+The no-U-turn sampler (Hoffman & Gelman 2014, JMLR 15, 1593) follows the gradient, so it needs a
+few evaluations per independent sample, however many parameters there are. It moves in the numbers
+of `fits.unbounded`, in which the walkers of emcee also start.
 """
 
 import inspect
@@ -33,12 +33,12 @@ ENOUGH = 50
 ACCEPTANCE = 0.9
 #: Width of the start positions of its chains, in standard deviations.
 SPREAD = 2.0
-#: Its steps in one call of a program: what progress is counted in.
+#: Its steps per call of a program, the unit of progress.
 BLOCK = 50
 #: R-hat of chains that agree, and effective samples that each of them needs, after Vehtari et al.
 #: (2021, Bayesian Analysis 16, 667).
 AGREEMENT, EFFECTIVE = 1.01, 100
-#: Share of divergent steps that does no harm: far out in the tail of a cut posterior.
+#: Harmless share of divergent steps, far out in the tail of a posterior cut by a prior.
 RARE = 1e-3
 
 
@@ -69,18 +69,18 @@ def _ensemble(
     nwalkers: int = 32,
     backend: KeptChain | None = None,
 ) -> dict[str, Any]:
-    """Steps of emcee's ensemble; those that a file already holds are not made again."""
+    """Run emcee's ensemble; steps that a file already contains are not made again."""
     size = len(labels)
     if nwalkers < 2 * size or nsteps < 1:
         raise ValueError(
             f"MCMC needs at least {2 * size} walkers and a step for {size} parameters, "
             f"not nwalkers={nwalkers}, nsteps={nsteps}."
         )
-    # Taken apart once rather than at each step, where it takes a third of the time.
+    # Flattened once rather than at each step, where it would take a third of the time.
     leaves, structure = jax.tree.flatten(unbounded.density)
 
     def log_probs(theta: np.ndarray) -> np.ndarray:
-        # At the start, too, in the halves that emcee moves: one program instead of two.
+        # Also at the start in the halves that emcee moves: one program instead of two.
         parts = np.split(theta, 2) if len(theta) == nwalkers and nwalkers % 2 == 0 else [theta]
         return np.concatenate([_log_probs(part, leaves, structure) for part in parts])
 
@@ -122,9 +122,9 @@ def _ensemble(
 def agreement(
     chain: Float[Array, "step chain par"],
 ) -> tuple[Float[Array, " par"], Float[Array, " par"]]:
-    """R-hat and effective number of samples of each parameter; R-hat is NaN if it never moves.
+    """Return R-hat and effective number of samples of each parameter; R-hat NaN if it never moves.
 
-    Of both, the worse of two: of ranks, and of ranks of distances from the median, which say how
+    Of both, the worse of two: of ranks, and of ranks of distances from the median, which show how
     well widths are known (Vehtari et al. 2021, Bayesian Analysis 16, 667).
     """
     chain = jnp.swapaxes(chain, 0, 1)
@@ -140,7 +140,7 @@ def _begun(unbounded, z):
 
 @partial(jax.jit, static_argnames="steps")
 def _advanced(unbounded, begun, key, first, nwarmup, steps):
-    """Some steps of all chains, from the number `first` on: where they end, and their course."""
+    """Make some steps of all chains, from number `first`; return their end and their course."""
     kernel = blackjax.nuts.build_kernel()
     metric = jnp.ones(unbounded.center.size)
     _, tuned, _ = dual_averaging_adaptation(ACCEPTANCE)
@@ -170,7 +170,7 @@ def _advanced(unbounded, begun, key, first, nwarmup, steps):
 
 
 def _course(unbounded, z, key, first, last, nwarmup, report) -> dict[str, np.ndarray]:
-    """The steps first ... last - 1 of chains that begin at z, in which the step size is tuned."""
+    """Return steps first ... last - 1 of chains that begin at z, tuning the step size."""
     for _ in range(30):
         chains = _begun(unbounded, z)
         bad = ~np.isfinite(np.asarray(chains.logdensity))
@@ -179,7 +179,7 @@ def _course(unbounded, z, key, first, last, nwarmup, report) -> dict[str, np.nda
         # Far out the laws may not be finite.
         z = np.where(bad[:, None], z / 2, z)
     begin, _, _ = dual_averaging_adaptation(ACCEPTANCE)
-    # Of one type from the first call on, so that there is one program.
+    # The same type from the first call on, so that there is one program.
     tuning = jax.tree.map(lambda x: jnp.asarray(x, float), begin(z.shape[1] ** -0.25))
     state, courses = (chains, tuning), []
     for number in range(first, last, BLOCK):
@@ -198,7 +198,7 @@ def _no_u_turn(
     nwarmup: int = 300,
     nchains: int = 4,
 ) -> dict[str, Any]:
-    """Chains of the no-U-turn sampler."""
+    """Run chains of the no-U-turn sampler."""
     if nsteps < 4 or nwarmup < 0 or nchains < 1:
         raise ValueError(
             "The sampler 'nuts' needs at least 4 steps and a chain, not "
@@ -209,7 +209,7 @@ def _no_u_turn(
     pilot = nwarmup // 2 // BLOCK * BLOCK
     parts = partial(_course, key=key, nwarmup=nwarmup, report=lambda done: report(done, total))
     if pilot and unbounded.root.ndim == 2:
-        # Half of the warm-up says how parameters vary together.
+        # Half of the warm-up measures the covariance of the parameters.
         chain = parts(unbounded, z, first=0, last=pilot, nwarmup=pilot)["chain"]
         unbounded = unbounded.adapted(chain[pilot // 3 :].reshape(-1, len(labels)))
         z = unbounded.coordinates(chain[-1])
@@ -250,7 +250,7 @@ def _no_u_turn(
     }
 
 
-#: The samplers, and what their results are called.
+#: The samplers, and the `method` of their results.
 SAMPLERS: dict[str, tuple[Callable[..., dict[str, Any]], str]] = {
     "emcee": (_ensemble, "mcmc"),
     "nuts": (_no_u_turn, "nuts"),
@@ -272,7 +272,7 @@ def sample(
     progress: bool | Callable[[int, int], None] = True,
     throw: bool = True,
 ) -> FitResult:
-    """Samples of the posterior.
+    """Draw samples of the posterior.
 
     The posterior is the likelihood times the priors. Where signals are near the noise of a pixel,
     a spectral likelihood is narrower than the scatter of its maximum, and so are its samples: see
@@ -286,17 +286,17 @@ def sample(
     priors : priors by name, the same in each region
     sampler : "emcee", the affine-invariant ensemble, or "nuts", the no-U-turn sampler of blackjax.
         For a few parameters the second takes seconds, nearly all of them to compile, and gives ten
-        times as many independent samples a second afterwards; for hundreds of regions, where the
+        times as many independent samples per second afterwards; for hundreds of regions, where the
         first fails, minutes. The first can be resumed, the second cannot.
-    nsteps : steps of each walker (5000) in all, or of each chain (1000) that are kept
-    nwarmup : "nuts": steps before that (300): half of them to see how parameters vary together,
-        if they are few, and all to tune the step size
+    nsteps : all steps of each walker (5000), or those of each chain that are kept (1000)
+    nwarmup : "nuts": steps before that (300): half of them to measure the covariance of the
+        parameters, if these are few, and all to tune the step size
     nchains : "nuts": number of chains (4)
     nwalkers : "emcee": size of the ensemble (32)
-    seed : of the start positions and the moves
-    backend : "emcee": file of the chain; one that already holds steps is resumed up to `nsteps`,
-        with the very steps an uninterrupted run would have made
-    progress : show a progress bar, or call a function with the steps done and those in all
+    seed : seed of the start positions and the moves
+    backend : "emcee": file of the chain; one that already has steps is resumed up to `nsteps`,
+        with exactly the steps that an uninterrupted run would have made
+    progress : show a progress bar, or call a function with the numbers of steps done and of all
     throw : raise if the chains are too short or do not agree
 
     Returns
@@ -316,9 +316,9 @@ def sample(
     FitError
         If data and priors do not determine the parameters, a chain of emcee is shorter than 50
         autocorrelation times, or, with "nuts", R-hat is 1.01 or more, there are fewer than 100
-        effective samples for each chain, or more than one in a thousand steps diverged. If chi^2
-        is that of no fit, or a parameter is left open (`fits.results`). Not if throw=False; the
-        result is in its `.result`.
+        effective samples per chain, or more than one in a thousand steps diverged. Also if chi^2
+        is far too large for a fit, or a parameter is not constrained (`fits.results`). Not if
+        throw=False; the result is in its `.result`.
     """
     check_seed("seed", seed)
     if sampler not in SAMPLERS:

@@ -1,6 +1,6 @@
-"""The data of a separation, from an experiment: pixels at a common resolution, or multipoles.
+"""The data of a component separation: pixels at a common resolution, or multipoles.
 
-All have the same methods, so that a separation does not ask which one it has.
+All kinds have the same methods, so that a separation works on any of them.
 """
 
 from collections.abc import Mapping
@@ -32,11 +32,11 @@ from jaxsky.settings import Experiment, SettingsError
 
 @dataclass(frozen=True, kw_only=True)
 class _Data:
-    """What all have: the laws and bands, start values by name, and the data in `unit`.
+    """Base class: the laws and bands, start values by name, and the data in `unit`.
 
-    `used` are the pixels that the results are of, and `mask` the weight of each in spectra, 0 to 1,
-    its edges smooth. Of a simulation `foregrounds` are those alone, like the data, and `truth` its
-    parameters that are numbers, "r" among them; both are None for real maps.
+    `used` are the pixels of the results, and `mask` the weight of each in spectra, 0 to 1, with
+    smooth edges. For a simulation, `foregrounds` are data with nothing else in them, and `truth`
+    the parameters that are numbers, including "r"; both are None for real maps.
     """
 
     sky: Sky
@@ -50,8 +50,8 @@ class _Data:
     truth: dict[str, float] | None
     description: str
 
-    #: Whether data are multipoles of the full sky, all of whose noise the likelihood knows, and
-    #: whether they are maps that are separated pixel by pixel.
+    #: Whether data are multipoles of the full sky, for which the likelihood is exact, and whether
+    #: they are maps that are separated pixel by pixel.
     exact: ClassVar[bool] = False
     by_pixel: ClassVar[bool] = True
 
@@ -61,8 +61,8 @@ class PixelData(_Data):
     """Maps that are separated pixel by pixel, all at one resolution.
 
     `labels` are the regions of the free parameters that have them, `noise` is infinite where
-    masked, `fluctuations` are the noise there is, correlated between pixels as it is [uK_RJ], and
-    `factors` what `unit` is per uK_RJ in each band.
+    masked, `fluctuations` are the actual noise, correlated between pixels [uK_RJ], and `factors`
+    are `unit` per uK_RJ in each band.
     """
 
     labels: dict[str, np.ndarray]
@@ -87,19 +87,19 @@ class PixelData(_Data):
         return found, found.amplitude
 
     def residuals(self, like: SpectralLikelihood, params: Mapping, amplitude):
-        """Maps (band, stokes, pix) of the data less the components; NaN in masked pixels."""
+        """Return maps (band, stokes, pix) of the data minus the components; NaN where masked."""
         return self.observed - emission_maps(like, params, amplitude)
 
     def emission(self, like: SpectralLikelihood, params: Mapping, amplitude):
-        """What components show in the bands; zero in masked pixels."""
+        """Return the emission of components in the bands; zero in masked pixels."""
         return emission_maps(like, params, np.where(self.used, amplitude, 0.0))
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Multipoles(_Data):
-    """What is separated multipole by multipole, into maps of `nside` and `fwhm` [arcmin].
+    """Data that are separated multipole by multipole, into maps of `nside` and `fwhm` [arcmin].
 
-    `spectra` is N_l of the noise in what is observed [unit^2 sr], `fwhms` are its beams [arcmin].
+    `spectra` is N_l of the noise in the data [unit^2 sr], and `fwhms` are their beams [arcmin].
     """
 
     by_pixel: ClassVar[bool] = False
@@ -109,7 +109,7 @@ class _Multipoles(_Data):
     fwhm: float
 
     def alm(self, data: Numeric) -> Float[np.ndarray, "_ stokes alm"]:
-        """Coefficients of data."""
+        """Return the coefficients of data."""
         return np.asarray(data)
 
     def likelihood(self, data: Float[np.ndarray, "band stokes _"]) -> SpectralLikelihood:
@@ -131,12 +131,12 @@ class MaskedSkyData(_Multipoles, PixelData):
     """Maps on part of the sky that are separated multipole by multipole, all at one beam.
 
     All bands have the same beam and mask, so the coefficients of the masked maps are those of the
-    masked components, mixed by the laws: what a mask mixes, E and B among it, it mixes alike in
-    all. The mask correlates multipoles, so errors come from simulations.
+    masked components, mixed by the laws: the mask mixes multipoles, and E with B, equally in all
+    bands. It correlates multipoles, so errors come from simulations.
     """
 
     def alm(self, data):
-        """Coefficients of maps times the mask."""
+        """Return the coefficients of maps times the mask."""
         seen, lmax = np.where(self.mask > 0, data, 0.0) * self.mask, self.spectra.shape[-1] - 1
         return np.stack([np.asarray(low_multipoles(jnp.asarray(rows), lmax)) for rows in seen])
 
@@ -157,7 +157,7 @@ class MaskedSkyData(_Multipoles, PixelData):
 class FullSkyData(_Multipoles):
     """Multipoles of the full sky, each band with its own beam; the likelihood is exact.
 
-    `noises` are those of the bands as observed, in `unit`, to be drawn.
+    `noises` are those of the bands as observed, in `unit`, for realisations.
     """
 
     exact: ClassVar[bool] = True
@@ -168,18 +168,18 @@ class FullSkyData(_Multipoles):
         return np.stack([noise.alm(key, name) for name, noise in self.noises.items()])
 
     def residuals(self, like: SpectralLikelihood, params: Mapping, amplitude):
-        """Maps (band, stokes, pix) of the data less the components, each with its own beam."""
+        """Return maps (band, stokes, pix) of the data minus components, each at its own beam."""
         rest = self.observed - self.emission(like, params, amplitude)
         return np.stack([np.asarray(synthesis(jnp.asarray(alm), self.nside)) for alm in rest])
 
     def emission(self, like: SpectralLikelihood, params: Mapping, amplitude):
-        """What components show in the bands, with their beams."""
+        """Return the emission of components in the bands, with their beams."""
         windows = jnp.stack([gaussian_beam(f, lmax_of(amplitude)) for f in self.fwhms])
         return emission_maps(like, params, amplitude) * np.asarray(expand(windows))[:, None]
 
 
 def separation_data(settings: Experiment) -> PixelData | FullSkyData:
-    """Read or simulate what the settings name, and check that it can work."""
+    """Read or simulate the data of a separation, and check that the settings allow it."""
     spec, common = settings.separate, settings.common
     if not settings.cmb.include:
         raise SettingsError("cmb.include: is false, but a separation has a CMB.")
@@ -236,7 +236,7 @@ def _pixel_data(
     factors: Float[np.ndarray, " band"],
     shared: dict[str, Any],
 ) -> PixelData:
-    """Maps at the common resolution; `factors` are the unit of the data per uK_RJ."""
+    """Return maps at the common resolution; `factors` are the unit of the data per uK_RJ."""
     prepared, common = prepared_maps(settings, inputs), settings.common
     used = prepared.used & inside
     _check_some(used)
@@ -279,7 +279,7 @@ def _full_sky_data(
     factors: Float[np.ndarray, " band"],
     shared: dict[str, Any],
 ) -> FullSkyData:
-    """Coefficients of the bands as observed."""
+    """Return coefficients of the bands as observed."""
     bands, common = inputs.bands, settings.common
     for name, band in bands.items():
         if np.ndim(band.beam):

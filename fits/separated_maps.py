@@ -1,4 +1,4 @@
-"""Maps of the components for given spectral parameters, and how well they describe the data."""
+"""Maps of components for given spectral parameters, with their errors and chi^2."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -31,10 +31,10 @@ class ComponentMaps(NamedTuple):
 
     `amplitude` are generalised least-squares estimates, uK at the reference frequency of each law,
     CMB in uK_CMB. `covariance` is that of the components in each pixel for each Stokes parameter,
-    and `alone` the variance of each were there no others; both are of a single pixel if they are
-    the same in all, and None if not asked for. `chi2` is the sum of the weighted residuals squared
-    over bands and Stokes parameters, `dof` their number less that of amplitudes, and `probability`
-    that to exceed chi2, the spectral parameters taken as known.
+    and `alone` the variance of each without the others; both have a single pixel if they are the
+    same in all, and are None if not requested. `chi2` is the weighted sum of squared residuals over
+    bands and Stokes parameters, `dof` their number minus that of amplitudes, and `probability` that
+    of exceeding chi2, with the spectral parameters taken as known.
     """
 
     components: tuple[str, ...]
@@ -46,18 +46,18 @@ class ComponentMaps(NamedTuple):
     probability: Float[np.ndarray, " pix"]
 
     def map(self, name: str) -> Float[np.ndarray, "stokes pix"]:
-        """Amplitude of a component: a map, or coefficients."""
+        """Return the amplitude of a component: a map, or coefficients."""
         return self.amplitude[self.components.index(name)]
 
     def sigma(self, name: str) -> Float[np.ndarray, "stokes ..."]:
-        """Standard deviation of the amplitude of a component."""
+        """Return the standard deviation of the amplitude of a component."""
         if self.covariance is None:
             raise ValueError("The covariance of the maps was not asked for.")
         i = self.components.index(name)
         return np.sqrt(self.covariance[i, i])
 
     def degradation(self, name: str) -> Float[np.ndarray, "stokes ..."]:
-        """Noise of a component over that of a sky without other components; at least 1."""
+        """Return the noise of a component over that without other components; at least 1."""
         sigma = self.sigma(name)
         assert self.alone is not None  # made with the covariance
         return sigma / np.sqrt(self.alone[self.components.index(name)])
@@ -65,9 +65,9 @@ class ComponentMaps(NamedTuple):
 
 @partial(jax.jit, static_argnames="errors")
 def _separated(matrix, pixels, errors):
-    """Amplitudes and chi^2, with a matrix for all pixels or for each.
+    """Return amplitudes and chi^2, with one matrix for all pixels or one per pixel.
 
-    With errors, too, the covariance of the amplitudes and the variance of each by itself.
+    With `errors` also the covariance of the amplitudes, and the variance of each alone.
     """
 
     def separated(m, p):
@@ -87,7 +87,7 @@ def _separated(matrix, pixels, errors):
 
 
 def _passes(like: SpectralLikelihood, params: Mapping[str, Numeric], npix: int) -> Iterator:
-    """(layout, slice of pixels, matrix of all pixels (1, row, unknown) or of each) for all maps."""
+    """Yield (layout, slice of pixels, matrix (1, row, unknown) of all or of each) for all maps."""
     known = matrices_at(like, like.check(params) if like.start else {})
     for layout, matrix in zip(like.layout, known, strict=True):
         for part in chunks(npix):
@@ -103,14 +103,14 @@ def component_maps(
     *,
     covariance: bool = True,
 ) -> ComponentMaps:
-    """Maps of the components, pixel by pixel, for spectral parameters that are known.
+    """Return maps of the components, pixel by pixel, for known spectral parameters.
 
     Parameters
     ----------
     like : from `spectral_likelihood`, for its laws, bands and regions
     params : spectral parameters, such as `FitResult.best_fit`
-    data, noise : as they were given to `spectral_likelihood`
-    covariance : whether to make the covariance of the amplitudes
+    data, noise : as for `spectral_likelihood`
+    covariance : whether to compute the covariance of the amplitudes
 
     Raises
     ------
@@ -158,7 +158,7 @@ def emission_maps(
     params: Mapping[str, Numeric],
     amplitude: Float[np.ndarray, "component stokes pix"],
 ) -> Float[np.ndarray, "band stokes pix"]:
-    """What components show in the bands, in the unit of the data, from maps or coefficients."""
+    """Return the emission in the bands, in the unit of the data, from maps or coefficients."""
     result = np.empty((len(like.mixing.names), *amplitude.shape[1:]))
     for layout, part, matrix in _passes(like, params, amplitude.shape[-1]):
         rows = layout.rows(amplitude[..., part])
@@ -173,18 +173,18 @@ def emission_maps(
 class HarmonicMaps(ComponentMaps):
     """Component maps as packed coefficients of E, B or I, E, B, without any beam.
 
-    `covariance` [uK^2 sr], the noise spectra, `chi2`, summed over m, too, `dof` and `probability`
-    are of multipoles instead of pixels. Where l < lmin, coefficients are zero and the others NaN.
+    `covariance` [uK^2 sr], the noise spectra, `chi2`, also summed over m, `dof` and `probability`
+    are per multipole instead of pixel. At l < lmin, coefficients are zero and the others NaN.
     """
 
     __slots__ = ()
 
     def noise(self, name: str) -> Float[np.ndarray, "stokes ell"]:
-        """Spectrum N_l of the noise of a component [uK^2 sr]."""
+        """Return the spectrum N_l of the noise of a component [uK^2 sr]."""
         return self.sigma(name) ** 2
 
     def maps(self, nside: int, beam: ArrayLike) -> Float[np.ndarray, "component stokes pix"]:
-        """Maps of the components; their noise has the spectra `covariance` times b_l^2.
+        """Return maps of the components; their noise has the spectra `covariance` times b_l^2.
 
         Multipoles above 2 nside are cut; the beam is a full width at half maximum [arcmin], or a
         table b_l from l = 0.
@@ -209,7 +209,7 @@ def harmonic_component_maps(
     lmax: int | None = None,
     covariance: bool = True,
 ) -> HarmonicMaps:
-    """Coefficients of the components for spectral parameters that are known.
+    """Return coefficients of the components for known spectral parameters.
 
     s_lm = (A^T W A)^-1 A^T W d, with d = d_lm / b_l and W = b_l^2 / N_l: the linear combination of
     bands with the smallest noise at each multipole that has unit response to the component and
@@ -217,8 +217,8 @@ def harmonic_component_maps(
 
     Parameters
     ----------
-    like : for its laws and bands: from `harmonic_likelihood`, or `spectral_likelihood` without
-        regions
+    like : from `harmonic_likelihood`, or `spectral_likelihood` without regions, for its laws and
+        bands
     params : spectral parameters, such as `FitResult.best_fit`
     alm, noise, beams, lmin, lmax : as for `harmonic_likelihood`; the multipoles need not be those
         that were fitted
@@ -260,7 +260,7 @@ def harmonic_component_maps(
 
 
 class Separated(NamedTuple):
-    """What `separate` finds: the fit of the laws, and the maps of the components."""
+    """Result of `separate`: the fit of the laws, and the maps of the components."""
 
     fit: FitResult
     maps: ComponentMaps
@@ -279,12 +279,12 @@ def separate(
 
     Parameters
     ----------
-    components : names of laws ("cmb", "dust", "synchrotron"), or components by name, of which the
-        laws count and not the amplitudes
+    components : names of laws ("cmb", "dust", "synchrotron"), or components by name, of which only
+        the laws count, not the amplitudes
     instrument : an instrument, or its bands by name or as a list
     data : observed maps, shape (band, stokes, pix) with Stokes Q, U or I, Q, U
     free : names of the free parameters, which start at the values of the components, or start
-        values by name; by default the spectral indices, all that are called "beta..."
+        values by name; by default the spectral indices, all names that begin with "beta"
     noise : standard deviations or covariances in the unit of the data (`fits.as_noise`); by default
         the white noise of the instrument
     unit : of the data, "uK_RJ", "uK_CMB" or the like

@@ -1,4 +1,4 @@
-"""The paper's spectral-index test: templates scaled to other bands, compared with maps there.
+"""The paper's spectral-index test: templates scaled to other bands and fitted to maps there.
 
 Templates and data are brought to a common resolution; the parameters are then fitted in each
 region, to Q, to U and to both, on a grid, by gradient and by MCMC.
@@ -31,13 +31,13 @@ from jaxsky.checks import Numeric
 from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 
-#: A band in which each template has less than this part of its weight has none.
+#: A band with less than this fraction of the weight of every template counts as weightless.
 WEIGHTLESS = 1e-6
-#: A fit whose coefficients change its own errors is repeated until it moves by less [sigma].
+#: A fit on which its own errors depend is repeated until it moves by less than this [sigma].
 SETTLED = 0.01
 #: The grid is narrowed to where the posterior exceeds exp(-NARROW/2) of its maximum (6 sigma).
 NARROW = 36.0
-#: A posterior that changes by less over the whole prior, in its logarithm, is flat.
+#: A posterior whose logarithm changes by less than this over the whole prior is flat.
 FLAT = 1e-6
 #: Probability of one standard deviation to either side.
 ONE_SIGMA = 0.6826894921370859
@@ -48,9 +48,9 @@ class RegionFit(NamedTuple):
 
     `chi2` is the paper's sum over pixels at the best fit of each method, with `dof` degrees of
     freedom; `chi2_amplitudes` and `dof_amplitudes` are those of the exact likelihood, which
-    compares the amplitudes of the templates only. Bands without weight (`weightless`) are not
-    counted in either. `noise_shares` says which part of the weighted power of each template is
-    noise, where there is any, and `corrected` whether the fits know of it.
+    compares only the amplitudes of the templates. Bands without weight (`weightless`) are not
+    counted in either. `noise_shares` is the fraction of the weighted power of each template that
+    is noise, if any, and `corrected` is True if the fits allow for it.
     """
 
     region: str
@@ -64,19 +64,19 @@ class RegionFit(NamedTuple):
     corrected: bool = True
 
     def probability_to_exceed(self, method: str) -> float | None:
-        """Probability of a larger chi^2 of the amplitudes; None for the diagonal likelihood."""
+        """Return the probability of a larger chi^2 of amplitudes; None if diagonal."""
         if not self.dof_amplitudes:
             return None
         return float(scipy.stats.chi2.sf(self.results[method].chi2, self.dof_amplitudes))
 
 
 def all_free(fits: Sequence[RegionFit]) -> tuple[str, ...]:
-    """Names of the parameters that are free in any of the fits."""
+    """Return names of the parameters that are free in any of the fits."""
     return tuple(sorted({name for f in fits for r in f.results.values() for name in r.free}))
 
 
 def known_truth(inputs: Inputs, fits: Sequence[RegionFit]) -> dict[str, float] | None:
-    """The truth about the free parameters, if there is one."""
+    """Return the true values of the free parameters, if they are known."""
     if inputs.truth is None:
         return None
     free = all_free(fits)
@@ -90,14 +90,14 @@ def settled(
     start: Mapping[str, float],
     priors: Mapping[str, Prior],
 ) -> SkyLikelihood:
-    """The likelihood whose covariance is that at its own best fit.
+    """Return the likelihood whose covariance is that at its own best fit.
 
-    `make` gives the likelihood with the covariance at given parameters. Within one the weights
-    are fixed, so that its best fit is unbiased.
+    `make` returns the likelihood with the covariance at given parameters. Its weights are then
+    fixed, so that its best fit is unbiased.
     """
     like, values = make(start), dict(start)
     if not isinstance(like, TemplateLikelihood):
-        return like  # those of pixels do not know of the noise
+        return like  # likelihoods on pixels ignore the noise of templates
     for _ in range(5):
         found = best_fit(like, start, priors=priors, throw=False)
         moved = [
@@ -119,8 +119,8 @@ def _fit_pixels(
     out: Path | None = None,
     progress: Progress = QUIET,
 ) -> RegionFit:
-    """The fits of one region and choice of Stokes parameters; see `fit_regions`."""
-    # An offset of a Stokes parameter that is not looked at has no effect.
+    """Fit one region and choice of Stokes parameters; see `fit_regions`."""
+    # An offset of a Stokes parameter that is not fitted has no effect.
     start = {
         name: value
         for name, value in settings.start("fit").items()
@@ -186,7 +186,7 @@ def _fit_pixels(
 def _noise_shares(
     prepared: CommonMaps, used: Bool[np.ndarray, " pix"], stokes: str
 ) -> dict[str, float]:
-    """Part of the weighted power of each template that is its noise."""
+    """Return the fraction of the weighted power of each template that is noise."""
     errors = prepared.template_errors
     assert prepared.sky is not None
     assert errors is not None  # as called
@@ -203,10 +203,10 @@ def _noise_shares(
 def _expected(
     prepared: CommonMaps, used: Bool[np.ndarray, " pix"], stokes: str, left_out: Sequence[str]
 ) -> float:
-    """Mean square of noise and CMB in a pixel over that of the noise, which chi^2 counts alone."""
+    """Return mean square of noise and CMB over that of noise, the only one that chi^2 counts."""
     power = prepared.fluctuations.cmb_power().sum(axis=1)
     ell = np.arange(power.shape[-1])
-    # Q and U have half of E and B each.
+    # Q and U each have half the variance of E and B.
     variance = power @ (2 * ell + 1) / (8 * np.pi)
     keep = np.array(["QU".index(s) for s in stokes])
     ratio = variance[:, None, None] / np.asarray(prepared.sigma)[:, keep][..., used] ** 2
@@ -220,7 +220,7 @@ def weightless(
     used: Bool[np.ndarray, " pix"],
     stokes: str,
 ) -> tuple[str, ...]:
-    """Bands in which no template is seen with any weight, compared with the other bands."""
+    """Return bands that carry no weight for any template, compared with the other bands."""
     assert prepared.sky is not None  # there are templates
     known = parameter_names(prepared.sky)
     values = {name: value for name, value in params.items() if name in known}
@@ -245,9 +245,9 @@ def fit_regions(
     out: Path | None = None,
     progress: Progress = QUIET,
 ) -> list[RegionFit]:
-    """All fits that the settings ask for, in each region.
+    """Make all fits of the settings, in each region.
 
-    `out` is a folder that keeps the chains; steps that it already holds are not made again.
+    `out` is a folder for the chains; steps that it already contains are not made again.
     """
     if not settings.free_in("fit"):
         raise SettingsError("free: name at least one parameter to fit.")
@@ -264,9 +264,9 @@ def fit_regions(
 
 @jax.jit
 def chi2_on_grid(like, axes):
-    """chi^2 on the product of the axes, which are arrays by name of parameter.
+    """Return chi^2 on the product of the axes, which are arrays by parameter name.
 
-    One vmap an axis, so that what depends on one parameter is computed along its axis only.
+    One vmap per axis, so that what depends on one parameter is computed only along its axis.
     """
     names = list(axes)
 
@@ -274,7 +274,7 @@ def chi2_on_grid(like, axes):
         return chi2(like, dict(zip(names, values, strict=True)))
 
     if isinstance(like, PixelLikelihood):
-        # One point after the other: all at once would hold the maps once for each of them.
+        # One point after the other: all at once would need the memory of as many sets of maps.
         mesh = jnp.meshgrid(*axes.values(), indexing="ij")
         flat = jax.lax.map(lambda values: point(*values), tuple(axis.ravel() for axis in mesh))
         return flat.reshape(mesh[0].shape)
@@ -285,14 +285,14 @@ def chi2_on_grid(like, axes):
 
 
 def _weights(axis: np.ndarray) -> np.ndarray:
-    """Trapezoid weights of an even axis."""
+    """Return trapezoid weights of an even axis."""
     weights = np.full(len(axis), axis[1] - axis[0])
     weights[[0, -1]] /= 2
     return weights
 
 
 def _along(values: np.ndarray, i: int) -> Float[np.ndarray, "point _"]:
-    """Values on the grid, a row for each point of axis i."""
+    """Return values on the grid, one row per point of axis i."""
     return np.moveaxis(values, i, 0).reshape(values.shape[i], -1)
 
 
@@ -303,10 +303,10 @@ def grid_fit(
     priors: Mapping[str, Prior],
     points: int = 200,
 ) -> FitResult:
-    """The posterior on a grid over the ranges of the uniform priors: the paper's test.
+    """Compute the posterior on a grid over the ranges of uniform priors: the paper's test.
 
-    The grid first spans the priors, then is narrowed, again with all its points, to where the
-    posterior is not negligible, until that no longer changes it much.
+    The grid first spans the priors, and is then narrowed, with the same number of points, to where
+    the posterior is not negligible, until its ranges hardly change.
 
     Parameters
     ----------
@@ -314,7 +314,7 @@ def grid_fit(
     start : the free parameters by name (the values do not matter), one or two; by default those
         of the likelihood
     priors : a uniform prior for each of them
-    points : points an axis
+    points : points per axis
 
     Returns
     -------
@@ -351,7 +351,7 @@ def grid_fit(
         chi2s = np.asarray(chi2_on_grid(like, axes))
         narrowed, shrunk = {}, []
         for i, (name, axis) in enumerate(axes.items()):
-            # To where the posterior matters, and one step wider on either side.
+            # Where the posterior matters, and one step further on either side.
             inside = np.flatnonzero(_along(chi2s, i).min(axis=1) - chi2s.min() < NARROW)
             low, high = axis[max(inside[0] - 1, 0)], axis[min(inside[-1] + 1, points - 1)]
             narrowed[name] = (float(low), float(high))

@@ -1,13 +1,13 @@
 """Linear systems: small ones in many pixels at once, and large ones of parameters in many cells.
 
-The unknowns of the small ones are amplitudes of components. In each pixel d = M s + n, with M the
+In the small ones the unknowns are amplitudes of components. In each pixel d = M s + n, with M the
 same for all pixels of a call, and inverse noise covariance W. Generalised least squares gives
 s = (M^T W M)^-1 M^T W d (Stompor et al. 2009) and leaves chi^2 = r^T W r with r = d - M s. Sums
 over bands are products of matrices; the small systems are factorised element by element, each
-element an array over pixels. chi^2 has a closed derivative: s is where it is stationary, so only
+element an array over pixels. chi^2 has a derivative in closed form: it is stationary in s, so only
 explicit dependences count.
 
-The large ones are symmetric, dense or sparse, as few of their parameters share a cell.
+The large ones are symmetric, and dense or sparse, since few of their parameters share a cell.
 """
 
 from collections.abc import Sequence
@@ -22,9 +22,9 @@ import scipy.sparse.linalg
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-#: Matrices up to this size are treated as dense ones.
+#: Matrices up to this size are dense.
 DENSE = 1500
-#: Columns solved for at a time, and the most of them for variances of a sparse matrix.
+#: Columns solved at a time, and most columns for the variances of a sparse matrix.
 COLUMNS, MOST = 64, 4096
 
 
@@ -32,7 +32,7 @@ class Pixels(NamedTuple):
     """Data in pixels that are treated in the same way.
 
     Rows are bands, or Q of each band and then U of each band. Weights are the inverse variance of
-    the noise, or the diagonal of its inverse covariance, and `cross` is the element QU of that.
+    the noise, or the diagonal of its inverse covariance, and `cross` is the QU element of that.
     """
 
     data: Float[Array, "*batch group row pix"]
@@ -41,7 +41,7 @@ class Pixels(NamedTuple):
 
 
 def _weighted(pixels: Pixels, maps: Array) -> Array:
-    """W times maps (group, row, pix)."""
+    """Return W times maps (group, row, pix)."""
     result = pixels.weights * maps
     if pixels.cross is None:
         return result
@@ -52,7 +52,7 @@ def _weighted(pixels: Pixels, maps: Array) -> Array:
 
 
 def _gram(mixing: Float[Array, "row unknown"], pixels: Pixels) -> list[list[Array]]:
-    """Lower triangle of M^T W M, each element an array (group, pix)."""
+    """Return the lower triangle of M^T W M, each element an array (group, pix)."""
     size = mixing.shape[1]
     i, j = np.tril_indices(size)
     products = mixing[:, i] * mixing[:, j]
@@ -67,7 +67,7 @@ def _gram(mixing: Float[Array, "row unknown"], pixels: Pixels) -> list[list[Arra
 
 
 def _cholesky(matrix: list[list[Array]]) -> list[list[Array]]:
-    """Lower factor with the inverses of its diagonal on the diagonal."""
+    """Return the lower factor, with the inverse of its diagonal on the diagonal."""
     lower: list[list[Array]] = []
     for i, row in enumerate(matrix):
         lower.append([])
@@ -78,7 +78,7 @@ def _cholesky(matrix: list[list[Array]]) -> list[list[Array]]:
 
 
 def _back_substituted(lower: list[list[Array]], right: Array) -> Array:
-    """The solution x of L L^T x = right (group, unknown, pix)."""
+    """Return the solution x of L L^T x = right (group, unknown, pix)."""
     size = len(lower)
     y: list[Array] = []
     for i in range(size):
@@ -90,7 +90,7 @@ def _back_substituted(lower: list[list[Array]], right: Array) -> Array:
 
 
 def _projected(mixing: Array, maps: Array) -> Array:
-    """M^T times maps (group, row, pix)."""
+    """Return M^T times maps (group, row, pix)."""
     return jnp.einsum("ru,krn->kun", mixing, maps)
 
 
@@ -99,13 +99,13 @@ def _model(mixing: Array, amplitudes: Array) -> Array:
 
 
 def _solved(mixing: Array, pixels: Pixels, right: Array) -> tuple[Array, list[list[Array]]]:
-    """The solution of M^T W M x = right (group, unknown, pix), and the factors of the matrix."""
+    """Return the solution of M^T W M x = right (group, unknown, pix), and the matrix's factors."""
     lower = _cholesky(_gram(mixing, pixels))
     return _back_substituted(lower, right), lower
 
 
 def _along(function, primals, tangents):
-    """The derivative of a function along tangents, of which those that are zero cost nothing."""
+    """Return the derivative of a function along tangents; zero tangents cost nothing."""
     leaves, structure = jax.tree.flatten(primals)
     slopes = jax.tree.leaves(tangents, is_leaf=lambda x: isinstance(x, SymbolicZero))
     moving = [i for i, slope in enumerate(slopes) if not isinstance(slope, SymbolicZero)]
@@ -119,12 +119,12 @@ def _along(function, primals, tangents):
 
 @jax.custom_jvp
 def solve(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, "group unknown pix"]:
-    """Amplitudes s = (M^T W M)^-1 M^T W d; NaN where a system is singular."""
+    """Return amplitudes s = (M^T W M)^-1 M^T W d; NaN where a system is singular."""
     return _solved(mixing, pixels, _projected(mixing, _weighted(pixels, pixels.data)))[0]
 
 
 def _solve_jvp(primals, tangents):
-    """From M^T W (d - M s) = 0: one more solution, and no derivative of the factors."""
+    """Differentiate M^T W (d - M s) = 0: one more solution, no derivative of the factors."""
     mixing, pixels = primals
     right = _projected(mixing, _weighted(pixels, pixels.data))
     amplitudes, lower = _solved(mixing, pixels, right)
@@ -141,7 +141,7 @@ solve.defjvp(_solve_jvp, symbolic_zeros=True)
 def inverse_gram(
     mixing: Float[Array, "row unknown"], pixels: Pixels
 ) -> Float[Array, "group unknown unknown pix"]:
-    """Covariance (M^T W M)^-1 of the amplitudes; one pixel if the weights are uniform."""
+    """Return the covariance (M^T W M)^-1 of amplitudes; one pixel if weights are uniform."""
     lower = _cholesky(_gram(mixing, pixels))
     size, one = len(lower), jnp.ones_like(lower[0][0])[:, None]
     units = jnp.eye(size)[:, :, None]
@@ -150,7 +150,7 @@ def inverse_gram(
 
 
 def residuals(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, "group row pix"]:
-    """Whitened residuals: their sum of squares is chi^2."""
+    """Return whitened residuals: their sum of squares is chi^2."""
     rest = pixels.data - _model(mixing, solve(mixing, pixels))
     if pixels.cross is None:
         return jnp.sqrt(pixels.weights) * rest
@@ -165,8 +165,8 @@ def residuals(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Arra
 class Derivatives(NamedTuple):
     """-ln L and its derivatives in the parameters that a mixing matrix depends on.
 
-    `fisher` has second derivatives for data that are what the parameters predict: the Fisher
-    matrix of the fitted amplitudes, positive semi-definite.
+    `fisher` has the second derivatives for data that equal the prediction of the parameters: the
+    Fisher matrix of the fitted amplitudes, positive semi-definite.
     """
 
     value: Float[Array, "*batch"]
@@ -181,7 +181,7 @@ def derivatives(
     second: Float[Array, "free free row unknown"],
     pixels: Pixels,
 ) -> Derivatives:
-    """chi^2 / 2 and its derivatives in closed form, from one factorisation.
+    """Return chi^2 / 2 and its derivatives in closed form, from one factorisation.
 
     With A the matrix, A_i its derivatives, G = A^T W A, amplitudes s, residuals r, B_i = A_i s and
     D_i = A_i^T W r - A^T W B_i,
@@ -214,7 +214,7 @@ def derivatives(
 
 
 def fitted(mixing: Float[Array, "row unknown"], pixels: Pixels) -> tuple[Array, Array, Array]:
-    """Amplitudes (group, unknown, pix), and residuals without and with weight (group, row, pix)."""
+    """Return amplitudes (group, unknown, pix), residuals (group, row, pix), and W times them."""
     amplitudes = solve(mixing, pixels)
     rest = pixels.data - _model(mixing, amplitudes)
     return amplitudes, rest, _weighted(pixels, rest)
@@ -222,9 +222,9 @@ def fitted(mixing: Float[Array, "row unknown"], pixels: Pixels) -> tuple[Array, 
 
 @jax.custom_jvp
 def least_chi2(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, ""]:
-    """Sum over pixels of r^T W r = d^T W d - (M^T W d)^T (M^T W M)^-1 (M^T W d).
+    """Return the sum over pixels of r^T W r = d^T W d - (M^T W d)^T (M^T W M)^-1 (M^T W d).
 
-    Formed from the residuals, so nothing cancels where signals are far above the noise.
+    It is computed from residuals, so nothing cancels where signals are far above the noise.
     """
     _, rest, weighted = fitted(mixing, pixels)
     return jnp.sum(rest * weighted)
@@ -234,7 +234,7 @@ def _chi2_jvp(primals, tangents):
     amplitudes, rest, weighted = fitted(*primals)
 
     def linear(mixing, pixels):
-        """With the derivative of chi^2, in which amplitudes count as constant."""
+        """Return a number with the derivative of chi^2 at constant amplitudes."""
         moved = pixels.data - _model(mixing, amplitudes)
         return 2 * jnp.sum(weighted * moved) + jnp.sum(rest * _weighted(pixels, rest))
 
@@ -250,7 +250,7 @@ def assembled(
     size: int,
     diagonal: Float[np.ndarray, " par"],
 ) -> np.ndarray | scipy.sparse.csc_matrix:
-    """The matrix of all parameters from those of each cell, plus a diagonal."""
+    """Return the matrix of all parameters from those of each cell, plus a diagonal."""
     if size <= DENSE:
         total = np.diag(np.asarray(diagonal, float))
         np.add.at(total, (index[:, :, None], index[:, None, :]), local)
@@ -262,7 +262,7 @@ def assembled(
 
 
 def _independent(matrix: np.ndarray) -> list[np.ndarray]:
-    """Positions of the independent blocks that a matrix falls into, as regions do."""
+    """Return positions of the independent blocks of a matrix, such as those of regions."""
     graph = scipy.sparse.csr_matrix(matrix != 0)
     count, block = scipy.sparse.csgraph.connected_components(graph, directed=False)
     order = np.argsort(block, kind="stable")
@@ -270,7 +270,7 @@ def _independent(matrix: np.ndarray) -> list[np.ndarray]:
 
 
 class Factor:
-    """Factors of a symmetric matrix, a dense one block by block; `positive` if it is definite."""
+    """Factors of a symmetric matrix, if dense in blocks; `positive` if it is positive definite."""
 
     def __init__(self, matrix: np.ndarray | scipy.sparse.csc_matrix) -> None:
         diagonal = matrix.diagonal()
@@ -303,7 +303,7 @@ class Factor:
         self.positive = bool(np.all(self._sparse.U.diagonal() > 0))
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """The solution for one right-hand side, or for several as columns."""
+        """Return the solution for one right-hand side, or for several as columns."""
         scale = self._scale if right.ndim == 1 else self._scale[:, None]
         if hasattr(self, "_sparse"):
             return scale * self._sparse.solve(scale * right)
@@ -317,7 +317,7 @@ class Factor:
 def degenerate(
     matrix: np.ndarray | scipy.sparse.csc_matrix, names: Sequence[str], threshold: float = 1e-10
 ) -> list[str]:
-    """Names of parameters that the data do not tell apart, from the curvature of -log posterior.
+    """Return names of degenerate parameters, from the curvature of -log posterior.
 
     `threshold` is the least eigenvalue of the matrix scaled to a unit diagonal.
     """
@@ -341,14 +341,14 @@ def degenerate(
 def variances(
     factor: Factor, scatter: scipy.sparse.csc_matrix, shared: np.ndarray
 ) -> Float[np.ndarray, " par"]:
-    """Diagonal of H^-1 S H^-1 for sparse H, given by its factor, and S; NaN if it takes too long.
+    """Return the diagonal of H^-1 S H^-1 for sparse H, given as factor; NaN if it takes too long.
 
-    Without parameters that many cells share H falls into small independent parts, so a few
+    Without parameters that many cells share, H consists of small independent parts, so a few
     solutions serve all of them at once.
     """
     size = len(shared)
     if shared.any():
-        # Everything hangs together: column by column, if there are not too many.
+        # All parameters are coupled: column by column, if there are not too many.
         if size > MOST:
             return np.full(size, np.nan)
         position = np.arange(size)

@@ -12,11 +12,11 @@ dict of parameters, so the grid, the optimiser and the sampler share one definit
 Both exist on inner products formed once (`TemplateLikelihood`) and, for spectral parameters that
 vary from pixel to pixel, pixel by pixel (`PixelLikelihood`), and agree where both apply.
 
-Names of parameters are those of the sky ("dust.beta_dust"), those of bands (`fits.mixing`), which
-are calibrated on the CMB, and "offset.<band>.<stokes>", a constant added to the model [uK_RJ].
+Names of parameters are those of the sky ("dust.beta_dust"), of bands (`fits.mixing`), which are
+calibrated on the CMB, and "offset.<band>.<stokes>", a constant added to the model [uK_RJ].
 
-Where an angle is free, Q of a band shows U of the templates, too, and its U their Q: they are
-templates like the others then, behind them.
+If an angle is free, Q of a band also contains U of the templates, and U their Q: these are then
+added as further templates after the others.
 """
 
 import dataclasses
@@ -41,14 +41,14 @@ from jaxsky.sky import OFFSET, interpolation_nodes, unknown_parameter
 #: Covariance of the inner products <rows, data>: (band, row, stokes, pix) -> square matrix over
 #: (band, row) flattened. `fits.common.Fluctuations.covariance` is one.
 CovarianceOf = Callable[[Float[Array, "band row stokes pix"]], Float[np.ndarray, "row row"]]
-#: Pixels per pass over templates; small enough that the weighted copies stay in cache.
+#: Pixels per pass over templates; few enough for the weighted copies to stay in cache.
 CHUNK = 1 << 14
 
 
 class SkyLikelihood(Likelihood):
-    """Base class of those whose amplitudes are the templates'.
+    """Base class of likelihoods whose amplitudes are the templates.
 
-    `values` are pixels with weight, or amplitudes for the exact form.
+    `values` counts pixels with weight, or amplitudes for the exact form.
     """
 
     mixing: Mixing
@@ -60,14 +60,14 @@ class SkyLikelihood(Likelihood):
     def rotated(
         self, seen: Float[Array, "band stokes x"], params: Mapping[str, Array]
     ) -> tuple[Float[Array, "band stokes x"], Float[Array, "band stokes x"]]:
-        """What Stokes parameters of rotated bands show of the same of the sky, and of the other."""
+        """Return what rotated bands see of the same Stokes parameter, and of the other one."""
         sign = np.array([{"I": 0, "Q": -1, "U": 1}[s] for s in self.stokes])
         angle = 2 * jnp.deg2rad(self.mixing.of_bands("angle", params))
         angle = (angle[:, None] * sign)[..., None]
         return jnp.cos(angle) * seen, jnp.sin(angle) * _swapped(seen)
 
     def offset(self, params: Mapping[str, Array]) -> Float[Array, "band stokes"]:
-        """Offsets [uK_RJ], 0 unless given."""
+        """Return offsets [uK_RJ], 0 unless given."""
         return jnp.array(
             [[params.get(f"offset.{b}.{s}", 0.0) for s in self.stokes] for b in self.mixing.names]
         )
@@ -92,15 +92,15 @@ class SkyLikelihood(Likelihood):
 class TemplateLikelihood(SkyLikelihood):
     """Likelihood on inner products; for spectral parameters that are constant over the region.
 
-    The sky of `mixing` has unit amplitudes on a single pixel: what a component shows in a band is
-    then the coefficient of its template. `matrix` turns (1, -coefficients, -offset) of all bands
+    The sky of `mixing` has unit amplitudes on a single pixel: the signal of a component in a band
+    is then the coefficient of its template. `matrix` turns (1, -coefficients, -offset) of all bands
     and Stokes parameters into residuals.
     """
 
     matrix: Float[Array, "row vector"]
 
     def coefficients(self, params: Mapping[str, Array]) -> Float[Array, "band stokes template"]:
-        """What each template is multiplied with in each band."""
+        """Return the factor of each template in each band."""
         laws = self.mixing.one(params)[:, None]
         components = self.mixing.laws(params).components.values()
         seen = laws * jnp.concatenate([c.template for c in components], axis=1)
@@ -144,10 +144,10 @@ def gram(
     weights: Float[Array, "band stokes pix"],
     chunk: int = CHUNK,
 ) -> Float[Array, "band stokes row row"]:
-    """Weighted inner products of (data, templates, 1), for each band and Stokes parameter.
+    """Return weighted inner products of (data, templates, 1), per band and Stokes parameter.
 
-    One pass over the pixels, after which nothing of a fit with constant laws depends on their
-    number: a model is a sum of templates, so chi^2 is a quadratic form in their coefficients.
+    After this one pass over the pixels, a fit with constant laws does not depend on their number:
+    a model is a sum of templates, so chi^2 is a quadratic form in their coefficients.
     Weights are 1/sigma^2, zero where masked, and broadcast against the data; `chunk` pixels are
     taken at once. Results for disjoint sets of pixels add up to that of their union.
     """
@@ -157,7 +157,7 @@ def gram(
     def products(d, t, w):
         t = jnp.broadcast_to(t, (bands, *t.shape)).swapaxes(1, 2)
         rows = jnp.concatenate([d[:, :, None], t, jnp.ones_like(d)[:, :, None]], axis=2)
-        # A masked pixel may hold anything, NaN among it.
+        # A masked pixel may contain anything, even NaN.
         rows = jnp.where(w[:, :, None] > 0, rows, 0)
         return jnp.einsum("bsip,bsp,bsjp->bsij", rows, w, rows)
 
@@ -201,7 +201,7 @@ def likelihood(
     pixelwise: bool = False,
     template_errors: TemplateErrors | None = None,
 ) -> SkyLikelihood:
-    """The likelihood of maps as a function of the parameters named in `start`.
+    """Return the likelihood of maps as a function of the parameters named in `start`.
 
     Parameters
     ----------
@@ -210,15 +210,15 @@ def likelihood(
     data : observed maps [uK_RJ], shape (band, stokes, pix)
     sigma : standard deviation of the data [uK_RJ], broadcasting to their shape; infinite where
         a pixel is masked
-    start : free parameters by name, at which the sky is otherwise expanded; a free parameter
-        that is a map in `sky` is replaced by a constant, one with ".offset" behind its name is
-        shifted
+    start : free parameters by name, with values at which the sky is otherwise expanded; a free
+        parameter that is a map in `sky` is replaced by a constant, or shifted if ".offset" is
+        appended to its name
     stokes : which rows to use, e.g. "Q"; default all, "QU" or "IQU" by their number
     covariance_of : covariance of inner products with the data, for the exact likelihood;
         None for the paper's diagonal one
     pixelwise : evaluate pixel by pixel even where inner products would do
-    template_errors : noise of the templates, which is taken out of the inner products; its part
-        of their covariance is that at `start`. Likelihoods pixel by pixel leave it out.
+    template_errors : noise of the templates, which is subtracted from the inner products; its
+        part of their covariance is that at `start`. Likelihoods pixel by pixel ignore it.
 
     Returns
     -------
@@ -299,7 +299,7 @@ def likelihood(
     matrix = _matrix(blocks[:, keep], keep, len(labels), whitening)
     if covariance_of is not None:
         return dataclasses.replace(like, values=jnp.asarray(len(whitening)), matrix=matrix)
-    # What no combination of the templates explains is the same for all parameters.
+    # The part that no combination of templates explains is the same for all parameters.
     left = products[:, keep, : used.stop, : used.stop]
     constant = jnp.zeros_like(matrix[:1]).at[0, keep[0] * products.shape[-1]]
     unexplained = constant.set(np.sqrt(np.sum(1 / np.linalg.inv(left)[..., 0, 0])))
@@ -307,13 +307,13 @@ def likelihood(
 
 
 def _swapped(maps: Float[Array, "*maps stokes x"]) -> Float[Array, "*maps stokes x"]:
-    """U in place of Q and Q in place of U; in place of I, which no angle changes, some other."""
+    """Exchange Q and U; in place of I, which no angle changes, put any other."""
     return maps[..., [-2, -1, -2][-maps.shape[-2] :], :]
 
 
 @jax.jit
 def _weights(data, sigma):
-    """1/sigma^2 of all data; counts of those that are used, of bad sigma, and of bad data."""
+    """Return 1/sigma^2 of all data, and counts of used data, bad sigma and bad data."""
     weights = jnp.broadcast_to(1 / sigma**2, data.shape)
     used = weights > 0
     unseen = used & (~jnp.isfinite(data) | (data < UNSEEN))
@@ -321,7 +321,7 @@ def _weights(data, sigma):
 
 
 def _matrix(blocks, keep, stokes, whitening=None):
-    """Blocks (band, kept stokes, row, vector) on the diagonal of a matrix for all Stokes rows."""
+    """Put blocks (band, kept stokes, row, vector) on the diagonal of a matrix for all Stokes."""
     bands, kept, rows, size = blocks.shape
     matrix = scipy.linalg.block_diag(*blocks.reshape(-1, rows, size))
     if whitening is not None:
@@ -335,7 +335,7 @@ def _matrix(blocks, keep, stokes, whitening=None):
 def _one_stokes_each(
     maps: Float[Array, "*band template stokes pix"], weights: Float[Array, "band stokes pix"]
 ) -> Float[Array, "band row stokes pix"]:
-    """Rows W T of each band and map, zero where masked, each with one Stokes parameter."""
+    """Return rows W T of each band and map, zero where masked, each of one Stokes parameter."""
     rows = weights[:, None] * jnp.where(weights[:, None] > 0, maps, 0)
     bands, templates, stokes, npix = rows.shape
     split = jnp.eye(stokes)[None, :, None, :, None] * rows[:, None]
@@ -347,9 +347,9 @@ def _of_kept(
     rows: Float[Array, "band row stokes pix"],
     keep: np.ndarray,
 ) -> Float[np.ndarray, "row row"]:
-    """The covariance of the rows of the Stokes parameters kept, cut out of that of all.
+    """Return the covariance of rows of the kept Stokes parameters, a part of that of all rows.
 
-    That of all is the same whatever is kept.
+    The covariance of all rows can so be reused for any choice.
     """
     bands, count, stokes, _ = rows.shape
     split = covariance.reshape(2 * (bands, stokes, count // stokes))
@@ -358,7 +358,7 @@ def _of_kept(
 
 
 def _whitening(covariance: Float[np.ndarray, "row row"]) -> Float[np.ndarray, "row row"]:
-    """W with W^T W the inverse of a covariance of products."""
+    """Return W with W^T W the inverse of a covariance of products."""
     scale = np.sqrt(np.diagonal(covariance))
     safe = np.where(scale > 0, scale, 1.0)
     correlation = covariance / safe[:, None] / safe
@@ -372,7 +372,7 @@ def _whitening(covariance: Float[np.ndarray, "row row"]) -> Float[np.ndarray, "r
 
 
 def _on_pixels(like, data, weights, keep, covariance_of):
-    """The likelihood of each pixel; its rows are the components' maps at the start values."""
+    """Return a likelihood on pixels; its rows are the components' maps at the start values."""
     mixing, params = like.mixing, like.start
     at_start = mixing.laws({n: value for n, value in params.items() if n.endswith(OFFSET)})
     used = jnp.zeros_like(weights).at[:, keep].set(weights[:, keep])

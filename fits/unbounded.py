@@ -1,10 +1,10 @@
-"""The posterior in numbers without bounds whose covariance is about the unit matrix.
+"""Transform a posterior to unbounded numbers whose covariance is about the unit matrix.
 
 A uniform prior becomes the logistic map of its range, whose Jacobian is part of the density; the
 curvature of -log posterior at the best fit gives the rest, until there are samples. Where a prior
-cuts the posterior, that map is far from linear. The other parameters then follow the one that is
-cut itself, not its unbounded number, or, from samples on, what fits best of both: so a narrow
-ridge remains straight.
+cuts the posterior, that map is far from linear. The other parameters are then linear in the cut
+parameter itself, not in its unbounded number, or, once there are samples, in the best combination
+of both: so a narrow ridge remains straight.
 """
 
 from typing import NamedTuple
@@ -18,18 +18,18 @@ from jaxtyping import Array, Bool, Float
 from fits.posterior import Density, Posterior
 from fits.systems import degenerate
 
-#: Samples for each parameter, from which on they tell more than the curvature at the best fit.
+#: Samples per parameter from which they say more than the curvature at the best fit.
 ENOUGH = 30
-#: A prior cuts a parameter that spreads this much in its unbounded number: whose edge is within
+#: Spread of an unbounded number above which its prior cuts the parameter: an edge is then within
 #: about four standard deviations.
 NEAR = 0.25
 
 
 class Unbounded(NamedTuple):
-    """Numbers to move in: those without bounds are center + root z, or root times z if a vector.
+    """Numbers z for samplers: unbounded numbers are center + root z, or root * z if a vector.
 
     `cut` are parameters that are cut by their prior, `middle` is about where they are, and `lean`
-    is added to the numbers of the others for each unit of distance from there.
+    is added to the numbers of the others per unit of distance from there.
     """
 
     density: Density
@@ -40,7 +40,7 @@ class Unbounded(NamedTuple):
     lean: Float[Array, "*par par"]
 
     def values(self, z: Float[Array, " par"]) -> tuple[Float[Array, " par"], Float[Array, ""]]:
-        """Parameters, and the log of the Jacobian of the logistic map."""
+        """Return parameters, and the log of the Jacobian of the logistic map."""
         low, width = self.density.low, self.density.high - self.density.low
         if self.root.ndim == 1:
             y = self.center + self.root * z
@@ -54,12 +54,12 @@ class Unbounded(NamedTuple):
         return values, jnp.sum(jnp.where(self.density.bounded, jacobian, 0.0))
 
     def log_density(self, z: Float[Array, " par"]) -> Float[Array, ""]:
-        """Log density of z."""
+        """Return the log density of z."""
         values, jacobian = self.values(z)
         return self.density.log_prob(values) + jacobian
 
     def coordinates(self, values: Float[np.ndarray, "sample par"]) -> np.ndarray:
-        """The z of parameters, where there is a matrix."""
+        """Return the z of parameters; `root` must be a matrix."""
         rest = self._unbounded(values) - np.asarray(self.center)
         moved = np.where(self.cut, values - np.asarray(self.middle), 0.0)
         return np.linalg.solve(self.root, (rest - moved @ np.asarray(self.lean).T).T).T
@@ -71,7 +71,7 @@ class Unbounded(NamedTuple):
         return np.where(bounded, scipy.special.logit(np.clip(unit, 1e-15, 1 - 1e-15)), values)
 
     def adapted(self, values: Float[np.ndarray, "sample par"]) -> "Unbounded":
-        """With the covariance of samples; the same if they are too few, or do not move."""
+        """Adapt to the covariance of samples; return itself if they are few or do not move."""
         if self.root.ndim == 1 or len(values) < ENOUGH * values.shape[1]:
             return self
         y = self._unbounded(values)
@@ -104,9 +104,9 @@ class Unbounded(NamedTuple):
 
 
 def unbounded_posterior(posterior: Posterior, theta: np.ndarray) -> tuple[Unbounded, list[str]]:
-    """The posterior, scaled by its curvature near the best fit theta.
+    """Return the posterior, scaled by its curvature near the best fit theta.
 
-    Also the labels of parameters that it does not determine.
+    Also return the labels of parameters that it does not determine.
     """
     density = posterior.density(theta)
     present, bounded, low, high = map(np.asarray, density[3:])
@@ -116,7 +116,7 @@ def unbounded_posterior(posterior: Posterior, theta: np.ndarray) -> tuple[Unboun
         matrix = posterior.curvature(theta, posterior.convex(theta), present)
         return matrix, posterior.value(theta)[1][present]
 
-    # Away from the edges by what the density falls over there.
+    # Away from the edges by the distance over which the density falls there.
     matrix, slope = derivatives(theta)
     with np.errstate(divide="ignore", invalid="ignore"):
         scales = np.stack([1 / np.sqrt(matrix.diagonal()), 1 / np.abs(slope), width / 4])
@@ -147,7 +147,7 @@ def unbounded_posterior(posterior: Posterior, theta: np.ndarray) -> tuple[Unboun
 
 
 def _straightened(matrix, bounded, scale, jacobian):
-    """Root, cut parameters, and lean of others on these; see `Unbounded`.
+    """Return root, cut parameters, and lean of others on these; see `Unbounded`.
 
     The matrix is the curvature in unbounded numbers times `scale` on both sides, with a unit
     diagonal; `jacobian` is the derivative of parameters in unbounded numbers.

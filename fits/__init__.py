@@ -1,6 +1,6 @@
 """Fitting tools for jaxsky skies ("fits" as in model fits, not FITS files).
 
-What users need is imported from here (`__all__`); each name when it is first asked for.
+Public names (`__all__`) are imported from here, each when it is first used.
 """
 
 from typing import TYPE_CHECKING

@@ -27,7 +27,7 @@ MALLOC = {-8: 1, -3: 8 * 2**20}
 TEMPLATE = "experiment"
 #: What `jaxsky simulate` may be restricted to.
 ONLY = ("noise", "signal", "foregrounds", "cmb")
-#: Commands that fit observed maps, or those that are simulated for them.
+#: Commands that analyse observed maps, or simulated ones.
 ANALYSES = {
     "fit": "Fit spectral indices to polarization maps: on a grid, by gradient and by MCMC.",
     "compare": "Compare observed maps with the model of foregrounds, CMB and noise.",

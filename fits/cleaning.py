@@ -75,7 +75,7 @@ class Response:
         gradient = np.array(value_and_gradient(like, self.theta)[1])
         draws = np.asarray(jax.random.normal(key, gradient.shape))
         for prior, where in self._posterior.priors:
-            assert isinstance(prior, Gaussian)  # the only one that is not a bound
+            assert isinstance(prior, Gaussian)  # the only prior that is not a bound
             gradient += np.where(where, draws / prior.sigma, 0.0)
         theta = self.theta.copy()
         theta[self._keep] -= self._factor.solve(gradient[self._keep])
@@ -204,7 +204,7 @@ def separate_data(
     kept = spec.nsims, settings.seed, path, _mark(settings, data), progress.advance
     simulated = simulated_noise(data, like, response, emission, spectra, window, lensed, *kept)
     progress.step("tensor-to-scalar ratio")
-    # What the spectra know of E in B is part of the model.
+    # The model has the mean E in B that the windows know of; only the rest is added.
     EE = lensed[1, : spectra.lmax + 1]
     leaked = simulated.leaked.mean(axis=0) - spectra.windows[1, :, 0] @ EE
     model = power_model(
@@ -295,7 +295,7 @@ def _spectra(
     highest = 2 * nside
     window = np.asarray(gaussian_beam(fwhm, highest))
     reach = int(np.flatnonzero(window > LEAST_WINDOW).max())
-    # Bins next to the last multipole are needed for what the mask mixes into those below.
+    # Bins beyond lmax are needed for power that the mask mixes into those below.
     lmax = min(reach, highest - how.width) if how.lmax is None else how.lmax
     if lmax > min(reach, highest - 1):
         raise SettingsError(

@@ -269,7 +269,7 @@ def used_pixels(noise: Noise, npix: int, components: int) -> np.ndarray:
 
 
 def _refuse(data: np.ndarray, noise: Noise) -> None:
-    """Raise the error for data that are not finite in pixels that are used."""
+    """Raise the error for data that are not finite in used pixels."""
     bad = 0
     for part in chunks(data.shape[-1]):
         values = data[..., part]

@@ -383,7 +383,7 @@ def modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
         numbers, has = read_parameters(folder, name, spec, nside, "common.nside")
         known &= has
         with at_key(f"sky.{name}"):
-            assert spec.law is not None  # as the settings see to
+            assert spec.law is not None  # the settings ensure this
             components[name] = component_class(spec.law)(amplitude, **numbers)
     others = set(settings.sky.components) - set(laws)
     fixed = {name: v for name, v in settings.fixed.items() if name.split(".")[0] not in others}

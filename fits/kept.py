@@ -120,7 +120,7 @@ def kept_realisations(
     held, saved = len(done), time.monotonic()
 
     def one(number: int) -> list[np.ndarray]:
-        key = stream(realisation_key(seed, number), "realisation")  # unlike what is observed
+        key = stream(realisation_key(seed, number), "realisation")  # not that of observed maps
         return [np.asarray(x) for x in make(key)]
 
     def made(numbers: range) -> Iterator[list[np.ndarray]]:

@@ -198,7 +198,7 @@ class Mixing(eqx.Module):
 class TemplateErrors(NamedTuple):
     """Noise of templates at the common resolution, as a sum of independent sources.
 
-    Sources are the noise of each template that no other map has, and that of bands which
+    Sources are the noise of each template that no other map has, and the noise of bands that
     templates share.
 
     Attributes

@@ -191,7 +191,7 @@ def best_fit(
         with uniform priors, those of numbers without bounds. Or `fits.Newton()`: damped
         steps of Newton's method with exact second derivatives, clipped at the bounds. By default
         that for spectral likelihoods, else `LevenbergMarquardt`
-    max_steps : of the search; by default 100 of Newton's method, or 500 of optimistix
+    max_steps : largest number of steps; by default 100 for Newton's method, 500 for optimistix
     throw : raise if it fails, or the optimum lies at the edge of a uniform prior
 
     Returns
@@ -210,7 +210,7 @@ def best_fit(
         priors that are neither uniform nor Gaussian with a least-squares solver.
     FitError
         If it did not converge, unless throw=False; the result is in its `.result`. That is so if
-        the search stopped away from an optimum, or at its start, if data and priors do not
+        the search stopped away from an optimum (even at its start), if data and priors do not
         determine a parameter, and if chi^2 is far too large for a fit (`fits.results`). The
         message says in how many regions and pixels, and which prior would help.
     """

@@ -24,8 +24,8 @@ from fits.pseudo_cl import PIVOT, PreparedPatches, band_powers, mean_spectrum
 from fits.tensor_ratio import covariance_terms
 from jaxsky.checks import check_shape
 
-#: The root of the variance of a power never falls below this part of what it is expected to be:
-#: where a law predicts nothing in a band, that band alone would decide.
+#: Least width in the variance of a power (`BandCombinations`), relative to the expected power:
+#: otherwise a band in which the law predicts nothing would decide alone.
 FLOOR = 0.3
 #: Mean and standard deviation of the Gaussian prior of alpha. Dust has -2.4 (Planck intermediate
 #: results 30, 2016).
@@ -82,11 +82,11 @@ def fit_patches(
     noise : noise of the maps, whose mean power is subtracted: a level [u arcmin], u being the unit
         of the maps, of white noise in their pixels; or its spectrum N_l in the maps, with the
         beam that they are smoothed with, of shape (ell,), (2, ell) for EE and BB, or
-        (patch, 2, ell). By default none, or with `other` what the difference of the two shows
-    other : Q and U of another map with noise of its own and of the same level, for cross-spectra
-    slope : mean and standard deviation of the Gaussian prior of alpha. It is wide, and there to
-        bound alpha where noise leaves nothing to see; alpha = 0.1 off where the truth is 1 off and
-        its error is 1
+        (patch, 2, ell). By default none, or with `other` that of the difference of the two
+    other : Q and U of another map with independent noise of the same level, for cross-spectra
+    slope : mean and standard deviation of the Gaussian prior of alpha. It is wide, and
+        bounds alpha where noise hides the signal; it moves alpha by 0.1 where the truth is 1 from
+        its mean and the error is 1
     """
     maps = _checked("maps", maps, patches)
     other = None if other is None else _checked("other", other, patches)

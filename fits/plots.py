@@ -78,7 +78,7 @@ def label(name: str) -> str:
 
 
 def draw_title(figure: plt.Figure, title: str, fontsize: float = 9, **options: Any) -> None:
-    """Write a title literally above a figure; each of its lines is wrapped to three at most."""
+    """Write a title literally above a figure; each of its lines is wrapped to at most three."""
     # A letter is some 0.55 times as wide as high, in points of 1/72 inch.
     letters = int(figure.get_figwidth() * 72 / (0.55 * fontsize))
     lines = [textwrap.fill(line, letters, max_lines=3) for line in title.splitlines()]

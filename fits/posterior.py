@@ -142,7 +142,7 @@ class Likelihood(eqx.Module):
         return tuple(sorted(self.start))
 
     def at(self, start: Mapping[str, Numeric] | None) -> "Likelihood":
-        """Return the likelihood with other start values; itself for None."""
+        """Return the likelihood with other start values; unchanged for None."""
         start = self.check(self.start if start is None else start)
         return dataclasses.replace(self, start=start)
 
@@ -210,7 +210,7 @@ def hessian(like: Likelihood, params: Mapping[str, Numeric]) -> Float[np.ndarray
 
 
 def fisher_matrix(like: Likelihood, params: Mapping[str, Numeric]) -> Float[np.ndarray, "par par"]:
-    """Fisher matrix of the parameters, amplitudes marginalised at their best values.
+    """Return the Fisher matrix of the parameters, amplitudes marginalised at their best values.
 
     sum_p s^T A_i^T [N^-1 - N^-1 A (A^T N^-1 A)^-1 A^T N^-1] A_j s with A_i the derivative of the
     mixing matrix (Errard, Stivoli & Stompor 2011, PRD 84, 063005).

@@ -227,7 +227,7 @@ def spectral_likelihood(
         For unknown parameters.
     TypeError, ValueError
         For shapes that do not match, units, noise that is not positive, data that are not
-        finite, too few bands, components that cannot be told apart, and labels that are no
+        finite, too few bands, components that cannot be told apart, and invalid
         labels.
     """
     check_double("fits")

@@ -39,12 +39,12 @@ FIELDS = ("EE", "BB")
 
 
 class MaskedSpectra(NamedTuple):
-    """How spectra are taken on part of the sky, up to lmax; from `masked_spectra`.
+    """Operators for spectra on part of the sky, up to lmax; from `masked_spectra`.
 
     `edges` are the first multipole of each bin, and the one after the last; `derivatives` those of
-    the mask, spin 1 and 2, where B is purified. From pseudo-spectra EE, BB `inverse` makes band
-    powers D_b; `windows` makes them of the sky's C_l, the beam in it, and `mixing` pseudo-spectra,
-    without it. `spread` correlates pseudo-spectra within and between E and B.
+    the mask, spin 1 and 2, where B is purified. `inverse` turns pseudo-spectra EE, BB into band
+    powers D_b; `windows` turns C_l of the sky into these, beam included, and `mixing` turns C_l
+    into pseudo-spectra, without it. `spread` correlates pseudo-spectra within and between E and B.
     """
 
     mask: Float[np.ndarray, " pix"]
@@ -63,7 +63,7 @@ class MaskedSpectra(NamedTuple):
 
 
 def bin_centers(edges: Sequence[int]) -> Float[np.ndarray, " bin"]:
-    """Middle multipole of each bin."""
+    """Return the middle multipole of each bin."""
     return (np.array(edges[:-1]) + np.array(edges[1:]) - 1) / 2
 
 

@@ -1,6 +1,6 @@
 """Regions of the sky by name, apodized masks, and regions of constant parameters.
 
-Regions are maps of labels 0, 1, ..., one for each parameter; cells are their intersections.
+Regions are maps of labels 0, 1, ..., one map per parameter; cells are their intersections.
 """
 
 import operator
@@ -50,7 +50,7 @@ def region_mask(
         if mask is None:
             continue
         path = find_file(Path(settings.data_dir), mask.files[0])
-        assert not isinstance(mask.hdu, list)  # as the settings see to
+        assert not isinstance(mask.hdu, list)  # the settings ensure this
         field = mask.fields[0] if mask.fields else None
         found = read_mask(path, field=field, hdu=mask.hdu or 1, ordering=mask.ordering)
         if coarser and found.size < inside.size:
@@ -108,7 +108,7 @@ def superpixels(nside_map: int, nside: int) -> Int[np.ndarray, " pix"]:
 
     Parameters
     ----------
-    nside_map, nside : of the map, and of the labels
+    nside_map, nside : resolution of the map, and of the labels
 
     Raises
     ------

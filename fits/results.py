@@ -81,7 +81,7 @@ class FitResult(NamedTuple):
     interval_68 : (low, high) of the central 68.27 % of each marginal distribution
     labels : name, and region if there are several, of each row of the covariance
         ("dust.beta_dust[3]")
-    covariance : of the estimates, shape (par, par); None for too many parameters
+    covariance : that of the estimates, shape (par, par); None for too many parameters
     chi2 : smallest value of -2 log L, priors left out; for the exact likelihood that of the
         template amplitudes
     dof : number of data with weight minus that of amplitudes and free parameters

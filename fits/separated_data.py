@@ -71,18 +71,18 @@ class PixelData(_Data):
     factors: Float[np.ndarray, " band"]
 
     def likelihood(self, data: Float[np.ndarray, "band stokes pix"]) -> SpectralLikelihood:
-        """The likelihood of data."""
+        """Return the likelihood of data."""
         return spectral_likelihood(
             self.sky, self.bands, data, self.noise, self.start, labels=self.labels, unit=self.unit
         )
 
     def noise_realisation(self, key: Array) -> Float[np.ndarray, "band stokes pix"]:
-        """Noise like that of the data."""
+        """Return noise like that of the data."""
         noise = self.fluctuations.noise_realisation(key)
         return np.asarray(noise) * self.factors[:, None, None]
 
     def components(self, like: SpectralLikelihood, params: Mapping, data, **options):
-        """Amplitudes of the components with all that is known of them, and as maps."""
+        """Return amplitudes of the components with their errors, and their maps."""
         found = component_maps(like, params, data, self.noise, **options)
         return found, found.amplitude
 
@@ -113,14 +113,14 @@ class _Multipoles(_Data):
         return np.asarray(data)
 
     def likelihood(self, data: Float[np.ndarray, "band stokes _"]) -> SpectralLikelihood:
-        """The likelihood of data."""
+        """Return the likelihood of data."""
         alm, given = self.alm(data), (self.sky, self.bands)
         return harmonic_likelihood(
             *given, alm, self.spectra, self.start, beams=self.fwhms, unit=self.unit
         )
 
     def components(self, like: SpectralLikelihood, params: Mapping, data, **options):
-        """Amplitudes of the components with all that is known of them, and as maps."""
+        """Return amplitudes of the components with their errors, and their maps."""
         alm, given = self.alm(data), {"beams": self.fwhms, **options}
         found = harmonic_component_maps(like, params, alm, self.spectra, **given)
         return found, found.maps(self.nside, self.fwhm)
@@ -141,10 +141,10 @@ class MaskedSkyData(_Multipoles, PixelData):
         return np.stack([np.asarray(low_multipoles(jnp.asarray(rows), lmax)) for rows in seen])
 
     def components(self, like, params, data, **options):
-        """Amplitudes of the components with all that is known of them, and as maps.
+        """Return amplitudes of the components with their errors, and their maps.
 
-        Maps are those of pixels, plus what multipoles find beyond: the same of all components, so
-        that only the noise is another, and nothing of the sky is lost at the last multipole.
+        Maps are those of pixels, their multipoles replaced by the harmonic ones: signals are the
+        same, so only the noise changes, and no signal is lost beyond the last multipole.
         """
         found, whole = super().components(like, params, data, **options)
         _, maps = PixelData.components(self, like, params, data, covariance=False)
@@ -164,7 +164,7 @@ class FullSkyData(_Multipoles):
     noises: dict[str, MapNoise]
 
     def noise_realisation(self, key: Array) -> Float[np.ndarray, "band stokes alm"]:
-        """Noise like that of the data."""
+        """Return noise like that of the data."""
         return np.stack([noise.alm(key, name) for name, noise in self.noises.items()])
 
     def residuals(self, like: SpectralLikelihood, params: Mapping, amplitude):
@@ -202,7 +202,7 @@ def separation_data(settings: Experiment) -> PixelData | FullSkyData:
     _check_some(inside, " in which parameters are known")
     inputs = inputs_of(settings, templates=False, foregrounds=True)
     truth = inputs.truth
-    if truth is not None:  # bands are simulated as they are described
+    if truth is not None:  # simulated bands have nominal parameters
         truth |= nominal(free)
     shared = {
         "sky": sky,

@@ -287,7 +287,7 @@ def separate(
         values by name; by default the spectral indices, all names that begin with "beta"
     noise : standard deviations or covariances in the unit of the data (`fits.as_noise`); by default
         the white noise of the instrument
-    unit : of the data, "uK_RJ", "uK_CMB" or the like
+    unit : unit of the data, "uK_RJ", "uK_CMB" or the like
 
     Returns
     -------

@@ -80,7 +80,7 @@ def known_truth(inputs: Inputs, fits: Sequence[RegionFit]) -> dict[str, float] |
     if inputs.truth is None:
         return None
     free = all_free(fits)
-    # Bands are simulated as they are described.
+    # Simulated bands have nominal parameters.
     truth = inputs.truth | nominal(free)
     return {name: truth[name] for name in free if name in truth}
 
@@ -189,7 +189,7 @@ def _noise_shares(
     """Return the fraction of the weighted power of each template that is noise."""
     errors = prepared.template_errors
     assert prepared.sky is not None
-    assert errors is not None  # as called
+    assert errors is not None  # checked by the caller
     keep = np.array([s in stokes for s in "QU"])
     inside = used & np.isfinite(prepared.sigma) & keep[:, None]
     weights = np.where(inside, 1 / np.asarray(prepared.sigma) ** 2, 0.0)

@@ -320,7 +320,7 @@ def _posterior(model: PowerModel, powers: np.ndarray, upper: float) -> tuple[np.
     mean = model.mean(0.0) + grid[:, None] * model.tensors
     modes = 2 * model.mean(0.0) ** 2 / np.diagonal(model.covariance(0.0))
     ratio = powers / mean
-    # A power may be negative where noise was subtracted with the mask; then the mean decides.
+    # Decoupling from the mask may make a power negative; its logarithm is then cut.
     log = np.log(np.maximum(ratio, 1e-3))
     log_posterior = -0.5 * np.sum(modes * (ratio - log), axis=1)
     return grid, np.exp(log_posterior - log_posterior.max())

@@ -67,7 +67,7 @@ class Unbounded(NamedTuple):
     def _unbounded(self, values: np.ndarray) -> np.ndarray:
         bounded, low, high = map(np.asarray, self.density[4:])
         unit = np.where(bounded, (values - low) / (high - low), 0.5)
-        # At an edge to rounding, the number is not infinite.
+        # At an edge to rounding, the number stays finite.
         return np.where(bounded, scipy.special.logit(np.clip(unit, 1e-15, 1 - 1e-15)), values)
 
     def adapted(self, values: Float[np.ndarray, "sample par"]) -> "Unbounded":

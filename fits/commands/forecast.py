@@ -310,7 +310,7 @@ def plot_b_modes(path: Path, found: Forecast, settings: Experiment) -> None:
 
 
 def plot_errors(path: Path, found: Forecast) -> None:
-    """Draw values with errors and their correlations, but not of the foregrounds' spectra in l."""
+    """Draw values with errors and their correlations, without those of foreground spectra in l."""
     errors = found.errors
     laws = [name for name in errors.free if not name.startswith(("EE.", "BB."))]
     names = laws or errors.free

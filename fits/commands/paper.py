@@ -120,7 +120,7 @@ def make_figures(
 def _kept(
     out: Path, settings: dict[str, Any], overwrite: bool
 ) -> tuple[dict[str, PaperFigure], set[str]]:
-    """Return the figures in a folder that have these settings, and pictures of other settings."""
+    """Return the figures in a folder made with these settings, and pictures of other settings."""
     path = out / KEPT
     if not path.exists():
         return {}, set()

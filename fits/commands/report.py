@@ -94,7 +94,7 @@ def print_tables(tables: Sequence[ResultTable], width: int | None = None) -> Non
 
 
 def print_written(paths: Sequence[Path]) -> None:
-    """Say what was written; not wrapped, so that paths can be copied."""
+    """Print the paths that were written, unwrapped so that they can be copied."""
     console.print("Written: " + ", ".join(map(str, paths)), soft_wrap=True)
 
 

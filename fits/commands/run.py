@@ -304,7 +304,7 @@ class _Interrupts:
         os._exit(130)
 
     def say(self) -> None:
-        """Say that the command was stopped, once."""
+        """Print that the command was stopped, once."""
         if not self.seen.is_set():
             self.seen.set()
             console.print(self.words)

@@ -48,7 +48,7 @@ SAMPLED = 500
 
 
 class Response:
-    """-H^-1 of a fit, with H the curvature of -log posterior.
+    """Linear response of a best fit to noise: -H^-1, with H the curvature of -log posterior.
 
     `theta` is the vector of the best fit, with start values in regions without a pixel.
     """

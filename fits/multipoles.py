@@ -275,7 +275,7 @@ def harmonic_likelihood(
     start : start values of the free parameters by name, as for `spectral_likelihood`
     beams : full widths at half maximum of Gaussian beams [arcmin], (band,), or tables b_l,
         (band, ell) from l = 0, with the window of the pixels if the maps have one
-    unit : of the data, "uK_RJ", "K_CMB" or the like; amplitudes are uK in any case (CMB: uK_CMB)
+    unit : unit of the data ("uK_RJ", "K_CMB", ...); amplitudes are uK in any case (CMB: uK_CMB)
     lmin, lmax : smallest and largest multipole that is used; by default 2 and that of `alm`
 
     Returns

@@ -199,7 +199,7 @@ def best_fit(
     Result whose intervals are one standard deviation to either side. Its covariance is the inverse
     of the curvature H of -log posterior; for spectral likelihoods H^-1 S H^-1 with S the
     covariance of its gradient, the same where signals are well above the noise of each pixel.
-    `details` holds "solver" by name, its "steps", the "distance" to the optimum that remained, in
+    `details` has "solver" by name, its "steps", the "distance" to the optimum that remained, in
     standard deviations, and "hessian" and "fisher", H and the Fisher matrix of the fitted
     amplitudes, both with the curvature of the priors; None for too many parameters.
 

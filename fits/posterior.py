@@ -265,7 +265,7 @@ class Density(NamedTuple):
 
 
 class Posterior:
-    """-log posterior as a function of the vector of parameters, within bounds.
+    """The -log posterior as a function of the vector of parameters, within bounds.
 
     `names` has the name of each parameter, `labels` name and region ("dust.beta_dust[3]");
     `present` is true for regions with pixels; `low` and `high` are bounds from uniform priors, and

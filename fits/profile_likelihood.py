@@ -211,7 +211,7 @@ def spectral_likelihood(
         `fits.mixing`)
     labels : maps of region numbers from 0 for parameters that vary, by name; start values are
         then arrays with one value for each region, or a number for all
-    unit : of the data, "uK_RJ", "K_CMB" or the like; amplitudes are uK in any case (CMB: uK_CMB)
+    unit : unit of the data ("uK_RJ", "K_CMB", ...); amplitudes are uK in any case (CMB: uK_CMB)
     compress : whether vectors replace pixels, which needs separable noise; by default if they are
         fewer
 
@@ -227,8 +227,7 @@ def spectral_likelihood(
         For unknown parameters.
     TypeError, ValueError
         For shapes that do not match, units, noise that is not positive, data that are not
-        finite, too few bands, components that cannot be told apart, and invalid
-        labels.
+        finite, too few bands, components that cannot be told apart, and invalid labels.
     """
     check_double("fits")
     sky = sky if isinstance(sky, Sky) else Sky(sky)

@@ -303,7 +303,7 @@ def sample(
     -------
     Result of method "mcmc" or "nuts", with the most probable sample, central intervals and
     covariance of the samples, of emcee after two autocorrelation times. Regions without a pixel
-    have no row in it. `details` holds "chain" (step, walker or chain, row), "log_prob", "tau" by
+    have no row in it. `details` has "chain" (step, walker or chain, row), "log_prob", "tau" by
     label, "acceptance", "discard" and "thin"; of "nuts" also "divergences", their number, "rhat"
     and "ess", the number of effective samples, by label, "gradients", their mean number for a
     step, and "step_size".

@@ -222,7 +222,7 @@ def harmonic_component_maps(
     params : spectral parameters, such as `FitResult.best_fit`
     alm, noise, beams, lmin, lmax : as for `harmonic_likelihood`; the multipoles need not be those
         that were fitted
-    covariance : whether to make the covariance of the amplitudes
+    covariance : whether to compute the covariance of the amplitudes
     """
     if len(like.index) != 1:
         raise ValueError(

@@ -203,7 +203,7 @@ def _noise_shares(
 def _expected(
     prepared: CommonMaps, used: Bool[np.ndarray, " pix"], stokes: str, left_out: Sequence[str]
 ) -> float:
-    """Return mean square of noise and CMB over that of noise, the only one that chi^2 counts."""
+    """Return the mean square of noise and CMB over that of noise, which alone chi^2 counts."""
     power = prepared.fluctuations.cmb_power().sum(axis=1)
     ell = np.arange(power.shape[-1])
     # Q and U each have half the variance of E and B.
@@ -319,7 +319,7 @@ def grid_fit(
     Returns
     -------
     Result with the values at the highest point, intervals and covariance by integration over
-    the grid. `details` holds "axes" by name, "log_posterior" relative to its maximum, with
+    the grid. `details` contains "axes" by name, "log_posterior" relative to its maximum, with
     axes in the order of `free`, and "marginals" by name.
 
     Raises

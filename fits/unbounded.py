@@ -71,7 +71,7 @@ class Unbounded(NamedTuple):
         return np.where(bounded, scipy.special.logit(np.clip(unit, 1e-15, 1 - 1e-15)), values)
 
     def adapted(self, values: Float[np.ndarray, "sample par"]) -> "Unbounded":
-        """Adapt to the covariance of samples; return itself if they are few or do not move."""
+        """Adapt to the covariance of samples; unchanged if they are too few, or do not move."""
         if self.root.ndim == 1 or len(values) < ENOUGH * values.shape[1]:
             return self
         y = self._unbounded(values)

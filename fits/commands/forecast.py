@@ -130,7 +130,7 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
     Parameters
     ----------
     settings : the experiment
-    progress : receives each step of the work
+    progress : is told each step of the work
 
     Raises
     ------

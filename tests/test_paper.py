@@ -246,6 +246,16 @@ def test_a_figure_that_cannot_be_made_is_said_and_left_out(small, tmp_path):
     assert made == ["Figure 1", "Figure 2", "Figure 1"]
 
 
+def test_figures_of_maps_are_left_out_without_bands(small, tmp_path):
+    bare = small.model_copy(update={"bands": []})
+    figures = make_figures(bare, tmp_path, ["5", "6", "7", "8", "9", "11", "Table 1"])
+    *maps, table = figures
+    assert {f.section.note for f in maps} == {
+        "Not made: It takes observed maps, but there are no bands."
+    }
+    assert table.section.table
+
+
 def test_other_settings_are_refused_or_replaced(small, tmp_path):
     steps = drawn([])
     make_figures(small, tmp_path, steps=steps)
@@ -412,10 +422,8 @@ def test_without_bands_of_the_paper(data_dir, monkeypatch, tmp_path):
     settings = settings.model_copy(update={"compare": how})
     figures = make_figures(settings, tmp_path / "out", [str(n) for n in range(5, 13)])
     items = {item.label: item for item in figures}
-    assert items["Figure 7"].section.note.startswith(
-        "Not compared: None of the bands 30, 44, 70, 353"
-    )
-    assert items["Figure 9"].section.note.startswith("Not compared: No band has a map of leakage")
+    assert items["Figure 7"].section.note.startswith("Not made: None of the bands 30, 44, 70, 353")
+    assert items["Figure 9"].section.note.startswith("Not made: No band has a map of leakage")
     shown = numbers_of(items)
     assert {"slope, V, Q and U", "slope, W, Q and U"} <= set(shown)
     # Planck finds half as much power in B as in E (intermediate results 30).

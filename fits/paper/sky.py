@@ -219,6 +219,8 @@ class PaperSky:
     @cached_property
     def inputs(self) -> Inputs:
         """Templates and maps of the bands."""
+        if not self.settings.bands:
+            raise Impossible("It takes observed maps, but there are no bands.")
         return inputs_of(self.settings, galaxy=self.galaxy if self.embedded else None)
 
     @cached_property

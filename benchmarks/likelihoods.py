@@ -12,10 +12,10 @@ import numpy as np
 
 from benchmarks.table import Row, time_text
 from benchmarks.timing import interleave, seconds
+from fits.grid import chi2_on_grid
 from fits.kept import KeptChain
 from fits.posterior import Likelihood, Uniform
 from fits.sampling import sample
-from fits.spectral_index import chi2_on_grid
 from fits.template_likelihood import gram, likelihood
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.sed import H_OVER_K

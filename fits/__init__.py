@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from fits.comparison import compare
     from fits.compress import as_noise
     from fits.fisher import fisher_errors
+    from fits.grid import grid_fit
     from fits.multipoles import harmonic_coefficients, harmonic_likelihood
     from fits.optimize import Newton, best_fit
     from fits.posterior import Gaussian, Uniform, chi2
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from fits.results import Convergence, FitError, FitResult
     from fits.sampling import sample
     from fits.separated_maps import component_maps, harmonic_component_maps, separate
-    from fits.spectral_index import grid_fit
     from fits.template_likelihood import likelihood
     from fits.tensor_ratio import fit_tensors, power_model
 

@@ -52,6 +52,7 @@ class Convergence(Enum):
     not_finite = "The search left the finite numbers."
     at_edge = "The best fit lies at the edge of a uniform prior."
     undetermined = "Data and priors do not determine all parameters."
+    unresolved = "The grid is too coarse for the posterior, or misses part of it."
     unmixed = "Chains are too short, or do not agree."
     misfit = "An optimum was reached, but chi2 is that of no fit."
 

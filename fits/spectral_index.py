@@ -10,24 +10,21 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.stats
-from jaxtyping import Bool, Float
-from scipy.integrate import cumulative_trapezoid
+from jaxtyping import Bool
 
 from fits.common import CommonMaps
+from fits.grid import grid_fit
 from fits.inputs import Inputs
 from fits.kept import KeptChain, fingerprint
 from fits.mixing import nominal
 from fits.optimize import best_fit
-from fits.posterior import Likelihood, Prior, Uniform, check_priors, chi2, priors_of
-from fits.results import Convergence, FitResult
+from fits.posterior import Prior, Uniform, chi2, priors_of
+from fits.results import FitResult
 from fits.sampling import sample
-from fits.template_likelihood import PixelLikelihood, SkyLikelihood, TemplateLikelihood
+from fits.template_likelihood import SkyLikelihood, TemplateLikelihood
 from jaxsky import observe_components, parameter_names, set_parameters
-from jaxsky.checks import Numeric
 from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 
@@ -35,12 +32,6 @@ from jaxsky.settings import Experiment, SettingsError, at_key
 WEIGHTLESS = 1e-6
 #: A fit on which its own errors depend is repeated until it moves by less than this [sigma].
 SETTLED = 0.01
-#: The grid is narrowed to where the posterior exceeds exp(-NARROW/2) of its maximum (6 sigma).
-NARROW = 36.0
-#: A posterior whose logarithm changes by less than this over the whole prior is flat.
-FLAT = 1e-6
-#: Probability of one standard deviation to either side.
-ONE_SIGMA = 0.6826894921370859
 
 
 class RegionFit(NamedTuple):
@@ -260,140 +251,3 @@ def fit_regions(
         for region, pixels in used.items()
         for stokes in settings.fit.stokes
     ]
-
-
-@jax.jit
-def chi2_on_grid(like, axes):
-    """Return chi^2 on the product of the axes, which are arrays by parameter name.
-
-    One vmap per axis, so that what depends on one parameter is computed only along its axis.
-    """
-    names = list(axes)
-
-    def point(*values):
-        return chi2(like, dict(zip(names, values, strict=True)))
-
-    if isinstance(like, PixelLikelihood):
-        # One point after the other: all at once would need the memory of as many sets of maps.
-        mesh = jnp.meshgrid(*axes.values(), indexing="ij")
-        flat = jax.lax.map(lambda values: point(*values), tuple(axis.ravel() for axis in mesh))
-        return flat.reshape(mesh[0].shape)
-    mapped = point
-    for i in reversed(range(len(names))):
-        mapped = jax.vmap(mapped, in_axes=tuple(0 if j == i else None for j in range(len(names))))
-    return mapped(*axes.values())
-
-
-def _weights(axis: np.ndarray) -> np.ndarray:
-    """Return trapezoid weights of an even axis."""
-    weights = np.full(len(axis), axis[1] - axis[0])
-    weights[[0, -1]] /= 2
-    return weights
-
-
-def _along(values: np.ndarray, i: int) -> Float[np.ndarray, "point _"]:
-    """Return values on the grid, one row per point of axis i."""
-    return np.moveaxis(values, i, 0).reshape(values.shape[i], -1)
-
-
-def grid_fit(
-    like: Likelihood,
-    start: Mapping[str, Numeric] | None = None,
-    *,
-    priors: Mapping[str, Prior],
-    points: int = 200,
-) -> FitResult:
-    """Compute the posterior on a grid over the ranges of uniform priors: the paper's test.
-
-    The grid first spans the priors, and is then narrowed, with the same number of points, to where
-    the posterior is not negligible, until its ranges hardly change.
-
-    Parameters
-    ----------
-    like : from `fits.likelihood` or `fits.spectral_likelihood`
-    start : the free parameters by name (the values do not matter), one or two; by default those
-        of the likelihood
-    priors : a uniform prior for each of them
-    points : points per axis
-
-    Returns
-    -------
-    Result with the values at the highest point, intervals and covariance by integration over
-    the grid. `details` contains "axes" by name, "log_posterior" relative to its maximum, with
-    axes in the order of `free`, and "marginals" by name.
-
-    Raises
-    ------
-    KeyError, ValueError
-        For unknown parameters, more than two of them, or one without a uniform prior.
-    """
-    like = like.at(start)
-    free = like.free
-    priors = check_priors(priors, free)
-    if len(free) > 2:
-        raise ValueError(
-            f"A grid takes one or two free parameters, not {len(free)} ({', '.join(free)}); "
-            "use the gradient fit or MCMC."
-        )
-    ranges = {}
-    for name in free:
-        if (size := like.start[name].size) > 1:
-            raise ValueError(
-                f"A grid takes parameters with one value, but {name!r} has {size}, one for "
-                "each region; use the gradient fit or MCMC."
-            )
-        if not isinstance(prior := priors.get(name), Uniform):
-            raise ValueError(f"A grid needs a uniform prior for {name!r}, to know its range.")
-        ranges[name] = (prior.low, prior.high)
-    limits = ranges
-    for _ in range(6):
-        axes = {name: np.linspace(low, high, points) for name, (low, high) in ranges.items()}
-        chi2s = np.asarray(chi2_on_grid(like, axes))
-        narrowed, shrunk = {}, []
-        for i, (name, axis) in enumerate(axes.items()):
-            # Where the posterior matters, and one step further on either side.
-            inside = np.flatnonzero(_along(chi2s, i).min(axis=1) - chi2s.min() < NARROW)
-            low, high = axis[max(inside[0] - 1, 0)], axis[min(inside[-1] + 1, points - 1)]
-            narrowed[name] = (float(low), float(high))
-            shrunk.append((high - low) / (axis[-1] - axis[0]))
-        if min(shrunk) > 0.8:
-            break
-        ranges = narrowed
-    log_posterior = (chi2s.min() - chi2s) / 2
-    weights = np.exp(log_posterior)
-    for axis_weights in np.meshgrid(*map(_weights, axes.values()), indexing="ij"):
-        weights = weights * axis_weights
-    weights = weights / weights.sum()
-    marginals, intervals = {}, {}
-    for i, (name, axis) in enumerate(axes.items()):
-        marginals[name] = _along(weights, i).sum(axis=1) / _weights(axis)
-        cumulative = cumulative_trapezoid(marginals[name], axis, initial=0.0)
-        levels = np.array([1 - ONE_SIGMA, 1 + ONE_SIGMA]) / 2
-        low, high = np.interp(levels, cumulative / cumulative[-1], axis).tolist()
-        intervals[name] = (low, high)
-    mesh = np.stack([m.ravel() for m in np.meshgrid(*axes.values(), indexing="ij")])
-    best = int(np.argmin(chi2s))
-    values = dict(zip(free, mesh[:, best].tolist(), strict=True))
-    covariance = np.atleast_2d(np.cov(mesh, aweights=weights.ravel(), ddof=0))
-    edges = [name for name, value in values.items() if value in limits[name]]
-    converged, message = Convergence.converged, "integrated"
-    if edges:
-        converged = Convergence.at_edge
-        message = f"The highest point lies at the edge of the uniform prior of {', '.join(edges)}."
-    if log_posterior.min() > -FLAT:
-        converged = Convergence.undetermined
-        message = f"The posterior is flat: the data do not constrain {', '.join(free)}."
-    result = FitResult(
-        method="grid",
-        best_fit=values,
-        sigma=dict(zip(free, np.sqrt(np.diagonal(covariance)).tolist(), strict=True)),
-        interval_68=intervals,
-        labels=free,
-        covariance=covariance,
-        chi2=float(chi2s.ravel()[best]),
-        dof=like.dof(len(free)),
-        converged=converged,
-        message=message,
-        details={"axes": axes, "log_posterior": log_posterior, "marginals": marginals},
-    )
-    return result.judged(result.chi2, result.dof, like.start)

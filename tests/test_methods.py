@@ -7,11 +7,11 @@ import numpy as np
 import optimistix as optx
 import pytest
 
+from fits.grid import grid_fit
 from fits.optimize import Newton, best_fit
-from fits.posterior import Gaussian, Uniform
+from fits.posterior import Gaussian, Likelihood, Uniform
 from fits.results import Convergence, FitError, misfit, with_error, write_json
 from fits.sampling import sample
-from fits.spectral_index import grid_fit
 from fits.template_likelihood import likelihood
 from jaxsky import Dust, Sky, observe, set_parameters
 from refusals import cases, raises
@@ -49,6 +49,41 @@ def test_the_three_methods_agree(like):
     assert mcmc.chi2 == pytest.approx(gradient.chi2, abs=0.02)
     assert 0.2 < mcmc.details["acceptance"] < 0.9
     assert all(20 < tau < 60 for tau in mcmc.details["tau"].values())
+
+
+class Ridge(Likelihood):
+    """Two correlated numbers with a Gaussian posterior."""
+
+    middle: np.ndarray
+    root: np.ndarray
+
+    def residuals(self, params):
+        return self.root @ (self.flat(params) - self.middle)
+
+    def check(self, params):
+        return {name: jnp.asarray(value, float) for name, value in params.items()}
+
+
+@pytest.mark.parametrize("points", [30, 200])
+@pytest.mark.parametrize("correlation", [0.0, 0.35, -0.9, 0.97, 0.99999])
+def test_a_grid_finds_a_narrow_posterior_or_says_that_it_does_not(correlation, points):
+    """Narrower than the spacing of the first grid by 100, with its peak anywhere between."""
+    sigma, priors = np.array([1e-4, 1e-3]), {"a": Uniform(0.5, 2.5), "b": Uniform(2.0, 4.5)}
+    covariance = sigma[:, None] * sigma * [[1, correlation], [correlation, 1]]
+    root = np.linalg.cholesky(np.linalg.inv(covariance)).T
+    for middle in np.random.default_rng(0).uniform([1.2, 2.7], [1.8, 3.4], (10, 2)):
+        like = Ridge({"a": jnp.array(1.5), "b": jnp.array(3.0)}, 2, middle, root)
+        found = grid_fit(like, priors=priors, points=points)
+        if correlation > 0.99 or (points < 200 and correlation > 0.95):
+            assert found.converged is Convergence.unresolved
+            assert f"{points} points per axis are too few" in found.message
+            continue
+        assert found.converged
+        np.testing.assert_allclose(list(found.sigma.values()), sigma, rtol=0.01)
+        steps = [axis[1] - axis[0] for axis in found.details["axes"].values()]
+        assert np.all(
+            np.abs(np.array(list(found.best_fit.values())) - middle) < 2 * np.array(steps)
+        )
 
 
 def test_parameters_are_recovered_without_noise():

@@ -109,7 +109,7 @@ def test_the_sweep_sees_the_packages():
     for name in (
         "jaxsky.bandpass.Bandpass.shifted",
         "jaxsky.sed.power_law",
-        "fits.spectral_index.grid_fit",
+        "fits.grid.grid_fit",
     ):
         assert name in PUBLIC
 

@@ -9,13 +9,13 @@ import pytest
 
 from fits import mixing, systems
 from fits.compress import as_noise
+from fits.grid import grid_fit
 from fits.optimize import best_fit
 from fits.posterior import Gaussian, Uniform, chi2
 from fits.profile_likelihood import spectral_likelihood
 from fits.regions import clusters, latitude_bands, superpixels
 from fits.results import FitError
 from fits.separated_maps import component_maps
-from fits.spectral_index import grid_fit
 from jaxsky import CMB, Bandpass, Dust, Sky, Synchrotron, observe, set_parameters
 from refusals import cases, raises
 from test_separation import BANDS, NPIX, START, TRUTH, problem, random_sky

@@ -263,7 +263,7 @@ def _leakage(
 ) -> dict[str, Float[Array, "2 pix"]]:
     """Return what leaks from the foregrounds' intensity into Q and U of each band [uK_RJ]."""
     fractions = {n: f for n, f in settings.simulate.leakage.items() if n in observation.channels}
-    if not any(fractions.values()):
+    if not names or not any(fractions.values()):
         return {}
     with at_key("simulate.leakage"):
         whole, _ = read_sky(settings, "IQU", names=names, galaxy=galaxy)

@@ -131,7 +131,7 @@ def _header(settings: Experiment, setup: SimulationInputs, name: str, index: int
     nu = np.asarray(channel.band.nu)
     header: dict[str, Any] = {
         "CREATOR": (f"jaxsky {jaxsky.__version__}", "software"),
-        "INSTRUME": (_ascii(settings.title) or "own bands", "experiment"),
+        "INSTRUME": _ascii(settings.title) or "own bands",  # long words leave no room for a comment
         "BAND": (name, "name of the band"),
         "FREQ": (float(channel.band.center), "[GHz] mean frequency of the band"),
         "FREQMIN": (float(nu.min()), "[GHz] lower end of the band"),
@@ -139,7 +139,7 @@ def _header(settings: Experiment, setup: SimulationInputs, name: str, index: int
         "LMAX": (setup.observation.lmax, "largest multipole of the sky"),
         "SEED": (settings.seed, "seed of all realisations"),
         "SIM": (index, "number of the realisation"),
-        "CONTENT": (", ".join(settings.included()), "what the total is made of"),
+        "CONTENT": ", ".join(settings.included()),
     }
     if not np.ndim(channel.map_beam):
         header["FWHM"] = (float(channel.map_beam), "[arcmin] beam of the maps")
@@ -165,7 +165,7 @@ def _columns(
     """Return names and values of the columns of a band's file, the total first."""
     spec, total = settings.simulate, maps["total"]
     if (leaked := setup.leakage.get(name)) is not None:
-        total = total.at[-2:].add(leaked)
+        total = total.at[-2:].add(leaked.astype(total.dtype))
     shown = {"": total} | {f"_{which}": m for which, m in maps.items() if which != "total"}
     names = [s + which for which in shown for s in spec.stokes]
     factor = float(setup.observation.channels[name].band.conversion("uK_RJ", spec.unit))

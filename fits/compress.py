@@ -146,6 +146,11 @@ def as_noise(
     if isinstance(noise, Noise):
         return noise
     array = bare("noise", noise)
+    if np.shape(shape) != (3,):
+        raise ValueError(
+            "Argument `shape` must be the shape (band, stokes, pix) of the data, but has itself "
+            f"shape {np.shape(shape)}."
+        )
     bands, stokes, npix = shape
     known = [(bands,), (bands, stokes), shape, (bands, 2, 2, npix)]
     if array.shape not in known or (array.ndim == 4 and stokes != 2):

@@ -206,8 +206,9 @@ def best_fit(
     Raises
     ------
     KeyError, TypeError, ValueError
-        For unknown parameters, start values outside their prior, an object that is no solver, and
-        priors that are neither uniform nor Gaussian with a least-squares solver.
+        For unknown parameters, start values outside their prior, an object that is no solver,
+        negative max_steps, and priors that are neither uniform nor Gaussian with a least-squares
+        solver.
     FitError
         If it did not converge, unless throw=False; the result is in its `.result`. That is so if
         the search stopped away from an optimum (even at its start), if data and priors do not
@@ -219,6 +220,8 @@ def best_fit(
             "Argument `solver` must be a least-squares solver or a minimiser of optimistix, or "
             f"fits.Newton(), not {type(solver).__name__}."
         )
+    if max_steps is not None and max_steps < 0:
+        raise ValueError(f"Argument `max_steps` must not be negative, but is {max_steps}.")
     like = like.at(start)
     posterior = Posterior(like, priors)
     if solver is None and like.profiled:

@@ -68,7 +68,17 @@ def bin_centers(edges: Sequence[int]) -> Float[np.ndarray, " bin"]:
 
 
 def bin_edges(lmin: int, lmax: int, width: int) -> tuple[int, ...]:
-    """Return edges of bins of one width from lmin to lmax inclusive; the last may be wider."""
+    """Return edges of bins of one width from lmin to lmax inclusive; the last may be wider.
+
+    Raises
+    ------
+    ValueError
+        If lmax is below lmin, or the width is not positive.
+    """
+    if lmax < lmin:
+        raise ValueError(f"Argument `lmax` must be at least `lmin`, {lmin}, but is {lmax}.")
+    if width < 1:
+        raise ValueError(f"Argument `width` must be positive, but is {width}.")
     count = max(1, (lmax + 1 - lmin) // width)
     return (*(lmin + width * i for i in range(count)), lmax + 1)
 

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.cluster.vq
 from jaxtyping import Bool, Float, Int
 
-from jaxsky.checks import Numeric, check_seed
+from jaxsky.checks import Numeric, check_nside, check_seed
 from jaxsky.inputs import one_column, read
 from jaxsky.io import degrade_mask, read_mask
 from jaxsky.settings import (
@@ -95,7 +95,14 @@ def apodize(used: Bool[np.ndarray, " pix"], width: float) -> Float[np.ndarray, "
     ----------
     used : True in used pixels, RING
     width : distance over which the mask rises [deg]; 0 leaves it unchanged
+
+    Raises
+    ------
+    TypeError
+        If the mask is not of bool.
     """
+    if used.dtype != bool:
+        raise TypeError(f"Argument `used` must be a mask of bool, but is of {used.dtype}.")
     if not width or used.all():
         return used.astype(float)
     distance = healpy.dist2holes(~used)  # 0 where not used
@@ -121,8 +128,7 @@ def superpixels(nside_map: int, nside: int) -> Int[np.ndarray, " pix"]:
     array([16, 16, 16, 16, 16, 16, 16, 16, 16, 16, 16, 16])
     """
     for name, value in (("nside_map", nside_map), ("nside", nside)):
-        if not healpy.isnsideok(value, nest=True):
-            raise ValueError(f"Argument `{name}` must be a power of 2, but is {value}.")
+        check_nside(name, value)
     if nside > nside_map:
         raise ValueError(
             f"Argument `nside` must be at most that of the map, {nside_map}, but is {nside}."
@@ -162,7 +168,7 @@ def clusters(
     Raises
     ------
     ValueError
-        For a wrong shape, or fewer pixels than clusters.
+        For a wrong shape, or fewer pixels, or different values, than clusters.
     """
     check_seed("seed", seed)
     values = np.atleast_2d(np.asarray(maps, float))
@@ -175,6 +181,10 @@ def clusters(
     middle = values[:, good].mean(axis=1, keepdims=True)
     spread = values[:, good].std(axis=1, keepdims=True)
     points = np.where(good, (values - middle) / np.where(spread > 0, spread, 1), 0).T
+    if (different := len(np.unique(points[good], axis=0))) < count:
+        raise ValueError(
+            f"Argument `maps` has {different} different values, too few for {count} clusters."
+        )
     _, found = scipy.cluster.vq.kmeans2(
         points[good], count, iter=iterations, minit="++", seed=np.random.default_rng(seed)
     )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsky.checks import Numeric, Summary, as_html, as_text
+from jaxsky.checks import Numeric, Summary, as_html, as_text, check_choice
 from jaxsky.io import write_text
 from jaxsky.settings import Experiment, circumstances
 
@@ -154,6 +154,8 @@ class FitResult(NamedTuple):
         """Return the correlation coefficient of two entries of `labels`."""
         if self.covariance is None:
             raise ValueError("The covariance of so many parameters was not computed.")
+        check_choice("first", first, self.labels)
+        check_choice("second", second, self.labels)
         i, j = self.labels.index(first), self.labels.index(second)
         scale = np.sqrt(self.covariance[i, i] * self.covariance[j, j])
         return float(self.covariance[i, j] / scale)

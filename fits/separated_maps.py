@@ -20,7 +20,7 @@ from fits.profile_likelihood import SpectralLikelihood, matrices_at, spectral_li
 from fits.results import FitResult
 from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
-from jaxsky.checks import Numeric, as_array, check_finite, check_shape
+from jaxsky.checks import Numeric, as_array, check_finite, check_names, check_shape
 from jaxsky.components import component_class
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
 from jaxsky.observation import Instrument
@@ -295,10 +295,14 @@ def separate(
 
     Raises
     ------
+    TypeError
+        If a string is given for a list of names.
     ValueError
         For unknown laws, bands without noise, and what `spectral_likelihood` refuses.
     """
     data = bare("data", data)
+    check_names("components", components)
+    check_names("free", free)
     if not isinstance(components, Mapping):
         nothing = jnp.zeros((data.shape[1] if data.ndim == 3 else 2, 1))
         components = {law: component_class(law)(nothing) for law in components}
@@ -309,6 +313,8 @@ def separate(
     if noise is None:
         if not isinstance(instrument, Instrument):
             raise ValueError("Argument `noise` is missing: the bands do not say what they have.")
+        good = data.ndim == 3 and healpy.isnpixok(data.shape[-1])
+        check_shape("data", data, good, "have shape (band, stokes, pix) with 12 nside^2 pixels")
         pixel = healpy.nside2resol(healpy.npix2nside(data.shape[-1]), arcmin=True)
         factors = [band.conversion("uK_RJ", unit) for band in instrument.bands().values()]
         noise = np.array([c.noise for c in instrument.values()]) * np.array(factors) / pixel

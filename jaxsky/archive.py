@@ -19,6 +19,7 @@ from jaxsky.io.files import cache_folder, locked
 from jaxsky.products import (
     DownloadError,
     Product,
+    catalogue,
     check_product,
     checksums,
     in_words,
@@ -202,7 +203,7 @@ def _reason(error: requests.RequestException) -> str:
 
 
 def fetch(
-    product: Product,
+    product: Product | str,
     folder: Path | None = None,
     *,
     mirror: str | None = None,
@@ -220,7 +221,7 @@ def fetch(
 
     Parameters
     ----------
-    product : from the catalogue
+    product : from the catalogue, or its name there
     folder : where files are kept, by default `cache_folder`
     mirror : address of a folder with the files, used instead of the archives
     accept : take a file whose size or hash differs from the catalogue's, if its structure is right
@@ -234,8 +235,15 @@ def fetch(
     jaxsky.io.InputError
         If the existing file or the record of hashes is damaged; it is left unchanged.
     ValueError
-        If the mirror is not an http or https address.
+        If the product is unknown, or the mirror is not an http or https address.
     """
+    if not isinstance(product, Product):
+        if product not in list(catalogue()):
+            raise ValueError(
+                "Argument `product` must be the name of a file in jaxsky.products.catalogue(), "
+                f"but is {product!r}."
+            )
+        product = catalogue()[product]
     folder = cache_folder() if folder is None else folder
     path, part = folder / product.name, folder / f"{product.name}.part"
     wanted = product._replace(size=None, hash=None) if accept else product

@@ -75,6 +75,26 @@ def check_positive(name: str, value: Array | np.ndarray) -> None:
         )
 
 
+def check_not_negative(name: str, value: object) -> None:
+    """Raise ValueError if a concrete number is negative or not finite; arrays are not looked at."""
+    if is_concrete(value) and not np.ndim(value):
+        check_finite(name, np.asarray(value))
+        if (number := float(np.asarray(value))) < 0:
+            raise ValueError(f"Argument `{name}` must not be negative, but is {number:g}.")
+
+
+def check_nside(name: str, value: int) -> None:
+    """Raise ValueError unless a resolution is a power of 2."""
+    if int(value) != value or value < 1 or int(value).bit_count() != 1:
+        raise ValueError(f"Argument `{name}` must be a power of 2, but is {value}.")
+
+
+def check_names(name: str, value: object) -> None:
+    """Raise TypeError if a string is given for a list of names: it would be split into letters."""
+    if isinstance(value, str):
+        raise TypeError(f"Argument `{name}` must be a list of names, not the string {value!r}.")
+
+
 @takes_quantities
 def as_number(name: str, value: object, positive: bool = False) -> Float[Array, ""]:
     """Return `value` as an array without axes, checked to be finite (and positive on request)."""

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsky.checks import Parameter, as_number, check_choice, check_seed
+from jaxsky.checks import Parameter, as_number, check_choice, check_not_negative, check_seed
 from jaxsky.components import Dust, Synchrotron
 from jaxsky.harmonics import degrees, resample, synthesis
 from jaxsky.sky import Sky
@@ -82,6 +82,7 @@ class GalaxyModel(eqx.Module):
         any_sign = ("psi0", "psi1", "chi0", "turbulence", "slope")
         for name in (field.name for field in dataclasses.fields(self)):
             setattr(self, name, as_number(name, getattr(self, name), name not in any_sign))
+        check_not_negative("turbulence", self.turbulence)
 
 
 class EmbeddedSky(eqx.Module):

@@ -11,7 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsky.bandpass import Bandpass
-from jaxsky.checks import Printed, check_choice, shown
+from jaxsky.checks import (
+    Printed,
+    check_choice,
+    check_names,
+    check_not_negative,
+    check_nside,
+    shown,
+)
 from jaxsky.components import Component
 from jaxsky.public import packaged
 from jaxsky.small_scales import SmallScales
@@ -48,6 +55,11 @@ class ObservedBand(Printed, eqx.Module):
     noise : uniform level [uK_RJ arcmin], covariance of each pixel [uK_RJ^2], shape
         (stokes, stokes, pix), or None
     diagonal : draw noise with the diagonal of the Cholesky factor only (`noise.draw`)
+
+    Raises
+    ------
+    ValueError
+        If a beam, the target or the level of the noise is negative or not finite.
     """
 
     band: Bandpass
@@ -55,6 +67,11 @@ class ObservedBand(Printed, eqx.Module):
     target: Float[Array, ""] | float | None = None
     noise: Float[Array, ""] | Float[Array, "stokes stokes pix"] | float | None = None
     diagonal: bool = eqx.field(static=True, default=False)
+
+    def __post_init__(self) -> None:
+        for name in ("beam", "target", "noise"):
+            if (value := getattr(self, name)) is not None:
+                check_not_negative(name, value)
 
     def summary(self):
         beam, noise = self.beam, "none" if self.noise is None else "a covariance"
@@ -90,7 +107,7 @@ class Observation(eqx.Module):
     Raises
     ------
     ValueError
-        If there is no channel, or `stokes` or `precision` is unknown.
+        If there is no channel, `nside` is no power of 2, or `stokes` or `precision` is unknown.
     """
 
     channels: dict[str, ObservedBand]
@@ -102,6 +119,7 @@ class Observation(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True, init=False)
 
     def __post_init__(self) -> None:
+        check_nside("nside", self.nside)
         # JAX sorts dictionaries when it flattens them, so `names` keeps the order.
         self.channels, self.names = dict(self.channels), tuple(self.channels)
         if self.lmax is None:
@@ -123,8 +141,14 @@ class Observation(eqx.Module):
 
 
 def check_sources(sources: Mapping[str, Source], observation: Observation) -> None:
-    """Raise ValueError unless the components can be observed together."""
+    """Raise TypeError or ValueError unless the components can be observed together."""
+    if not isinstance(sources, Mapping):
+        raise TypeError(
+            f"Argument `sources` must be a dictionary of Source, but is {type(sources).__name__}."
+        )
     for name, source in sources.items():
+        if not isinstance(source, Source):
+            raise TypeError(f"Component {name!r} must be a Source, not {type(source).__name__}.")
         rows, wanted = len(source.component.template), observation.stokes
         if rows != len(wanted):
             raise ValueError(
@@ -192,6 +216,8 @@ def load_instrument(
         If a name is unknown; the message lists the known ones.
     TypeError
         If `channels` is a string.
+    ValueError
+        If the target is negative or not finite.
 
     Examples
     --------
@@ -202,10 +228,7 @@ def load_instrument(
     presets = packaged("instruments.toml")
     if name not in presets:
         raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(presets)}.")
-    if isinstance(channels, str):
-        raise TypeError(
-            f"Argument `channels` must be a list of names, not the string {channels!r}."
-        )
+    check_names("channels", channels)
     found = {}
     for table in band_tables(name, channels):
         band = Bandpass.top_hat(**table["bandpass"], samples=samples)

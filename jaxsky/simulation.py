@@ -368,6 +368,8 @@ def simulate(
 
     Raises
     ------
+    TypeError
+        If `sources` is no dictionary of Source.
     ValueError
         If a beam is finer than that of a component without small scales, or inputs do not match.
     """

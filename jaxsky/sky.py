@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.bandpass import Bandpass
-from jaxsky.checks import Printed, as_array
+from jaxsky.checks import Printed, as_array, check_names
 from jaxsky.components import Component, check_value, declared
 from jaxsky.interpolation import Nodes, band_sed, choose_nodes
 
@@ -25,7 +25,7 @@ class Sky(Printed, eqx.Module):
     Raises
     ------
     TypeError
-        If a value is not a component.
+        If `components` is no dictionary, or a value is not a component.
     ValueError
         If the mapping is empty, a name has a dot, or the shapes (stokes, pix) of the amplitudes
         differ.
@@ -42,6 +42,11 @@ class Sky(Printed, eqx.Module):
     components: dict[str, Component]
 
     def __init__(self, components: Mapping[str, Component]) -> None:
+        if not isinstance(components, Mapping):
+            raise TypeError(
+                "Argument `components` must be a dictionary of components by name, but is "
+                f"{type(components).__name__}."
+            )
         # JAX sorts dictionaries when it flattens them; sorted here, the order is always the same.
         self.components = {name: components[name] for name in sorted(components)}
         if not self.components:
@@ -84,7 +89,9 @@ def interpolation_nodes(sky: Sky, bands: Sequence[Bandpass], tolerance: float) -
     return tuple(choose_nodes(c, tuple(bands), tolerance) for c in sky.components.values())
 
 
-def _check_bands(bands: object) -> tuple[Bandpass, ...]:
+def _check_bands(sky: object, bands: object) -> tuple[Bandpass, ...]:
+    if not isinstance(sky, Sky):
+        raise TypeError(f"Argument `sky` must be a Sky, but is {type(sky).__name__}.")
     # A dictionary would lose its order under jit, and with it the order of the result.
     if isinstance(bands, Bandpass) or not isinstance(bands, Sequence):
         raise TypeError(
@@ -153,9 +160,9 @@ def observe(
     Raises
     ------
     TypeError, ValueError
-        If `bands` is not a list of at least one Bandpass.
+        If `sky` is no Sky, or `bands` is not a list of at least one Bandpass.
     """
-    bands = _check_bands(bands)
+    bands = _check_bands(sky, bands)
     return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance), False)
 
 
@@ -174,7 +181,7 @@ def observe_components(
     nodes: tuple[Nodes, ...] | None = None,
 ) -> dict[str, Float[Array, "band stokes pix"]]:
     """Observe each component separately [uK_RJ]; see `observe`."""
-    bands = _check_bands(bands)
+    bands = _check_bands(sky, bands)
     return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance), True)
 
 
@@ -208,8 +215,11 @@ def get_parameters(sky: Sky, names: Iterable[str]) -> dict[str, Array]:
     ------
     KeyError
         If a name is unknown; the message lists the known ones.
+    TypeError
+        If `names` is a string.
     """
-    leaves, _ = _flatten(sky)
+    check_names("names", names)
+    names, (leaves, _) = tuple(names), _flatten(sky)
     for name in names:
         if name not in leaves:
             raise unknown_parameter(name, leaves)

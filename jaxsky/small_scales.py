@@ -24,9 +24,9 @@ from jaxsky.checks import (
     as_array,
     as_number,
     check_finite,
+    check_not_negative,
     check_positive,
     check_shape,
-    is_concrete,
 )
 from jaxsky.cmb import gaussian_fields, repair
 from jaxsky.harmonics import (
@@ -57,8 +57,8 @@ class SmallScales(eqx.Module):
     Raises
     ------
     TypeError, ValueError
-        For ranges that are not two integers, wrong shapes, numbers that are not finite, a
-        negative amplitude or a modulation_fwhm that is not positive.
+        For ranges that are not two integers or too short for a fit, wrong shapes, numbers that are
+        not finite, a negative amplitude or a modulation_fwhm that is not positive.
     """
 
     EE: tuple[int, int] = eqx.field(static=True)
@@ -73,6 +73,10 @@ class SmallScales(eqx.Module):
             ends = getattr(self, name)
             if [type(end) for end in ends] != [int, int]:
                 raise TypeError(f"Argument `{name}` must be two integers, but is {ends!r}.")
+            if not 2 <= ends[0] <= ends[1] - 3:
+                raise ValueError(
+                    f"Argument `{name}` must span four multipoles from l = 2 on, but is {ends!r}."
+                )
             setattr(self, name, tuple(ends))
         if self.slope is not None:
             slope = as_array("slope", self.slope)
@@ -82,10 +86,7 @@ class SmallScales(eqx.Module):
         for name in ("tilt", "amplitude", "modulation_fwhm"):
             positive = name == "modulation_fwhm"
             setattr(self, name, as_number(name, getattr(self, name), positive))
-        if is_concrete(self.amplitude) and self.amplitude < 0:
-            raise ValueError(
-                f"Argument `amplitude` must not be negative, but is {self.amplitude:g}."
-            )
+        check_not_negative("amplitude", self.amplitude)
 
 
 #: The paper's ranges for its templates.

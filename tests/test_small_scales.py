@@ -486,14 +486,13 @@ def test_refuses_nonsense(argument, error, message):
     raises(getattr(builtins, error), message, SmallScales, **given)
 
 
-@pytest.mark.parametrize("ends", [(1, 10), (5, 7), (10, 5), (5, 65)])
-def test_refuses_ranges_that_cannot_be_fitted(template, ends):
+def test_refuses_ranges_that_cannot_be_fitted(template):
     message = (
-        f"A power law cannot be fitted from l = {ends[0]} to {ends[1]} to a spectrum that ends at "
+        "A power law cannot be fitted from l = 5 to 65 to a spectrum that ends at "
         "64; it needs four multipoles from l = 2 on."
     )
     with pytest.raises(ValueError, match=message):
-        add_small_scales(KEY, template, 0.0, 60.0, NSIDE, SmallScales(EE=ends, BB=(5, 20)))
+        add_small_scales(KEY, template, 0.0, 60.0, NSIDE, SmallScales(EE=(5, 65), BB=(5, 20)))
 
 
 def test_refuses_templates_without_power_or_of_the_wrong_shape(template):

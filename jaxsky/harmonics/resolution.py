@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxsky.checks import check_finite, is_concrete
+from jaxsky.checks import check_finite, check_shape, is_concrete
 from jaxsky.harmonics.transforms import analysis, expand, map_variance, resize, synthesis
 
 #: A window below this is treated as zero: what it lets through is lost in rounding.
@@ -157,8 +157,11 @@ def smooth(
     Raises
     ------
     ValueError
-        If the target is finer than the maps' own beam, or values are not finite or UNSEEN.
+        For a wrong shape, a target finer than the maps' own beam, or values that are not finite
+        or UNSEEN.
     """
+    good = maps.ndim == 2 and healpy.isnpixok(maps.shape[-1])
+    check_shape("maps", maps, good, "have shape (stokes, pix) with 12 nside^2 pixels")
     check_finite("maps", maps)
     nside = healpy.npix2nside(maps.shape[-1])
     window = beam_ratio(fwhm, own, 2 * nside if lmax is None else lmax)

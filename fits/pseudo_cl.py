@@ -72,13 +72,11 @@ def bin_edges(lmin: int, lmax: int, width: int) -> tuple[int, ...]:
 
     Raises
     ------
-    ValueError
-        If lmax is below lmin, or the width is not positive.
+    ValueError : if lmax is below lmin, or the width is not positive
     """
-    if lmax < lmin:
-        raise ValueError(f"Argument `lmax` must be at least `lmin`, {lmin}, but is {lmax}.")
-    if width < 1:
-        raise ValueError(f"Argument `width` must be positive, but is {width}.")
+    for name, value, least in (("lmax", lmax, lmin), ("width", width, 1)):
+        if value < least:
+            raise ValueError(f"Argument `{name}` must be at least {least}, but is {value}.")
     count = max(1, (lmax + 1 - lmin) // width)
     return (*(lmin + width * i for i in range(count)), lmax + 1)
 

@@ -75,7 +75,7 @@ def check_positive(name: str, value: Array | np.ndarray) -> None:
         )
 
 
-def check_not_negative(name: str, value: object) -> None:
+def check_not_negative(name: str, value: Numeric) -> None:
     """Raise ValueError if a concrete number is negative or not finite; arrays are not looked at."""
     if is_concrete(value) and not np.ndim(value):
         check_finite(name, np.asarray(value))

@@ -23,12 +23,14 @@ from jaxsky.io import InputError, write_maps, write_text
 from jaxsky.io.files import alone, check_guards
 from jaxsky.io.tables import open_fits
 from jaxsky.noise import realisation_key
-from jaxsky.settings import Experiment, circumstances
+from jaxsky.settings import Experiment, changed_settings, check_log, circumstances
 from jaxsky.simulation import HarmonicSource, harmonic_sources, observe_bands, plan_terms
 
 LOG = "simulation.json"
 #: Settings that do not affect the maps.
 LAYOUT: Any = {"simulate": {"sheet"}}
+#: Settings that affect only the realisation or the output.
+SAME_SKY = {"seed", *(f"simulate.{k}" for k in ("stokes", "unit", "components", "precision"))}
 #: Settings and tables of settings that simulations depend on.
 CONTENT = {"seed", "sky", "bands", "cmb", "fixed", "truth", "simulate"}
 
@@ -63,15 +65,7 @@ def check_folder(
                 f"{out}: holds a simulation already; go on with --resume, replace it with "
                 "--overwrite, or choose another --out."
             )
-        try:
-            there = json.loads(log.read_text())["settings"]
-        except (ValueError, KeyError, TypeError):
-            raise ValueError(f"{log}: is damaged; start again with --overwrite.") from None
-        if there != _content(settings):
-            raise ValueError(
-                f"{out}: holds a simulation with other settings; choose another --out, or start "
-                "again with --overwrite."
-            )
+        check_log(log, _content(settings), "a simulation")
     elif any(_maps(out)):
         raise ValueError(
             f"{out}: holds maps of unknown settings, for {LOG} is missing; choose another --out, "
@@ -89,10 +83,8 @@ def other_sky(settings: Experiment) -> list[str]:
     now = _content(settings)
     try:
         was = json.loads((Path(settings.data_dir, maps).parent / LOG).read_text())["settings"]
-        for key in ("stokes", "unit", "components", "precision"):  # these affect only the output
-            was["simulate"].pop(key, None)
-            now["simulate"].pop(key, None)
-        changed = [name for name in now if name != "seed" and was.get(name) != now[name]]
+        keys = [key for key in changed_settings(was, now) if key not in SAME_SKY]
+        changed = dict.fromkeys(key.split(".")[0] for key in keys)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return []
     said = (

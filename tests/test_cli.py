@@ -111,12 +111,23 @@ def test_options_replace_settings_and_results_are_kept(folder, tmp_path, monkeyp
     assert set(json.loads(before)["results"]["strip"]) == {"QU"}
     assert "holds results already; go on with --resume" in mistake("fit", path, *options)
     assert (out / "result.json").read_bytes() == before
-    # Another seed is another chain: it is not gone on with.
+    # Results of other settings are not gone on with.
+    for value, key in (("seed=6", "seed"), ('fit.methods=["gradient"]', "fit.methods")):
+        said = mistake("fit", path, *options, "--set", value, "--resume")
+        assert f"holds results of other settings ({key})" in said
+    log = out / "log.json"
+    log.write_text("{")
+    assert "log.json: is damaged; start again" in mistake("fit", path, *options, "--resume")
+    # Of a run that was stopped, the chain knows.
+    log.unlink()
     other = [*options, "--set", "seed=6"]
     assert "holds a chain of other data or settings" in mistake("fit", path, *other, "--resume")
     assert jaxsky(monkeypatch, "fit", path, *options, "--resume") == 0
     again = json.loads((out / "result.json").read_text())
     assert again["results"] == json.loads(before)["results"]
+    # But a chain may be longer.
+    longer = ["--set", "fit.nsteps=2300", "--set", 'title="longer"']
+    assert jaxsky(monkeypatch, "fit", path, *options, *longer, "--resume") == 0
 
 
 @pytest.mark.parametrize("noise", ["{ rms = 9e-7 }", "{ estimate_above = 0 }"])
@@ -202,7 +213,7 @@ def test_maps_of_ones_own(folder, tmp_path, monkeypatch, capsys, mistake):
     again = json.loads((out / "result.json").read_text())
     assert again == json.loads(before)
     assert jaxsky(monkeypatch, "separate", path, "--out", out, "--resume", "--set", "seed=8") == 2
-    assert "holds realisations of other data or settings" in said(capsys)
+    assert "holds results of other settings (seed)" in said(capsys)
 
 
 @pytest.mark.slow

@@ -266,7 +266,7 @@ def test_a_monte_carlo_is_split_over_processes(three, tmp_path, monkeypatch, mis
                 "simulate", path, "--out", out, *options
             )
         assert command(monkeypatch, path, "--out", out, "--first", 2) == 0
-        assert "holds a simulation with other settings" in mistake(
+        assert "holds a simulation of other settings" in mistake(
             "simulate", path, "--out", out, "--first", 1, "--set", "seed=4"
         )
         assert command(monkeypatch, path, "--out", out, "--first", 1) == 0
@@ -287,7 +287,7 @@ def test_processes_with_other_settings_do_not_meet(three, tmp_path, monkeypatch,
         return observe(*arguments, **options)
 
     monkeypatch.setattr(montecarlo, "observe_bands", meanwhile)
-    assert "holds a simulation with other settings" in mistake("simulate", path, "--out", out)
+    assert "holds a simulation of other settings" in mistake("simulate", path, "--out", out)
     assert list(content(out)) == []
 
 
@@ -482,9 +482,9 @@ def test_a_folder_with_results_is_left_alone(folder, tmp_path, monkeypatch, caps
         return one_sentence(capsys)
 
     assert "holds a simulation already; go on with --resume, replace it" in refused(path)
-    for options in (("--set", "seed=4"), ("--only", "noise")):
+    for options, key in ((("--set", "seed=4"), "seed"), (("--only", "noise"), "simulate.include")):
         said = refused(path, "--resume", *options)
-        assert "holds a simulation with other settings; choose another --out" in said
+        assert f"holds a simulation of other settings ({key}); choose another --out" in said
     # A mistake that only the small scales notice does not cost the old results.
     wrong = write(folder, "small", ("[4, 10]", "[4, 30]"), name="wrong")
     assert "from l = 4 to 30" in refused(wrong, "--overwrite")

@@ -260,7 +260,7 @@ def test_other_settings_are_refused_or_replaced(small, tmp_path):
     steps = drawn([])
     make_figures(small, tmp_path, steps=steps)
     other = small.model_copy(update={"title": "another sky"})
-    with pytest.raises(ValueError, match="holds figures of other settings"):
+    with pytest.raises(ValueError, match=r"holds figures of other settings \(title\)"):
         make_figures(other, tmp_path, steps=steps)
     items = make_figures(other, tmp_path, ["1"], overwrite=True, steps=steps)
     assert [item.label for item in items] == ["Figure 1", NUMBERS]

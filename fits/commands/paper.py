@@ -15,7 +15,7 @@ from fits.paper.sky import TEXTS, Impossible, PaperFigure, PaperSky, picture_of
 from fits.results import write_log
 from jaxsky.io import write_text
 from jaxsky.programs import QUIET, Progress, forget_programs
-from jaxsky.settings import Experiment
+from jaxsky.settings import Experiment, changed_settings
 
 #: File of the settings and the figures made with them, from which a stopped run resumes.
 KEPT, FILE = "figures.json", TypeAdapter(tuple[dict[str, Any], list[PaperFigure]])
@@ -133,9 +133,10 @@ def _kept(
     if made_with == settings:
         return {figure.label: figure for figure in figures}, set()
     if not overwrite:
+        changed = ", ".join(changed_settings(made_with, settings))
         raise ValueError(
-            f"{out}: holds figures of other settings; choose another --out, or start again with "
-            "--overwrite."
+            f"{out}: holds figures of other settings ({changed}); choose another --out, or start "
+            "again with --overwrite."
         )
     return {}, {f.section.picture for f in figures if f.section.picture is not None}
 

@@ -33,7 +33,7 @@ from fits.commands.report import (
 )
 from fits.results import write_json, write_log
 from jaxsky.io.files import ALL, Folder, occupied
-from jaxsky.settings import Experiment, load, of_file
+from jaxsky.settings import Experiment, check_log, load, of_file
 
 #: Files in every results folder: the steps with their times, and the page of results.
 LOG, PAGE = "log.txt", "index.html"
@@ -41,6 +41,9 @@ LOG, PAGE = "log.txt", "index.html"
 WRITTEN = "; all results are written"
 #: When, where and with what a command was run, next to its numbers.
 CIRCUMSTANCES = "log.json"
+#: Settings that may differ where results are gone on with.
+MAY_DIFFER = {"title", "data_dir", "fit.nsteps", "compare.nsims"}
+MAY_DIFFER |= {f"separate.{key}" for key in ("nsims", "nsteps", "sampler")}
 #: Folder of the experiments that commands run by default.
 DEFAULTS = Path(__file__).parents[1] / "defaults"
 #: File in the results folder for the traceback of an error.
@@ -73,8 +76,9 @@ class Report(NamedTuple):
 
 
 class Run(NamedTuple):
-    """A running command: its results folder, its options, and the steps that it reports."""
+    """A running command: its settings, results folder and options, and the steps it reports."""
 
+    settings: Experiment
     out: Path
     resume: bool
     overwrite: bool
@@ -90,10 +94,13 @@ class Run(NamedTuple):
         return self.out / (f"log_{first:05d}.txt" if first else LOG)
 
     def begin(self) -> None:
-        """Remove results to be replaced and begin the log, once the input is known to be good."""
+        """Check or remove what is there and begin the log, once the input is known to be good."""
         if self.overwrite:
             self.folder.remove((*self.results, CIRCUMSTANCES))
             self.folder.narrow(self.part)  # others may make the rest
+        elif self.resume and self.results and (log := self.out / CIRCUMSTANCES).exists():
+            said = self.settings.model_dump(mode="json", exclude_none=True)
+            check_log(log, said, "results", MAY_DIFFER)
         self.steps.keep(self.log)
 
 
@@ -144,7 +151,7 @@ def run_command(
         from jaxsky.montecarlo import other_sky
 
         mpl.use("Agg")  # pictures go to files
-        running = Run(out, bool(resume), overwrite, command.results, folder, steps, part)
+        running = Run(settings, out, bool(resume), overwrite, command.results, folder, steps, part)
         report = command.work(settings, running)
         report = report._replace(warnings=[*report.warnings, *other_sky(settings)])
         written = _write(settings, report, running)
@@ -170,6 +177,8 @@ def _write(settings: Experiment, report: Report, command: Run) -> list[Path]:
         for name, (draw, *drawn) in report.pictures.items():
             if draw(out / name, *drawn) is not False:
                 written.append(out / name)
+            else:
+                (out / name).unlink(missing_ok=True)
         write_log(written[1], settings, command.steps.seconds)
     written += report.written
     if report.page:

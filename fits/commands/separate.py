@@ -298,6 +298,14 @@ def plot_ratio(path: Path, found: Separation, settings: Experiment) -> None:
         plots.legend_below(axes, 2, fontsize=7)
 
 
+def plot_posterior(path: Path, found: Separation, settings: Experiment) -> bool:
+    """Draw the posterior of the chain. Return False, without a picture, if there is none."""
+    if found.chain is not None:
+        chains = {found.chain.method: found.chain}
+        plots.plot_chains(path, chains, found.data.truth, settings.title)
+    return found.chain is not None
+
+
 #: Pictures and the functions that draw them; maps; files from which a stopped run resumes.
 PICTURES = {
     "components.png": plot_components,
@@ -305,8 +313,8 @@ PICTURES = {
     "spectra.png": plot_spectra,
     "r.png": plot_ratio,
     "parameters.png": plot_parameters,
+    "posterior.png": plot_posterior,
 }
-POSTERIOR = "posterior.png"
 MAPS = ("components.fits", "residuals.fits", "parameters.fits")
 KEPT = ("simulations.npz", "chain.npz")
 
@@ -319,17 +327,14 @@ def _work(settings: Experiment, command: Run) -> Report:
         found = separate_data(settings, data, command.out, command.steps)
     except FitError as error:
         raise ValueError(f"The spectral parameters were not found. {error}") from None
-    drawn: dict[str, Any] = {name: (plot, found, settings) for name, plot in PICTURES.items()}
-    if (chain := found.chain) is not None:
-        drawn[POSTERIOR] = plots.plot_chains, {chain.method: chain}, data.truth, settings.title
     return Report(
         data.description,
         [_table(found)],
         separation_warnings(found, settings),
         _numbers(found, settings),
-        drawn,
+        {name: (plot, found, settings) for name, plot in PICTURES.items()},
         _write_maps(command.out, found, settings),
     )
 
 
-COMMAND = Command("separate", _work, ("result.json", *MAPS, *PICTURES, POSTERIOR, *KEPT))
+COMMAND = Command("separate", _work, ("result.json", *MAPS, *PICTURES, *KEPT))

@@ -18,6 +18,8 @@ from jaxsky.settings.tables import (
 )
 from jaxsky.settings.toml import (
     at_key,
+    changed_settings,
+    check_log,
     circumstances,
     find_file,
     found_files,

@@ -6,7 +6,7 @@ import platform
 import re
 import sys
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -194,6 +194,34 @@ def circumstances(settings: Experiment) -> dict[str, Any]:
         "versions": {name: version(name) for name in PACKAGES.split()},
         "files": found_files(settings),
     }
+
+
+def changed_settings(was: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return the keys, with their tables, that differ between two written experiments."""
+    old, new = (
+        {
+            f"{table}.{key}".rstrip("."): value
+            for table, entry in said.items()
+            for key, value in (entry if isinstance(entry, dict) else {"": entry}).items()
+        }
+        for said in (was, now)
+    )
+    return [key for key in {**old, **new} if old.get(key) != new.get(key)]
+
+
+def check_log(
+    log: Path, now: Mapping[str, Any], what: str, may_differ: Container[str] = ()
+) -> None:
+    """Raise ValueError if a folder's log has other settings, except keys that may differ."""
+    try:
+        changed = changed_settings(json.loads(log.read_text())["settings"], now)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise ValueError(f"{log}: is damaged; start again with --overwrite.") from None
+    if words := ", ".join(key for key in changed if key not in may_differ):
+        raise ValueError(
+            f"{log.parent}: holds {what} of other settings ({words}); choose another --out, or "
+            "start again with --overwrite."
+        )
 
 
 def named_files(value: Any) -> Iterator[str]:

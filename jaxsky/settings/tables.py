@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
+from jaxsky.checks import listed
 from jaxsky.components import AME, component_class, declared
 from jaxsky.galaxy import GalaxyModel
 from jaxsky.observation import band_tables
@@ -126,8 +127,9 @@ class ComponentTable(BeamedKeys):
             given = self.parameters["nu_ref"]
             raise ValueError(f"nu_ref belongs next to law; here parameters have it, {given!r}")
         if self.file is None:
-            if self.angles or self.fwhm or self.noise:
-                raise ValueError("fwhm, angles and noise are of a map, but file is missing")
+            if named := [key for key in ("fwhm", "angles", "noise") if getattr(self, key)]:
+                verb = "is" if len(named) == 1 else "are"
+                raise ValueError(f"{listed(named)} {verb} of a map, but file is missing")
             return self
         if self.law is None:
             raise ValueError("law is missing")

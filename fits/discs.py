@@ -113,6 +113,11 @@ class PatchComparison(NamedTuple):
         """Return True for patches where EE (0) or BB (1) is detected in both."""
         return self.observed.detected[:, index] & self.model.detected[:, index]
 
+    @property
+    def any_detected(self) -> bool:
+        """True if EE or BB of any patch is detected in both."""
+        return bool((self.observed.detected & self.model.detected).any())
+
     def ratio(self, index: int) -> tuple[float, float]:
         """Return the geometric mean of A observed over A of the model, and its error.
 

@@ -14,9 +14,15 @@ from commands import jaxsky
 from fits.commands.compare import comparison_warnings, plot_patches, plot_template_patches
 from fits.common import common_maps
 from fits.comparison import compare, compare_pixels, compare_spectra, simulated_fluctuations
-from fits.discs import _patch_noise, compare_patches, paper_patches, template_patches
+from fits.discs import (
+    PatchComparison,
+    _patch_noise,
+    compare_patches,
+    paper_patches,
+    template_patches,
+)
 from fits.inputs import inputs_of
-from fits.patches import fit_patches
+from fits.patches import PatchFits, fit_patches
 from fits.pseudo_cl import band_powers, cosmic_error, hotelling, polarization_alms, prepare_patches
 from fits.regions import region_masks
 from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis
@@ -394,6 +400,20 @@ def test_map_and_model_agree(found, tmp_path):
         assert abs(difference) < 4 * error
     plot_patches(tmp_path / "patches.png", found, "small")
     assert (tmp_path / "patches.png").stat().st_size > 10_000
+
+
+def test_patches_that_are_not_detected_are_not_drawn(tmp_path):
+    """Of one map drawn twice: none is detected, or one in EE alone."""
+    shape, none = (3, 2), np.zeros((3, 2), bool)
+    covariance = np.broadcast_to(0.01 * np.eye(2), (*shape, 2, 2))
+    numbers = np.ones(shape), np.full(shape, -2.4), covariance, np.ones(shape), np.ones(shape)
+    powers = np.ones((*shape, 4)), np.ones((*shape, 4)), np.arange(4.0)
+    fit = PatchFits(("a", "b", "c"), *numbers, none, ~none, *powers)
+    path = tmp_path / "patches.png"
+    assert not plot_patches(path, PatchComparison("353", fit, fit, np.eye(3)), "none")
+    assert not path.exists()
+    one = fit._replace(detected=np.array([[True, False], *2 * [[False, False]]]))
+    assert plot_patches(path, PatchComparison("353", one, one, np.eye(3)), "one")
 
 
 @pytest.mark.slow

@@ -281,19 +281,26 @@ def _plot_patch_pairs(
         plots.legend_below(panels[0, 0])
 
 
-def plot_patches(path: Path, patches: PatchComparison, title: str) -> None:
-    """Draw A and alpha of the patches, observed against model (the paper's fig. 10)."""
+def plot_patches(path: Path, patches: PatchComparison, title: str) -> bool:
+    """Draw A and alpha of the patches, observed against model (the paper's fig. 10).
+
+    Return False, without a picture, if no patch is detected.
+    """
+    if not patches.any_detected:
+        return False
     title = f"{title}\n{patches.band}: patches of 400 square degrees"
     series: list[Series] = [
         (name, patches.detected(i), (patches.model, i), (patches.observed, i))
         for i, name in enumerate(FIELDS)
     ]
     found = {"observed / model": patches.ratio, "observed - model": patches.slope_difference}
+    several = [i for i in range(len(FIELDS)) if patches.detected(i).sum() > 1]
     heads = [
-        f"{what}: {', '.join(f'{name} {with_error(*of(i))}' for i, name in enumerate(FIELDS))}"
+        f"{what}: {', '.join(f'{FIELDS[i]} {with_error(*of(i))}' for i in several) or 'too few'}"
         for what, of in found.items()
     ]
     _plot_patch_pairs(path, series, "model", "observed", heads, title)
+    return True
 
 
 def plot_template_patches(path: Path, fit: PatchFits, heads: Sequence[str], title: str) -> None:
@@ -333,14 +340,16 @@ def _work(settings: Experiment, command: Run) -> Report:
     command.steps.step("realisations")
     simulations, report = command.out / "simulations.npz", command.steps.advance
     found = compare(settings, prepared, regions, simulations, report)
-    patches = None
+    patches, warnings = None, comparison_warnings(found, settings)
     if settings.compare.patches is not None:
         command.steps.step("patches")
         patches = compare_patches(settings, inputs)
+        if not patches.any_detected:
+            warnings.append(f"{patches.band}: neither EE nor BB is detected in any patch.")
     return Report(
         inputs.description,
         [_table(found)],
-        comparison_warnings(found, settings),
+        warnings,
         _numbers(found, patches),
         _pictures(found, settings, patches),
     )

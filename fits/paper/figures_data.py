@@ -131,7 +131,8 @@ def figure_patches(paper: PaperSky, picture: Path) -> PaperFigure:
     if settings.compare.patches is None:
         return _template_patches(paper, picture)
     found = compare_patches(settings, paper.inputs)
-    pictures.plot_patches(picture, found, settings.title)
+    if not pictures.plot_patches(picture, found, settings.title):
+        raise Impossible(f"None of the patches is detected in band {found.band}.")
     for i, name in enumerate(("EE", "BB")):
         A, alpha = found.correlation(i)
         ratio, difference = with_error(*found.ratio(i)), with_error(*found.slope_difference(i))

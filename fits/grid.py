@@ -134,11 +134,14 @@ def grid_fit(
     Raises
     ------
     KeyError, ValueError
-        For unknown parameters, more than two of them, or one without a uniform prior.
+        For unknown parameters, more than two of them, one without a uniform prior, or less than
+        three points.
     """
     like = like.at(start)
     free = like.free
     priors = check_priors(priors, free)
+    if points < 3:
+        raise ValueError(f"Argument `points` must be at least 3, not {points}.")
     if len(free) > 2:
         raise ValueError(
             f"A grid takes one or two free parameters, not {len(free)} ({', '.join(free)}); "

@@ -173,6 +173,8 @@ def test_a_grid_needs_one_or_two_parameters_with_ranges(like):
         grid_fit(like, START | {"gain.44": 1.0}, priors=PRIORS)
     with pytest.raises(ValueError, match=r"uniform prior for 'synchrotron.beta_syn'"):
         grid_fit(like, START, priors={"dust.beta_dust": Uniform(1, 2)})
+    with pytest.raises(ValueError, match="`points` must be at least 3, not 1"):
+        grid_fit(like, START, priors=PRIORS, points=1)
 
 
 def test_a_grid_of_one_parameter(like):

@@ -105,7 +105,8 @@ def fit_warnings(inputs: Inputs, settings: Experiment, fits: Sequence[RegionFit]
         for method, result in fit.results.items():
             if not result.converged:
                 sentences.append(f"{where}, {method}: {result.message}")
-        method, result = next(iter(fit.results.items()))
+        # The first method that converged, if any did.
+        method, result = min(fit.results.items(), key=lambda pair: not pair[1].converged)
         probability = fit.probability_to_exceed(method)
         if probability is not None and probability < UNLIKELY:
             sentences.append(
@@ -142,6 +143,7 @@ def plot_grids(
                 _draw_grid(axes, fit.results["grid"], truth)
                 alike = [f for f in with_grid if f.stokes == fit.stokes]
                 axes.set(xlim=_limits(alike, x), ylim=_limits(alike, y))
+                axes.locator_params(axis="x", nbins=3)  # small errors have long numbers
                 axes.set(xlabel=f"${label(x)}$", ylabel=f"${label(y)}$")
                 axes.set_title(plain(f"{fit.region}, {' + '.join(fit.stokes)}"))
         legend_below(panels[0, 0])
@@ -204,6 +206,7 @@ def plot_marginals(
                 axes.xaxis.set_tick_params(labelbottom=True)
         for axes, name in zip(panels[-1], free, strict=True):
             axes.set(xlabel=f"${label(name)}$", xlim=_limits(fits, name))
+            axes.locator_params(axis="x", nbins=4)
         legend_below(panels[0, 0])
 
 

@@ -41,7 +41,7 @@ LOG, PAGE = "log.txt", "index.html"
 WRITTEN = "; all results are written"
 #: When, where and with what a command was run, next to its numbers.
 CIRCUMSTANCES = "log.json"
-#: Settings that may differ where results are gone on with.
+#: Settings that may differ where results are resumed.
 MAY_DIFFER = {"title", "data_dir", "fit.nsteps", "compare.nsims"}
 MAY_DIFFER |= {f"separate.{key}" for key in ("nsims", "nsteps", "sampler")}
 #: Folder of the experiments that commands run by default.

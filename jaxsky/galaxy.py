@@ -22,7 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsky.checks import Parameter, as_number, check_choice, check_not_negative, check_seed
+from jaxsky.checks import (
+    Parameter,
+    as_number,
+    check_choice,
+    check_not_negative,
+    check_nside,
+    check_seed,
+)
 from jaxsky.components import Dust, Synchrotron
 from jaxsky.harmonics import degrees, resample, synthesis
 from jaxsky.sky import Sky
@@ -277,8 +284,7 @@ def _check(nside: int, seed: int, steps: int) -> None:
     for name, value in {"nside": nside, "steps": steps}.items():
         if not isinstance(value, int | np.integer) or isinstance(value, bool):
             raise TypeError(f"Argument `{name}` must be an int, but is {value!r}.")
-    if not healpy.isnsideok(nside, nest=True):
-        raise ValueError(f"Argument `nside` must be a power of two, but is {nside}.")
+    check_nside("nside", nside)
     if steps < 1:
         raise ValueError(f"Argument `steps` must be positive, but is {steps}.")
 

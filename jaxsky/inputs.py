@@ -14,7 +14,13 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from jaxsky import galaxy as model_galaxy
 from jaxsky.bandpass import Bandpass
 from jaxsky.checks import listed
-from jaxsky.components import AME, Component, component_class, parameter_declaration
+from jaxsky.components import (
+    AME,
+    Component,
+    check_law,
+    component_class,
+    parameter_declaration,
+)
 from jaxsky.galaxy import EmbeddedSky, GalaxyModel, embedded_sky
 from jaxsky.io import Maps, read_bandpass, read_beam, read_maps, unit_factor
 from jaxsky.io.columns import sentinels
@@ -238,6 +244,8 @@ def _read_template(
             if padded:
                 maps = jnp.pad(maps[:1], ((0, 2), (0, 0)))
             component = law(maps[-len(stokes) :], **parameters)
+        if ":" in component.law:  # a class of the user's
+            check_law(component)
     return Template(component, spec.fwhm or 0.0, used, found.unit)
 
 

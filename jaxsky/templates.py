@@ -19,7 +19,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from jaxsky.checks import Numeric, as_array, check_finite, check_positive, check_shape, is_concrete
+from jaxsky.checks import (
+    Numeric,
+    as_array,
+    check_finite,
+    check_nside,
+    check_positive,
+    check_shape,
+    is_concrete,
+)
 from jaxsky.components import Component, component_class
 from jaxsky.harmonics import beam_ratio, resample, shortened
 from jaxsky.public import packaged
@@ -50,11 +58,6 @@ def _healpix(name: str, values: ArrayLike, rows: tuple[int, ...] = ()) -> tuple[
     return array, nside
 
 
-def _check_nside(nside: int) -> None:
-    if not healpy.isnsideok(nside, nest=True):
-        raise ValueError(f"Argument `nside` must be a power of 2, but is {nside}.")
-
-
 def polarization_template(
     maps: ArrayLike, own_fwhm: Numeric, fwhm: Numeric, nside: int
 ) -> Float[Array, "stokes pix"]:
@@ -66,7 +69,7 @@ def polarization_template(
     """
     maps, nside_in = _healpix("maps", maps, rows=(2, 3))
     check_finite("maps", maps)
-    _check_nside(nside)
+    check_nside("nside", nside)
     window = beam_ratio(fwhm, own_fwhm, 2 * min(nside_in, nside), "the template")
     return resample(maps, shortened(window), nside, ITERATIONS)
 
@@ -85,7 +88,7 @@ def dust_index(
     resolve. Widths are in arcmin.
     """
     beta, nside_in = _healpix("beta", beta)
-    _check_nside(nside)
+    check_nside("nside", nside)
     if mask is not None:
         good = np.shape(mask) == beta.shape
         check_shape("mask", np.asarray(mask), good, f"have shape {beta.shape} like `beta`")

@@ -31,6 +31,18 @@ class Steep(Component):
 
     def sed(self, nu):
         return sed.power_law(nu, self.slope, self.nu_ref)
+
+class Nothing(Component):
+    amplitude: object = template()
+    nu_ref: object = reference(30.0, within=(1.0, 1e3))
+
+class Undefined(Nothing):
+    def sed(self, nu):
+        return (30.0 - nu) ** 0.5
+
+class Three(Nothing):
+    def sed(self, nu):
+        return sed.power_law(nu, 2.5, self.nu_ref)[None].repeat(3)
 """
 
 

@@ -11,6 +11,7 @@ import pkgutil
 
 from jaxsky.components.base import (
     Component,
+    check_law,
     check_value,
     component_class,
     declared,

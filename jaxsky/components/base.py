@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
@@ -138,7 +139,7 @@ class Component(Printed, eqx.Module):
 
     def sed(self, nu: ArrayLike) -> Float[Array, ""] | Float[Array, " pix"]:
         """Return the spectral law at one frequency [GHz]; a map if any parameter is a map."""
-        raise TypeError(f"{type(self).__name__} must define `sed`.")
+        raise ValueError(f"{type(self).__name__} must define `sed`.")
 
     @property
     def template(self) -> Float[Array, "stokes pix"]:
@@ -201,6 +202,18 @@ def check_value(name: str, value: Array, metadata: Mapping[str, Any]) -> None:
             f"Argument `{name}` must be from {low:g} to {high:g}, but {what} {middle:g}; "
             f"{metadata['hint']}."
         )
+
+
+def check_law(component: Component, nu: float = 100.0) -> None:
+    """Raise ValueError unless a law gives a finite number, or a map of them, at `nu` [GHz]."""
+    value, npix = np.asarray(component.sed(jnp.asarray(nu))), component.amplitude.shape[-1]
+    law = f"the law {component.law!r} at {nu:g} GHz"
+    if value.shape not in ((), (npix,)):
+        raise ValueError(
+            f"{law} is neither a number nor a map of {npix} pixels, but has shape {value.shape}"
+        )
+    if not np.isfinite(value).all():
+        raise ValueError(f"{law} is not finite for these parameters")
 
 
 def declared(component: type[Component], field: str) -> Mapping[str, Any]:

@@ -14,7 +14,7 @@ from jaxsky import programs
 SCRIPT = """
 import sys
 from pathlib import Path
-order, folder = sys.argv[1:]
+order, folder, transforms = sys.argv[1:]
 import jax, jax.numpy as jnp, numpy as np
 jax.config.update("jax_enable_x64", True)
 if order == "other":
@@ -22,6 +22,11 @@ if order == "other":
     from jaxsky import templates
 from jaxsky.harmonics import analysis, rotate, synthesis
 from jaxsky.programs import keep_programs
+if transforms == "callback":
+    from jax.interpreters import mlir
+    from jaxbind import jaxbind
+    from jaxsky.harmonics.transforms import _lower_callback
+    mlir.register_lowering(jaxbind._prim, _lower_callback, platform="cpu")
 keep_programs(Path(folder))
 alm = jnp.asarray(np.random.default_rng(1).normal(size=(2, 81)))
 def chi2(x):
@@ -36,9 +41,9 @@ for found in done if order == "one" else done[::-1]:
 """
 
 
-def process(folder, order="one", fixed=False, **environment):
+def process(folder, order="one", fixed=False, transforms="direct", **environment):
     """What such a process prints, and its warnings."""
-    line = [sys.executable, "-W", "always", "-c", SCRIPT, order, str(folder)]
+    line = [sys.executable, "-W", "always", "-c", SCRIPT, order, str(folder), transforms]
     clean = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     run = subprocess.run(
         ["setarch", "-R", *line] if fixed else line,
@@ -55,12 +60,14 @@ def kept(folder):
 
 
 @pytest.mark.slow
-def test_a_second_process_adds_nothing_and_transforms_are_not_kept(tmp_path):
-    first, _ = process(tmp_path)
+@pytest.mark.parametrize("transforms", ["direct", "callback"])
+def test_a_second_process_adds_nothing_and_transforms_are_not_kept(tmp_path, transforms):
+    """Also where transforms are called as on a GPU."""
+    first, _ = process(tmp_path, transforms=transforms)
     names = kept(tmp_path)
     assert any(name.startswith("jit__lambda") for name in names)
     assert not [n for n in names if any(w in n for w in ("synthesis", "analysis", "rotate"))]
-    second, said = process(tmp_path)
+    second, said = process(tmp_path, transforms=transforms)
     assert kept(tmp_path) == names
     assert second == first
     assert "cache" not in said

@@ -10,6 +10,7 @@ import contextlib
 import ctypes
 import math
 import os
+import pickle
 import threading
 import time
 from functools import cache, partial
@@ -119,7 +120,32 @@ def _lower(ctx: Any, *operands: Any, **parameters: Any) -> Any:
     return jaxbind._lowering(ctx, *operands, **parameters)
 
 
+def _through_callback(*operands: Any, _func: Any, **parameters: Any) -> Any:
+    """Call a function of jaxbind on the host, where the arrays are on an accelerator.
+
+    The primitive stays jaxbind's, and with it gradients, transposes and batches. JAX does not
+    cache programs with callbacks on disk.
+    """
+    found = jaxbind._exec_abstract(*operands, _func=_func, **parameters)
+    shapes = [jax.ShapeDtypeStruct(one.shape, one.dtype) for one in found]
+    if _func.can_batch:
+        parameters["batch_axes"] = _func.batch_axes
+    dump = np.frombuffer(pickle.dumps(parameters), dtype=np.uint8)
+
+    def call(*arrays: Array) -> list[np.ndarray]:
+        out = [np.empty(shape.shape, shape.dtype) for shape in shapes]
+        _func.f(tuple(out), tuple(map(np.asarray, arrays)), dump)
+        return out
+
+    return jax.pure_callback(call, shapes, *operands)
+
+
+#: How a transform is lowered on an accelerator; jaxbind's own way needs a function for CUDA that
+#: its packages do not have.
+_lower_callback = mlir.lower_fun(_through_callback, multiple_results=True)
+
 mlir.register_lowering(jaxbind._prim, _lower, platform="cpu")
+mlir.register_lowering(jaxbind._prim, _lower_callback, platform="gpu")
 
 
 @cache
@@ -256,10 +282,14 @@ def _finish_at_exit() -> None:
 
 def _finish() -> None:
     """Wait for the computations of this thread, then for those of others."""
-    with contextlib.suppress(Exception), jax.default_device(jax.devices("cpu")[0]):
-        # JAX runs the computations of a thread one after the other, even those whose results
-        # were dropped; only the cheapest skip the queue, and none that calls Python.
-        jax.jit(lambda: jax.pure_callback(lambda: np.int32(0), np.int32(0)))().block_until_ready()
+    # JAX runs the computations of a thread on a device one after the other, even those whose
+    # results were dropped; only the cheapest skip the queue, and none that calls Python.
+    last = jax.jit(lambda: jax.pure_callback(lambda: np.int32(0), np.int32(0)))
+    for platform in {jax.default_backend(), "cpu"}:
+        with contextlib.suppress(Exception):
+            for device in jax.local_devices(backend=platform):
+                with jax.default_device(device):
+                    last().block_until_ready()
     daemons = [thread for thread in threading.enumerate() if thread.daemon]
     if _THREADS.is_dir() and not _calm(seconds=1.0 if daemons else 60.0):
         for thread in daemons:

@@ -1,0 +1,430 @@
+"""Every compiled function is made for CUDA, on a machine without a GPU.
+
+A module with a function under `jit` has a table of calls here, and each of its functions has to
+appear in one of them. What has transforms has to have JAX's callback to the host, and nothing of
+jaxbind's own for GPUs, which its packages do not have; all else has to pass `jax.export`.
+"""
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from blackjax.adaptation.step_size import dual_averaging_adaptation
+from jax.extend.core import jaxprs_in_params
+from jax.interpreters import mlir
+
+import fits
+import jaxsky
+from fits import (
+    common,
+    comparison,
+    compress,
+    fisher,
+    grid,
+    mixing,
+    optimize,
+    patches,
+    posterior,
+    profile_likelihood,
+    pseudo_cl,
+    sampling,
+    separated_maps,
+    template_likelihood,
+    tensor_ratio,
+    unbounded,
+)
+from jaxsky import (
+    bandpass,
+    cmb,
+    galaxy,
+    harmonics,
+    interpolation,
+    noise,
+    sed,
+    simulation,
+    sky,
+    templates,
+)
+from jaxsky.components import laws
+from systems import bands, components, dust_and_synchrotron, random_maps, spread
+
+NSIDE, LMAX = 4, 8
+NPIX = healpy.nside2npix(NSIDE)
+KEY = jax.random.key(1)
+ELL = np.arange(LMAX + 1.0)
+FALLING = 1 / (1 + ELL) ** 2
+MAPS, ALM = random_maps(1, npix=NPIX), random_maps(2, npix=(LMAX + 1) ** 2)
+MASK = np.linspace(0, 1, NPIX)
+NU = np.array([30.0, 100.0])
+BANDS = bands()
+SAMPLES = bandpass.stack_bands(BANDS)
+SKY = dust_and_synchrotron(NPIX)
+DUST = jaxsky.Dust(MAPS, spread(1.53, 0.1, NPIX), spread(20.0, 1.0, NPIX))
+COUNTS = (5, 5)
+START = {"dust.beta_dust": 1.55, "synchrotron.beta_syn": 3.05}
+FOUR = {f"{c:g}": jaxsky.Bandpass.top_hat(c, c / 4, samples=5) for c in (30.0, 95.0, 220.0, 353.0)}
+Calls = Iterator[tuple[Any, ...]]
+
+
+def spectral_laws() -> Calls:
+    yield sed.power_law, NU, 3.1, 30.0
+    yield sed.curved_power_law, NU, 3.1, -0.1, 23.0, 30.0
+    yield sed.modified_blackbody, NU, 1.5, 20.0, 353.0
+    yield sed.modified_blackbodies, NU, (1.7, 2.7), (9.4, 16.2), (0.5, 1.0), 353.0
+    yield sed.ame_log_parabola, NU, 4.0, 20.0, 22.8
+    yield sed.cmb_derivative, NU
+
+
+def emission() -> Calls:
+    yield laws.amplitude_from_emission_measure, MAPS[0], 8000.0, 30.0
+
+
+def bandpasses() -> Calls:
+    yield partial(bandpass._across, samples=9), 100.0, 20.0
+    for convention in ("RJ", "power", "CMB"):
+        yield partial(bandpass._integrand, convention=convention), NU, np.ones(2)
+        yield partial(bandpass._quadrature, convention=convention), NU, np.ones(2)
+    yield bandpass.stack_bands, tuple(BANDS)
+    yield partial(bandpass.band_conversion, "uK_RJ", "MJy/sr"), NU, np.ones(2), 353.0
+    yield jax.grad(lambda x: jaxsky.Bandpass.top_hat(x, 20.0).conversion("K_CMB", "uK_RJ")), 100.0
+
+
+def interpolated() -> Calls:
+    yield interpolation._tails, DUST, SAMPLES
+    yield partial(interpolation._series, counts=COUNTS), DUST, BANDS[0]
+    yield partial(interpolation._all_series, counts=COUNTS), DUST, SAMPLES
+    yield partial(interpolation._weights, counts=COUNTS), DUST, SAMPLES, np.ones((2, 25))
+    yield interpolation.term, DUST, np.ones(COUNTS)
+    yield (
+        lambda dust: interpolation.band_seds(dust, SAMPLES, interpolation.NodeCounts(COUNTS)),
+        DUST,
+    )
+
+
+def observed() -> Calls:
+    def total(one):
+        return jnp.sum(jaxsky.observe(one, BANDS) ** 2)
+
+    everything = sky.Sky(components())
+    yield lambda one: jaxsky.observe(one, BANDS), everything
+    yield lambda one: jaxsky.observe(one, BANDS), sky.Sky({"dust": DUST})
+    yield lambda one: jaxsky.observe(one, BANDS, tolerance=0), sky.Sky({"dust": DUST})
+    yield lambda one: sky.observe_components(one, BANDS), everything
+    yield jax.grad(total), everything
+    yield jax.grad(total), sky.Sky({"dust": DUST})
+
+
+def transforms() -> Calls:
+    yield harmonics.expand, ELL
+    yield partial(harmonics.resize, lmax=5), ALM
+    yield harmonics.power_spectrum, ALM, ALM
+    yield partial(harmonics.synthesis, nside=NSIDE), ALM
+    yield partial(harmonics.adjoint_synthesis, lmax=LMAX), MAPS
+    yield partial(harmonics.analysis, lmax=LMAX), MAPS
+    yield partial(harmonics.rotate, source="G", target="C"), ALM
+    yield jax.grad(lambda alm: jnp.sum(harmonics.synthesis(alm, NSIDE) ** 3)), ALM
+    yield jax.vmap(partial(harmonics.analysis, lmax=LMAX)), MAPS[None]
+
+
+def resolution() -> Calls:
+    prepared = harmonics.Preparation.smoothing(NSIDE, 0.0, NSIDE // 2, 2000.0, LMAX)
+    yield lambda fwhm, own: harmonics.beam_ratio(fwhm, own, LMAX), 2000.0, 1000.0
+    yield partial(harmonics.resample, nside=2), MAPS, ELL
+    yield partial(harmonics.average_pixels, nside=2), MAPS
+    yield prepared.transpose, MAPS[:, : NPIX // 4]
+
+
+def random_fields() -> Calls:
+    spectra = np.eye(2)[..., None] * FALLING
+    yield cmb.realisation, KEY, np.stack([FALLING] * 4)
+    yield cmb.repair, spectra
+    yield jax.grad(lambda x: cmb.repair(x)[0].sum()), spectra
+    yield cmb.gaussian_fields, KEY, spectra
+
+
+def noises() -> Calls:
+    covariance = np.eye(2)[..., None] * np.ones(NPIX)
+    yield partial(noise.normal, shape=(2, 5), dtype=np.dtype(float)), KEY
+    yield partial(noise.stokes_noise, stokes=2, size=5, dtype=np.dtype(float)), KEY
+    yield partial(noise.uniform_covariance, nside=NSIDE), 10.0
+    yield partial(noise.uniform_alm, lmax=LMAX), KEY, 10.0
+    yield noise.cholesky, covariance
+    yield noise.draw, KEY, covariance
+    yield partial(noise.white_alm, lmax=LMAX), KEY, covariance
+    yield noise._number_indefinite, covariance
+
+
+def galaxies() -> Calls:
+    angles = healpy.pix2ang(NSIDE, np.arange(NPIX))
+    model = galaxy.GalaxyModel()
+    yield partial(galaxy._integrate, steps=4), model, KEY, angles
+    yield galaxy._scaled, np.ones((2, 3, NPIX)), random_maps(1, npix=6 * 48).reshape(2, 3, -1)
+
+
+def simulations() -> Calls:
+    part = simulation._Part((ALM, ALM), (1.0, 2.0), jnp.asarray(ELL))
+    yield simulation._importance, dict(SKY.components), SAMPLES
+    yield partial(simulation._term_alm, lmax=LMAX, steps=1), MAPS, DUST, np.ones(COUNTS)
+    yield simulation._summed, (part, part)
+
+
+def correlations() -> Calls:
+    yield partial(templates._jackknife, number=4), MAPS[0], MAPS[1], np.arange(NPIX) % 4
+
+
+def fluctuations() -> Calls:
+    prepared = harmonics.Preparation.smoothing(NSIDE, 0.0, NSIDE, 2000.0, LMAX)
+    found = common.Fluctuations(
+        (prepared,),
+        (jnp.eye(2)[..., None] * jnp.ones(NPIX),),
+        (jnp.asarray(FALLING),),
+        jnp.stack([FALLING] * 2),
+        jnp.asarray(FALLING[None]),
+        jnp.ones(1),
+        ("44",),
+    )
+    yield common._modes, MAPS[None], np.stack([FALLING] * 2)
+    yield found.cmb_realisation, KEY
+    yield found.noise_realisation, KEY
+
+
+def template_fit(**options):
+    data = jaxsky.observe(SKY, list(FOUR.values()))
+    return fits.likelihood(SKY, FOUR, data, 1.0, START, **options)
+
+
+def separation():
+    data = jaxsky.observe(SKY, list(FOUR.values())) + random_maps(5, npix=NPIX)
+    labels = {"dust.beta_dust": np.arange(NPIX) % 3}
+    return fits.spectral_likelihood(SKY, FOUR, data, np.ones(4), START, labels=labels)
+
+
+def all_likelihoods():
+    per_pixel = np.linspace(0.5, 1.5, 4 * 2 * NPIX).reshape(4, 2, NPIX)
+    data = jaxsky.observe(SKY, list(FOUR.values())) + random_maps(5, npix=NPIX)
+    yield template_fit()
+    yield template_fit(pixelwise=True)
+    yield template_fit(covariance_of=lambda rows: np.eye(rows.shape[0] * rows.shape[1]))
+    yield separation()
+    yield fits.spectral_likelihood(SKY, FOUR, data, per_pixel, {**START, "angle.95": 0.1})
+
+
+def posteriors() -> Calls:
+    priors = [(fits.Gaussian(1.5, 0.1), np.array([True, False]))]
+    yield posterior.prior_terms, np.ones(2), priors
+    for like in all_likelihoods():
+        params = dict(like.start)
+        theta = like.flat(params)
+        yield type(like).residuals, like, params
+        yield posterior.chi2, like, params
+        yield jax.grad(posterior.chi2, argnums=1), like, params
+        yield posterior.value_and_gradient, like, theta
+        yield posterior._cell_derivatives, like, theta
+
+
+def template_passes() -> Calls:
+    data = np.ones((4, 2, NPIX))
+    yield template_likelihood.gram, data, MAPS[None], data
+    yield template_likelihood._weights, data, 2 * data
+    yield template_likelihood._one_stokes_each, MAPS[None], data
+
+
+def comparisons() -> Calls:
+    yield comparison._sums_of_squares, np.ones((4, 2, NPIX)), np.ones((3, NPIX), bool)
+
+
+def compression() -> Calls:
+    yield compress.square_root, np.eye(4)[None]
+
+
+def separations() -> Calls:
+    like = separation()
+    yield profile_likelihood.matrices_at, like, dict(like.start)
+
+
+def separated() -> Calls:
+    matrix = np.random.default_rng(1).normal(size=(1, 4, 2))
+    pixels = compress.Pixels(np.ones((2, 4, NPIX)), np.ones((2, 4, NPIX)), None)
+    each = np.repeat(matrix, NPIX, axis=0)
+    for errors in (False, True):
+        yield partial(separated_maps._separated, errors=errors), matrix, pixels
+        yield partial(separated_maps._separated, errors=errors), each, pixels
+
+
+def grids() -> Calls:
+    axes = {name: np.linspace(0.9, 1.1, 3) * value for name, value in START.items()}
+    yield grid.chi2_on_grid, template_fit(), axes
+    yield grid.chi2_on_grid, template_fit(pixelwise=True), axes
+
+
+def densities(like):
+    priors = {"dust.beta_dust": fits.Uniform(1.0, 2.0), "synchrotron.beta_syn": fits.Gaussian(3, 1)}
+    own = posterior.Posterior(like, priors)
+    return own, own.density(own.start)
+
+
+def optimisers() -> Calls:
+    own, density = densities(template_fit())
+    yield optimize._values, own.start, density, np.ones(2)
+    yield jax.grad(optimize._objective), own.start, (density, np.ones(2))
+    yield jax.jacfwd(optimize._residuals), own.start, (density, np.ones(2))
+
+
+def samplers() -> Calls:
+    for like in (template_fit(), separation()):
+        own, _ = densities(like)
+        z = np.ones((4, own.start.size))
+        numbers, _ = unbounded.unbounded_posterior(own, own.start)
+        leaves, structure = jax.tree.flatten(numbers.density)
+        yield partial(sampling._log_probs, structure=structure), z, leaves
+        yield sampling._values, numbers, z
+        yield sampling._begun, numbers, z
+        tuning = jax.tree.map(
+            lambda x: jnp.asarray(x, float), dual_averaging_adaptation(0.8)[0](0.5)
+        )
+        begun = sampling._begun(numbers, z), tuning
+        yield partial(sampling._advanced, steps=2), numbers, begun, KEY, 0, 10
+    yield sampling.agreement, np.random.default_rng(1).normal(size=(100, 4, 2))
+
+
+def forecasts() -> Calls:
+    law = {name: jax.tree.map(lambda x: x[:, :1] if x.ndim == 2 else x, one)
+           for name, one in SKY.components.items()}  # fmt: skip
+    foregrounds = {"BB.dust.synchrotron.correlation": 0.4}
+    for name in SKY:
+        foregrounds |= {f"BB.{name}.amplitude": 1.0, f"BB.{name}.slope": -2.5}
+    model = fisher.ForecastModel(
+        mixing.Mixing.of(sky.Sky(law), FOUR, "uK_CMB"),
+        jnp.ones((LMAX, 4)),
+        jnp.ones((1, LMAX)),
+        jnp.ones((1, LMAX)),
+        jnp.asarray(ELL[1:]),
+        jnp.asarray(0.6),
+        ("BB",),
+    )
+    params = fisher.fiducial(model.sky, foregrounds, 0.01, 1.0)
+    yield partial(fisher._root, free=("r", "dust.beta_dust")), params, model
+
+
+def masked() -> Calls:
+    maps = random_maps(3, npix=NPIX)
+    yield partial(pseudo_cl._masked_alm, lmax=LMAX), MASK, np.ones((4, NPIX)), maps
+    yield partial(pseudo_cl._masked_alm, lmax=LMAX), MASK, None, maps
+    yield partial(pseudo_cl.mean_spectrum, lmax=LMAX), MASK, maps
+
+
+def patch_laws() -> Calls:
+    row = np.ones((3, 2))
+    rows = patches.BandCombinations(row, row, row, row, np.ones((3, 2, 10)))
+    yield partial(patches.minimise, ends=(2, 9)), rows, np.array([-2.4, 0.3])
+
+
+def tensors() -> Calls:
+    shape = (2, 2, 3, LMAX + 1, 5)
+    ordered = np.moveaxis(np.ones(shape), 2, 0)
+    yield tensor_ratio._squares, ordered, ordered, np.ones(3), np.ones((1, 2, LMAX + 1))
+
+
+#: The calls of each module with compiled functions.
+CALLS: dict[str, Callable[[], Calls]] = {
+    "jaxsky.sed": spectral_laws,
+    "jaxsky.components.laws": emission,
+    "jaxsky.bandpass": bandpasses,
+    "jaxsky.interpolation": interpolated,
+    "jaxsky.sky": observed,
+    "jaxsky.harmonics.transforms": transforms,
+    "jaxsky.harmonics.resolution": resolution,
+    "jaxsky.cmb": random_fields,
+    "jaxsky.noise": noises,
+    "jaxsky.galaxy": galaxies,
+    "jaxsky.simulation": simulations,
+    "jaxsky.templates": correlations,
+    "fits.common": fluctuations,
+    "fits.posterior": posteriors,
+    "fits.template_likelihood": template_passes,
+    "fits.comparison": comparisons,
+    "fits.compress": compression,
+    "fits.profile_likelihood": separations,
+    "fits.separated_maps": separated,
+    "fits.grid": grids,
+    "fits.optimize": optimisers,
+    "fits.sampling": samplers,
+    "fits.fisher": forecasts,
+    "fits.pseudo_cl": masked,
+    "fits.patches": patch_laws,
+    "fits.tensor_ratio": tensors,
+}
+
+
+def jitted(function) -> bool:
+    return hasattr(function, "lower")
+
+
+def compiled(module: str) -> set[str]:
+    """The functions under `jit` that a module defines, methods included, as JAX names them."""
+    found = importlib.import_module(module)
+    own = [x for x in vars(found).values() if getattr(x, "__module__", None) == module]
+    own += [x for one in own if inspect.isclass(one) for x in vars(one).values()]
+    names = set()
+    for one in filter(callable, own):
+        made = inspect.unwrap(one, stop=jitted)
+        if jitted(made) and not inspect.isclass(one):
+            code = inspect.unwrap(one).__code__
+            place = f" at {code.co_filename}:{code.co_firstlineno}"
+            # JAX sees equinox in place of what is under `filter_jit`, and its name.
+            names.add(code.co_name + (place if hasattr(made, "trace") else ""))
+    return names
+
+
+def called(jaxpr) -> Iterator[str]:
+    """Primitives of a traced program, and functions with their place."""
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for inner in jaxprs_in_params(equation.params):
+            name, _, place = str(inner.debug_info.func_src_info).partition(" at ")
+            yield name if "equinox" in place else f"{name} at {place}"
+            yield from called(inner)
+
+
+def lowered(function, arguments, monkeypatch) -> tuple[str, set[str]]:
+    """The text of a program for CUDA, and what it calls."""
+    whole = jax.jit(lambda *given: function(*given))
+    traced = whole.trace(*arguments)
+    inside = set(called(traced.jaxpr.jaxpr))
+    if "jaxbind_prim" not in inside:
+        return jax.export.export(whole, platforms=["cuda"])(*arguments).mlir_module(), inside
+    with monkeypatch.context() as patch:
+        # `jax.export` takes no callback, and to lower one JAX asks for the GPU, without using it.
+        patch.setattr(mlir.ModuleContext, "get_backend", lambda *_, **__: None)
+        text = traced.lower(lowering_platforms=("cuda",)).as_text()
+    assert "xla_ffi_python_gpu_callback" in text
+    return text, inside
+
+
+@pytest.mark.parametrize("module", CALLS)
+def test_compiled_functions_are_made_for_a_gpu(module, monkeypatch):
+    left = compiled(module)
+    assert left
+    for function, *arguments in CALLS[module]():
+        text, inside = lowered(function, arguments, monkeypatch)
+        assert "gpu_pycall" not in text
+        left -= inside
+    assert not left, "add a call of each to this file"
+
+
+def test_no_module_is_forgotten():
+    found = {
+        module.name
+        for package in (jaxsky, fits)
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+        if module.name != "jaxsky.__main__" and compiled(module.name)
+    }
+    assert found == set(CALLS)

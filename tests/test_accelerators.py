@@ -1,6 +1,7 @@
 """What runs on an accelerator, without one: transforms through a callback, programs for CUDA."""
 
 import contextlib
+import sys
 
 import healpy
 import jax
@@ -10,6 +11,7 @@ import pytest
 from jax.interpreters import mlir
 from jaxbind import jaxbind
 
+from benchmarks import gpu
 from jaxsky import Observation, ObservedBand, Sky, Source, harmonics, set_parameters, simulate
 from jaxsky.harmonics import transforms
 from systems import bands, dust_and_synchrotron
@@ -88,3 +90,22 @@ def test_transforms_through_a_callback_are_the_same(name):
         # Within rounding: the rest of a program may be fused in another way.
         accuracy = 1e-12 if one.dtype == np.float64 else 1e-6
         np.testing.assert_allclose(one, other, rtol=0, atol=accuracy * size)
+
+
+def test_the_script_for_a_gpu_runs(monkeypatch, capsys):
+    """On small maps; the numbers are right, and there is no verdict on speed."""
+    monkeypatch.setattr(sys, "argv", ["benchmarks.gpu", "--nside", "16"])
+    with pytest.raises(SystemExit) as end:
+        gpu.main()
+    said = capsys.readouterr().out
+    assert end.value.code == 0, said
+    for words in ("band average", "likelihood and gradient", "separated", "smoothing", "A trial"):
+        assert words in said
+    assert "MISS" not in said
+
+
+def test_wrong_numbers_are_missed_by_the_script(monkeypatch):
+    monkeypatch.setattr(gpu, "ACCURACY", {np.float64: 1e-20})
+    assert gpu.band_average(8, np.float64, trial=True).met is False
+    monkeypatch.setattr(gpu, "ACCURACY", {np.float64: 1e-9})
+    assert gpu.band_average(8, np.float64, trial=True).met is None

@@ -15,8 +15,9 @@ from benchmarks.timing import interleave, seconds
 from fits.grid import chi2_on_grid
 from fits.kept import KeptChain
 from fits.posterior import Likelihood, Uniform
+from fits.products import gram
 from fits.sampling import sample
-from fits.template_likelihood import gram, likelihood
+from fits.template_likelihood import likelihood
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.sed import H_OVER_K
 

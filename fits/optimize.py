@@ -23,6 +23,7 @@ from fits.posterior import Gaussian, Likelihood, Matrix, Posterior, Prior
 from fits.results import Convergence, FitResult, help_by_prior
 from fits.systems import Factor, degenerate, variances
 from jaxsky.checks import Numeric
+from jaxsky.mesh import mesh_of
 
 #: Most steps of a search with optimistix and with Newton's method, by default.
 MAX_STEPS, NEWTON_STEPS = 500, 100
@@ -190,7 +191,7 @@ def best_fit(
         values at the start for the first, and of their standard deviations there for the second;
         with uniform priors, those of numbers without bounds. Or `fits.Newton()`: damped
         steps of Newton's method with exact second derivatives, clipped at the bounds. By default
-        that for spectral likelihoods, else `LevenbergMarquardt`
+        that for spectral likelihoods and distributed pixels, else `LevenbergMarquardt`
     max_steps : largest number of steps; by default 100 for Newton's method, 500 for optimistix
     throw : raise if it fails, or the optimum lies at the edge of a uniform prior
 
@@ -224,7 +225,13 @@ def best_fit(
         raise ValueError(f"Argument `max_steps` must not be negative, but is {max_steps}.")
     like = like.at(start)
     posterior = Posterior(like, priors)
-    if solver is None and like.profiled:
+    distributed = mesh_of(like) is not None
+    if distributed and isinstance(solver, optx.AbstractLeastSquaresSolver):
+        raise ValueError(
+            f"Argument `solver` is {type(solver).__name__}, which takes the residuals of all "
+            "pixels to one device; for distributed pixels take a minimiser, or fits.Newton()."
+        )
+    if solver is None and (like.profiled or distributed):
         solver = Newton()
     elif solver is None:
         solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)

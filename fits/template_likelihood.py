@@ -21,28 +21,27 @@ added as further templates after the others.
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from fits.compress import square_root
 from fits.mixing import Mixing, TemplateErrors, check_signal, named_bands, unit_sky
 from fits.posterior import Likelihood
+from fits.products import checked_weights, gram, one_stokes_each, swapped
 from jaxsky import Bandpass, Sky, observe_components, parameter_names
-from jaxsky.checks import UNSEEN, Numeric, as_array, check_double, check_shape
+from jaxsky.checks import Numeric, as_array, check_double, check_shape
 from jaxsky.interpolation import NodeCounts, Nodes
+from jaxsky.mesh import SUMS, along, maps_of, of_own, over_pixels, total, typed
 from jaxsky.sky import OFFSET, interpolation_nodes, unknown_parameter
 
 #: Covariance of the inner products <rows, data>: (band, row, stokes, pix) -> square matrix over
 #: (band, row) flattened. `fits.common.Fluctuations.covariance` is one.
 CovarianceOf = Callable[[Float[Array, "band row stokes pix"]], Float[np.ndarray, "row row"]]
-#: Pixels per pass over templates; few enough for the weighted copies to stay in cache.
-CHUNK = 1 << 14
 
 
 class SkyLikelihood(Likelihood):
@@ -64,7 +63,7 @@ class SkyLikelihood(Likelihood):
         sign = np.array([{"I": 0, "Q": -1, "U": 1}[s] for s in self.stokes])
         angle = 2 * jnp.deg2rad(self.mixing.of_bands("angle", params))
         angle = (angle[:, None] * sign)[..., None]
-        return jnp.cos(angle) * seen, jnp.sin(angle) * _swapped(seen)
+        return jnp.cos(angle) * seen, jnp.sin(angle) * swapped(seen)
 
     def offset(self, params: Mapping[str, Array]) -> Float[Array, "band stokes"]:
         """Return offsets [uK_RJ], 0 unless given."""
@@ -124,6 +123,18 @@ class PixelLikelihood(SkyLikelihood):
     whitening: Float[Array, "row row"] | None
 
     def residuals(self, params):
+        out = maps_of(1) if self.rows is None else SUMS
+        return over_pixels(out)(PixelLikelihood._residuals)(self, params)
+
+    def derivatives(self, local):
+        # Of each device's own pixels, and then their sum.
+        def own(like, local):
+            return jax.tree.map(total, Likelihood.derivatives(like, of_own(local)))
+
+        whole = super().derivatives
+        return over_pixels(SUMS)(own)(self, local) if self.rows is None else whole(local)
+
+    def _residuals(self, params):
         bands = self.mixing.moved(params)
         seen = observe_components(self.mixing.laws(params), bands, nodes=self.nodes)
         model = sum(seen.values()) * self.mixing.factors(bands, params)[:, None, None]
@@ -133,60 +144,8 @@ class PixelLikelihood(SkyLikelihood):
         model = model + self.offset(params)[..., None]
         if self.rows is None:
             return ((self.data - model) * self.root_weights).ravel()
-        products = jnp.einsum("brsp,bsp->br", self.rows, self.data - model)
+        products = total(jnp.einsum("brsp,bsp->br", self.rows, self.data - model))
         return jnp.asarray(self.whitening) @ products.ravel()
-
-
-@partial(jax.jit, static_argnames="chunk")
-def gram(
-    data: Float[Array, "band stokes pix"],
-    templates: Float[Array, "template stokes pix"],
-    weights: Float[Array, "band stokes pix"],
-    chunk: int = CHUNK,
-) -> Float[Array, "band stokes row row"]:
-    """Return weighted inner products of (data, templates, 1), per band and Stokes parameter.
-
-    After this one pass over the pixels, a fit with constant laws does not depend on their number:
-    a model is a sum of templates, so chi^2 is a quadratic form in their coefficients.
-    Weights are 1/sigma^2, zero where masked, and broadcast against the data; `chunk` pixels are
-    taken at once. Results for disjoint sets of pixels add up to that of their union.
-    """
-    bands, _, npix = data.shape
-    weights = jnp.broadcast_to(weights, data.shape)
-
-    def products(d, t, w):
-        t = jnp.broadcast_to(t, (bands, *t.shape)).swapaxes(1, 2)
-        rows = jnp.concatenate([d[:, :, None], t, jnp.ones_like(d)[:, :, None]], axis=2)
-        # A masked pixel may contain anything, even NaN.
-        rows = jnp.where(w[:, :, None] > 0, rows, 0)
-        return jnp.einsum("bsip,bsp,bsjp->bsij", rows, w, rows)
-
-    chunk = min(chunk, npix)
-    whole = npix // chunk * chunk
-
-    def add(total, start):
-        def cut(x):
-            return jax.lax.dynamic_slice_in_dim(x, start, chunk, axis=-1)
-
-        return total + products(cut(data), cut(templates), cut(weights)), None
-
-    total = products(data[..., whole:], templates[..., whole:], weights[..., whole:])
-    return jax.lax.scan(add, total, jnp.arange(0, whole, chunk))[0]
-
-
-def _checked_weights(data: Array, sigma: Array) -> tuple[Array, Int[np.ndarray, "band stokes"]]:
-    """Return 1/sigma^2 of all data, and how many are not masked per band and Stokes parameter."""
-    weights, used, wrong, unseen = _weights(data, sigma)
-    if wrong:
-        raise ValueError(f"Argument `sigma` has {wrong} of {sigma.size} values that are not > 0.")
-    if unseen:
-        raise ValueError(
-            f"Argument `data` has {unseen} values that are not finite (or UNSEEN) in pixels that "
-            "are used; mask them with an infinite `sigma`."
-        )
-    if not used.any():
-        raise ValueError("No pixel is left: the mask, or an infinite `sigma`, covers the map.")
-    return weights, np.asarray(used)
 
 
 def likelihood(
@@ -236,14 +195,15 @@ def likelihood(
     """
     check_double("fits")
     bands = named_bands(bands)
-    data, sigma = as_array("data", data), as_array("sigma", sigma)
+    data, sigma = typed((as_array("data", data), as_array("sigma", sigma)))
+    sky, sigma = along(data, (sky, sigma))
     shape = (len(bands), *sky.shape)
     form = f"(band, stokes, pix) = {shape}"
     check_shape("data", data, data.shape == shape, f"have shape {form}")
     pairs = zip(sigma.shape[::-1], shape[::-1], strict=False)
     broadcasts = sigma.ndim <= len(shape) and all(n in (1, size) for n, size in pairs)
     check_shape("sigma", sigma, broadcasts, f"broadcast to {form}")
-    weights, counts = _checked_weights(data, sigma)
+    weights, counts = checked_weights(data, sigma)
     labels = "QU" if len(data[0]) == 2 else "IQU"
     stokes = labels if stokes is None else stokes
     if not stokes or set(stokes) - set(labels):
@@ -270,7 +230,7 @@ def likelihood(
     mixing = dataclasses.replace(mixing, sky=unit_sky(sky, len(labels)))
     templates = jnp.stack([c.amplitude for c in sky.components.values()])
     if angles:
-        templates = jnp.concatenate([templates, _swapped(templates)])
+        templates = jnp.concatenate([templates, swapped(templates)])
     products = np.asarray(gram(data, templates, weights))
     values = int(counts[:, keep].sum())
     like = TemplateLikelihood(
@@ -281,7 +241,7 @@ def likelihood(
         return dataclasses.replace(like, matrix=matrix)
     # A constant row tells offsets from templates.
     maps = [*templates, *([jnp.ones_like(templates[0])] if offsets else [])]
-    rows = _one_stokes_each(jnp.stack(maps), weights)
+    rows = one_stokes_each(jnp.stack(maps), weights)
     used = slice(1, len(maps) + 1)
     if covariance_of is not None:
         covariance = np.asarray(covariance_of(rows))
@@ -306,20 +266,6 @@ def likelihood(
     return dataclasses.replace(like, matrix=jnp.concatenate([matrix, unexplained]))
 
 
-def _swapped(maps: Float[Array, "*maps stokes x"]) -> Float[Array, "*maps stokes x"]:
-    """Exchange Q and U; in place of I, which no angle changes, put any other."""
-    return maps[..., [-2, -1, -2][-maps.shape[-2] :], :]
-
-
-@jax.jit
-def _weights(data, sigma):
-    """Return 1/sigma^2 of all data, and counts of used data, bad sigma and bad data."""
-    weights = jnp.broadcast_to(1 / sigma**2, data.shape)
-    used = weights > 0
-    unseen = used & (~jnp.isfinite(data) | (data < UNSEEN))
-    return weights, used.sum(axis=-1), jnp.sum(~(sigma > 0)), unseen.sum()
-
-
 def _matrix(blocks, keep, stokes, whitening=None):
     """Put blocks (band, kept stokes, row, vector) on the diagonal of a matrix for all Stokes."""
     bands, kept, rows, size = blocks.shape
@@ -329,17 +275,6 @@ def _matrix(blocks, keep, stokes, whitening=None):
     full = np.zeros((len(matrix), bands, stokes, size))
     full[:, :, keep] = matrix.reshape(-1, bands, kept, size)
     return jnp.asarray(full.reshape(len(matrix), -1))
-
-
-@jax.jit
-def _one_stokes_each(
-    maps: Float[Array, "*band template stokes pix"], weights: Float[Array, "band stokes pix"]
-) -> Float[Array, "band row stokes pix"]:
-    """Return rows W T of each band and map, zero where masked, each of one Stokes parameter."""
-    rows = weights[:, None] * jnp.where(weights[:, None] > 0, maps, 0)
-    bands, templates, stokes, npix = rows.shape
-    split = jnp.eye(stokes)[None, :, None, :, None] * rows[:, None]
-    return split.reshape(bands, stokes * templates, stokes, npix)
 
 
 def _of_kept(
@@ -375,7 +310,8 @@ def _on_pixels(like, data, weights, keep, covariance_of):
     """Return a likelihood on pixels; its rows are the components' maps at the start values."""
     mixing, params = like.mixing, like.start
     at_start = mixing.laws({n: value for n, value in params.items() if n.endswith(OFFSET)})
-    used = jnp.zeros_like(weights).at[:, keep].set(weights[:, keep])
+    kept = np.isin(np.arange(len(like.stokes)), keep)[:, None]
+    used = jnp.where(kept, weights, 0)
     data = jnp.where(used > 0, data, 0)
     # Two spare nodes: a shift of a map moves its range, hardly its width.
     plan = interpolation_nodes(at_start, mixing.bandpasses, 1e-10)
@@ -385,10 +321,10 @@ def _on_pixels(like, data, weights, keep, covariance_of):
     if covariance_of is not None:
         maps = list(observe_components(at_start, mixing.bandpasses, nodes=nodes).values())
         if like.angles:
-            maps += [_swapped(one) for one in maps]
+            maps += [swapped(one) for one in maps]
         if any(name.startswith("offset.") for name in params):
             maps.append(jnp.ones_like(data))
-        rows = _one_stokes_each(jnp.stack(maps, axis=1), weights)
+        rows = one_stokes_each(jnp.stack(maps, axis=1), weights)
         covariance = _of_kept(np.asarray(covariance_of(rows)), rows, keep)
         whitening = jnp.asarray(_whitening(covariance))
         kept = (keep[:, None] * len(maps) + np.arange(len(maps))).ravel()

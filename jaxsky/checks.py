@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxsky.mesh import spread
 from jaxsky.public import refuse_unit, takes_quantities
 
 #: Arguments of the spectral laws: numbers or arrays that broadcast.
@@ -55,12 +56,17 @@ def check_shape(name: str, array: Array | np.ndarray, good: bool, form: str) -> 
 UNSEEN = -1.6e30
 
 
+def looked_at(value: Any) -> tuple[Any, Any]:
+    """Return numbers to look at, and the module for it; distributed ones stay where they are."""
+    return (value, jnp) if spread(value) else (np.asarray(value), np)
+
+
 def check_finite(name: str, value: Array | np.ndarray) -> None:
     """Raise ValueError if a concrete array has NaN, infinite or UNSEEN values, and count them."""
     if not is_concrete(value):
         return
-    numbers = np.asarray(value)
-    if bad := int(np.sum(~np.isfinite(numbers) | (numbers < UNSEEN))):
+    numbers, xp = looked_at(value)
+    if bad := int(xp.sum(~xp.isfinite(numbers) | (numbers < UNSEEN))):
         raise ValueError(
             f"Argument `{name}` has {bad} of {value.size} values that are not finite (or UNSEEN)."
         )
@@ -69,7 +75,7 @@ def check_finite(name: str, value: Array | np.ndarray) -> None:
 def check_positive(name: str, value: Array | np.ndarray) -> None:
     """Raise ValueError if a concrete array has values that are not finite and positive."""
     check_finite(name, value)
-    if is_concrete(value) and not np.all(np.asarray(value) > 0):
+    if is_concrete(value) and not (looked_at(value)[0] > 0).all():
         raise ValueError(
             f"Argument `{name}` must be positive, but its smallest value is {float(value.min()):g}."
         )
@@ -169,6 +175,8 @@ def shown(value: Any, unit: str = "") -> str:
         return ", ".join(shown(one, unit) for one in value)
     if not is_concrete(value):
         return f"unknown while JAX traces, shape {np.shape(value)}"
+    if spread(value):
+        return f"map over {len(value.sharding.device_set)} devices"
     if np.ndim(value):
         low, middle, high = np.percentile(value, [0, 50, 100])
         return f"map from {shown(low)} to {shown(high, unit)}, median {middle:.5g}"

@@ -21,6 +21,7 @@ from numpy.polynomial.chebyshev import chebpts1, chebvander
 from jaxsky.bandpass import Bandpass, Samples, average, stack_bands
 from jaxsky.checks import is_concrete
 from jaxsky.components import Component
+from jaxsky.mesh import SUMS, extremes, over_pixels
 
 
 class NodeCounts(NamedTuple):
@@ -80,7 +81,7 @@ def _split(component: Component) -> tuple[list[Array], Callable[..., Component]]
 
 def _range(values: Array) -> tuple[Array, Array]:
     """Return the middle and half-width of the values; a constant map gets a small width."""
-    low, high = jax.lax.stop_gradient((values.min(), values.max()))
+    low, high = extremes(*jax.lax.stop_gradient((values.min(), values.max())))
     middle = (low + high) / 2
     # Wide enough that the slope of the series is not lost in the rounding of its values.
     least = float(jnp.finfo(values.dtype).eps) ** (1 / 3)
@@ -88,6 +89,7 @@ def _range(values: Array) -> tuple[Array, Array]:
 
 
 @jax.jit
+@over_pixels(SUMS)
 def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
     """Bound the relative error of a series cut at each length, for each map, over all bands.
 

@@ -12,6 +12,7 @@ from jaxsky.bandpass import Bandpass
 from jaxsky.checks import Printed, as_array, check_names
 from jaxsky.components import Component, check_value, declared
 from jaxsky.interpolation import Nodes, band_sed, choose_nodes
+from jaxsky.mesh import maps_of, over_pixels, typed
 
 
 class Sky(Printed, eqx.Module):
@@ -125,13 +126,18 @@ def _emission(
 @partial(jax.jit, static_argnames=("plan", "apart"))
 def _observe(sky, bands, plan, apart):
     """Return the maps of all components together, or of each separately."""
-    emissions = {
-        name: _emission(component, bands, nodes)
-        for (name, component), nodes in zip(sky.components.items(), plan, strict=True)
-    }
-    if apart:
-        return {name: jnp.stack(maps) for name, maps in emissions.items()}
-    return jnp.stack([sum(maps) for maps in zip(*emissions.values(), strict=True)])
+
+    @over_pixels(maps_of(3))
+    def observed(sky, bands):
+        emissions = {
+            name: _emission(component, bands, nodes)
+            for (name, component), nodes in zip(sky.components.items(), plan, strict=True)
+        }
+        if apart:
+            return {name: jnp.stack(maps) for name, maps in emissions.items()}
+        return jnp.stack([sum(maps) for maps in zip(*emissions.values(), strict=True)])
+
+    return observed(sky, bands)
 
 
 def observe(
@@ -162,7 +168,7 @@ def observe(
     TypeError, ValueError
         If `sky` is no Sky, or `bands` is not a list of at least one Bandpass.
     """
-    bands = _check_bands(sky, bands)
+    sky, bands = typed(sky), _check_bands(sky, bands)
     return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance), False)
 
 
@@ -181,7 +187,7 @@ def observe_components(
     nodes: tuple[Nodes, ...] | None = None,
 ) -> dict[str, Float[Array, "band stokes pix"]]:
     """Observe each component separately [uK_RJ]; see `observe`."""
-    bands = _check_bands(sky, bands)
+    sky, bands = typed(sky), _check_bands(sky, bands)
     return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance), True)
 
 

@@ -16,7 +16,8 @@ from fits.compress import square_root
 from fits.mixing import NOMINAL
 from fits.optimize import best_fit
 from fits.posterior import Gaussian, chi2
-from fits.template_likelihood import gram, likelihood
+from fits.products import gram
+from fits.template_likelihood import likelihood
 from jaxsky import (
     AME,
     Bandpass,

@@ -16,8 +16,8 @@ from fits.common import Fluctuations, common_maps
 from fits.inputs import Band, Inputs, TemplateNoise, level_spectrum, read_band
 from fits.plots import label
 from fits.posterior import chi2
+from fits.products import gram, one_stokes_each
 from fits.spectral_index import fit_regions, known_truth
-from fits.template_likelihood import _one_stokes_each, gram
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, inputs, observe
 from jaxsky.harmonics import Preparation, alm_ell, gaussian_beam, resample, synthesis
 from jaxsky.inputs import Template
@@ -252,7 +252,7 @@ def test_noise_of_templates_in_products_and_their_covariance():
     made = common_maps(inputs_of(sky, bands, noises), NSIDE, 0.0)
     errors, weights = made.template_errors, 1 / np.asarray(made.sigma) ** 2
     templates = jnp.stack([c.amplitude for c in sky.components.values()])
-    rows = _one_stokes_each(templates, weights)
+    rows = one_stokes_each(templates, weights)
     coefficients = np.random.default_rng(1).normal(size=(2, 4, 2))
     coefficients[:, :2], coefficients[:, 2:] = coefficients[:, :1], coefficients[:, 2:3]
     window = jnp.sqrt(noises["dust"].correlated)[alm_ell(4 * NSIDE)]

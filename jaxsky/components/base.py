@@ -19,8 +19,10 @@ from jaxsky.checks import (
     check_positive,
     check_shape,
     is_concrete,
+    looked_at,
     shown,
 )
+from jaxsky.mesh import spread
 
 #: Components by the name of their law, or "module:Class"; filled as classes are defined.
 _LAWS: dict[str, type["Component"]] = {}
@@ -149,7 +151,7 @@ class Component(Printed, eqx.Module):
     def summary(self):
         stokes, npix = self.amplitude.shape
         maps = f"{'I, Q, U' if stokes == 3 else 'Q, U'} in {npix} pixels"
-        if is_concrete(self.amplitude):
+        if is_concrete(self.amplitude) and not spread(self.amplitude):
             rms = np.sqrt(np.mean(np.square(self.amplitude[-2:])))
             maps = f"{maps}, rms {rms:.4g} {self.unit}"
         rows = [("amplitude", maps)]
@@ -195,9 +197,11 @@ def check_value(name: str, value: Array, metadata: Mapping[str, Any]) -> None:
     within = metadata.get("within")
     if within is None or not is_concrete(value):
         return
-    (low, high), middle = within, float(np.median(value))
+    # A median of distributed pixels would gather them.
+    kind = "mean" if spread(value) else "median"
+    (low, high), middle = within, float(getattr(looked_at(value)[1], kind)(value))
     if not low <= middle <= high:
-        what = "is" if value.ndim == 0 else "its median is"
+        what = "is" if value.ndim == 0 else f"its {kind} is"
         raise ValueError(
             f"Argument `{name}` must be from {low:g} to {high:g}, but {what} {middle:g}; "
             f"{metadata['hint']}."

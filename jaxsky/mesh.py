@@ -1,0 +1,207 @@
+"""Pixels shared out over devices, of one process or of several, and passes over them.
+
+Maps are distributed over a mesh of devices with the axis "pix", and the types of arrays say so; a
+pass over pixels is marked with `over_pixels`, and ends in sums over the devices. Arrays that are
+not distributed pass through unchanged.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, Final, TypeVar
+
+import jax
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array
+
+from jaxsky.public import refuse_unit
+
+#: Name of the axis of devices that share the pixels.
+PIX: Final = "pix"
+#: Results of passes: sums over all pixels, and maps whose last axis are pixels.
+SUMS: Final = PartitionSpec()
+
+Tree = TypeVar("Tree")
+
+
+def maps_of(axes: int) -> PartitionSpec:
+    """Return how arrays with this number of axes are distributed if the last one are pixels."""
+    return PartitionSpec(*[None] * (axes - 1), PIX)
+
+
+def pixel_mesh() -> Mesh:
+    """Return the mesh of all devices of all processes, with the axis "pix"."""
+    return _mesh_over(np.array(jax.devices()))
+
+
+def _mesh_over(devices: np.ndarray) -> Mesh:
+    return Mesh(devices.ravel(), (PIX,), axis_types=(AxisType.Explicit,))
+
+
+def distribute(
+    maps: Any,
+    mesh: Mesh | None = None,
+    *,
+    shape: tuple[int, ...] | None = None,
+    dtype: Any = float,
+    fill: float | None = None,
+) -> Array:
+    """Distribute maps over the devices of a mesh; each process supplies its own pixels only.
+
+    Devices have as many pixels each. If that does not divide the pixels, the last ones are padded:
+    give the padding no weight by `fill=np.inf` for standard deviations.
+
+    Parameters
+    ----------
+    maps : array (..., pix), or a function that returns the pixels of a slice, (..., pixels), to
+        read or make no more than a process needs
+    mesh : by default `pixel_mesh()`
+    shape : shape (..., pix) of all maps, if `maps` is a function
+    dtype : type of the numbers, if `maps` is a function
+    fill : value of the padding; by default that of the last pixel, which keeps maps of parameters
+        within their range
+
+    Returns
+    -------
+    Distributed maps, of shape (..., pix) with padding.
+
+    Raises
+    ------
+    TypeError
+        If `maps` is a function, and there is no `shape`.
+    ValueError
+        If the mesh has more devices than there are pixels.
+
+    Examples
+    --------
+    >>> distribute(np.ones((2, 48))).shape
+    (2, 48)
+    """
+    refuse_unit("maps", maps)
+    mesh = pixel_mesh() if mesh is None else mesh
+    if callable(maps):
+        if shape is None:
+            raise TypeError("Argument `shape` is missing: `maps` is a function.")
+        read: Callable[[slice], Any] = maps
+    else:
+        array = np.asarray(maps)
+        shape, dtype, read = array.shape, array.dtype, lambda pixels: array[..., pixels]
+    *rows, npix = shape
+    if mesh.size > npix:
+        raise ValueError(
+            f"Argument `mesh` has {mesh.size} devices for {npix} pixels; take one with fewer."
+        )
+
+    def part(index: Any) -> np.ndarray:
+        """Return the pixels of a device, padded."""
+        start, stop, _ = index[-1].indices(padded)
+        found = np.asarray(read(slice(min(start, npix - 1), min(stop, npix))), dtype)
+        last = found[..., -1:] if fill is None else np.full_like(found[..., -1:], fill)
+        missing = max(0, stop - max(start, npix))
+        kept = found if start < npix else found[..., :0]
+        return np.concatenate([kept, np.repeat(last, missing, axis=-1)], -1) if missing else found
+
+    padded = -(-npix // mesh.size) * mesh.size
+    sharding = NamedSharding(mesh, maps_of(len(shape)))
+    return jax.make_array_from_callback((*rows, padded), sharding, part)
+
+
+def spread(value: Any) -> bool:
+    """Return whether an array lies on several devices."""
+    traced = isinstance(value, jax.core.Tracer)
+    return isinstance(value, jax.Array) and not traced and len(value.sharding.device_set) > 1
+
+
+def mesh_of(tree: Any) -> Any:
+    """Return the mesh over which arrays are distributed by their types, None if none is."""
+    for leaf in jax.tree.leaves(tree):
+        if isinstance(leaf, jax.Array):
+            traced = isinstance(leaf, jax.core.Tracer)
+            sharding: Any = jax.typeof(leaf).sharding if traced else leaf.sharding
+            mesh = getattr(sharding, "mesh", None)
+            if mesh is not None and PIX in mesh.explicit_axes:
+                return mesh
+    return None
+
+
+def typed(tree: Tree) -> Tree:
+    """Return arrays with what is distributed in their types, without a copy.
+
+    So are those on meshes with automatic axes, or with axes of other names, made alike. Unchanged
+    while something is traced: then XLA distributes the work.
+    """
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)):
+        return tree
+
+    def one(leaf: Any) -> Any:
+        sharding: Any = leaf.sharding if spread(leaf) and mesh_of(leaf) is None else None
+        if not isinstance(sharding, NamedSharding):
+            return leaf
+        axes = tuple(sharding.spec)
+        shared = bool(axes) and len(axes) == leaf.ndim and axes[-1] is not None
+        mesh = _mesh_over(np.array(sharding.mesh.devices))
+        return jax.device_put(leaf, NamedSharding(mesh, maps_of(leaf.ndim) if shared else SUMS))
+
+    return jax.tree.map(one, tree)
+
+
+def along(data: Any, tree: Tree) -> Tree:
+    """Return arrays with as many pixels as distributed data, distributed like them.
+
+    Unchanged if the data are not distributed.
+    """
+    mesh = mesh_of(data)
+    if mesh is None:
+        return tree
+
+    def one(leaf: Any) -> Any:
+        if np.shape(leaf)[-1:] != data.shape[-1:] or spread(leaf):
+            return leaf
+        return distribute(leaf, mesh)
+
+    return jax.tree.map(one, typed(tree))
+
+
+def _inside() -> bool:
+    """Return whether a pass over distributed pixels is being traced."""
+    return PIX in jax.sharding.get_abstract_mesh().manual_axes
+
+
+def total(value: Any) -> Any:
+    """Return sums over the pixels of a device, summed over devices; to be used in a pass."""
+    return jax.lax.psum(value, PIX) if _inside() else value
+
+
+def extremes(low: Array, high: Array) -> tuple[Array, Array]:
+    """Return the least and greatest values of all devices; to be used in a pass."""
+    return (jax.lax.pmin(low, PIX), jax.lax.pmax(high, PIX)) if _inside() else (low, high)
+
+
+def of_own(value: Array) -> Array:
+    """Return a parameter whose derivatives are those of a device's own pixels; for a pass."""
+    return jax.lax.pcast(value, PIX, to="varying") if _inside() else value
+
+
+def over_pixels(out: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Mark a function as a pass over pixels of its positional arguments, which may be distributed.
+
+    Each device then runs it on its own pixels, and nothing is exchanged but what the function asks
+    for by `total` and `extremes`. For other arrays, and inside of another pass, it is unchanged.
+
+    Parameters
+    ----------
+    out : `SUMS` or `maps_of(axes)`, for all results or for each of them
+    """
+
+    def marked(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def passed(*args: Any, **options: Any) -> Any:
+            mesh = None if _inside() else mesh_of(args)
+            if mesh is None:
+                return function(*args, **options)
+            own = functools.partial(function, **options)
+            return jax.shard_map(own, mesh=mesh, out_specs=out)(*args)
+
+        return passed
+
+    return marked

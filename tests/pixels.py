@@ -1,0 +1,84 @@
+"""Skies, data and noise whose pixels may be distributed, and all that is found from them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.multihost_utils import process_allgather
+
+from fits.optimize import best_fit
+from fits.posterior import chi2
+from fits.products import gram
+from fits.template_likelihood import likelihood
+from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe, observe_components
+
+BANDS = {
+    "30": Bandpass.top_hat(30.0, 8.0, samples=9),
+    "44": Bandpass.top_hat(44.0, 10.0, samples=11),
+    "70": Bandpass(np.linspace(63.0, 77.0, 15), np.hanning(17)[1:-1], "power"),
+    "143": Bandpass.top_hat(143.0, 40.0, samples=15),
+    "217": Bandpass.top_hat(217.0, 60.0, samples=15),
+}
+START = {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}
+
+#: Maps, and the value of their padding, to maps that are distributed or as they were.
+Place = Callable[..., Any]
+
+
+def sky_of(npix: int, varying: bool) -> Sky:
+    """Dust and synchrotron; `varying` indices are maps."""
+    rng = np.random.default_rng(1)
+    dust, synchrotron = 10 * rng.normal(size=(2, 2, npix))
+    beta = 1.53 + 0.02 * rng.uniform(-1, 1, npix) if varying else 1.53
+    return Sky({"dust": Dust(dust, beta, 21.0), "synchrotron": Synchrotron(synchrotron, 3.1)})
+
+
+def placed(sky: Sky, place: Place) -> Sky:
+    """The sky with its maps in their place."""
+    return jax.tree.map(lambda leaf: place(np.asarray(leaf)) if leaf.ndim else leaf, sky)
+
+
+def data_of(npix: int, varying: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Maps in the bands, and standard deviations, infinite in some pixels."""
+    rng = np.random.default_rng(2)
+    maps = np.asarray(observe(sky_of(npix, varying), list(BANDS.values())))
+    sigma = rng.uniform(0.5, 1.5, maps.shape)
+    sigma[:, :, rng.uniform(size=npix) < 0.1] = np.inf
+    noise = rng.normal(size=maps.shape)
+    return maps + np.where(np.isfinite(sigma), sigma, 1.0) * noise, sigma
+
+
+def whole(maps: Any, npix: int) -> np.ndarray:
+    """All pixels of maps without their padding, from all processes."""
+    gathered = maps if jax.process_count() == 1 else process_allgather(maps, tiled=True)
+    return np.asarray(gathered)[..., :npix]
+
+
+#: Few bands are enough for templates, and are compiled sooner.
+FEW = {name: BANDS[name] for name in ("44", "70")}
+
+
+def of_templates(npix: int, place: Place, varying: bool) -> dict[str, np.ndarray]:
+    """What the model and the likelihood of templates say."""
+    sky = placed(sky_of(npix, varying), place)
+    data, sigma = (maps[1:3] for maps in data_of(npix, varying))
+    data, sigma = place(data), place(sigma, np.inf)
+    bands = list(FEW.values())
+    found = {"maps": whole(observe(sky, bands), npix)}
+    for name, maps in observe_components(sky, bands).items():
+        found[f"maps of {name}"] = whole(maps, npix)
+    suffix = ".offset" if varying else ""
+    start = {f"dust.beta_dust{suffix}": 0.05 if varying else 1.6, "offset.70.Q": 0.0}
+    like = likelihood(sky, FEW, data, sigma, start)
+    found["chi2"] = np.asarray(chi2(like, start))
+    fit = best_fit(like, throw=False)
+    names = sorted(start)
+    found |= {"sigma": np.array([fit.sigma[n] for n in names]), "dof": np.array(fit.dof)}
+    found["best fit in sigma"] = np.array([fit.best_fit[n] / fit.sigma[n] for n in names])
+    if not varying:
+        templates = jnp.stack([sky[name].amplitude for name in sky])
+        weights = jnp.where(jnp.isfinite(sigma), 1 / sigma**2, 0)
+        found["inner products"] = np.asarray(gram(data, templates, weights))
+    return found

@@ -3,8 +3,7 @@
 A command is declared here; its module in `fits.commands` is imported when it runs.
 """
 
-import contextlib
-import ctypes
+import inspect
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -19,10 +18,8 @@ from fits.commands.data import data_commands
 from fits.commands.report import print_written
 from fits.commands.run import DEFAULTS, Command, interruptible, print_error, run_command
 from jaxsky.io.files import cache_folder
-from jaxsky.programs import keep_programs
+from jaxsky.programs import keep_programs, return_memory
 
-#: Parameters of glibc's mallopt: M_ARENA_MAX, M_MMAP_THRESHOLD.
-MALLOC = {-8: 1, -3: 8 * 2**20}
 #: The experiment file with all keys, commented.
 TEMPLATE = "experiment"
 #: What `jaxsky simulate` may be restricted to.
@@ -44,6 +41,13 @@ Values = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Any key of the file; repeatable."),
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Keep what is in --out, and go on with it.")]
+Workers = Annotated[
+    str | None,
+    typer.Option(
+        metavar="N|tcp://HOST:PORT",
+        help="Make realisations in N processes, or on the workers of a Dask scheduler.",
+    ),
+]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace the results that are in --out.")
 ]
@@ -97,6 +101,7 @@ def _simulate(
         str | None, typer.Option(help=f"Simulate one thing only: {', '.join(ONLY)}.")
     ] = None,
     values: Values = None,
+    workers: Workers = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -106,8 +111,16 @@ def _simulate(
     if only is not None and only not in ONLY:
         raise ValueError(f"--only must be one of {', '.join(ONLY)}, not {only!r}.")
     command = Command("simulate", partial(make_realisations, only=only))
-    part = range(first, first + nsims)
-    run_command(command, settings_file, out, values, resume=resume, overwrite=overwrite, part=part)
+    run_command(
+        command,
+        settings_file,
+        out,
+        values,
+        resume=resume,
+        overwrite=overwrite,
+        part=range(first, first + nsims),
+        workers=workers,
+    )
 
 
 def _analysis(name: str) -> Callable[..., None]:
@@ -123,14 +136,25 @@ def _analysis(name: str) -> Callable[..., None]:
             ),
         ] = None,
         values: Values = None,
+        workers: Workers = None,
         resume: Resume = False,
         overwrite: Overwrite = False,
     ) -> None:
-        named = import_module(f"fits.commands.{name}").COMMAND
         run_command(
-            named, settings_file, out, values, resume=resume, overwrite=overwrite, maps=maps
+            import_module(f"fits.commands.{name}").COMMAND,
+            settings_file,
+            out,
+            values,
+            resume=resume,
+            overwrite=overwrite,
+            maps=maps,
+            workers=workers,
         )
 
+    if name == "fit":  # it has no realisations
+        given = inspect.signature(command)
+        kept = [one for one in given.parameters.values() if one.name != "workers"]
+        command.__signature__ = given.replace(parameters=kept)  # type: ignore[attr-defined]
     return command
 
 
@@ -160,6 +184,7 @@ def _paper(
         typer.Option(help="A figure by its number, or 'table 1'; repeatable. Default all."),
     ] = None,
     values: Values = None,
+    workers: Workers = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -167,28 +192,23 @@ def _paper(
     from fits.commands.paper import KEPT, report_figures
 
     command = Command("paper", partial(report_figures, only=only or ()), (KEPT,))
-    run_command(command, settings_file, out, values, resume=resume, overwrite=overwrite)
+    run_command(
+        command,
+        settings_file,
+        out,
+        values,
+        resume=resume,
+        overwrite=overwrite,
+        workers=workers,
+    )
 
 
 app.add_typer(data_commands, name="data")
 
 
-def _return_memory() -> None:
-    """Make glibc return freed memory to the system.
-
-    JAX computes in threads, and glibc gives each a heap that keeps freed memory, including maps of
-    up to 32 MiB: a third of all memory in use. So all threads share one heap, and large arrays are
-    allocated outside it.
-    """
-    with contextlib.suppress(OSError, AttributeError):  # other systems have other ways
-        mallopt = ctypes.CDLL(None).mallopt
-        for parameter, value in MALLOC.items():
-            mallopt(parameter, value)
-
-
 def main() -> None:
     """Run the command line in double precision; an error is one sentence and exit code 2."""
-    _return_memory()
+    return_memory()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # what a terminal's encoding lacks is replaced
             stream.reconfigure(errors="replace")

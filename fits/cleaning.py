@@ -7,6 +7,8 @@ those parameters, so that residual foregrounds appear with the noise that caused
 """
 
 from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,7 +61,9 @@ class Response:
         params: Mapping[str, Numeric],
         priors: Mapping[str, Prior] | None = None,
     ) -> None:
-        self._posterior = posterior = Posterior(like, priors)
+        posterior = Posterior(like, priors)
+        # Without the likelihood, which is large, since workers are sent this.
+        self._priors, self._low, self._high = posterior.priors, posterior.low, posterior.high
         self.theta = np.array(like.flat(like.check(params)))
         self._keep = np.flatnonzero(posterior.present & ~posterior.edges(self.theta))
         hessian = posterior.derivatives(self.theta).hessian
@@ -74,12 +78,12 @@ class Response:
         """
         gradient = np.array(value_and_gradient(like, self.theta)[1])
         draws = np.asarray(jax.random.normal(key, gradient.shape))
-        for prior, where in self._posterior.priors:
+        for prior, where in self._priors:
             assert isinstance(prior, Gaussian)  # the only prior that is not a bound
             gradient += np.where(where, draws / prior.sigma, 0.0)
         theta = self.theta.copy()
         theta[self._keep] -= self._factor.solve(gradient[self._keep])
-        return np.clip(theta, self._posterior.low, self._posterior.high)
+        return np.clip(theta, self._low, self._high)
 
 
 def widened(
@@ -169,11 +173,13 @@ def separate_data(
     data: PixelData | FullSkyData,
     out: Path | None = None,
     progress: Progress = QUIET,
+    executor: Executor | None = None,
 ) -> Separation:
     """Fit the laws, separate the components, and measure r.
 
     `data` are from `fits.separated_data.separation_data`, and `out` is the folder for simulations
-    and chains; what it contains is not made again.
+    and chains; what it contains is not made again. `executor` makes the simulations, by default
+    this process; see `kept_realisations`.
     """
     check_double("A separation")
     spec, priors = settings.separate, priors_of(settings, "separate")
@@ -201,7 +207,7 @@ def separate_data(
     foregrounds[row] = 0.0
     emission = data.emission(like, best, foregrounds)
     path = None if out is None else out / "simulations.npz"
-    kept = spec.nsims, settings.seed, path, _mark(settings, data), progress.advance
+    kept = spec.nsims, settings.seed, path, _mark(settings, data), progress.advance, executor
     simulated = simulated_noise(data, like, response, emission, spectra, window, lensed, *kept)
     progress.step("tensor-to-scalar ratio")
     # The model has the mean E in B that the windows know of; only the rest is added.
@@ -254,6 +260,33 @@ def cleaned_cmb(
     return maps[found.components.index("cmb")]
 
 
+@dataclass(frozen=True)
+class _NoiseSimulation:
+    """A simulation as a function of its key, see `simulated_noise`."""
+
+    data: PixelData | FullSkyData
+    like: SpectralLikelihood
+    response: Response
+    emission: Float[np.ndarray, "band stokes _"]
+    spectra: MaskedSpectra
+    window: Float[np.ndarray, " ell"]
+    lensed: Float[np.ndarray, "4 ell"]
+
+    def __call__(self, key: Array) -> list[np.ndarray]:
+        data, like, spectra, theta = self.data, self.like, self.spectra, self.response.theta
+        noise = data.noise_realisation(key)
+        observed = self.emission + noise
+        moved = self.response.moved(data.likelihood(observed), stream(key, "priors"))
+        alone = cleaned_cmb(data, like, like.named(jnp.asarray(theta)), noise)
+        both = cleaned_cmb(data, like, like.named(jnp.asarray(moved)), observed)
+        nside = healpy.npix2nside(both.shape[-1])
+        alm = realisation(stream(key, "cmb"), self.lensed) * expand(jnp.asarray(self.window))
+        sky, E = synthesis(alm, nside), synthesis(alm.at[1].set(0.0), nside)
+        every = (alone, both - alone, both, both + sky, E)
+        powers = [band_powers(spectra, jnp.asarray(maps))[1] for maps in every]
+        return [moved - theta, *powers, mean_spectrum(spectra.mask, both, spectra.lmax)]
+
+
 def simulated_noise(
     data: PixelData | FullSkyData,
     like: SpectralLikelihood,
@@ -269,21 +302,7 @@ def simulated_noise(
     `response` is that of the best fit to noise, `emission` the foregrounds in the bands, `window`
     the beam of the maps, and `lensed` C_l of a CMB without tensors up to its end [uK_CMB^2].
     """
-    best = like.named(jnp.asarray(response.theta))
-
-    def make(key: Array) -> list[np.ndarray]:
-        noise = data.noise_realisation(key)
-        observed = emission + noise
-        moved = response.moved(data.likelihood(observed), stream(key, "priors"))
-        alone = cleaned_cmb(data, like, best, noise)
-        both = cleaned_cmb(data, like, like.named(jnp.asarray(moved)), observed)
-        nside = healpy.npix2nside(both.shape[-1])
-        alm = realisation(stream(key, "cmb"), lensed) * expand(jnp.asarray(window))
-        sky, E = synthesis(alm, nside), synthesis(alm.at[1].set(0.0), nside)
-        every = (alone, both - alone, both, both + sky, E)
-        powers = [band_powers(spectra, jnp.asarray(maps))[1] for maps in every]
-        return [moved - response.theta, *powers, mean_spectrum(spectra.mask, both, spectra.lmax)]
-
+    make = _NoiseSimulation(data, like, response, emission, spectra, window, lensed)
     return kept_realisations(make, SimulatedNoise, *kept)
 
 

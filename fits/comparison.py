@@ -8,6 +8,8 @@ are compared in the same way with those of the complete model.
 import itertools
 import math
 from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -17,7 +19,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Array, Bool, Float
 
-from fits.common import CommonMaps
+from fits.common import CommonMaps, Fluctuations
 from fits.kept import fingerprint, kept_realisations
 from fits.pseudo_cl import (
     EDGES,
@@ -188,6 +190,7 @@ def compare(
     regions: Mapping[str, Bool[np.ndarray, " pix"]],
     simulations: Path | None = None,
     report: Callable[[int, int], None] = QUIET.advance,
+    executor: Executor | None = None,
 ) -> Comparison:
     """Compare the maps with the model of foregrounds, CMB and noise.
 
@@ -198,6 +201,7 @@ def compare(
     regions : pixels of each region
     simulations : file of realisations; those that it contains are not made again
     report : called with the number of realisations done, and of all
+    executor : makes the realisations, by default this process; see `kept_realisations`
 
     Raises
     ------
@@ -219,12 +223,33 @@ def compare(
         simulations,
         f"{fingerprint((prepared, used))} {settings.seed} {how.lmax}",
         report,
+        executor,
     )
     scatters = compare_pixels(prepared, model, used, simulated)
     spectra = []
     if prepared.used.all():
         spectra = compare_spectra(prepared, model, simulated, how.width)
     return Comparison(prepared, model, used, scatters, spectra)
+
+
+@dataclass(frozen=True)
+class _Fluctuation:
+    """Statistics of a realisation as a function of its key, see `simulated_fluctuations`."""
+
+    fluctuations: Fluctuations
+    foregrounds: Float[Array, "band 2 alm"]
+    sigma: Float[Array, "band stokes pix"]
+    inside: Bool[Array, "region pix"]
+    lmax: int
+
+    def __call__(self, key: Array) -> tuple[Array, ...]:
+        noise = self.fluctuations.noise_realisation(key)
+        cmb = self.fluctuations.cmb_realisation(key)
+        noise_alms = polarization_alms(noise, self.lmax)
+        alms = self.foregrounds + noise_alms + polarization_alms(cmb, self.lmax)
+        chi2 = _sums_of_squares((noise + cmb) / self.sigma, self.inside)
+        squares = _sums_of_squares(noise + cmb, self.inside)
+        return chi2, squares, power_spectrum(alms), power_spectrum(noise_alms)
 
 
 def simulated_fluctuations(
@@ -237,16 +262,7 @@ def simulated_fluctuations(
     """Simulate noise and CMB on top of the foregrounds; `kept` is for `kept_realisations`."""
     foregrounds = polarization_alms(model, lmax)
     inside = jnp.asarray(np.stack(list(regions.values())))
-
-    def make(key):
-        noise = prepared.fluctuations.noise_realisation(key)
-        cmb = prepared.fluctuations.cmb_realisation(key)
-        noise_alms = polarization_alms(noise, lmax)
-        spectra = power_spectrum(foregrounds + noise_alms + polarization_alms(cmb, lmax))
-        chi2 = _sums_of_squares((noise + cmb) / prepared.sigma, inside)
-        squares = _sums_of_squares(noise + cmb, inside)
-        return chi2, squares, spectra, power_spectrum(noise_alms)
-
+    make = _Fluctuation(prepared.fluctuations, foregrounds, prepared.sigma, inside, lmax)
     return kept_realisations(make, ComparisonRealisations, *kept)
 
 

@@ -31,10 +31,10 @@ from jaxsky.inputs import (
     uK_RJ_per,
 )
 from jaxsky.io import MissingFileError
-from jaxsky.montecarlo import Observed, observed_band, read_observed
 from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum, realisation_key
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import Observation, ObservedBand
+from jaxsky.observed import Observed, observed_band, read_observed
 from jaxsky.settings import (
     BandTable,
     ComponentTable,

@@ -9,7 +9,8 @@ import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -20,8 +21,10 @@ from jaxtyping import Array
 
 from jaxsky.checks import check_seed
 from jaxsky.io import InputError, whole
+from jaxsky.io.files import cache_folder
 from jaxsky.noise import realisation_key, stream
 from jaxsky.programs import QUIET
+from jaxsky.workers import realised
 
 #: Interval at which files are written [s]; they also are when a run is stopped.
 SAVED_EVERY = 10.0
@@ -98,6 +101,18 @@ class KeptChain(emcee.backends.Backend):
         self._due = now + max(self.every, 20 * (now - start))
 
 
+@dataclass(frozen=True)
+class _Realisation:
+    """A realisation as a function of its number, for workers."""
+
+    make: Callable[[Array], Sequence[Array | np.ndarray]]
+    seed: int
+
+    def __call__(self, number: int) -> list[np.ndarray]:
+        key = stream(realisation_key(self.seed, number), "realisation")  # not that of observed maps
+        return [np.asarray(x) for x in self.make(key)]
+
+
 def kept_realisations(
     make: Callable[[Array], Sequence[Array | np.ndarray]],
     kind: type[Kind],
@@ -106,12 +121,14 @@ def kept_realisations(
     path: Path | None = None,
     mark: str = "",
     report: Callable[[int, int], None] = QUIET.advance,
+    executor: Executor | None = None,
 ) -> Kind:
     """Return results of a function of a random key, stacked over realisations, as a NamedTuple.
 
     A realisation depends only on the seed and its own number. Those in the file are not made again;
     a file with another mark, which stands for all that the results depend on, is refused. `report`
-    is called with the number of realisations done, and of all.
+    is called with the number of realisations done, and of all. They are made in this process, or
+    by an executor, see `jaxsky.workers.realised`, through the folder of the file, or the cache's.
     """
     check_seed("seed", seed)
     names = kind._fields
@@ -119,12 +136,13 @@ def kept_realisations(
     done = [] if there is None else [list(row) for row in zip(*there, strict=True)]
     held, saved = len(done), time.monotonic()
 
-    def one(number: int) -> list[np.ndarray]:
-        key = stream(realisation_key(seed, number), "realisation")  # not that of observed maps
-        return [np.asarray(x) for x in make(key)]
+    one = _Realisation(make, seed)
 
     def made(numbers: range) -> Iterator[list[np.ndarray]]:
-        """Yield realisations in order, made by one thread per processor."""
+        """Yield realisations in order, made by one thread per processor, or by the executor."""
+        if executor is not None:
+            yield from realised(one, numbers, executor, path.parent if path else cache_folder())
+            return
         yield from map(one, numbers[:1])  # alone, so that each program is compiled once
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             yield from pool.map(one, numbers[1:])

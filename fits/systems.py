@@ -273,7 +273,7 @@ class Factor:
     """Factors of a symmetric matrix, if dense in blocks; `positive` if it is positive definite."""
 
     def __init__(self, matrix: np.ndarray | scipy.sparse.csc_matrix) -> None:
-        diagonal = matrix.diagonal()
+        self._matrix, diagonal = matrix, matrix.diagonal()
         self.positive = bool(np.all(diagonal > 0) and np.isfinite(diagonal).all())
         self._scale = 1 / np.sqrt(diagonal) if self.positive else np.ones_like(diagonal)
         if not self.positive:
@@ -301,6 +301,9 @@ class Factor:
             self.positive = False
             return
         self.positive = bool(np.all(self._sparse.U.diagonal() > 0))
+
+    def __reduce__(self) -> tuple[Any, ...]:  # sparse factors cannot be sent to a process
+        return Factor, (self._matrix,)
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Return the solution for one right-hand side, or for several as columns."""

@@ -1,30 +1,24 @@
-"""Simulate realisations into files, in any order and number of processes; runs can be resumed.
-
-Each file records how its map was observed, in tables of bandpass, beam, noise, leakage and truth.
-"""
+"""Simulate realisations into files, in any order and number of processes; runs can be resumed."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from astropy.io import fits as pyfits
 from jaxtyping import Array, Float
 
 import jaxsky
-from jaxsky.bandpass import Bandpass
 from jaxsky.experiment import SimulationInputs
-from jaxsky.harmonics import beam_ratio
 from jaxsky.interpolation import Terms
-from jaxsky.io import InputError, write_maps, write_text
+from jaxsky.io import write_maps, write_text
 from jaxsky.io.files import alone, check_guards
-from jaxsky.io.tables import open_fits
 from jaxsky.noise import realisation_key
+from jaxsky.observed import observed_band, observed_tables
 from jaxsky.settings import Experiment, changed_settings, check_log, circumstances
 from jaxsky.simulation import HarmonicSource, harmonic_sources, observe_bands, plan_terms
+from jaxsky.workers import realised
 
 LOG = "simulation.json"
 #: Settings that do not affect the maps.
@@ -187,6 +181,7 @@ def run(
     overwrite: bool = False,
     note: Callable[[str], None] = lambda message: None,
     begun: Callable[[], None] = lambda: None,
+    executor: Executor | None = None,
 ) -> Iterator[bool]:
     """Simulate realisations into files, one per band; existing files are kept.
 
@@ -194,189 +189,125 @@ def run(
     number. The folder is first changed when the first map is ready, so an earlier failure leaves it
     untouched. Sources are removed from `setup` once used, if no other realisation needs them.
     `note` is called with sentences for the user, `begun` once the folder has its log and the old
-    files have been removed (`overwrite`).
+    files have been removed (`overwrite`). Realisations are made in this process, or by an executor
+    (see `jaxsky.workers.realised`), for which the folder is changed once the templates are ready.
     """
-    observation = setup.observation
-    terms: Mapping[str, Terms | None] | None = None
-    prepared: Mapping[str, HarmonicSource] | None = None
-    # Templates without small scales, or with the same for all realisations, are prepared once.
-    random = setup.small_scales_seed is None and any(
-        source.small_scales is not None for source in setup.sources.values()
-    )
-    correlated = [name for name, source in setup.sources.items() if source.correlated_with]
-    claimed, writing = False, list[Future[None]]()
-    with ThreadPoolExecutor(1) as thread:
-        for index in indices:
-            files = paths(out, observation.names, index)
-            stale = overwrite and not claimed
-            missing = [name for name, path in files.items() if stale or not path.exists()]
-            yield from [False] * (len(files) - len(missing))
-            if not missing:
-                continue
-            key = realisation_key(settings.seed, index)
-            if prepared is None or random:
-                terms = plan_terms(setup.sources, observation) if terms is None else terms
-                scales = setup.small_scales_key(key)
-                prepared = harmonic_sources(
-                    scales, setup.sources, observation, terms, release=not random
-                )
-                for name in correlated:
-                    if repaired := int(prepared[name].repaired):
-                        note(
-                            f"{name}: its extrapolated cross-spectra exceed what the auto-spectra "
-                            f"allow at {repaired} multipoles; correlations were reduced there."
-                        )
-            apart = settings.simulate.components
-            seen = observe_bands(
-                key, prepared, observation, setup.cmb, components=apart, names=missing
+    names = setup.observation.names
+    make = _Maker(settings, setup, out if executor is None else out.absolute())
+
+    def claim() -> None:
+        _claim(out, settings, overwrite)
+        begun()
+
+    if executor is None:
+        yield from make.files(indices, note, claim, overwrite)
+        return
+    there = [all(path.exists() for path in paths(out, names, i).values()) for i in indices]
+    missing = [i for i, kept in zip(indices, there, strict=True) if overwrite or not kept]
+    yield from [False] * (len(names) * (len(indices) - len(missing)))
+    if missing:
+        make.prepare(note)
+        claim()
+        for written, notes in realised(make, missing, executor, out):
+            for sentence in notes:
+                note(sentence)
+            yield from written
+
+
+class _Maker:
+    """Makes the files of realisations, in this process or a worker.
+
+    Templates without small scales, or with the same for all realisations, are prepared once.
+    """
+
+    def __init__(self, settings: Experiment, setup: SimulationInputs, out: Path) -> None:
+        self.settings, self.setup, self.out = settings, setup, out
+        self._random = setup.small_scales_seed is None and any(
+            source.small_scales is not None for source in setup.sources.values()
+        )
+        self._correlated = [name for name, one in setup.sources.items() if one.correlated_with]
+        self._terms: Mapping[str, Terms | None] | None = None
+        self._sources: Mapping[str, HarmonicSource] | None = None
+
+    def __call__(self, index: int) -> tuple[list[bool], list[str]]:
+        """Return for each file of a realisation whether it was written, and notes."""
+        notes = list[str]()
+        return list(self.files([index], notes.append)), notes
+
+    def prepare(self, note: Callable[[str], None]) -> None:
+        """Make what all realisations share."""
+        self._terms = plan_terms(self.setup.sources, self.setup.observation)
+        if not self._random:
+            self.sources(realisation_key(self.settings.seed), note)
+
+    def sources(self, key: Array, note: Callable[[str], None]) -> Mapping[str, HarmonicSource]:
+        """Return the sources of the realisation with this key in harmonic space."""
+        sources, observation = self.setup.sources, self.setup.observation
+        if self._sources is None or self._random:
+            if self._terms is None:
+                self._terms = plan_terms(sources, observation)
+            scales = self.setup.small_scales_key(key)
+            self._sources = None  # or there would be two of them in memory
+            ready = harmonic_sources(
+                scales, sources, observation, self._terms, release=not self._random
             )
-            for name, maps in seen:
-                names, columns = _columns(settings, setup, name, maps)
-                if not claimed:
-                    _claim(out, settings, overwrite)
-                    begun()
-                    claimed = True
-                # Write this file while the next band is being made.
+            for name in self._correlated:
+                if repaired := int(ready[name].repaired):
+                    note(
+                        f"{name}: its extrapolated cross-spectra exceed what the auto-spectra "
+                        f"allow at {repaired} multipoles; correlations were reduced there."
+                    )
+            self._sources = ready
+        return self._sources
+
+    def files(
+        self,
+        indices: Iterable[int],
+        note: Callable[[str], None],
+        claim: Callable[[], None] | None = None,
+        overwrite: bool = False,
+    ) -> Iterator[bool]:
+        """Write the missing files; `claim`, if given, is called before the first is written."""
+        settings, setup, observation = self.settings, self.setup, self.setup.observation
+        writing = list[Future[None]]()
+        with ThreadPoolExecutor(1) as thread:
+            for index in indices:
+                files = paths(self.out, observation.names, index)
+                stale = overwrite and claim is not None
+                missing = [name for name, path in files.items() if stale or not path.exists()]
+                yield from [False] * (len(files) - len(missing))
+                if not missing:
+                    continue
+                key = realisation_key(settings.seed, index)
+                seen = observe_bands(
+                    key,
+                    self.sources(key, note),
+                    observation,
+                    setup.cmb,
+                    components=settings.simulate.components,
+                    names=missing,
+                )
+                for name, maps in seen:
+                    names, columns = _columns(settings, setup, name, maps)
+                    if claim is not None:
+                        claim()
+                        claim = None
+                    # Write this file while the next band is being made.
+                    while writing:
+                        writing.pop().result()
+                        yield True
+                    job = thread.submit(
+                        _write,
+                        files[name],
+                        columns,
+                        names=names,
+                        unit=settings.simulate.unit,
+                        extra_header=_header(settings, setup, name, index),
+                        single=settings.simulate.precision == "single",
+                        tables=observed_tables(observed_band(setup, name)),
+                    )
+                    writing.append(job)
+                    del maps, columns  # or they would stay in memory while the next band is made
                 while writing:
                     writing.pop().result()
                     yield True
-                job = thread.submit(
-                    _write,
-                    files[name],
-                    columns,
-                    names=names,
-                    unit=settings.simulate.unit,
-                    extra_header=_header(settings, setup, name, index),
-                    single=settings.simulate.precision == "single",
-                    tables=observed_tables(observed_band(setup, name)),
-                )
-                writing.append(job)
-                del maps, columns  # or they would stay in memory while the next band is made
-            while writing:
-                writing.pop().result()
-                yield True
-
-
-#: Marks the tables written by this module.
-CREATOR = "jaxsky"
-#: Numeric columns of each table.
-TABLES = {
-    "BANDPASS": ("NU", "WEIGHT"),
-    "BEAM": ("BEAM",),
-    "NOISE_SPECTRUM": ("N_L",),
-    "NOISE": ("QQ", "QU", "UU"),
-    "LEAKAGE": ("Q", "U"),
-    "TRUTH": ("VALUE",),
-}
-
-
-class Observed(NamedTuple):
-    """How a map was observed.
-
-    `beam` is the FWHM of a Gaussian [arcmin], or a table b_l. `noise` is a level [uK_RJ arcmin]
-    or the covariance of Q and U in each pixel [uK_RJ^2]. If it was smoothed with the map, `noise`
-    is None and `spectrum` is N_l [uK_RJ^2], where known. `leakage` is Q and U leaked from the
-    intensity [uK_RJ], with the beam of the map; `truth` has spectral parameters by dotted name.
-    """
-
-    bandpass: Bandpass
-    beam: float | Float[Array, " ell"]
-    noise: float | Float[Array | np.ndarray, "2 2 pix"] | None = None
-    spectrum: Float[np.ndarray, " ell"] | None = None
-    leakage: Float[np.ndarray, "2 pix"] | None = None
-    truth: Mapping[str, float] = {}
-
-
-def observed_band(setup: SimulationInputs, name: str) -> Observed:
-    """Return how the maps of a band are observed."""
-    channel = setup.observation.channels[name]
-    beam = channel.map_beam
-    noise, spectrum = channel.noise, None
-    if noise is not None and channel.target is not None:
-        if not jnp.ndim(noise):
-            lmax = setup.observation.lmax
-            window = np.asarray(beam_ratio(beam, channel.beam, lmax, f"band {name!r}"))
-            spectrum = (float(noise) * np.radians(1 / 60) * window) ** 2
-            spectrum[:2] = 0.0
-        noise = None
-    return Observed(
-        channel.band,
-        jnp.asarray(beam) if jnp.ndim(beam) else float(beam),
-        noise if noise is None or jnp.ndim(noise) else float(noise),
-        spectrum,
-        None if name not in setup.leakage else np.asarray(setup.leakage[name]),
-        setup.truth,
-    )
-
-
-def observed_tables(observed: Observed) -> list[pyfits.BinTableHDU]:
-    """Return the tables of a FITS file that `read_observed` reads back exactly."""
-    band = observed.bandpass
-    rows: dict[str, list[Any]] = {"BANDPASS": [band.nu, band.weights]}
-    if np.ndim(observed.beam):
-        rows["BEAM"] = [observed.beam]
-    if observed.spectrum is not None:
-        rows["NOISE_SPECTRUM"] = [observed.spectrum]
-    if not (observed.noise is None or isinstance(observed.noise, float)):
-        (QQ, QU), (_, UU) = np.asarray(observed.noise)[-2:, -2:]
-        rows["NOISE"] = [QQ, QU, UU]
-    if observed.leakage is not None:
-        rows["LEAKAGE"] = list(observed.leakage)
-    if observed.truth:
-        rows["TRUTH"] = [list(observed.truth.values())]
-    tables = []
-    for name, values in rows.items():
-        named = zip(TABLES[name], map(np.asarray, values), strict=True)
-        columns = [pyfits.Column(n, "D", array=array) for n, array in named]
-        if name == "TRUTH":
-            length = max(map(len, observed.truth))
-            columns.insert(0, pyfits.Column("NAME", f"{length}A", array=list(observed.truth)))
-        tables.append(pyfits.BinTableHDU.from_columns(columns, name=name))
-    header = tables[0].header
-    header["CREATOR"] = CREATOR
-    header["CONVENT"] = (band.convention, "convention of the weights")
-    if not np.ndim(observed.beam):
-        header["FWHM"] = (float(observed.beam), "[arcmin] beam of the map")
-    if isinstance(observed.noise, float):
-        header["NOISE"] = (observed.noise, "[uK_RJ arcmin] uniform noise")
-    return tables
-
-
-def read_observed(path: Path) -> Observed | None:
-    """Read how the map in a file was observed; None if it has no `observed_tables`."""
-    with open_fits(path) as hdus:
-        tables = {hdu.name: hdu for hdu in hdus[1:]}
-        if "BANDPASS" not in tables or tables["BANDPASS"].header.get("CREATOR") != CREATOR:
-            return None
-        header, npix = tables["BANDPASS"].header, hdus[1].header["NAXIS2"]
-        found: dict[str, np.ndarray] = {}
-        for table, names in TABLES.items():
-            if table not in tables:
-                continue
-            values = found[table] = np.array([tables[table].data[n] for n in names], float)
-            if not np.isfinite(values).all():
-                raise InputError(f"{path}: its table {table} has values that are not finite.")
-            if table in ("NOISE", "LEAKAGE") and values.shape[1] != npix:
-                raise InputError(
-                    f"{path}: its table {table} has {values.shape[1]} pixels, its map {npix}."
-                )
-        stated = {key: float(header[key]) for key in ("FWHM", "NOISE") if key in header}
-        for key, value in stated.items():
-            if not 0 <= value < np.inf:
-                raise InputError(f"{path}: {key} of its table BANDPASS is {value}.")
-        if "FWHM" not in stated and "BEAM" not in found:
-            raise InputError(f"{path}: the table of its beam is missing.")
-        truth: dict[str, float] = {}
-        if "TRUTH" in tables:
-            parameters = map(str, tables["TRUTH"].data["NAME"])
-            truth = dict(zip(parameters, found["TRUTH"][0].tolist(), strict=True))
-        nu, weights = found["BANDPASS"]
-        spectrum, noise = found.get("NOISE_SPECTRUM"), found.get("NOISE")
-        return Observed(
-            Bandpass(nu, weights, header["CONVENT"]),
-            stated["FWHM"] if "FWHM" in stated else jnp.asarray(found["BEAM"][0]),
-            stated.get("NOISE") if noise is None else np.array([noise[:2], noise[1:]]),
-            None if spectrum is None else spectrum[0],
-            found.get("LEAKAGE"),
-            truth,
-        )

@@ -32,6 +32,8 @@ class Progress:
 QUIET = Progress()
 
 
+#: Parameters of glibc's mallopt: M_ARENA_MAX, M_MMAP_THRESHOLD.
+MALLOC = {-8: 1, -3: 8 * 2**20}
 #: Largest size of the cache [bytes], and number of (JAX version, processor) pairs in it.
 LARGEST, KINDS = 2**30, 4
 
@@ -91,6 +93,19 @@ def forget_programs() -> None:
     gc.collect()
     with contextlib.suppress(OSError, AttributeError):  # glibc only: free memory inside the heap
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def return_memory() -> None:
+    """Make glibc return freed memory to the system.
+
+    JAX computes in threads, and glibc gives each a heap that keeps freed memory, including maps of
+    up to 32 MiB: a third of all memory in use. So all threads share one heap, and large arrays are
+    allocated outside it.
+    """
+    with contextlib.suppress(OSError, AttributeError):  # other systems have other ways
+        mallopt = ctypes.CDLL(None).mallopt
+        for parameter, value in MALLOC.items():
+            mallopt(parameter, value)
 
 
 def _prune(folder: Path) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from commands import jaxsky, one_sentence
+from jaxsky.workers import Processes
 from misbehaving import Handler, serving
 
 
@@ -18,6 +19,13 @@ def mistake(monkeypatch, capsys) -> Callable[..., str]:
         return one_sentence(capsys)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def two() -> Iterator[Processes]:
+    """Two processes that make realisations."""
+    with Processes(2) as processes:
+        yield processes
 
 
 @pytest.fixture(scope="session")

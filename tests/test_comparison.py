@@ -1,6 +1,7 @@
 """Observed maps against the model: slopes, spectra, patches; their errors are confirmed."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import healpy
@@ -253,7 +254,8 @@ def test_realisations_are_kept(prepared, model, regions, tmp_path):
         counts.append(done)
 
     first = simulated_fluctuations(prepared, model, regions, 20, 2, 0, path, "a")
-    more = simulated_fluctuations(prepared, model, regions, 20, 3, 0, path, "a", count)
+    kept, executor = (path, "a", count), ThreadPoolExecutor(2)
+    more = simulated_fluctuations(prepared, model, regions, 20, 3, 0, *kept, executor)
     assert counts == [2, 3]
     np.testing.assert_array_equal(more.chi2[:2], first.chi2)
     fresh = simulated_fluctuations(prepared, model, regions, 20, 3, 0)

@@ -334,6 +334,32 @@ def test_a_stopped_run_goes_on(three, tmp_path, monkeypatch, capsys):
     assert content(out) == expected
 
 
+CORRELATED = (
+    "[sky.synchrotron.small_scales]",
+    '[sky.synchrotron.small_scales]\ncorrelated_with = "dust"',
+)
+
+
+@pytest.mark.parametrize("changes", [("iqu",), ("both", CORRELATED, COMPONENTS)])
+def test_workers_write_the_same_files(changes, folder, tmp_path, two):
+    """From templates that are prepared once, and with small scales that are always others."""
+    settings, found = load(write(folder, *changes)), {}
+    for out, executor in ((tmp_path / "own", None), (tmp_path / "out", two)):
+        notes, begun = [], []
+        how = {"note": notes.append, "begun": lambda b=begun: b.append(1), "executor": executor}
+        files = montecarlo.run(settings, simulation_inputs(settings), out, range(2, 7), **how)
+        assert list(files) == [True] * 10
+        found[out.name] = content(out), set(notes), begun
+    assert found["out"] == found["own"]
+    assert (len(found["out"][0]), begun) == (10, [1])
+    assert bool(notes) == ("both" in changes)
+    (out / "sim_00003" / "30.fits").unlink()
+    again = simulation_inputs(settings), out, range(2, 8), False
+    assert sorted(montecarlo.run(settings, *again, executor=two)) == [False] * 9 + [True] * 3
+    whole = content(out)
+    assert {name: whole[name] for name in found["own"][0]} == found["own"][0]
+
+
 def test_what_cannot_be_written_stops_the_run(three, tmp_path, monkeypatch, mistake):
     """Bands are written while the next one is made; an error there is one, and leaves no file."""
     path, _ = three

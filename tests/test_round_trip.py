@@ -16,7 +16,8 @@ from jaxsky import Bandpass
 from jaxsky.experiment import cmb_spectra, simulation_inputs
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.io import InputError, write_maps
-from jaxsky.montecarlo import Observed, observed_tables, read_observed, run
+from jaxsky.montecarlo import run
+from jaxsky.observed import Observed, observed_tables, read_observed
 from jaxsky.settings import SettingsError, load
 from refusals import raises
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from concurrent.futures import ThreadPoolExecutor
 
 import healpy
 import jax
@@ -306,7 +307,8 @@ def test_simulations_are_kept_and_gone_on_with(tmp_path):
         def advance(self, done, of):
             counts.append(done)
 
-    again = separate_data(how, given, tmp_path, Counted())
+    with ThreadPoolExecutor(2) as executor:
+        again = separate_data(how, given, tmp_path, Counted(), executor)
     assert counts == list(range(21))
     counts.clear()
     more = how.model_copy(update={"separate": how.separate.model_copy(update={"nsims": 22})})

@@ -339,7 +339,7 @@ def _work(settings: Experiment, command: Run) -> Report:
     command.begin()
     command.steps.step("realisations")
     simulations, report = command.out / "simulations.npz", command.steps.advance
-    found = compare(settings, prepared, regions, simulations, report)
+    found = compare(settings, prepared, regions, simulations, report, command.executor)
     patches, warnings = None, comparison_warnings(found, settings)
     if settings.compare.patches is not None:
         command.steps.step("patches")

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -73,13 +74,15 @@ def make_figures(
     begin: Callable[[], None] = lambda: None,
     progress: Progress = QUIET,
     steps: Mapping[str, Make] = STEPS,
+    executor: Executor | None = None,
 ) -> list[PaperFigure]:
     """Make the missing figures and tables, and `index.html`, which shows all that exist.
 
     `only` lists numbers or labels of figures; `steps` has the function that makes each. With
     `overwrite`, the wanted figures are made again; others in the folder are kept if they were made
     with these settings, and otherwise removed once the first new figure is there. `begin` is called
-    after the checks, before anything is written. Returns all figures of the page, new and old.
+    after the checks, before anything is written; `executor` is that of `compare`. Returns all
+    figures of the page, new and old.
     """
     started = time.perf_counter()
     wanted = labels_of(only, steps)
@@ -87,7 +90,7 @@ def make_figures(
     figures, other = _kept(out, mark, overwrite)
     begin()
     out.mkdir(parents=True, exist_ok=True)
-    paper = PaperSky(settings)
+    paper = PaperSky(settings, executor)
     made = {
         label
         for label, (_, section, *_) in figures.items()
@@ -173,6 +176,7 @@ def report_figures(settings: Experiment, command: Run, *, only: Sequence[str]) -
         # Old figures are replaced one by one.
         begin=lambda: command.steps.keep(command.log),
         progress=command.steps,
+        executor=command.executor,
     )
     sections = {figure.label: figure.section for figure in figures}
     missing = [f"{n}: {s.note}" for n, s in sections.items() if not (s.picture or s.table)]

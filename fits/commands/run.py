@@ -6,7 +6,6 @@ is printed as one sentence, with its traceback in a file, and Ctrl-C ends any co
 
 import _thread
 import atexit
-import dis
 import json
 import os
 import signal
@@ -16,6 +15,7 @@ import tempfile
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,6 +34,7 @@ from fits.commands.report import (
 from fits.results import write_json, write_log
 from jaxsky.io.files import ALL, Folder, occupied
 from jaxsky.settings import Experiment, check_log, load, of_file
+from jaxsky.workers import raised_in, workers_of
 
 #: Files in every results folder: the steps with their times, and the page of results.
 LOG, PAGE = "log.txt", "index.html"
@@ -76,7 +77,10 @@ class Report(NamedTuple):
 
 
 class Run(NamedTuple):
-    """A running command: its settings, results folder and options, and the steps it reports."""
+    """A running command: its settings, results folder and options, and the steps it reports.
+
+    `executor` makes realisations, None in this process.
+    """
 
     settings: Experiment
     out: Path
@@ -86,6 +90,7 @@ class Run(NamedTuple):
     folder: Folder
     steps: Steps
     part: range
+    executor: Executor | None
 
     @property
     def log(self) -> Path:
@@ -125,6 +130,7 @@ def run_command(
     overwrite: bool = False,
     maps: Path | None = None,
     part: range = ALL,
+    workers: str | None = None,
 ) -> None:
     """Run a command with the options of the command line; `resume` is None if it has no --resume.
 
@@ -145,13 +151,15 @@ def run_command(
             part=ALL if overwrite else part,
         ) as folder,
         Steps() as steps,
+        workers_of(workers, warn) as executor,
     ):
         import matplotlib as mpl
 
         from jaxsky.montecarlo import other_sky
 
         mpl.use("Agg")  # pictures go to files
-        running = Run(settings, out, bool(resume), overwrite, command.results, folder, steps, part)
+        options = settings, out, bool(resume), overwrite, command.results
+        running = Run(*options, folder, steps, part, executor)
         report = command.work(settings, running)
         report = report._replace(warnings=[*report.warnings, *other_sky(settings)])
         written = _write(settings, report, running)
@@ -237,24 +245,13 @@ def results_folder(
             raise
 
 
-def _raised_in(error: BaseException) -> tuple[str, bool]:
-    """Return the package where an error arose, and True if its own code raised it."""
-    trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-    if trace is None:
-        return "", False
-    package = str(trace.tb_frame.f_globals.get("__name__", "")).partition(".")[0]
-    return package, trace.tb_frame.f_code.co_code[trace.tb_lasti] == dis.opmap["RAISE_VARARGS"]
-
-
 def _sentence(error: BaseException) -> tuple[str, bool]:
     """Return an error on one line, and True if it names the file, key or argument at fault."""
     from fits.results import FitError
 
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}.", True
-    package, raised = _raised_in(error)
+    package, raised = raised_in(error)
     kinds = (ValueError, KeyError, OSError, FitError)
     if raised and package in ("jaxsky", "fits") and isinstance(error, kinds):
         # The KeyError of a dictionary has the key alone.

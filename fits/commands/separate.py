@@ -324,7 +324,7 @@ def _work(settings: Experiment, command: Run) -> Report:
     data = separation_data(settings)
     command.begin()
     try:
-        found = separate_data(settings, data, command.out, command.steps)
+        found = separate_data(settings, data, command.out, command.steps, command.executor)
     except FitError as error:
         raise ValueError(f"The spectral parameters were not found. {error}") from None
     return Report(

@@ -46,7 +46,9 @@ def make_realisations(settings: Experiment, command: Run, *, only: str | None) -
     names, notes = setup.observation.names, list[str]()
     seconds, count = [], len(indices) * len(names)
     steps.step("simulating")
-    files = montecarlo.run(settings, setup, out, indices, overwrite, notes.append, command.begin)
+    files = montecarlo.run(
+        settings, setup, out, indices, overwrite, notes.append, command.begin, command.executor
+    )
     before = time.perf_counter()
     for done, written in enumerate(files, 1):
         steps.advance(done, count)
@@ -54,13 +56,17 @@ def make_realisations(settings: Experiment, command: Run, *, only: str | None) -
             now = time.perf_counter()
             seconds.append(now - before)
             before = now
+    if command.executor is not None:
+        command.folder.clean()  # of files that workers which died have not finished
     if settings.simulate.sheet:
         steps.step("drawing")
         shown = montecarlo.paths(out, names, indices.start)
         _draw_sheet(out / f"sim_{indices.start:05d}.png", shown, setup.observation.lmax, settings)
     kept = count - len(seconds)
     there = f"; {kept} maps were there already" if kept else ""
-    rate = f"{statistics.median(seconds):.2g} s a band, " if seconds else ""
+    # Files of workers are reported several at once.
+    middle = statistics.median if command.executor is None else statistics.mean
+    rate = f"{middle(seconds):.2g} s a band, " if seconds else ""
     took = f"{rate}{steps.seconds:.1f} s in all"
     return Report(
         setup.description,

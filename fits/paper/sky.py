@@ -4,6 +4,7 @@ import dataclasses
 import re
 import tomllib
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -130,8 +131,8 @@ class Layer(NamedTuple):
 class PaperSky:
     """Data shared by the figures of one experiment, made when first needed."""
 
-    def __init__(self, settings: Experiment) -> None:
-        self.settings = settings
+    def __init__(self, settings: Experiment, executor: Executor | None = None) -> None:
+        self.settings, self.executor = settings, executor
         self.folder = Path(settings.data_dir)
         self.key = realisation_key(settings.seed)
         # Made once, at the first call.
@@ -227,7 +228,8 @@ class PaperSky:
     def comparison(self) -> Comparison:
         """Comparison of the maps with the model, at the common resolution."""
         masks = region_masks(self.settings, self.settings.compare.regions)
-        return compare(self.settings, prepared_maps(self.settings, self.inputs), masks)
+        prepared = prepared_maps(self.settings, self.inputs)
+        return compare(self.settings, prepared, masks, executor=self.executor)
 
     def _spec(self, law: str) -> tuple[str, ComponentTable]:
         found = [(n, spec) for n, spec in self.settings.sky.components.items() if spec.law == law]

@@ -64,6 +64,8 @@ def check_file(path: Path) -> None:
 
 #: Prefix of the names of incomplete files, followed by the id of the process that writes them.
 PARTIAL = ".partial-"
+#: In a worker, the id of the process that it works for and a word of its own; else nothing.
+writer = ""
 #: Functions called before anything is written; if one raises, nothing is written.
 guards: list[Callable[[], None]] = []
 
@@ -88,7 +90,7 @@ def whole(path: Path) -> Iterator[Path]:
     An existing file survives a killed process and a full disk. Data are flushed to disk before the
     file is renamed, as some file systems report only then that there was no room.
     """
-    beside = path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
+    beside = path.with_name(f"{PARTIAL}{writer or os.getpid()}-{path.name}")
     check_guards()
     try:
         yield beside

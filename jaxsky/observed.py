@@ -1,0 +1,140 @@
+"""How simulated maps were observed: tables of bandpass, beam, noise, leakage and truth in files."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from astropy.io import fits as pyfits
+from jaxtyping import Array, Float
+
+from jaxsky.bandpass import Bandpass
+from jaxsky.experiment import SimulationInputs
+from jaxsky.harmonics import beam_ratio
+from jaxsky.io import InputError
+from jaxsky.io.tables import open_fits
+
+#: Marks the tables written by this module.
+CREATOR = "jaxsky"
+#: Numeric columns of each table.
+TABLES = {
+    "BANDPASS": ("NU", "WEIGHT"),
+    "BEAM": ("BEAM",),
+    "NOISE_SPECTRUM": ("N_L",),
+    "NOISE": ("QQ", "QU", "UU"),
+    "LEAKAGE": ("Q", "U"),
+    "TRUTH": ("VALUE",),
+}
+
+
+class Observed(NamedTuple):
+    """How a map was observed.
+
+    `beam` is the FWHM of a Gaussian [arcmin], or a table b_l. `noise` is a level [uK_RJ arcmin]
+    or the covariance of Q and U in each pixel [uK_RJ^2]. If it was smoothed with the map, `noise`
+    is None and `spectrum` is N_l [uK_RJ^2], where known. `leakage` is Q and U leaked from the
+    intensity [uK_RJ], with the beam of the map; `truth` has spectral parameters by dotted name.
+    """
+
+    bandpass: Bandpass
+    beam: float | Float[Array, " ell"]
+    noise: float | Float[Array | np.ndarray, "2 2 pix"] | None = None
+    spectrum: Float[np.ndarray, " ell"] | None = None
+    leakage: Float[np.ndarray, "2 pix"] | None = None
+    truth: Mapping[str, float] = {}
+
+
+def observed_band(setup: SimulationInputs, name: str) -> Observed:
+    """Return how the maps of a band are observed."""
+    channel = setup.observation.channels[name]
+    beam = channel.map_beam
+    noise, spectrum = channel.noise, None
+    if noise is not None and channel.target is not None:
+        if not jnp.ndim(noise):
+            lmax = setup.observation.lmax
+            window = np.asarray(beam_ratio(beam, channel.beam, lmax, f"band {name!r}"))
+            spectrum = (float(noise) * np.radians(1 / 60) * window) ** 2
+            spectrum[:2] = 0.0
+        noise = None
+    return Observed(
+        channel.band,
+        jnp.asarray(beam) if jnp.ndim(beam) else float(beam),
+        noise if noise is None or jnp.ndim(noise) else float(noise),
+        spectrum,
+        None if name not in setup.leakage else np.asarray(setup.leakage[name]),
+        setup.truth,
+    )
+
+
+def observed_tables(observed: Observed) -> list[pyfits.BinTableHDU]:
+    """Return the tables of a FITS file that `read_observed` reads back exactly."""
+    band = observed.bandpass
+    rows: dict[str, list[Any]] = {"BANDPASS": [band.nu, band.weights]}
+    if np.ndim(observed.beam):
+        rows["BEAM"] = [observed.beam]
+    if observed.spectrum is not None:
+        rows["NOISE_SPECTRUM"] = [observed.spectrum]
+    if not (observed.noise is None or isinstance(observed.noise, float)):
+        (QQ, QU), (_, UU) = np.asarray(observed.noise)[-2:, -2:]
+        rows["NOISE"] = [QQ, QU, UU]
+    if observed.leakage is not None:
+        rows["LEAKAGE"] = list(observed.leakage)
+    if observed.truth:
+        rows["TRUTH"] = [list(observed.truth.values())]
+    tables = []
+    for name, values in rows.items():
+        named = zip(TABLES[name], map(np.asarray, values), strict=True)
+        columns = [pyfits.Column(n, "D", array=array) for n, array in named]
+        if name == "TRUTH":
+            length = max(map(len, observed.truth))
+            columns.insert(0, pyfits.Column("NAME", f"{length}A", array=list(observed.truth)))
+        tables.append(pyfits.BinTableHDU.from_columns(columns, name=name))
+    header = tables[0].header
+    header["CREATOR"] = CREATOR
+    header["CONVENT"] = (band.convention, "convention of the weights")
+    if not np.ndim(observed.beam):
+        header["FWHM"] = (float(observed.beam), "[arcmin] beam of the map")
+    if isinstance(observed.noise, float):
+        header["NOISE"] = (observed.noise, "[uK_RJ arcmin] uniform noise")
+    return tables
+
+
+def read_observed(path: Path) -> Observed | None:
+    """Read how the map in a file was observed; None if it has no `observed_tables`."""
+    with open_fits(path) as hdus:
+        tables = {hdu.name: hdu for hdu in hdus[1:]}
+        if "BANDPASS" not in tables or tables["BANDPASS"].header.get("CREATOR") != CREATOR:
+            return None
+        header, npix = tables["BANDPASS"].header, hdus[1].header["NAXIS2"]
+        found: dict[str, np.ndarray] = {}
+        for table, names in TABLES.items():
+            if table not in tables:
+                continue
+            values = found[table] = np.array([tables[table].data[n] for n in names], float)
+            if not np.isfinite(values).all():
+                raise InputError(f"{path}: its table {table} has values that are not finite.")
+            if table in ("NOISE", "LEAKAGE") and values.shape[1] != npix:
+                raise InputError(
+                    f"{path}: its table {table} has {values.shape[1]} pixels, its map {npix}."
+                )
+        stated = {key: float(header[key]) for key in ("FWHM", "NOISE") if key in header}
+        for key, value in stated.items():
+            if not 0 <= value < np.inf:
+                raise InputError(f"{path}: {key} of its table BANDPASS is {value}.")
+        if "FWHM" not in stated and "BEAM" not in found:
+            raise InputError(f"{path}: the table of its beam is missing.")
+        truth: dict[str, float] = {}
+        if "TRUTH" in tables:
+            parameters = map(str, tables["TRUTH"].data["NAME"])
+            truth = dict(zip(parameters, found["TRUTH"][0].tolist(), strict=True))
+        nu, weights = found["BANDPASS"]
+        spectrum, noise = found.get("NOISE_SPECTRUM"), found.get("NOISE")
+        return Observed(
+            Bandpass(nu, weights, header["CONVENT"]),
+            stated["FWHM"] if "FWHM" in stated else jnp.asarray(found["BEAM"][0]),
+            stated.get("NOISE") if noise is None else np.array([noise[:2], noise[1:]]),
+            None if spectrum is None else spectrum[0],
+            found.get("LEAKAGE"),
+            truth,
+        )

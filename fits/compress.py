@@ -7,7 +7,7 @@ of D replace the pixels. Everything else is streamed over pixels, from disk if n
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fits.regions import Cells
-from fits.systems import Pixels
+from fits.systems import Pixels, square_root
 from jaxsky.checks import UNSEEN, Numeric
+from jaxsky.mesh import as_double, module_of, spread, typed
 from jaxsky.public import refuse_unit, takes_quantities
 
 #: Pixels per pass over data, and in a block of the likelihood: few enough for the cache, enough for
@@ -29,20 +30,6 @@ ROUNDING = 1e-6
 LEAST_SHARE = 1e-6
 
 
-@jax.jit
-def square_root(matrix: Float[Array, "... row row"]) -> Float[Array, "... row row"]:
-    """Return R with R^T R = G for symmetric positive semi-definite G, even singular.
-
-    Rows and columns are scaled to a unit diagonal first, so that maps in different units do not
-    cost accuracy.
-    """
-    diagonal = jnp.diagonal(matrix, axis1=-2, axis2=-1)
-    scale = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
-    values, vectors = jnp.linalg.eigh(matrix / scale[..., :, None] / scale[..., None, :])
-    root = jnp.sqrt(jnp.maximum(values, 0.0))[..., :, None] * jnp.swapaxes(vectors, -1, -2)
-    return root * scale[..., None, :]
-
-
 def chunks(npix: int, size: int = PIECE) -> Iterator[slice]:
     """Yield slices that cover the pixels."""
     for start in range(0, npix, size):
@@ -51,12 +38,23 @@ def chunks(npix: int, size: int = PIECE) -> Iterator[slice]:
 
 @takes_quantities
 def bare(name: str, value: object) -> np.ndarray:
-    """Return a numeric array without a copy, in its own precision."""
+    """Return a numeric array without a copy, in its own precision; distributed ones as they are."""
     refuse_unit(name, value)
-    array = np.asarray(value)
+    array: Any = typed(value) if spread(value) else np.asarray(value)
     if array.dtype.kind not in "fiu":
         raise TypeError(f"Argument `{name}` must be a real array, but is {array.dtype}.")
     return array
+
+
+def carrying(
+    weights: Float[np.ndarray, " band"],
+    counts: Float[np.ndarray, " band"],
+    squares: Float[np.ndarray, "band component"],
+) -> tuple[Bool[np.ndarray, " band"], int]:
+    """Return the bands that carry weight, and the number of data in them; see `Noise.heavy`."""
+    share = weights[:, None] * squares
+    heavy = (share >= LEAST_SHARE * share.sum(axis=0)).any(axis=1)
+    return heavy, int(counts[heavy].sum())
 
 
 class Noise(NamedTuple):
@@ -79,16 +77,16 @@ class Noise(NamedTuple):
         """Return 1 / pixel_sigma^2 in some of the pixels."""
         if self.pixel_sigma is None:
             return 1.0
-        return 1 / np.asarray(self.pixel_sigma[pixels], float) ** 2
+        return 1 / as_double(self.pixel_sigma[pixels]) ** 2
 
     def weights(self, pixels: slice | np.ndarray) -> Float[np.ndarray, "band stokes #pix"]:
         """Return inverse variances, or the diagonal of inverse covariances; 0 where masked."""
         if self.covariance is not None:
             (QQ, UU), determinant = self._elements(pixels)[:2]
-            return np.stack([UU / determinant, QQ / determinant], axis=1)
+            return module_of(QQ).stack([UU / determinant, QQ / determinant], axis=1)
         assert self.sigma is not None
         sigma = self.sigma if self.separable else self.sigma[..., pixels]
-        return 1 / np.asarray(sigma, float) ** 2 * self.pixel_weights(pixels)
+        return 1 / as_double(sigma) ** 2 * self.pixel_weights(pixels)
 
     def cross(self, pixels: slice | np.ndarray) -> Float[np.ndarray, "band pix"] | None:
         """Return element QU of the inverse covariances; None if Q and U are independent."""
@@ -109,18 +107,17 @@ class Noise(NamedTuple):
             own = self.weights(part) * used[part]
             weights += own.sum(axis=(1, 2))
             counts += np.count_nonzero(own, axis=(1, 2))
-        share = weights[:, None] * squares
-        heavy = (share >= LEAST_SHARE * share.sum(axis=0)).any(axis=1)
-        return heavy, int(counts[heavy].sum())
+        return carrying(weights, counts, squares)
 
     def _elements(self, pixels):
         assert self.covariance is not None
-        block = np.asarray(self.covariance[..., pixels], float)
-        masked = ~np.isfinite(block[:, 0, 0]) | ~np.isfinite(block[:, 1, 1])
-        QQ, UU = (np.where(masked, 1.0, block[:, s, s]) for s in range(2))
-        QU = np.where(masked, 0.0, block[:, 0, 1])
-        determinant = np.where(masked, np.inf, QQ * UU - QU**2)
-        return np.stack([QQ, UU]), determinant, QU
+        block = as_double(self.covariance[..., pixels])
+        xp = module_of(block)
+        masked = ~xp.isfinite(block[:, 0, 0]) | ~xp.isfinite(block[:, 1, 1])
+        QQ, UU = (xp.where(masked, 1.0, block[:, s, s]) for s in range(2))
+        QU = xp.where(masked, 0.0, block[:, 0, 1])
+        determinant = xp.where(masked, np.inf, QQ * UU - QU**2)
+        return xp.stack([QQ, UU]), determinant, QU
 
 
 def as_noise(
@@ -170,6 +167,8 @@ def as_noise(
     if array.ndim == 4:
         return _covariance(array)
     _check_positive("noise", array)
+    if spread(array):
+        return Noise(array)
     if array.ndim < 3:
         if not np.isfinite(array).all():
             raise ValueError("Argument `noise` must be finite for a whole band; leave it out.")
@@ -179,7 +178,7 @@ def as_noise(
 
 
 def _check_positive(name: str, sigma: np.ndarray) -> None:
-    if bad := int(sigma.size - np.sum(sigma > 0)):
+    if bad := int(sigma.size - (sigma > 0).sum()):
         raise ValueError(f"Argument `{name}` has {bad} of {sigma.size} values that are not > 0.")
 
 
@@ -204,12 +203,12 @@ def _separated(sigma: np.ndarray) -> Noise | None:
 
 def _covariance(covariance: np.ndarray) -> Noise:
     noise = Noise(None, None, covariance)
-    bad = 0
-    for part in chunks(covariance.shape[-1]):
+    bad, xp = 0, module_of(covariance)
+    for part in [slice(None)] if spread(covariance) else chunks(covariance.shape[-1]):
         (QQ, UU), determinant, _ = noise._elements(part)
         block = covariance[..., part]
-        asymmetric = np.isfinite(determinant) & (block[:, 0, 1] != block[:, 1, 0])
-        bad += int(np.sum(~((QQ > 0) & (UU > 0) & (determinant > 0)) | asymmetric))
+        asymmetric = xp.isfinite(determinant) & (block[:, 0, 1] != block[:, 1, 0])
+        bad += int(xp.sum(~((QQ > 0) & (UU > 0) & (determinant > 0)) | asymmetric))
     if bad:
         size = covariance.shape[0] * covariance.shape[-1]
         raise ValueError(
@@ -234,8 +233,8 @@ class Layout(NamedTuple):
 
     def rows(self, maps: np.ndarray) -> np.ndarray:
         """Return maps (band, stokes, pix) as (group, row, pix)."""
-        groups = [np.concatenate([maps[:, s] for s in group]) for group in self.groups]
-        return np.stack(groups)
+        xp = module_of(maps)
+        return xp.stack([xp.concatenate([maps[:, s] for s in group]) for group in self.groups])
 
     def maps(self, rows: np.ndarray) -> np.ndarray:
         """Return the inverse for these Stokes parameters: (row or unknown, stokes, pix)."""
@@ -335,18 +334,18 @@ def compressed(
 
 
 def pixel_rows(
-    data: np.ndarray, noise: Noise, layout: Layout, pixels: slice | np.ndarray, used: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    data: Any, noise: Noise, layout: Layout, pixels: Any, used: Any
+) -> tuple[Any, Any, Any | None]:
     """Return the fields of `Pixels` for some pixels; unused ones are zero with unit weight.
 
     If noise is the same in all pixels and all are used, the weights are those of a single pixel.
     """
-    weights = noise.weights(pixels)
-    if weights.shape[-1] > 1 or not used.all():
-        weights = np.where(used, weights, 1.0)
-    values = np.where(used & (weights > 0), np.asarray(data[..., pixels], float), 0.0)
+    weights, xp = noise.weights(pixels), module_of(data)
+    if weights.shape[-1] > 1 or xp is jnp or not used.all():
+        weights = xp.where(used, weights, 1.0)
+    values = xp.where(used & (weights > 0), as_double(data[..., pixels]), 0.0)
     cross = noise.cross(pixels) if layout.joint else None
-    cross = None if cross is None else np.where(used, cross, 0.0)[None]
+    cross = None if cross is None else xp.where(used, cross, 0.0)[None]
     return layout.rows(values), layout.rows(weights), cross
 
 

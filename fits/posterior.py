@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
+from fits.distributed import counted
 from fits.systems import Derivatives, assembled
 from jaxsky.checks import Numeric, as_array
 from jaxsky.settings import Experiment
@@ -316,8 +317,7 @@ class Posterior:
         """Return names of parameters, with numbers of regions and pixels, for messages."""
         of_cell = np.zeros(len(self.index), int)
         if (of_pixel := getattr(self.like, "of_pixel", None)) is not None:
-            of_pixel = np.asarray(of_pixel)
-            of_cell = np.bincount(of_pixel[of_pixel >= 0], minlength=len(self.index))
+            of_cell = np.asarray(counted(of_pixel, number=len(self.index)))
         pixels = np.zeros(len(self.owner), int)
         np.add.at(pixels, self.index, of_cell[:, None])
         named = []

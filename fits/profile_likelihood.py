@@ -13,6 +13,7 @@ pixels (`fits.compress`), and the cost does not depend on nside.
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,15 +21,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from fits import systems
+from fits import distributed, regions, systems
 from fits.compress import Layout, Noise, as_noise, bare, compressed, gathered, layouts, used_pixels
 from fits.mixing import Mixing, named_bands, spectral_names, unit_sky
 from fits.posterior import Likelihood
-from fits.regions import Cells, check_labels, intersections
+from fits.regions import Cells, check_labels
 from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.bandpass import parse_unit
 from jaxsky.checks import Numeric, as_array, check_double, check_finite, check_shape
+from jaxsky.mesh import SUMS, maps_of, over_pixels, spread
+from jaxsky.mesh import total as over_devices
 from jaxsky.sky import check_parameter, unknown_parameter
 
 #: Pixels processed at once.
@@ -114,13 +117,22 @@ class SpectralLikelihood(Likelihood):
             results.append(jax.lax.map(one, (cells, pixels), batch_size=at_once))
         return tuple(results)
 
+    def _blocks(self) -> "SpectralLikelihood":
+        """Return it without the map of cells, which passes over blocks of pixels do not take."""
+        return dataclasses.replace(self, of_pixel=None)
+
     def _cell_of_block(self, blocks: int) -> Int[Array, " block"]:
         return jnp.arange(blocks) if self.block_cell is None else self.block_cell
 
     def total(self, local: Float[Array, "cell free"]) -> Float[Array, ""]:
         """Return -2 ln L for parameters of each cell."""
-        parts = self._mapped(systems.least_chi2, self.matrices(local))
-        return sum((jnp.sum(part) for part in parts), jnp.zeros(()))
+
+        @over_pixels(SUMS)
+        def summed(like, matrices):
+            parts = like._mapped(systems.least_chi2, matrices)
+            return over_devices(sum((jnp.sum(part) for part in parts), jnp.zeros(())))
+
+        return summed(self._blocks(), self.matrices(local))
 
     def derivatives(self, local: Float[Array, "cell free"]) -> systems.Derivatives:
         """Return -ln L of each cell, and its derivatives in the parameters of the cell."""
@@ -136,18 +148,27 @@ class SpectralLikelihood(Likelihood):
         along = partial(slope, first, local)
         (matrices, one), (_, two) = jax.vmap(along, out_axes=(None, 1))(units)
         every = tuple(zip(matrices, one, two, strict=True))
-        parts = self._mapped(lambda m, own: systems.derivatives(m[0], m[1], m[2], own), every)
-        summed = []
-        for part in parts:
-            cells = self._cell_of_block(len(part.value))
-            summed.append(
-                jax.tree.map(lambda x, c=cells: jax.ops.segment_sum(x, c, len(local)), part)
-            )
-        return jax.tree.map(lambda *rows: sum(rows), *summed)
+
+        @over_pixels(SUMS)
+        def summed(like, every):
+            parts = like._mapped(lambda m, own: systems.derivatives(m[0], m[1], m[2], own), every)
+            found = []
+            for part in parts:
+                cells = like._cell_of_block(len(part.value))
+                found.append(
+                    jax.tree.map(lambda x, c=cells: jax.ops.segment_sum(x, c, len(local)), part)
+                )
+            return over_devices(jax.tree.map(lambda *rows: sum(rows), *found))
+
+        return summed(self._blocks(), every)
 
     def residuals(self, params):
-        parts = self._mapped(systems.residuals, self.matrices(self.flat(params)[self.index]))
-        return jnp.concatenate([part.ravel() for part in parts])
+        @over_pixels(maps_of(1))
+        def rows(like, matrices):
+            parts = like._mapped(systems.residuals, matrices)
+            return jnp.concatenate([part.ravel() for part in parts])
+
+        return rows(self._blocks(), self.matrices(self.flat(params)[self.index]))
 
 
 def _start_values(
@@ -246,13 +267,27 @@ def spectral_likelihood(
         )
     mixing = Mixing.of(unit_sky(sky), bands, unit)
     noise = as_noise(noise, data.shape)
-    used = used_pixels(noise, data.shape[-1], components)
-    maps = {n: check_labels(n, v, used.size, used) for n, v in (labels or {}).items()}
+    looked: distributed.Looked | None = None
+    used: Any
+    maps: dict[str, Any]
+    if spread(data):
+        noise = distributed.noise_like(data, noise)
+        looked = distributed.look(data, noise, components)
+        used = looked.used
+        maps = {n: distributed.check_labels(n, v, used) for n, v in (labels or {}).items()}
+    else:
+        used = used_pixels(noise, data.shape[-1], components)
+        maps = {n: check_labels(n, v, used.size, used) for n, v in (labels or {}).items()}
     values = _start_values(mixing, start, maps)
 
     held = get_parameters(sky, [name for name in spectral_names(sky) if name not in start])
     fixed = {name: np.asarray(value) for name, value in held.items() if value.ndim}
     varying = dict(maps)
+    if looked is not None and fixed:
+        raise ValueError(
+            f"Parameter {next(iter(fixed))!r} is a map, which distributed pixels do not take; give "
+            "a number, or free it with `labels`."
+        )
     for name, value in fixed.items():
         if value.shape != used.shape:
             raise ValueError(
@@ -260,10 +295,10 @@ def spectral_likelihood(
                 f"{used.size}."
             )
         varying[name] = np.unique(value, return_inverse=True)[1]
-    cells = intersections(varying, used)
-    # A pixel of each cell.
-    first = np.flatnonzero(used)[:1]
-    if cells.of_pixel is not None:
+    cells = (distributed if looked else regions).intersections(varying, used)
+    # A pixel of each cell, of which parameters that are maps are taken.
+    first = np.flatnonzero(used)[:1] if fixed else np.zeros(0, int)
+    if cells.of_pixel is not None and fixed:
         found, at = np.unique(cells.of_pixel, return_index=True)
         first = at[found >= 0]
     angles = any(name.startswith("angle.") for name in start)
@@ -281,15 +316,24 @@ def spectral_likelihood(
         (),
     )
     matrix = _check_matrices(like)[:, : len(data), :components]
-    heavy, number = noise.heavy(used, np.mean(matrix**2, axis=0))
+    squares = np.mean(matrix**2, axis=0)
+    heavy, number = noise.heavy(used, squares) if looked is None else looked.heavy(squares)
+    pixels_used = int(used.sum()) if looked is None else looked.number
     rows = [len(data) * len(layout.groups[0]) for layout in like.layout]
-    fewer = cells.number * max(rows) < used.sum()
+    fewer = cells.number * max(rows) < pixels_used
     if compress and not noise.separable:
         raise ValueError("Only noise that is separable into bands and pixels can be compressed.")
     block_cell = None
     parts = []
+    few = noise.separable and (fewer if compress is None else compress)
+    blocks = distributed.blocks(cells, used) if looked is not None else None
     for layout in like.layout:
-        if noise.separable and (fewer if compress is None else compress):
+        if blocks is not None and few:
+            parts.append(distributed.compressed(data, noise, cells, blocks, layout))
+        elif blocks is not None:
+            parts.append(distributed.gathered(data, noise, blocks, layout))
+            block_cell = blocks.cell
+        elif few:
             parts.append(compressed(data, noise, cells, used, layout))
         else:
             pixels, block_cell = gathered(data, noise, cells, used, layout)
@@ -298,7 +342,7 @@ def spectral_likelihood(
         like,
         pixels=tuple(parts),
         block_cell=block_cell,
-        values=number - components * data.shape[1] * int(used.sum()),
+        values=number - components * data.shape[1] * pixels_used,
         weightless=tuple(name for name, some in zip(bands, heavy, strict=True) if not some),
     )
 

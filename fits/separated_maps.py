@@ -12,7 +12,8 @@ import scipy.special
 from jaxtyping import ArrayLike, Float
 
 from fits import systems
-from fits.compress import Noise, as_noise, bare, chunks, pixel_rows, used_pixels
+from fits.compress import PIECE, Noise, as_noise, bare, chunks, pixel_rows, used_pixels
+from fits.distributed import noise_like
 from fits.mixing import spectral_names
 from fits.multipoles import check_alm, multipoles_of
 from fits.optimize import best_fit
@@ -23,11 +24,12 @@ from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.checks import Numeric, as_array, check_finite, check_names, check_shape
 from jaxsky.components import component_class
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
+from jaxsky.mesh import along, maps_of, module_of, over_pixels, spread
 from jaxsky.observation import Instrument
 
 
 class ComponentMaps(NamedTuple):
-    """Maps of the components; NaN in masked pixels.
+    """Maps of the components; NaN in masked pixels. Those of distributed data are distributed.
 
     `amplitude` are generalised least-squares estimates, uK at the reference frequency of each law,
     CMB in uK_CMB. `covariance` is that of the components in each pixel for each Stokes parameter,
@@ -54,13 +56,13 @@ class ComponentMaps(NamedTuple):
         if self.covariance is None:
             raise ValueError("The covariance of the maps was not asked for.")
         i = self.components.index(name)
-        return np.sqrt(self.covariance[i, i])
+        return module_of(self.covariance).sqrt(self.covariance[i, i])
 
     def degradation(self, name: str) -> Float[np.ndarray, "stokes ..."]:
         """Return the noise of a component over that without other components; at least 1."""
         sigma = self.sigma(name)
         assert self.alone is not None  # made with the covariance
-        return sigma / np.sqrt(self.alone[self.components.index(name)])
+        return sigma / module_of(sigma).sqrt(self.alone[self.components.index(name)])
 
 
 @partial(jax.jit, static_argnames="errors")
@@ -95,6 +97,49 @@ def _passes(like: SpectralLikelihood, params: Mapping[str, Numeric], npix: int) 
             yield layout, part, own
 
 
+@partial(jax.jit, static_argnames=("layouts", "errors"))
+def _on_devices(of_pixel, known, data, noise, layouts, errors):
+    """Return the fields of `ComponentMaps` but the first, for distributed pixels."""
+    bands, stokes, _ = data.shape
+
+    def separated(of_pixel, known, data, noise, own):
+        weights = jnp.broadcast_to(noise.weights(own), (bands, stokes, own.size))
+        used = (weights > 0).any(axis=(0, 1))
+        size = known[0].shape[-1] // (1 + layouts[0].joint)
+        amplitude, alone = jnp.zeros((2, size, stokes, own.size))
+        blocks, square = jnp.zeros((size, *alone.shape)), jnp.zeros(own.size)
+        for layout, matrix in zip(layouts, known, strict=True):
+            every = matrix if of_pixel is None else matrix[jnp.maximum(of_pixel[own], 0)]
+            pixels = Pixels(*pixel_rows(data, noise, layout, own, used))
+            solved, squares, *variances = _separated(every, pixels, errors)
+            amplitude = amplitude.at[:, np.array(layout.stokes)].set(layout.maps(solved))
+            square = square + squares
+            for k, s in enumerate(layout.stokes if errors else ()):
+                group, first = (0, k * size) if layout.joint else (k, 0)
+                cut = slice(first, first + size)
+                blocks = blocks.at[:, :, s].set(variances[0][group, cut, cut])
+                alone = alone.at[:, s].set(variances[1][group, cut])
+        count = (weights > 0).sum(axis=(0, 1)) - 1.0 * size * stokes
+        exceeding = jax.scipy.special.gammaincc(jnp.maximum(count, 1) / 2, square / 2)
+        probability = jnp.where(count > 0, exceeding, 0.0)
+        found = amplitude, blocks, alone, square, count, probability
+        return jax.tree.map(lambda x: jnp.where(used, x, jnp.nan), found)
+
+    @over_pixels((maps_of(3), maps_of(4), maps_of(3), maps_of(1), maps_of(1), maps_of(1)))
+    def on_device(of_pixel, known, data, noise):
+        npix = data.shape[-1]
+
+        def some(start):
+            own = jnp.minimum(start + np.arange(min(PIECE, npix)), npix - 1)
+            return separated(of_pixel, known, data, noise, own)
+
+        parts = jax.lax.map(some, jnp.arange(0, npix, PIECE))
+        every = [jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1) for x in parts]
+        return tuple(x[..., :npix] for x in every)
+
+    return on_device(of_pixel, known, data, noise)
+
+
 def component_maps(
     like: SpectralLikelihood,
     params: Mapping[str, Numeric],
@@ -122,6 +167,11 @@ def component_maps(
     check_shape("data", data, good, f"have shape (band, stokes, pix) = {(*wanted, 'pix')}")
     names, (_, stokes, npix) = tuple(like.mixing.sky), data.shape
     noise = as_noise(noise, data.shape)
+    if spread(data):
+        known = matrices_at(like, like.check(params) if like.start else {})
+        args = along(data, like.of_pixel), known, data, noise_like(data, noise)
+        found = ComponentMaps(names, *_on_devices(*args, like.layout, covariance))
+        return found if covariance else found._replace(covariance=None, alone=None)
     used = used_pixels(noise, npix, len(names))
     amplitude = np.empty((len(names), stokes, npix))
     square, count = np.zeros(npix), np.zeros(npix)

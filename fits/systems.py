@@ -244,6 +244,20 @@ def _chi2_jvp(primals, tangents):
 least_chi2.defjvp(_chi2_jvp, symbolic_zeros=True)
 
 
+@jax.jit
+def square_root(matrix: Float[Array, "... row row"]) -> Float[Array, "... row row"]:
+    """Return R with R^T R = G for symmetric positive semi-definite G, even singular.
+
+    Rows and columns are scaled to a unit diagonal first, so that maps in different units do not
+    cost accuracy.
+    """
+    diagonal = jnp.diagonal(matrix, axis1=-2, axis2=-1)
+    scale = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
+    values, vectors = jnp.linalg.eigh(matrix / scale[..., :, None] / scale[..., None, :])
+    root = jnp.sqrt(jnp.maximum(values, 0.0))[..., :, None] * jnp.swapaxes(vectors, -1, -2)
+    return root * scale[..., None, :]
+
+
 def assembled(
     local: Float[np.ndarray, "cell free free"],
     index: np.ndarray,

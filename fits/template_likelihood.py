@@ -29,10 +29,10 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
-from fits.compress import square_root
 from fits.mixing import Mixing, TemplateErrors, check_signal, named_bands, unit_sky
 from fits.posterior import Likelihood
 from fits.products import checked_weights, gram, one_stokes_each, swapped
+from fits.systems import square_root
 from jaxsky import Bandpass, Sky, observe_components, parameter_names
 from jaxsky.checks import Numeric, as_array, check_double, check_shape
 from jaxsky.interpolation import NodeCounts, Nodes

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, Final, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
@@ -44,12 +45,12 @@ def distribute(
     *,
     shape: tuple[int, ...] | None = None,
     dtype: Any = float,
-    fill: float | None = None,
+    fill: float | None = np.nan,
 ) -> Array:
     """Distribute maps over the devices of a mesh; each process supplies its own pixels only.
 
-    Devices have as many pixels each. If that does not divide the pixels, the last ones are padded:
-    give the padding no weight by `fill=np.inf` for standard deviations.
+    Each device has the same number of pixels. If there are not enough, some are added at the end.
+    So that they have no weight, they have to be infinite (`fill=np.inf`) in standard deviations.
 
     Parameters
     ----------
@@ -58,8 +59,8 @@ def distribute(
     mesh : by default `pixel_mesh()`
     shape : shape (..., pix) of all maps, if `maps` is a function
     dtype : type of the numbers, if `maps` is a function
-    fill : value of the padding; by default that of the last pixel, which keeps maps of parameters
-        within their range
+    fill : value of pixels that are added: NaN, which is refused wherever it would count; None for
+        that of the last pixel, for maps of a sky and of labels
 
     Returns
     -------
@@ -87,6 +88,8 @@ def distribute(
         array = np.asarray(maps)
         shape, dtype, read = array.shape, array.dtype, lambda pixels: array[..., pixels]
     *rows, npix = shape
+    if not np.issubdtype(dtype, np.floating):
+        fill = None
     if mesh.size > npix:
         raise ValueError(
             f"Argument `mesh` has {mesh.size} devices for {npix} pixels; take one with fewer."
@@ -110,6 +113,16 @@ def spread(value: Any) -> bool:
     """Return whether an array lies on several devices."""
     traced = isinstance(value, jax.core.Tracer)
     return isinstance(value, jax.Array) and not traced and len(value.sharding.device_set) > 1
+
+
+def module_of(array: Any) -> Any:
+    """Return the module for the functions of an array, `numpy` or `jax.numpy`."""
+    return jnp if isinstance(array, jax.Array) else np
+
+
+def as_double(array: Any) -> Any:
+    """Return an array in double precision, of numpy or of JAX as before."""
+    return module_of(array).asarray(array, float)
 
 
 def mesh_of(tree: Any) -> Any:
@@ -160,6 +173,24 @@ def along(data: Any, tree: Tree) -> Tree:
         return distribute(leaf, mesh)
 
     return jax.tree.map(one, typed(tree))
+
+
+def parts_of(maps: Array) -> list[np.ndarray]:
+    """Return the pixels (..., pix) of each device of this process."""
+    return [np.asarray(shard.data) for shard in maps.addressable_shards]
+
+
+def from_parts(parts: Any, like: Array) -> Array:
+    """Return a distributed array from those of this process's devices, joined along the first axis.
+
+    They are in the order of `parts_of(like)`.
+    """
+    mesh = mesh_of(like)
+    sharding = NamedSharding(mesh, PartitionSpec(PIX))
+    devices = [shard.device for shard in like.addressable_shards]
+    shape = (mesh.size * len(parts[0]), *parts[0].shape[1:])
+    placed = [jax.device_put(part, device) for part, device in zip(parts, devices, strict=True)]
+    return jax.make_array_from_single_device_arrays(shape, sharding, placed)
 
 
 def _inside() -> bool:

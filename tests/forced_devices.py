@@ -11,8 +11,12 @@ import pytest
 from jax.sharding import AxisType, Mesh, NamedSharding
 
 import pixels
+from fits import distributed
 from fits.optimize import best_fit
+from fits.posterior import _cell_derivatives, value_and_gradient
 from fits.products import gram
+from fits.profile_likelihood import spectral_likelihood
+from fits.separated_maps import _on_devices
 from fits.template_likelihood import likelihood
 from jaxsky import Synchrotron, observe
 from jaxsky.mesh import along, distribute, maps_of
@@ -24,7 +28,7 @@ def ordinary(maps, fill=None):
     return maps
 
 
-def explicit(maps, fill=None):
+def explicit(maps, fill=np.nan):
     return distribute(maps, fill=fill)
 
 
@@ -54,8 +58,23 @@ def test_template_likelihoods_are_those_of_one_device(place, npix, varying):
     same(found, pixels.of_templates(npix, ordinary, varying))
 
 
+@pytest.mark.parametrize(
+    ("place", "npix", "kind", "regions", "compress"),
+    [
+        (explicit, 192, "factor", False, None),
+        (explicit, 50, "factor", True, False),
+        (explicit, 50, "pixels", True, None),
+        (automatic, 192, "pixels", False, None),
+        (automatic, 192, "covariance", True, None),
+    ],
+)
+def test_components_are_those_of_one_device(place, npix, kind, regions, compress):
+    found = pixels.of_components(npix, place, kind, regions, compress)
+    same(found, pixels.of_components(npix, ordinary, kind, regions, compress))
+
+
 def test_pixels_lie_where_they_belong():
-    maps = distribute(np.arange(50.0))
+    maps = distribute(np.arange(50.0), fill=None)
     assert maps.shape == (56,)
     parts = [np.asarray(shard.data) for shard in maps.addressable_shards]
     np.testing.assert_array_equal(np.concatenate(parts)[:50], np.arange(50.0))
@@ -107,6 +126,48 @@ def test_what_cannot_be_distributed_is_refused():
     raises(ValueError, words, law, explicit(np.r_[np.full(46, 3.0), np.nan, np.inf]))
 
 
+def test_data_are_refused_as_on_one_device():
+    data, sigma = pixels.data_of(48, False)
+    sky, bands, start = pixels.sky_of(1, False), pixels.BANDS, pixels.START
+
+    def refused(words, noise, data=data, error=ValueError, sky=sky, **options):
+        for place in (explicit, ordinary):
+            call = partial(spectral_likelihood, sky, bands, place(data), place(noise, np.inf))
+            raises(error, words, call, start, **options)
+
+    refused(
+        "5 of 480 values that are not > 0", np.where(np.arange(48) < 1, [[[0], [1]]], sigma)[:5]
+    )
+    refused(
+        "42 pixels are seen in fewer bands",
+        np.where(np.arange(5)[:, None, None] < 4, np.inf, sigma),
+    )
+    refused("No pixel is left", np.full_like(sigma, np.inf))
+    refused(
+        "`data` has 30 values that are not",
+        np.ones_like(sigma),
+        np.where(np.arange(48) < 3, np.nan, data),
+    )
+    labels = {"dust.beta_dust": np.arange(48) - 2}
+    refused("negative in 2 pixels that are used", np.ones_like(sigma), labels=labels)
+    labels = {"dust.beta_dust": np.ones(48)}
+    refused("must be integers", np.ones_like(sigma), error=TypeError, labels=labels)
+    labels = {"dust.beta_dust": np.ones(47, int)}
+    refused("must have shape .48,. like a map", np.ones_like(sigma), labels=labels)
+    covariance = np.broadcast_to(np.array([[1.0, 2.0], [2.0, 1.0]])[..., None], (5, 2, 2, 48))
+    refused("not positive definite in 240 of 240 values", covariance)
+
+
+def test_what_only_distributed_pixels_refuse():
+    data, _ = pixels.data_of(50, False)
+    call = partial(spectral_likelihood, bands=pixels.BANDS, data=explicit(data), noise=np.ones(5))
+    sky = pixels.sky_of(50, True)
+    raises(ValueError, "`data` has 60 values that are not finite", call, sky, start=pixels.START)
+    sky, start = pixels.sky_of(48, True), {"synchrotron.beta_syn": 3.0}
+    data = explicit(pixels.data_of(48, False)[0])
+    raises(ValueError, "'dust.beta_dust' is a map", call, sky, data=data, start=start)
+
+
 COLLECTIVES = ("all-reduce", "all-gather", "all-to-all", "collective-permute", "reduce-scatter")
 BYTES = {"f64": 8, "f32": 4, "s64": 8, "s32": 4, "u32": 4, "u8": 1, "pred": 1}
 
@@ -130,16 +191,34 @@ def programs(nside: int) -> dict[str, jax.stages.Lowered]:
     bands = tuple(pixels.BANDS.values())
     templates = explicit(np.ones((2, 2, npix)))
     nodes = interpolation_nodes(sky, bands, 1e-10)
+    noise, labels = pixels.noise_of("factor", npix, explicit), np.arange(npix) // 5 % 3
+    like = spectral_likelihood(
+        *(pixels.sky_of(1, False), pixels.BANDS, data, noise, pixels.START),
+        labels={"dust.beta_dust": labels},
+        compress=False,
+    )
+    used = distributed.look(data, noise, 2).used
+    labels = distributed.check_labels("labels", labels, used)
+    blocks = distributed.blocks(distributed.intersections({"labels": labels}, used), used)
+    (layout,) = like.layout
     return {
         "observe": _observe.lower(sky, bands, nodes, False),
         "gram": jax.jit(gram).lower(data, templates, sigma),
+        "likelihood": _cell_derivatives.lower(like, like.flat({})),
+        "gradient": jax.jit(value_and_gradient).lower(like, like.flat({})),
+        "band covariance": distributed._covariance.lower(data, noise, blocks, layout, 3),
+        "blocks": jax.jit(partial(distributed.gathered, layout=layout)).lower(data, noise, blocks),
+        "used pixels": distributed._look.lower(data, noise, 2),
+        "maps": _on_devices.lower(None, (np.ones((1, 5, 2)),), data, noise, (layout,), True),
     }
 
 
 def test_nothing_that_grows_with_nside_is_moved():
     small, large = programs(4), programs(16)
     for name, program in small.items():
-        assert 0 < moved(program) == moved(large[name]), name
+        # Maps of components and blocks take nothing from other devices.
+        assert (moved(program) == 0) == (name in ("maps", "blocks")), name
+        assert moved(program) == moved(large[name]), name
 
 
 def test_what_grows_with_nside_is_seen():

@@ -8,9 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.multihost_utils import process_allgather
 
+from fits.compress import as_noise
 from fits.optimize import best_fit
-from fits.posterior import chi2
+from fits.posterior import chi2, value_and_gradient
 from fits.products import gram
+from fits.profile_likelihood import spectral_likelihood
+from fits.separated_maps import component_maps
 from fits.template_likelihood import likelihood
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe, observe_components
 
@@ -37,7 +40,7 @@ def sky_of(npix: int, varying: bool) -> Sky:
 
 def placed(sky: Sky, place: Place) -> Sky:
     """The sky with its maps in their place."""
-    return jax.tree.map(lambda leaf: place(np.asarray(leaf)) if leaf.ndim else leaf, sky)
+    return jax.tree.map(lambda leaf: place(np.asarray(leaf), None) if leaf.ndim else leaf, sky)
 
 
 def data_of(npix: int, varying: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -81,4 +84,43 @@ def of_templates(npix: int, place: Place, varying: bool) -> dict[str, np.ndarray
         templates = jnp.stack([sky[name].amplitude for name in sky])
         weights = jnp.where(jnp.isfinite(sigma), 1 / sigma**2, 0)
         found["inner products"] = np.asarray(gram(data, templates, weights))
+    return found
+
+
+def noise_of(kind: str, npix: int, place: Place) -> Any:
+    """Noise with a factor in each pixel, in all pixels, or with covariances of Q and U."""
+    rng = np.random.default_rng(3)
+    factor = np.where(rng.uniform(size=npix) < 0.1, np.inf, rng.uniform(0.8, 1.2, npix))
+    level = np.linspace(0.5, 1.5, len(BANDS))
+    if kind == "factor":
+        factor = place(factor, np.inf)
+        return as_noise(level, (len(BANDS), 2, factor.size), factor)
+    sigma = level[:, None, None] * factor * rng.uniform(0.9, 1.1, (len(BANDS), 2, npix))
+    if kind == "pixels":
+        return place(sigma, np.inf)
+    QQ, UU = sigma[:, 0] ** 2, sigma[:, 1] ** 2
+    QU = np.where(np.isinf(QQ), 0.0, 0.3 * sigma[:, 0] * sigma[:, 1])
+    covariance = np.stack([QQ, QU, QU, UU], axis=1)
+    return place(covariance.reshape(len(BANDS), 2, 2, npix), np.inf)
+
+
+def of_components(
+    npix: int, place: Place, kind: str, regions: bool, compress: bool | None = None
+) -> dict[str, np.ndarray]:
+    """What the spectral likelihood says, and the components' maps."""
+    data, noise = place(data_of(npix, False)[0]), noise_of(kind, npix, place)
+    labels = {"dust.beta_dust": place(np.arange(npix) // 5 % 3)} if regions else {}
+    options = {"labels": labels, "compress": compress}
+    like = spectral_likelihood(sky_of(1, False), BANDS, data, noise, START, **options)
+    value, gradient = value_and_gradient(like, like.flat({}))
+    fit = best_fit(like, throw=False)
+    names = sorted(START)
+    sigma = np.concatenate([np.atleast_1d(fit.sigma[name]) for name in names])
+    values = np.concatenate([np.atleast_1d(fit.best_fit[name]) for name in names])
+    found = {"chi2": np.asarray(value), "gradient": np.asarray(gradient), "sigma": sigma}
+    found |= {"best fit in sigma": values / sigma, "dof": np.array(fit.dof)}
+    maps = component_maps(like, {}, data, noise)
+    for name in maps._fields[1:]:
+        found[f"{name} of maps"] = whole(getattr(maps, name), npix)
+    found["degradation"] = whole(maps.degradation("dust"), npix)
     return found

@@ -27,17 +27,19 @@ from fits import (
     common,
     comparison,
     compress,
+    distributed,
     fisher,
     grid,
     mixing,
     optimize,
     patches,
     posterior,
+    products,
     profile_likelihood,
     pseudo_cl,
     sampling,
     separated_maps,
-    template_likelihood,
+    systems,
     tensor_ratio,
     unbounded,
 )
@@ -232,17 +234,28 @@ def posteriors() -> Calls:
 
 def template_passes() -> Calls:
     data = np.ones((4, 2, NPIX))
-    yield template_likelihood.gram, data, MAPS[None], data
-    yield template_likelihood._weights, data, 2 * data
-    yield template_likelihood._one_stokes_each, MAPS[None], data
+    yield products.gram, data, MAPS[None], data
+    yield products._weights, data, 2 * data
+    yield products.one_stokes_each, MAPS[None], data
 
 
 def comparisons() -> Calls:
     yield comparison._sums_of_squares, np.ones((4, 2, NPIX)), np.ones((3, NPIX), bool)
 
 
-def compression() -> Calls:
-    yield compress.square_root, np.eye(4)[None]
+def decompositions() -> Calls:
+    yield systems.square_root, np.eye(4)[None]
+
+
+def shared_pixels() -> Calls:
+    data, layout = np.ones((4, 2, NPIX)), compress.Layout(False, (0, 1))
+    noise, used = compress.Noise(np.ones((4, 2, 1)), np.ones(NPIX)), np.ones(NPIX, bool)
+    blocks = distributed.Blocks(np.arange(NPIX).reshape(2, -1), np.arange(2))
+    yield partial(distributed._look, components=2), data, noise
+    yield partial(distributed.counted, number=3), np.arange(NPIX)
+    yield distributed._numbered, np.arange(3), np.arange(NPIX), used
+    yield partial(distributed._covariance, layout=layout, number=2), data, noise, blocks
+    yield partial(distributed.gathered, layout=layout), data, noise, blocks
 
 
 def separations() -> Calls:
@@ -254,7 +267,11 @@ def separated() -> Calls:
     matrix = np.random.default_rng(1).normal(size=(1, 4, 2))
     pixels = compress.Pixels(np.ones((2, 4, NPIX)), np.ones((2, 4, NPIX)), None)
     each = np.repeat(matrix, NPIX, axis=0)
+    data, noise = np.ones((4, 2, NPIX)), compress.Noise(np.ones((4, 2, NPIX)))
     for errors in (False, True):
+        options = {"layouts": (compress.Layout(False, (0, 1)),), "errors": errors}
+        whole = partial(separated_maps._on_devices, None, **options)
+        yield whole, (matrix,), jnp.asarray(data), jax.tree.map(jnp.asarray, noise)
         yield partial(separated_maps._separated, errors=errors), matrix, pixels
         yield partial(separated_maps._separated, errors=errors), each, pixels
 
@@ -349,9 +366,10 @@ CALLS: dict[str, Callable[[], Calls]] = {
     "jaxsky.templates": correlations,
     "fits.common": fluctuations,
     "fits.posterior": posteriors,
-    "fits.template_likelihood": template_passes,
+    "fits.products": template_passes,
     "fits.comparison": comparisons,
-    "fits.compress": compression,
+    "fits.systems": decompositions,
+    "fits.distributed": shared_pixels,
     "fits.profile_likelihood": separations,
     "fits.separated_maps": separated,
     "fits.grid": grids,

@@ -12,11 +12,11 @@ from jax.test_util import check_grads
 
 import systems
 from fits.common import Fluctuations
-from fits.compress import square_root
 from fits.mixing import NOMINAL
 from fits.optimize import best_fit
 from fits.posterior import Gaussian, chi2
 from fits.products import gram
+from fits.systems import square_root
 from fits.template_likelihood import likelihood
 from jaxsky import (
     AME,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsky.checks import UNSEEN
+from jaxsky.checks import EXACT, UNSEEN
 from jaxsky.mesh import SUMS, maps_of, over_pixels, total
 
 #: Pixels per pass over templates; few enough for the weighted copies to stay in cache.
@@ -37,7 +37,7 @@ def gram(
         rows = jnp.concatenate([d[:, :, None], t, jnp.ones_like(d)[:, :, None]], axis=2)
         # A masked pixel may contain anything, even NaN.
         rows = jnp.where(w[:, :, None] > 0, rows, 0)
-        return jnp.einsum("bsip,bsp,bsjp->bsij", rows, w, rows)
+        return jnp.einsum("bsip,bsp,bsjp->bsij", rows, w, rows, precision=EXACT)
 
     chunk = min(chunk, npix)
     whole = npix // chunk * chunk

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.checks import (
+    EXACT,
     Numeric,
     Printed,
     as_array,
@@ -126,7 +127,7 @@ class Bandpass(Printed, eqx.Module):
     @property
     def center(self) -> Float[Array, ""]:
         """Mean frequency with the weights on antenna temperature [GHz]."""
-        return jnp.dot(self.quadrature, self.nu)
+        return jnp.dot(self.quadrature, self.nu, precision=EXACT)
 
     def shifted(self, delta: ArrayLike) -> "Bandpass":
         """Return the band shifted by delta [GHz]; averages over it are normalised again."""
@@ -205,7 +206,7 @@ def average(sed: Callable[[Array], Array], band: Bandpass | Samples) -> Float[Ar
     """
     shape = jax.eval_shape(sed, band.nu[0]).shape
     if shape == ():
-        return jnp.dot(band.quadrature, jax.vmap(sed)(band.nu))
+        return jnp.dot(band.quadrature, jax.vmap(sed)(band.nu), precision=EXACT)
 
     @jax.checkpoint
     def add(total, sample):

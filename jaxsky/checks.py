@@ -2,7 +2,7 @@
 
 import html
 from collections.abc import Iterable, Sequence
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,8 @@ from jaxsky.public import refuse_unit, takes_quantities
 
 #: Arguments of the spectral laws: numbers or arrays that broadcast.
 Numeric: TypeAlias = float | Array | np.ndarray
+#: Precision of matrix products: GPUs round single-precision factors to 11 bits unless told not to.
+EXACT: Final = "highest"
 #: A spectral parameter: a number or a map; inside a component always an array.
 Parameter: TypeAlias = Float[Array, ""] | Float[Array, " pix"] | float
 

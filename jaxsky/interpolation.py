@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.polynomial.chebyshev import chebpts1, chebvander
 
 from jaxsky.bandpass import Bandpass, Samples, average, stack_bands
-from jaxsky.checks import is_concrete
+from jaxsky.checks import EXACT, is_concrete
 from jaxsky.components import Component
 from jaxsky.mesh import SUMS, extremes, over_pixels
 
@@ -50,7 +50,8 @@ def _coefficients(values: Float[Array, "..."]) -> Float[Array, "..."]:
     for axis, n in enumerate(values.shape):
         inverse = chebvander(chebpts1(n), n - 1).T * 2 / n
         inverse[0] /= 2
-        moved = jnp.tensordot(jnp.asarray(inverse, values.dtype), values, axes=(1, axis))
+        own = jnp.asarray(inverse, values.dtype)
+        moved = jnp.tensordot(own, values, axes=(1, axis), precision=EXACT)
         values = jnp.moveaxis(moved, 0, axis)
     return values
 
@@ -221,7 +222,7 @@ def term_weights(
 
 @partial(jax.jit, static_argnames="counts")
 def _weights(component, samples, vectors, counts):
-    return tuple(_all_series(component, samples, counts) @ vectors.T)
+    return tuple(jnp.dot(_all_series(component, samples, counts), vectors.T, precision=EXACT))
 
 
 @jax.jit
@@ -283,7 +284,7 @@ def band_seds(
             polynomials = [jnp.ones_like(point), point]
             for _ in range(n - 2):
                 polynomials.append(2 * point * polynomials[-1] - polynomials[-2])
-            product = product @ jnp.stack(polynomials[:n])
+            product = jnp.matmul(product, jnp.stack(polynomials[:n]), precision=EXACT)
         return product
 
     def interpolated():

@@ -95,6 +95,8 @@ def bandpasses() -> Calls:
         yield partial(bandpass._integrand, convention=convention), NU, np.ones(2)
         yield partial(bandpass._quadrature, convention=convention), NU, np.ones(2)
     yield bandpass.stack_bands, tuple(BANDS)
+    yield lambda band: band.center, BANDS[0]
+    yield partial(bandpass.average, lambda nu: nu**-3.1), BANDS[0]
     yield partial(bandpass.band_conversion, "uK_RJ", "MJy/sr"), NU, np.ones(2), 353.0
     yield jax.grad(lambda x: jaxsky.Bandpass.top_hat(x, 20.0).conversion("K_CMB", "uK_RJ")), 100.0
 
@@ -112,16 +114,15 @@ def interpolated() -> Calls:
 
 
 def observed() -> Calls:
-    def total(one):
-        return jnp.sum(jaxsky.observe(one, BANDS) ** 2)
+    def total(one, bands):
+        return jnp.sum(jaxsky.observe(one, bands) ** 2)
 
-    everything = sky.Sky(components())
-    yield lambda one: jaxsky.observe(one, BANDS), everything
-    yield lambda one: jaxsky.observe(one, BANDS), sky.Sky({"dust": DUST})
-    yield lambda one: jaxsky.observe(one, BANDS, tolerance=0), sky.Sky({"dust": DUST})
-    yield lambda one: sky.observe_components(one, BANDS), everything
-    yield jax.grad(total), everything
-    yield jax.grad(total), sky.Sky({"dust": DUST})
+    everything, varying = sky.Sky(components()), sky.Sky({"dust": DUST})
+    for one in (everything, varying):
+        yield jaxsky.observe, one, BANDS
+        yield partial(jaxsky.observe, tolerance=0), one, BANDS
+        yield jax.grad(total), one, BANDS
+    yield sky.observe_components, everything, BANDS
 
 
 def transforms() -> Calls:
@@ -382,6 +383,15 @@ CALLS: dict[str, Callable[[], Calls]] = {
 }
 
 
+#: Modules whose calls also take single precision.
+SINGLE = ("jaxsky.bandpass", "jaxsky.interpolation", "jaxsky.sky", "fits.products")
+
+
+def in_single_precision(x):
+    x = jnp.asarray(x)
+    return x.astype(np.float32) if x.dtype == np.float64 else x
+
+
 def jitted(function) -> bool:
     return hasattr(function, "lower")
 
@@ -446,3 +456,17 @@ def test_no_module_is_forgotten():
         if module.name != "jaxsky.__main__" and compiled(module.name)
     }
     assert found == set(CALLS)
+
+
+@pytest.mark.parametrize("module", SINGLE)
+def test_matrix_products_in_single_precision_are_not_rounded_further(module, monkeypatch):
+    """As GPUs do with what has no precision of its own."""
+    products = 0
+    for function, *arguments in CALLS[module]():
+        single = jax.tree.map(in_single_precision, arguments)
+        text, _ = lowered(function, single, monkeypatch)
+        for line in text.splitlines():
+            if "dot_general" in line and "f32>" in line:
+                products += 1
+                assert "precision = [HIGHEST, HIGHEST]" in line
+    assert products

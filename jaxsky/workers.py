@@ -85,15 +85,18 @@ def realised(
                 left.popleft()
                 tasks.popleft()
                 yield from done
-        except BrokenExecutor:
-            raise ChildProcessError(
-                "Worker processes died twice: were they killed, or is memory short? What was "
-                "complete is kept; go on with --resume, perhaps with fewer workers."
-            ) from None
         except CancelledError:
             raise ConnectionError(
                 "The connection to the scheduler of the workers was lost. What was complete is "
                 "kept; go on with --resume once it is there again."
+            ) from None
+        except Exception as error:
+            # Dask has tried a task several times before it raises this.
+            if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":
+                raise
+            raise ChildProcessError(
+                "Workers died more than once: were they killed, or is memory short? What was "
+                "complete is kept; go on with --resume, perhaps with fewer workers."
             ) from None
         finally:
             for future in tasks:

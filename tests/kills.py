@@ -96,9 +96,9 @@ def content(out: Path) -> dict:
 class Killing:
     """Kills of a command, chained, against an undisturbed run in an empty folder."""
 
-    def __init__(self, name: str, folder: Path, seed: int = 0) -> None:
+    def __init__(self, name: str, folder: Path, seed: int = 0, options: tuple = ()) -> None:
         self.name, self.out, self.rng = name, folder / "out", np.random.default_rng(seed)
-        self.finished = 0
+        self.finished, self.options = 0, options
         began, whole = time.monotonic(), folder / "whole"
         process = start(name, whole)
         self.changes = watch(process, whole, 10**9, 600)
@@ -126,7 +126,7 @@ class Killing:
     def stop(self, how: int, changes: int, seconds: float) -> bool:
         """Begin or resume, and stop at a moment; False if the end came before."""
         began, fresh = time.monotonic(), not self.out.exists()
-        process = start(self.name, self.out, *([] if fresh else ["--resume"]))
+        process = start(self.name, self.out, *self.options, *([] if fresh else ["--resume"]))
         if how == signal.SIGINT:  # when Python is there to hear it
             watch(process, self.out, 1, 600)
         watch(process, self.out, changes, seconds)

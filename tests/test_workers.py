@@ -1,5 +1,6 @@
 """Realisations made by workers: processes of this machine, and any executor."""
 
+import logging
 import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -7,14 +8,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from distributed import LocalCluster
 
 from fits.commands.run import keep_traceback
 from fits.kept import kept_realisations
 from jaxsky import workers
 from jaxsky.settings import SettingsError
-from jaxsky.workers import Processes, realised, workers_of
-from realisations import Dying, Pair, drawn, failing, mistaken, surroundings
+from jaxsky.workers import realised, workers_of
+from realisations import Pair, drawn, failing, mistaken, surroundings
 from refusals import cases, raises, refused
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """The address of a Dask cluster of two processes."""
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
+    ) as cluster:
+        yield cluster.scheduler_address
 
 
 def pairs(path=None, executor=None, count=9, reports=None):
@@ -51,21 +62,23 @@ def test_workers_are_like_this_process(two, tmp_path):
     assert os.environ == environment
 
 
-@pytest.mark.parametrize("kills", [1, 2])
-def test_a_worker_that_dies_is_replaced_once(kills, tmp_path):
-    for i in range(kills):
-        (tmp_path / f"kill{i}").touch()
-    done = []
-    with Processes(1) as processes:
-        making = realised(Dying(tmp_path, 3), range(8), processes, tmp_path)
-        if kills == 1:
-            done.extend(making)
-            assert done == list(range(8))
-        else:
-            with pytest.raises(ChildProcessError, match=r"died twice.* go on with --resume"):
-                done.extend(making)
-            assert done == [0, 1, 2]
-    assert not list(tmp_path.iterdir())
+def test_a_dask_cluster_finds_the_same(cluster, tmp_path):
+    notes = []
+    with workers_of(cluster, notes.append) as executor:
+        found = pairs(tmp_path / "kept.npz", executor)
+        with pytest.raises(SettingsError, match=r"^separate.lmax: is wrong.$") as caught:
+            list(realised(mistaken, range(3), executor, tmp_path))
+        assert workers.raised_in(caught.value) == ("realisations", True)
+    assert [array.tobytes() for array in found] == [array.tobytes() for array in pairs()]
+    assert not notes
+    assert os.listdir(tmp_path) == ["kept.npz"]
+
+
+def test_a_dask_worker_of_another_version_is_refused(cluster, monkeypatch):
+    monkeypatch.setattr(workers.jax, "__version__", "0.0.7")
+    words = r"^The worker tcp://.* has jax \d+\..*, but 0.0.7 is needed"
+    with refused(words, ValueError), workers_of(cluster):
+        pass
 
 
 def test_errors_of_workers_are_those_of_this_process(two, tmp_path):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from fits.compress import BLOCK, Layout, Noise, carrying, pixel_rows
+from fits.compress import BLOCK, PIECE, Layout, Noise, carrying, pixel_rows
 from fits.regions import Cells
 from fits.systems import Pixels, square_root
 from jaxsky.checks import UNSEEN
@@ -156,6 +156,17 @@ def blocks(cells: Cells, used: Bool[Array, " pix"]) -> Blocks:
 
     pixels, cell = zip(*map(arranged, own, sizes), strict=True)
     return Blocks(from_parts(pixels, of_pixel), from_parts(cell, of_pixel))
+
+
+@jax.jit
+@over_pixels(maps_of(1))
+def pieces(used: Bool[Array, " pix"]) -> Blocks:
+    """Return the pixels of each device as they are, in blocks of one cell; -1 where not used."""
+    npix = used.shape[-1]
+    size = min(PIECE, npix)
+    own = jnp.arange(-(-npix // size) * size, dtype=jnp.int32)
+    own = jnp.where(used[jnp.minimum(own, npix - 1)] & (own < npix), own, -1).reshape(-1, size)
+    return Blocks(own, jnp.zeros(len(own), int))
 
 
 @partial(jax.jit, static_argnames=("layout", "number"))

@@ -30,7 +30,7 @@ from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.bandpass import parse_unit
 from jaxsky.checks import Numeric, as_array, check_double, check_finite, check_shape
-from jaxsky.mesh import SUMS, maps_of, over_pixels, spread
+from jaxsky.mesh import SUMS, in_place, maps_of, over_pixels, spread
 from jaxsky.mesh import total as over_devices
 from jaxsky.sky import check_parameter, unknown_parameter
 
@@ -253,6 +253,10 @@ def spectral_likelihood(
     check_double("fits")
     sky = sky if isinstance(sky, Sky) else Sky(sky)
     bands = named_bands(bands)
+    held = get_parameters(sky, [name for name in spectral_names(sky) if name not in start])
+    fixed = {name: np.asarray(value) for name, value in held.items() if value.ndim}
+    # On one accelerator, maps of parameters are taken by the pass on the host.
+    data, noise = (data, noise) if fixed else in_place(data, noise)
     data = bare("data", data)
     components = len(sky.components)
     if parse_unit(unit)[1] not in ("K_RJ", "K_CMB"):
@@ -280,8 +284,6 @@ def spectral_likelihood(
         maps = {n: check_labels(n, v, used.size, used) for n, v in (labels or {}).items()}
     values = _start_values(mixing, start, maps)
 
-    held = get_parameters(sky, [name for name in spectral_names(sky) if name not in start])
-    fixed = {name: np.asarray(value) for name, value in held.items() if value.ndim}
     varying = dict(maps)
     if looked is not None and fixed:
         raise ValueError(
@@ -326,7 +328,11 @@ def spectral_likelihood(
     block_cell = None
     parts = []
     few = noise.separable and (fewer if compress is None else compress)
-    blocks = distributed.blocks(cells, used) if looked is not None else None
+    blocks = None
+    if looked is not None:
+        # A sum over all pixels needs no order.
+        ordered = cells.of_pixel is not None or not few
+        blocks = distributed.blocks(cells, used) if ordered else distributed.pieces(used)
     for layout in like.layout:
         if blocks is not None and few:
             parts.append(distributed.compressed(data, noise, cells, blocks, layout))

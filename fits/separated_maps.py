@@ -24,7 +24,7 @@ from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.checks import Numeric, as_array, check_finite, check_names, check_shape
 from jaxsky.components import component_class
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
-from jaxsky.mesh import along, maps_of, module_of, over_pixels, spread
+from jaxsky.mesh import along, in_place, maps_of, module_of, over_pixels, spread
 from jaxsky.observation import Instrument
 
 
@@ -162,6 +162,7 @@ def component_maps(
     KeyError, TypeError, ValueError
         For unknown parameters, and what `spectral_likelihood` refuses.
     """
+    data, noise = in_place(data, noise)
     data, wanted = bare("data", data), (len(like.mixing.names), len(like.stokes))
     good = data.ndim == 3 and data.shape[:2] == wanted
     check_shape("data", data, good, f"have shape (band, stokes, pix) = {(*wanted, 'pix')}")

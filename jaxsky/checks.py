@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsky.mesh import spread
+from jaxsky.mesh import on_accelerator, spread
 from jaxsky.public import refuse_unit, takes_quantities
 
 #: Arguments of the spectral laws: numbers or arrays that broadcast.
@@ -59,8 +59,9 @@ UNSEEN = -1.6e30
 
 
 def looked_at(value: Any) -> tuple[Any, Any]:
-    """Return numbers to look at, and the module for it; distributed ones stay where they are."""
-    return (value, jnp) if spread(value) else (np.asarray(value), np)
+    """Return numbers to look at, and the module for it; those on other devices stay there."""
+    away = spread(value) or on_accelerator(value)
+    return (value, jnp) if away else (np.asarray(value), np)
 
 
 def check_finite(name: str, value: Array | np.ndarray) -> None:

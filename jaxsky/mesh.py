@@ -110,9 +110,33 @@ def distribute(
 
 
 def spread(value: Any) -> bool:
-    """Return whether an array lies on several devices."""
-    traced = isinstance(value, jax.core.Tracer)
-    return isinstance(value, jax.Array) and not traced and len(value.sharding.device_set) > 1
+    """Return whether an array lies on several devices, or is distributed over a mesh of one."""
+    if not isinstance(value, jax.Array) or isinstance(value, jax.core.Tracer):
+        return False
+    return len(value.sharding.device_set) > 1 or mesh_of(value) is not None
+
+
+def on_accelerator(value: Any) -> bool:
+    """Return whether an array lies on accelerators: looking at it on the host means a copy."""
+    if not isinstance(value, jax.Array) or isinstance(value, jax.core.Tracer):
+        return False
+    return all(device.platform != "cpu" for device in value.devices())
+
+
+def in_place(data: Any, *others: Any) -> tuple[Any, ...]:
+    """Return maps (..., band, stokes, pix) as distributed over the accelerator that holds the data.
+
+    Nothing is copied, and nothing changed if the data lie elsewhere or are distributed already.
+    """
+    if spread(data) or not on_accelerator(data):
+        return data, *others
+    mesh = _mesh_over(np.array(list(data.devices())))
+    return tuple(
+        jax.device_put(one, NamedSharding(mesh, maps_of(one.ndim)))
+        if on_accelerator(one) and one.ndim > 2
+        else one
+        for one in (data, *others)
+    )
 
 
 def module_of(array: Any) -> Any:

@@ -12,7 +12,23 @@ from jax.interpreters import mlir
 from jaxbind import jaxbind
 
 from benchmarks import gpu
-from jaxsky import Observation, ObservedBand, Sky, Source, harmonics, set_parameters, simulate
+from fits.optimize import best_fit
+from fits.profile_likelihood import spectral_likelihood
+from fits.separated_maps import component_maps
+from jaxsky import (
+    Bandpass,
+    Dust,
+    Observation,
+    ObservedBand,
+    Sky,
+    Source,
+    checks,
+    harmonics,
+    mesh,
+    observe,
+    set_parameters,
+    simulate,
+)
 from jaxsky.harmonics import transforms
 from systems import bands, dust_and_synchrotron
 
@@ -109,3 +125,59 @@ def test_wrong_numbers_are_missed_by_the_script(monkeypatch):
     assert gpu.band_average(8, np.float64, trial=True).met is False
     monkeypatch.setattr(gpu, "ACCURACY", {np.float64: 1e-9})
     assert gpu.band_average(8, np.float64, trial=True).met is None
+
+
+@pytest.fixture
+def on_an_accelerator(monkeypatch):
+    """Arrays of JAX count as those of an accelerator."""
+    for module in (mesh, checks):
+        monkeypatch.setattr(module, "on_accelerator", lambda x: isinstance(x, jax.Array))
+
+
+def test_separations_stay_where_the_maps_are(on_an_accelerator):
+    """With the same results as for numpy arrays."""
+    rng, instrument = np.random.default_rng(3), [30.0, 95.0, 150.0, 220.0, 353.0]
+    channels = {f"{nu:g}": Bandpass.top_hat(nu, nu / 4, samples=5) for nu in instrument}
+    start = {"dust.beta_dust": 1.55, "synchrotron.beta_syn": 3.05}
+    sigma = np.full((5, 2, NPIX), 0.3)
+    sigma[..., :40] = np.inf
+    data = np.asarray(observe(SKY, list(channels.values()))) + 0.3 * rng.normal(size=sigma.shape)
+    data[..., :40] = np.nan
+    varying = sigma * rng.uniform(1, 2, sigma.shape)
+    labels = {"dust.beta_dust": np.arange(NPIX) // 400}
+    for noise, options in ((sigma[..., -1:].mean(axis=(1, 2)), {}), (varying, {"labels": labels})):
+        whole = data if noise.ndim > 1 else np.where(np.isnan(data), 0.0, data)
+        found = {}
+        for place in (np.asarray, jnp.asarray):
+            given = place(whole), place(noise)
+            like = spectral_likelihood(SKY, channels, *given, start, **options)
+            fit = best_fit(like, throw=False)
+            maps = component_maps(like, fit.best_fit, *given)
+            assert isinstance(maps.amplitude, jax.Array) == (place is jnp.asarray)
+            found[place] = fit.best_fit, maps.amplitude, maps.chi2, maps.sigma("dust")
+        for one, other in zip(*map(jax.tree.leaves, found.values()), strict=True):
+            # Errors of one noise are those of one pixel, or of all.
+            one, other = np.broadcast_arrays(one, other)
+            np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-10)
+
+
+def test_maps_of_parameters_are_taken_on_an_accelerator(on_an_accelerator):
+    varying = set_parameters(SKY, {"dust.beta_dust": jnp.linspace(1.5, 1.6, NPIX)})
+    channels = {f"{nu:g}": Bandpass.top_hat(nu, nu / 4, samples=5) for nu in (30.0, 95.0, 353.0)}
+    data = observe(varying, list(channels.values()))
+    like = spectral_likelihood(varying, channels, data, np.ones(3), {})
+    np.testing.assert_allclose(
+        component_maps(like, {}, data, np.ones(3)).amplitude[0],
+        varying["dust"].amplitude,
+        rtol=1e-8,
+    )
+
+
+def test_checks_say_the_same_of_what_lies_elsewhere(on_an_accelerator):
+    for array in (jnp.array([1.0, jnp.nan, -2e30]), np.array([1.0, np.nan, -2e30])):
+        with pytest.raises(ValueError, match="`x` has 2 of 3 values that are not finite"):
+            checks.check_finite("x", array)
+    with pytest.raises(ValueError, match="positive, but its smallest value is -1"):
+        checks.check_positive("x", jnp.array([1.0, -1.0]))
+    with pytest.raises(ValueError, match=r"`nu_ref` must be from 1 to 20000, but is 0\.5"):
+        Dust(jnp.ones((2, 12)), 1.5, 20.0, nu_ref=jnp.array(0.5))

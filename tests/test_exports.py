@@ -254,6 +254,7 @@ def shared_pixels() -> Calls:
     blocks = distributed.Blocks(np.arange(NPIX).reshape(2, -1), np.arange(2))
     yield partial(distributed._look, components=2), data, noise
     yield partial(distributed.counted, number=3), np.arange(NPIX)
+    yield distributed.pieces, used
     yield distributed._numbered, np.arange(3), np.arange(NPIX), used
     yield partial(distributed._covariance, layout=layout, number=2), data, noise, blocks
     yield partial(distributed.gathered, layout=layout), data, noise, blocks

@@ -117,7 +117,7 @@ class Noise(NamedTuple):
         QQ, UU = (xp.where(masked, 1.0, block[:, s, s]) for s in range(2))
         QU = xp.where(masked, 0.0, block[:, 0, 1])
         determinant = xp.where(masked, np.inf, QQ * UU - QU**2)
-        return xp.stack([QQ, UU]), determinant, QU
+        return (QQ, UU), determinant, QU
 
 
 def as_noise(

@@ -6,7 +6,9 @@ not distributed pass through unchanged.
 """
 
 import functools
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Final, TypeVar
 
 import jax
@@ -19,6 +21,10 @@ from jaxsky.public import refuse_unit
 
 #: Name of the axis of devices that share the pixels.
 PIX: Final = "pix"
+#: Seconds after which a process that does not answer is taken to have ended.
+HEARTBEAT: Final = 10
+#: Variables by which JAX knows the processes of SLURM, and of Open MPI up to version 4.
+LAUNCHED: Final = ("SLURM_STEP_NODELIST", "OMPI_MCA_orte_hnp_uri")
 #: Results of passes: sums over all pixels, and maps whose last axis are pixels.
 SUMS: Final = PartitionSpec()
 
@@ -28,6 +34,68 @@ Tree = TypeVar("Tree")
 def maps_of(axes: int) -> PartitionSpec:
     """Return how arrays with this number of axes are distributed if the last one are pixels."""
     return PartitionSpec(*[None] * (axes - 1), PIX)
+
+
+@contextmanager
+def processes(
+    address: str | None = None, number: int | None = None, index: int | None = None
+) -> Iterator[Mesh]:
+    """Join the processes of a job, before anything else is done with JAX, and share their devices.
+
+    Processes that SLURM or Open MPI start find each other. Others are given an address, or find it,
+    their number and their index in the environment variables JAX_COORDINATOR_ADDRESS,
+    JAX_NUM_PROCESSES and JAX_PROCESS_ID. Without any of this there is one process. All have to do
+    the same.
+
+    Parameters
+    ----------
+    address : "host:port" of the first process, where the port is a free one
+    number : number of processes
+    index : which of them this is, from 0
+
+    Yields
+    ------
+    The mesh of all devices (`pixel_mesh`).
+
+    Raises
+    ------
+    RuntimeError
+        If another process has ended, which exchanges of pixels notice at once, and all others
+        after `HEARTBEAT` seconds: then JAX ends the process with a text of its own.
+    ValueError
+        If only some of address, number and index are known.
+    """
+    address = address or os.environ.get("JAX_COORDINATOR_ADDRESS")
+    number, index = (
+        int(os.environ[word]) if value is None and word in os.environ else value
+        for value, word in ((number, "JAX_NUM_PROCESSES"), (index, "JAX_PROCESS_ID"))
+    )
+    given = {"address": address, "number": number, "index": index}
+    lacking = [name for name, value in given.items() if value is None]
+    if 0 < len(lacking) < len(given):
+        raise ValueError(
+            f"Argument `{lacking[0]}` is missing: give all of address, number and index, or none."
+        )
+    if address or any(word in os.environ for word in LAUNCHED):
+        jax.distributed.initialize(
+            address,
+            number,
+            index,
+            heartbeat_timeout_seconds=HEARTBEAT,
+            shutdown_timeout_seconds=HEARTBEAT,
+        )
+    try:
+        yield pixel_mesh()
+    except Exception as error:
+        lost = any(word in str(error) for word in ("Gloo", "NCCL", "coordination service"))
+        if jax.process_count() == 1 or not lost:
+            raise
+        raise RuntimeError(
+            f"Another of the {jax.process_count()} processes has ended, and number "
+            f"{jax.process_index()} cannot go on without it; what it said tells why."
+        ) from error
+    if jax.distributed.is_initialized():
+        jax.distributed.shutdown()
 
 
 def pixel_mesh() -> Mesh:

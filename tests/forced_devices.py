@@ -38,16 +38,6 @@ def automatic(maps, fill=None):
     return jax.device_put(maps, NamedSharding(mesh, maps_of(maps.ndim)))
 
 
-def same(found, expected):
-    """Equal to rounding; parameters to 1e-6 of their standard deviation, and that likewise."""
-    assert found.keys() == expected.keys()
-    for name, value in expected.items():
-        np.testing.assert_array_equal(np.isnan(found[name]), np.isnan(value), err_msg=name)
-        scale = 1.0 if name == "best fit in sigma" else np.nanmax(np.abs(value))
-        most = (1e-6 if name in ("best fit in sigma", "sigma") else 1e-12) * scale
-        assert np.nanmax(np.abs(found[name] - value)) <= most, name
-
-
 # 50 pixels are padded to 56.
 @pytest.mark.parametrize(
     ("place", "npix", "varying"),
@@ -55,7 +45,7 @@ def same(found, expected):
 )
 def test_template_likelihoods_are_those_of_one_device(place, npix, varying):
     found = pixels.of_templates(npix, place, varying)
-    same(found, pixels.of_templates(npix, ordinary, varying))
+    pixels.same(found, pixels.of_templates(npix, ordinary, varying))
 
 
 @pytest.mark.parametrize(
@@ -70,7 +60,7 @@ def test_template_likelihoods_are_those_of_one_device(place, npix, varying):
 )
 def test_components_are_those_of_one_device(place, npix, kind, regions, compress):
     found = pixels.of_components(npix, place, kind, regions, compress)
-    same(found, pixels.of_components(npix, ordinary, kind, regions, compress))
+    pixels.same(found, pixels.of_components(npix, ordinary, kind, regions, compress))
 
 
 def test_pixels_lie_where_they_belong():

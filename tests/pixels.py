@@ -124,3 +124,37 @@ def of_components(
         found[f"{name} of maps"] = whole(getattr(maps, name), npix)
     found["degradation"] = whole(maps.degradation("dust"), npix)
     return found
+
+
+def in_single_precision(npix: int, place: Place) -> dict[str, np.ndarray]:
+    """Inner products and emission of maps in single precision."""
+    sky = sky_of(npix, False)
+    data, sigma = (maps.astype(np.float32) for maps in data_of(npix, False))
+    weights = np.where(np.isfinite(sigma), 1 / sigma**2, 0)
+    templates = np.stack([sky[name].amplitude for name in sky]).astype(np.float32)
+    products = gram(place(data, 0.0), place(templates, 0.0), place(weights, 0.0))
+    return {"inner products": np.asarray(products)}
+
+
+def every(npix: int, place: Place) -> dict[str, np.ndarray]:
+    """All of these by name, with the same order everywhere."""
+    cases = {
+        "templates": of_templates(npix, place, False),
+        "varying": of_templates(npix, place, True),
+        "factor": of_components(npix, place, "factor", False),
+        "pixels": of_components(npix, place, "pixels", True),
+        "covariance": of_components(npix, place, "covariance", False),
+        "single": in_single_precision(npix, place),
+    }
+    return {f"{case}: {name}": v for case, found in cases.items() for name, v in found.items()}
+
+
+def same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    """Equal to rounding; parameters to 1e-6 of their standard deviation, and that likewise."""
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        np.testing.assert_array_equal(np.isnan(found[name]), np.isnan(value), err_msg=name)
+        fitted = name.endswith("sigma")
+        scale = 1.0 if name.endswith("in sigma") else np.nanmax(np.abs(value))
+        most = 1e-6 if fitted else 1e-5 if name.startswith("single") else 1e-12
+        assert np.nanmax(np.abs(found[name] - value)) <= most * scale, name

@@ -1,0 +1,33 @@
+"""Processes on this machine that share pixels, over the loopback address."""
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+SCRIPT = Path(__file__).with_name("processes.py")
+
+
+def launch(number: int, folder: Path, *arguments: str) -> list[subprocess.Popen]:
+    """Start processes of `processes.py`; what they say is in files of the folder."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    started = []
+    for index in range(number):
+        own = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": str(number)}
+        own |= {"JAX_PROCESS_ID": str(index), "XLA_FLAGS": ""}
+        with (folder / f"{index}.log").open("w") as log:
+            command = [sys.executable, str(SCRIPT), str(folder), *arguments]
+            started.append(subprocess.Popen(command, env=os.environ | own, stdout=log, stderr=log))
+    return started
+
+
+def ended(started: list[subprocess.Popen], timeout: float = 300.0) -> list[int]:
+    """Wait for the end of processes; their exit codes."""
+    try:
+        return [process.wait(timeout) for process in started]
+    finally:
+        for process in started:
+            process.kill()

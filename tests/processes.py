@@ -1,0 +1,56 @@
+"""One of several processes that share pixels: `python processes.py FOLDER KIND ...`."""
+
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsky.mesh import SUMS, distribute, over_pixels, processes, total
+
+KINDS = {}
+
+
+def kind(function):
+    KINDS[function.__name__] = function
+    return function
+
+
+def place(maps, fill=np.nan):
+    return distribute(maps, fill=fill)
+
+
+@kind
+def templates(folder: Path, npix: str) -> None:
+    """Write what each process finds from templates."""
+    import pixels  # which calls JAX
+
+    found = pixels.of_templates(int(npix), place, False)
+    np.savez(folder / f"{jax.process_index()}.npz", **found)
+
+
+@kind
+def every(folder: Path, npix: str) -> None:
+    """Write all that each process finds."""
+    import pixels
+
+    np.savez(folder / f"{jax.process_index()}.npz", **pixels.every(int(npix), place))
+
+
+@kind
+def endless(folder: Path) -> None:
+    """Add up pixels until another process ends."""
+    maps = distribute(np.arange(48.0))
+    added = jax.jit(over_pixels(SUMS)(lambda maps: total(jnp.sum(maps))))
+    (folder / f"{jax.process_index()}.begun").touch()
+    while True:
+        added(maps).block_until_ready()
+        time.sleep(0.01)
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    with processes():
+        KINDS[sys.argv[2]](Path(sys.argv[1]), *sys.argv[3:])

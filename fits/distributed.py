@@ -17,7 +17,17 @@ from fits.compress import BLOCK, PIECE, Layout, Noise, carrying, pixel_rows
 from fits.regions import Cells
 from fits.systems import Pixels, square_root
 from jaxsky.checks import UNSEEN
-from jaxsky.mesh import SUMS, along, from_parts, maps_of, of_own, over_pixels, parts_of, total
+from jaxsky.mesh import (
+    SUMS,
+    along,
+    at_once,
+    from_parts,
+    maps_of,
+    of_own,
+    over_pixels,
+    parts_of,
+    total,
+)
 
 #: All pixels of a device.
 ALL = slice(None)
@@ -163,7 +173,7 @@ def blocks(cells: Cells, used: Bool[Array, " pix"]) -> Blocks:
 def pieces(used: Bool[Array, " pix"]) -> Blocks:
     """Return the pixels of each device as they are, in blocks of one cell; -1 where not used."""
     npix = used.shape[-1]
-    size = min(PIECE, npix)
+    size = min(at_once(PIECE), npix)
     own = jnp.arange(-(-npix // size) * size, dtype=jnp.int32)
     own = jnp.where(used[jnp.minimum(own, npix - 1)] & (own < npix), own, -1).reshape(-1, size)
     return Blocks(own, jnp.zeros(len(own), int))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsky.checks import EXACT, UNSEEN
-from jaxsky.mesh import SUMS, maps_of, over_pixels, total
+from jaxsky.mesh import SUMS, at_once, maps_of, over_pixels, total
 
 #: Pixels per pass over templates; few enough for the weighted copies to stay in cache.
 CHUNK = 1 << 14
@@ -20,7 +20,7 @@ def gram(
     data: Float[Array, "band stokes pix"],
     templates: Float[Array, "template stokes pix"],
     weights: Float[Array, "band stokes pix"],
-    chunk: int = CHUNK,
+    chunk: int | None = None,
 ) -> Float[Array, "band stokes row row"]:
     """Return weighted inner products of (data, templates, 1), per band and Stokes parameter.
 
@@ -39,7 +39,7 @@ def gram(
         rows = jnp.where(w[:, :, None] > 0, rows, 0)
         return jnp.einsum("bsip,bsp,bsjp->bsij", rows, w, rows, precision=EXACT)
 
-    chunk = min(chunk, npix)
+    chunk = min(chunk or at_once(CHUNK), npix)
     whole = npix // chunk * chunk
 
     def add(found, start):

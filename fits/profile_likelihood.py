@@ -30,7 +30,7 @@ from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.bandpass import parse_unit
 from jaxsky.checks import Numeric, as_array, check_double, check_finite, check_shape
-from jaxsky.mesh import SUMS, in_place, maps_of, over_pixels, spread
+from jaxsky.mesh import SUMS, at_once, in_place, maps_of, over_pixels, spread
 from jaxsky.mesh import total as over_devices
 from jaxsky.sky import check_parameter, unknown_parameter
 
@@ -109,12 +109,13 @@ class SpectralLikelihood(Likelihood):
                 cell, own = inputs
                 return function(jax.tree.map(lambda x: x[cell], of_cell), own)
 
-            if blocks * size <= PASS:
+            most = at_once(PASS)
+            if blocks * size <= most:
                 results.append(jax.vmap(one)((cells, pixels)))
                 continue
             # With a batch size of 1 XLA copies all data and weights first.
-            at_once = PASS // size if 2 * size <= PASS else None
-            results.append(jax.lax.map(one, (cells, pixels), batch_size=at_once))
+            batch = most // size if 2 * size <= most else None
+            results.append(jax.lax.map(one, (cells, pixels), batch_size=batch))
         return tuple(results)
 
     def _blocks(self) -> "SpectralLikelihood":

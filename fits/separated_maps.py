@@ -24,7 +24,7 @@ from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.checks import Numeric, as_array, check_finite, check_names, check_shape
 from jaxsky.components import component_class
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
-from jaxsky.mesh import along, in_place, maps_of, module_of, over_pixels, spread
+from jaxsky.mesh import along, at_once, in_place, maps_of, module_of, over_pixels, spread
 from jaxsky.observation import Instrument
 
 
@@ -128,12 +128,13 @@ def _on_devices(of_pixel, known, data, noise, layouts, errors):
     @over_pixels((maps_of(3), maps_of(4), maps_of(3), maps_of(1), maps_of(1), maps_of(1)))
     def on_device(of_pixel, known, data, noise):
         npix = data.shape[-1]
+        size = min(at_once(PIECE), npix)
 
         def some(start):
-            own = jnp.minimum(start + np.arange(min(PIECE, npix)), npix - 1)
+            own = jnp.minimum(start + np.arange(size), npix - 1)
             return separated(of_pixel, known, data, noise, own)
 
-        parts = jax.lax.map(some, jnp.arange(0, npix, PIECE))
+        parts = jax.lax.map(some, jnp.arange(0, npix, size))
         every = [jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1) for x in parts]
         return tuple(x[..., :npix] for x in every)
 

@@ -21,7 +21,7 @@ from numpy.polynomial.chebyshev import chebpts1, chebvander
 from jaxsky.bandpass import Bandpass, Samples, average, stack_bands
 from jaxsky.checks import EXACT, is_concrete
 from jaxsky.components import Component
-from jaxsky.mesh import SUMS, extremes, over_pixels
+from jaxsky.mesh import SUMS, at_once, extremes, over_pixels
 
 
 class NodeCounts(NamedTuple):
@@ -288,7 +288,7 @@ def band_seds(
         return product
 
     def interpolated():
-        return jax.lax.map(pixel, _points(component), batch_size=AT_ONCE)
+        return jax.lax.map(pixel, _points(component), batch_size=at_once(AT_ONCE))
 
     if nodes.tolerance is None:
         return interpolated()

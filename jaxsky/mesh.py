@@ -28,6 +28,9 @@ LAUNCHED: Final = ("SLURM_STEP_NODELIST", "OMPI_MCA_orte_hnp_uri")
 #: Results of passes: sums over all pixels, and maps whose last axis are pixels.
 SUMS: Final = PartitionSpec()
 
+#: How many times more pixels than a CPU an accelerator takes at once.
+WIDER = 64
+
 Tree = TypeVar("Tree")
 
 
@@ -189,6 +192,14 @@ def on_accelerator(value: Any) -> bool:
     if not isinstance(value, jax.Array) or isinstance(value, jax.core.Tracer):
         return False
     return all(device.platform != "cpu" for device in value.devices())
+
+
+def at_once(few: int) -> int:
+    """Return how many pixels a step of a pass takes: few, for the cache of a CPU, or many.
+
+    An accelerator has no such cache, and needs longer to begin a step than to compute a small one.
+    """
+    return few if jax.default_backend() == "cpu" else WIDER * few
 
 
 def in_place(data: Any, *others: Any) -> tuple[Any, ...]:

@@ -13,6 +13,8 @@ from jaxbind import jaxbind
 
 from benchmarks import gpu
 from fits.optimize import best_fit
+from fits.posterior import chi2
+from fits.products import gram
 from fits.profile_likelihood import spectral_likelihood
 from fits.separated_maps import component_maps
 from jaxsky import (
@@ -159,6 +161,33 @@ def test_separations_stay_where_the_maps_are(on_an_accelerator):
             # Errors of one noise are those of one pixel, or of all.
             one, other = np.broadcast_arrays(one, other)
             np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-10)
+
+
+def test_passes_of_accelerators_give_the_same(monkeypatch):
+    """More pixels are taken at once there."""
+    npix, rng = 40_000, np.random.default_rng(4)
+    channels = {f"{nu:g}": Bandpass.top_hat(nu, nu / 4, samples=5) for nu in (30.0, 95.0, 353.0)}
+    one, start = dust_and_synchrotron(npix), {"dust.beta_dust": 1.55}
+    sigma = rng.uniform(1, 2, (3, 2, npix))
+    data = np.asarray(observe(one, list(channels.values()))) + sigma * rng.normal(size=sigma.shape)
+    templates = jnp.stack([part.amplitude for part in one.components.values()])
+
+    def results():
+        like = spectral_likelihood(one, channels, data, sigma, start)
+        slope = jax.jit(jax.grad(lambda x: chi2(like, {"dust.beta_dust": x})))
+        products = jax.jit(lambda *maps: gram(*maps))
+        found = slope(1.6), products(jnp.asarray(data), templates, jnp.asarray(1 / sigma**2))
+        return found, str(jax.make_jaxpr(slope)(1.6))
+
+    few, text = results()
+    jax.clear_caches()  # a process has one kind of default device
+    with monkeypatch.context() as patch:
+        patch.setattr(jax, "default_backend", lambda: "gpu")
+        many, other = results()
+    jax.clear_caches()
+    assert text != other
+    for one, two in zip(few, many, strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-10, atol=1e-10 * float(jnp.abs(two).max()))
 
 
 def test_maps_of_parameters_are_taken_on_an_accelerator(on_an_accelerator):

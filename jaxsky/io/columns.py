@@ -13,9 +13,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import healpy
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxsky.bandpass import UNITS
 from jaxsky.io.files import InputError, UnfitError
@@ -168,11 +167,7 @@ class Column(NamedTuple):
     alone: bool
     coordinates: str
     polarization: str
-
-    @property
-    def nside(self) -> int:
-        """Resolution of the map."""
-        return healpy.npix2nside(self.values.size)
+    nside: int
 
 
 #: Attributes that all columns read together must share, and the advice if they do not.
@@ -250,6 +245,7 @@ def _read_table(
     fields: list[int | str] | None,
     unit: str | None,
     stated: Mapping[str, str | None],
+    own: slice | None,
 ) -> list[Column]:
     with open_table(path, hdu) as table:
         wanted = default_fields(table) if fields is None else [table.index(f) for f in fields]
@@ -260,21 +256,27 @@ def _read_table(
         frame = table.state("coordinates", stated["coordinates"])
         sign = table.state("polarization", stated["polarization"], "COSMO")
         alone = sum(name.upper() not in PIXELS for name in table.names) == 1
-        rest = (alone, frame, sign)
+        rest = (alone, frame, sign, table.nside)
+        where, names = table.where, table.names
         return [
-            Column(table.where, table.names[i], own, table.values(i, order), table.lowest(i), *rest)
-            for i, own in units.items()
+            Column(where, names[i], text, table.values(i, order, own=own), table.lowest(i), *rest)
+            for i, text in units.items()
         ]
 
 
 def read_columns(
-    path: Any, hdu: Any, fields: Any, unit: str | None, stated: Mapping[str, str | None]
+    path: Any,
+    hdu: Any,
+    fields: Any,
+    unit: str | None,
+    stated: Mapping[str, str | None],
+    own: slice | None = None,
 ) -> list[Column]:
     """Read the columns of one or several tables; arguments as in `read_maps`.
 
-    `stated` contains ordering, coordinates and polarization.
+    `stated` contains ordering, coordinates and polarization; `own` is a range of pixels, or all.
     """
-    tables = [_read_table(*one, unit, stated) for one in _split(path, hdu, fields)]
+    tables = [_read_table(*one, unit, stated, own) for one in _split(path, hdu, fields)]
     first, *others = (column for table in tables for column in table)
     for (name, hint), other in product(_COMMON.items(), others):
         one, two = getattr(first, name), getattr(other, name)
@@ -355,3 +357,21 @@ def mark_missing(columns: Sequence[Column], missing: Any, zeros_are_data: bool) 
             f"{columns[0].where}: {'; '.join(suspects)}; give `missing`, the numbers that mark "
             "pixels without a value, or `missing = []` if all are data."
         )
+
+
+def stacked(
+    columns: list[Column], kinds: Sequence[str | None]
+) -> tuple[Float[np.ndarray, "field pix"], Bool[np.ndarray, " pix"]]:
+    """Return maps with the COSMO sign of U, and where all have values; elsewhere they are 0.
+
+    The list is emptied to free memory. `kinds` are the Stokes parameters.
+    """
+    sign = -1.0 if columns[0].polarization == "IAU" else 1.0
+    maps = np.empty((len(columns), columns[0].values.size))
+    for row in maps:
+        row[:] = columns.pop(0).values
+    mask = np.asarray(np.isfinite(maps).all(axis=0))
+    maps[:, ~mask] = 0
+    if sign < 0:
+        maps *= np.array([[sign ** (kind or "").count("U")] for kind in kinds])
+    return maps, mask

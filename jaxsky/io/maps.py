@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.checks import Numeric, check_shape
-from jaxsky.io.columns import column_stokes, default_fields, mark_missing, read_columns
+from jaxsky.io.columns import column_stokes, default_fields, mark_missing, read_columns, stacked
 from jaxsky.io.files import InputError, UnfitError, check_file, in_file, whole
 from jaxsky.io.quantities import unit_factor, unit_name
 from jaxsky.io.tables import equals, in_ring, open_table, spelled
@@ -193,15 +193,9 @@ def read_maps(
     kinds = column_stokes(columns, stokes)
     blocks = None if first.coordinates == "G" else _blocks(where, names, kinds)
     mark_missing(columns, missing, zeros_are_data)
-    maps = np.empty((len(names), first.values.size))
-    for row in range(len(names)):
-        maps[row] = columns.pop(0).values  # frees their memory: maps may be large
-    mask = np.asarray(np.isfinite(maps).all(axis=0))
+    maps, mask = stacked(columns, kinds)
     if not mask.any():
         raise InputError(f"{where}: no pixel has values in {', '.join(names)}.")
-    maps[:, ~mask] = 0
-    if first.polarization == "IAU":
-        maps *= np.array([[(-1.0) ** (kind or "").count("U")] for kind in kinds])
     if blocks is not None:
         maps, mask = _to_galactic(maps, mask, blocks, first.coordinates)
     return Maps(maps, mask, first.unit, names, kinds)

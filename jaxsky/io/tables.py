@@ -155,10 +155,22 @@ def in_ring(values: Float[np.ndarray, " pix"], ordering: str) -> Float[np.ndarra
     """Reorder values from an ordering to RING."""
     if ordering == "RING":
         return values
-    nside = healpy.npix2nside(values.size)
+    return values[_nested(_nestable(healpy.npix2nside(values.size)))]
+
+
+def _nestable(nside: int) -> int:
+    """Return nside, if it may be that of NESTED maps."""
     if not healpy.isnsideok(nside, nest=True):
         raise UnfitError(f"ordering is NESTED, but nside is {nside}, no power of 2.")
-    return values[_nested(nside)]
+    return nside
+
+
+def _taken(column: np.ndarray, places: np.ndarray | None) -> np.ndarray:
+    """Return places of a column (row,) or (row, width), counted along its rows; None for all."""
+    if places is None:
+        return column
+    width = column.shape[1] if column.ndim == 2 else 1
+    return column[np.divmod(places, width)] if width > 1 else column.reshape(-1)[places]
 
 
 class HealpixTable:
@@ -256,8 +268,10 @@ class HealpixTable:
         """Return TUNIT of a column; None if it is missing or blank."""
         return str(self._table.header.get(f"TUNIT{index + 1}", "")).strip() or None
 
-    def _stored(self, index: int, dtype: type | None = None) -> np.ndarray:
-        """Return a flat copy of a column of numbers, in its own or another type."""
+    def _stored(
+        self, index: int, dtype: type | None = None, places: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return a flat copy of a column of numbers, or some places, in its own or another type."""
         kind, name = self._kinds[index], self.names[index]
         if kind not in NUMBERS:
             raise UnfitError(f"column {name} holds {KINDS.get(kind, kind)}, not real numbers.")
@@ -265,7 +279,21 @@ class HealpixTable:
         if found.ndim > 2:
             shape = " x ".join(map(str, found.shape[1:]))
             raise UnfitError(f"column {name} has a table of {shape} in each row.")
-        return np.array(found, dtype=dtype).ravel()
+        return np.array(_taken(found, places), dtype=dtype).ravel()
+
+    def _places(self, pixels: slice, ordering: str) -> Int[np.ndarray, " pix"]:
+        """Return the places of RING pixels in the columns; -1 where they are not listed."""
+        npix = healpy.nside2npix(self.nside)
+        if not 0 <= pixels.start < pixels.stop <= npix or pixels.step not in (None, 1):
+            raise UnfitError(f"argument `pixels` must be a range from 0 to {npix}, not {pixels}.")
+        own = np.arange(pixels.start, pixels.stop)
+        if ordering == "NESTED":
+            own = healpy.ring2nest(_nestable(self.nside), own)
+        if self._pixels is None:
+            return own
+        order = np.argsort(self._pixels)
+        found = np.append(order, -1)[np.searchsorted(self._pixels, own, sorter=order)]
+        return np.where(np.append(self._pixels, -1)[found] == own, found, -1)
 
     def lowest(self, index: int) -> float | None:
         """Return the value of the lowest integer a column can store; None for other types."""
@@ -277,29 +305,38 @@ class HealpixTable:
         return least * header.get(f"TSCAL{number}", 1.0) + header.get(f"TZERO{number}", 0.0)
 
     def values(
-        self, index: int, ordering: str, *, logical: bool = False
+        self, index: int, ordering: str, *, logical: bool = False, own: slice | None = None
     ) -> Float[np.ndarray, " pix"]:
         """Return a column over the full sky in RING order, float64; `ordering` is the file's.
 
         It is NaN where there is no value: pixels that are not listed, UNSEEN, the header's BAD_DATA
-        and TNULL, NaN and infinity. If `logical`, columns of true and false become 1 and 0.
+        and TNULL, NaN and infinity. If `logical`, columns of true and false become 1 and 0. Given
+        a range of RING pixels of one's own, only these are read of the mapped file, and returned.
         """
+        if own is not None:
+            places = self._places(own, ordering)
+            self._check_size(index, self._table.data.field(index).size)
+            return np.where(places < 0, np.nan, self._real(index, places))
         if logical and self._kinds[index] == "L":
             column = np.array(self._table.data.field(index), dtype=np.float64).ravel()
         else:
             column = self._real(index)
+        self._check_size(index, column.size)
         npix, pixels = healpy.nside2npix(self.nside), self._pixels
-        if column.size != (expected := npix if pixels is None else pixels.size):
-            name = self.names[index]
-            raise UnfitError(f"column {name} has {column.size} values for {expected} pixels.")
         if pixels is not None:
             listed, column = column, np.full(npix, np.nan)
             column[pixels] = listed
         return in_ring(column, ordering)
 
-    def _real(self, index: int) -> Float[np.ndarray, " row"]:
-        """Return a column of real numbers, NaN where it has no value."""
-        column = self._stored(index, np.float64)
+    def _check_size(self, index: int, size: int) -> None:
+        expected = healpy.nside2npix(self.nside) if self._pixels is None else self._pixels.size
+        if size != expected:
+            name = self.names[index]
+            raise UnfitError(f"column {name} has {size} values for {expected} pixels.")
+
+    def _real(self, index: int, places: np.ndarray | None = None) -> Float[np.ndarray, " row"]:
+        """Return a column of real numbers, or some places of it, NaN where it has no value."""
+        column = self._stored(index, np.float64, places)
         bad = ~np.isfinite(column) | equals(column, healpy.UNSEEN, 1e-5)
         if (text := self.keyword("BAD_DATA")) not in (None, "UNSEEN", "NAN"):
             if np.isnan(stated := _number(str(text))):
@@ -312,7 +349,7 @@ class HealpixTable:
             if not (null := _number(text)).is_integer():
                 raise UnfitError(f"{key} is {text}, which is not a whole number.")
             raw = self._table.data.view(np.ndarray)
-            stored = raw[raw.dtype.names[index]].ravel()
+            stored = _taken(raw[raw.dtype.names[index]], places).ravel()
             exact = stored.dtype.kind in "iu"
             bad |= stored == int(null) if exact else equals(column, null, 1e-5)
         column[bad] = np.nan

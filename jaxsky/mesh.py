@@ -5,10 +5,10 @@ pass over pixels is marked with `over_pixels`, and ends in sums over the devices
 not distributed pass through unchanged.
 """
 
-import functools
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial, wraps
 from typing import Any, Final, TypeVar
 
 import jax
@@ -21,6 +21,8 @@ from jaxsky.public import refuse_unit
 
 #: Name of the axis of devices that share the pixels.
 PIX: Final = "pix"
+#: Pixels that are read at a time.
+PIECE: Final = 1 << 18
 #: Seconds after which a process that does not answer is taken to have ended.
 HEARTBEAT: Final = 10
 #: Variables by which JAX knows the processes of SLURM, and of Open MPI up to version 4.
@@ -166,18 +168,36 @@ def distribute(
             f"Argument `mesh` has {mesh.size} devices for {npix} pixels; take one with fewer."
         )
 
-    def part(index: Any) -> np.ndarray:
-        """Return the pixels of a device, padded."""
-        start, stop, _ = index[-1].indices(padded)
+    def part(start: int, stop: int) -> np.ndarray:
+        """Return some pixels, padded."""
         found = np.asarray(read(slice(min(start, npix - 1), min(stop, npix))), dtype)
         last = found[..., -1:] if fill is None else np.full_like(found[..., -1:], fill)
         missing = max(0, stop - max(start, npix))
         kept = found if start < npix else found[..., :0]
         return np.concatenate([kept, np.repeat(last, missing, axis=-1)], -1) if missing else found
 
-    padded = -(-npix // mesh.size) * mesh.size
-    sharding = NamedSharding(mesh, maps_of(len(shape)))
-    return jax.make_array_from_callback((*rows, padded), sharding, part)
+    def own(device: jax.Device, start: int, stop: int) -> Array:
+        """Return the pixels of a device, read in pieces so that there are no two copies."""
+        if stop - start <= PIECE:
+            return jax.device_put(part(start, stop), device)
+        pixels = jnp.zeros((*rows, stop - start), dtype, device=device)
+        for first in range(start, stop, PIECE):
+            first = min(first, stop - PIECE)
+            # One after the other, or pieces that wait take as much memory again.
+            pixels = _put(pixels, part(first, first + PIECE), first - start).block_until_ready()
+        return pixels
+
+    padded = (*rows, -(-npix // mesh.size) * mesh.size)
+    sharding = NamedSharding(mesh, maps_of(len(padded)))
+    places = sharding.addressable_devices_indices_map(padded)
+    parts = [own(d, *index[-1].indices(padded[-1])[:2]) for d, index in places.items() if index]
+    return jax.make_array_from_single_device_arrays(padded, sharding, parts)
+
+
+@partial(jax.jit, donate_argnums=0)
+def _put(pixels, piece, start):
+    """Return maps with a piece in its place."""
+    return jax.lax.dynamic_update_slice_in_dim(pixels, piece, start, axis=-1)
 
 
 def spread(value: Any) -> bool:
@@ -328,12 +348,12 @@ def over_pixels(out: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """
 
     def marked(function: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(function)
+        @wraps(function)
         def passed(*args: Any, **options: Any) -> Any:
             mesh = None if _inside() else mesh_of(args)
             if mesh is None:
                 return function(*args, **options)
-            own = functools.partial(function, **options)
+            own = partial(function, **options)
             return jax.shard_map(own, mesh=mesh, out_specs=out)(*args)
 
         return passed

@@ -18,7 +18,7 @@ from fits.products import gram
 from fits.profile_likelihood import spectral_likelihood
 from fits.separated_maps import _on_devices
 from fits.template_likelihood import likelihood
-from jaxsky import Synchrotron, observe
+from jaxsky import Synchrotron, mesh, observe
 from jaxsky.mesh import along, distribute, maps_of
 from jaxsky.sky import _observe, interpolation_nodes
 from refusals import raises
@@ -34,8 +34,8 @@ def explicit(maps, fill=np.nan):
 
 def automatic(maps, fill=None):
     """As any user's mesh: with automatic axes."""
-    mesh = Mesh(np.array(jax.devices()), ("pix",), axis_types=(AxisType.Auto,))
-    return jax.device_put(maps, NamedSharding(mesh, maps_of(maps.ndim)))
+    devices = Mesh(np.array(jax.devices()), ("pix",), axis_types=(AxisType.Auto,))
+    return jax.device_put(maps, NamedSharding(devices, maps_of(maps.ndim)))
 
 
 # 50 pixels are padded to 56.
@@ -63,13 +63,16 @@ def test_components_are_those_of_one_device(place, npix, kind, regions, compress
     pixels.same(found, pixels.of_components(npix, ordinary, kind, regions, compress))
 
 
-def test_pixels_lie_where_they_belong():
+@pytest.mark.parametrize("piece", [4, 7, 8])
+def test_pixels_lie_where_they_belong(piece, monkeypatch):
+    monkeypatch.setattr(mesh, "PIECE", piece)
     maps = distribute(np.arange(50.0), fill=None)
     assert maps.shape == (56,)
     parts = [np.asarray(shard.data) for shard in maps.addressable_shards]
     np.testing.assert_array_equal(np.concatenate(parts)[:50], np.arange(50.0))
     np.testing.assert_array_equal(np.concatenate(parts)[50:], 49.0)
     assert np.isinf(distribute(np.arange(9.0), fill=np.inf)).sum() == 7
+    monkeypatch.undo()
     asked = []
 
     def read(part):

@@ -49,6 +49,7 @@ from jaxsky import (
     galaxy,
     harmonics,
     interpolation,
+    mesh,
     noise,
     sed,
     simulation,
@@ -352,8 +353,13 @@ def tensors() -> Calls:
     yield tensor_ratio._squares, ordered, ordered, np.ones(3), np.ones((1, 2, LMAX + 1))
 
 
+def pieces() -> Calls:
+    yield mesh._put, np.ones((2, NPIX)), np.ones((2, 5)), 3
+
+
 #: The calls of each module with compiled functions.
 CALLS: dict[str, Callable[[], Calls]] = {
+    "jaxsky.mesh": pieces,
     "jaxsky.sed": spectral_laws,
     "jaxsky.components.laws": emission,
     "jaxsky.bandpass": bandpasses,

@@ -12,6 +12,7 @@ from benchmarks import (
     command,
     comparisons,
     likelihoods,
+    realisations,
     separation,
     simulations,
 )
@@ -45,9 +46,10 @@ BENCHMARKS = {
     "coupling": comparisons.coupling,
     "patches": comparisons.patches,
     "commands": comparisons.commands,
+    "workers": realisations.workers,
 }
 #: These take minutes: they are run by name, and when the table is kept.
-LONG = ("planck", "nside-2048", "separation-pixels", "commands")
+LONG = ("planck", "nside-2048", "separation-pixels", "commands", "workers")
 
 
 def _arguments() -> argparse.Namespace:

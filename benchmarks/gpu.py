@@ -1,9 +1,9 @@
 """An accelerator next to a copy in its own memory, and its numbers next to those of the CPU.
 
-`python -m benchmarks.gpu` takes minutes on a GPU with 80 GB, prints what is measured and what is
-asked, and ends with exit code 1 if something is missed. `--nside 64` tries it on any machine: then,
-and on CPUs, only wrong numbers are a miss, and there is no verdict on speed. What is timed has been
-compiled before.
+`python -m benchmarks.gpu` is made to take minutes on a GPU with 80 GB, and has not been run on one
+yet. It prints what is measured and what is asked, and ends with exit code 1 if something is missed.
+`--nside 64` tries it on any machine: then, and on CPUs, only wrong numbers are a miss, and there is
+no verdict on speed. What is timed has been compiled before.
 """
 
 import argparse

@@ -2,6 +2,7 @@
 
 import importlib.util
 import sys
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -14,28 +15,41 @@ from fits.optimize import best_fit
 from fits.posterior import priors_of
 from fits.regions import region_masks
 from fits.spectral_index import settled
-from jaxsky.galaxy import embedded_sky
-from jaxsky.settings import load
+from jaxsky.galaxy import EmbeddedSky, embedded_sky
+from jaxsky.settings import Experiment, load
+from jaxsky.workers import Processes, processors, realised
 
 SKIES = 500
 KINDS = [("exact", "Q"), ("exact", "U"), ("exact", "QU"), ("diagonal", "QU")]
 
 
-@pytest.fixture(scope="module")
-def pulls():
-    """(best fit - truth) / sigma of both indices in each sky, by likelihood and Stokes."""
-    values = ["common.nside=16", "common.fwhm=300.0", "sky.embedded.nside=32"]
-    settings, galaxy = load(DEFAULTS / "fit.toml", values), embedded_sky(32)
-    start, rows = settings.start("fit"), {how: [] for how in KINDS}
-    for seed in range(SKIES):
-        inputs = inputs_of(settings.model_copy(update={"seed": seed}), galaxy=galaxy)
-        prepared = common_maps(inputs, 16, 300.0)
+@dataclass(frozen=True)
+class Pulls:
+    """(best fit - truth) / sigma of both indices in the sky of a seed, by likelihood and Stokes."""
+
+    settings: Experiment
+    galaxy: EmbeddedSky
+
+    def __call__(self, seed: int) -> list[list[float]]:
+        settings, start = self.settings, self.settings.start("fit")
+        inputs = inputs_of(settings.model_copy(update={"seed": seed}), galaxy=self.galaxy)
+        prepared, rows = common_maps(inputs, 16, 300.0), []
         for kind, stokes in KINDS:
             found = best_fit(prepared.likelihood(start, kind=kind, stokes=stokes), start)
-            rows[kind, stokes].append(
+            rows.append(
                 [(found.best_fit[n] - inputs.truth[n]) / found.sigma[n] for n in found.free]
             )
-    return {how: np.array(row) for how, row in rows.items()}
+        return rows
+
+
+@pytest.fixture(scope="module")
+def pulls(tmp_path_factory):
+    """The pulls in all skies, by likelihood and Stokes."""
+    values = ["common.nside=16", "common.fwhm=300.0", "sky.embedded.nside=32"]
+    work = Pulls(load(DEFAULTS / "fit.toml", values), embedded_sky(32))
+    with Processes(processors()) as executor:
+        made = realised(work, range(SKIES), executor, tmp_path_factory.mktemp("pulls"))
+        return dict(zip(KINDS, np.swapaxes(list(made), 0, 1), strict=True))
 
 
 @pytest.mark.parametrize("stokes", ["Q", "U", "QU"])

@@ -6,8 +6,11 @@ the parameters move by -H^-1 times the gradient of -ln L; the components are the
 those parameters, so that residual foregrounds appear with the noise that caused them.
 """
 
+import dataclasses
+import threading
 from collections.abc import Mapping
 from concurrent.futures import Executor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +23,8 @@ from jaxtyping import Array, Float
 
 from fits.kept import KeptChain, fingerprint, kept_realisations
 from fits.optimize import best_fit
-from fits.posterior import Gaussian, Likelihood, Posterior, Prior, priors_of, value_and_gradient
+from fits.posterior import Likelihood, Posterior, value_and_gradient
+from fits.priors import Gaussian, Prior, priors_of
 from fits.profile_likelihood import SpectralLikelihood
 from fits.pseudo_cl import (
     LEAST_WINDOW,
@@ -39,6 +43,7 @@ from jaxsky.checks import Numeric, check_double
 from jaxsky.cmb import realisation, tensor_spectra
 from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import expand, gaussian_beam, synthesis
+from jaxsky.io.stacks import Maps, Stack, computed
 from jaxsky.noise import stream
 from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
@@ -47,6 +52,8 @@ from jaxsky.settings import Experiment, SettingsError, at_key
 WALKERS = 32
 #: Most parameters whose posterior is sampled.
 SAMPLED = 500
+#: Held while a simulation of large maps is made.
+ONE = threading.Lock()
 
 
 class Response:
@@ -159,13 +166,15 @@ class Separation(NamedTuple):
     @property
     def degradation(self) -> float:
         """Mean noise of the CMB relative to that of a sky without foregrounds."""
-        return float(np.nanmean(self.found.degradation("cmb")))
+        return self.found.mean_degradation("cmb")
 
-    def of_pixel(self, name: str, values: Mapping[str, Any]) -> Float[np.ndarray, " pix"]:
+    def of_pixel(
+        self, name: str, values: Mapping[str, Any], part: slice = slice(None)
+    ) -> Float[np.ndarray, " pix"]:
         """Return the map of a parameter with regions, from its values; NaN where masked."""
         assert isinstance(self.data, PixelData)  # the one with regions
-        labels = self.data.labels[name]
-        return np.where(self.data.used, np.asarray(values[name])[labels], np.nan)
+        labels = self.data.labels[name][part]
+        return np.where(self.data.used[part], np.asarray(values[name])[labels], np.nan)
 
 
 def separate_data(
@@ -203,8 +212,8 @@ def separate_data(
         tensors = tensor_spectra(highest, **settings.cmb.cosmology)
     # Lensing is that of the settings, in simulations and in the model.
     lensed = cmb_spectra(settings, highest, r=0.0)
-    foregrounds = np.array(amplitude)
-    foregrounds[row] = 0.0
+    others = (np.arange(len(found.components)) != row)[:, None, None]
+    foregrounds = computed(amplitude.shape, lambda part: amplitude[..., part] * others)
     emission = data.emission(like, best, foregrounds)
     path = None if out is None else out / "simulations.npz"
     kept = spec.nsims, settings.seed, path, _mark(settings, data), progress.advance, executor
@@ -229,7 +238,7 @@ def separate_data(
     sigma, covariance = _errors(data, like, fit, simulated)
     chain = None
     ratio = fit_tensors(model, band_powers(spectra, maps[row])[1])
-    if spec.sampler != "none" and len(fit.labels) <= SAMPLED:
+    if spec.sampler != "none" and len(fit.labels) <= SAMPLED and like.source is None:
         progress.step("posterior")
         chain = _chain(settings, data, like, fit, simulated, out, progress)
     return Separation(
@@ -267,23 +276,34 @@ class _NoiseSimulation:
     data: PixelData | FullSkyData
     like: SpectralLikelihood
     response: Response
-    emission: Float[np.ndarray, "band stokes _"]
+    emission: Maps
     spectra: MaskedSpectra
     window: Float[np.ndarray, " ell"]
     lensed: Float[np.ndarray, "4 ell"]
 
     def __call__(self, key: Array) -> list[np.ndarray]:
+        # Transforms of large maps use all processors, and much memory: one after the other.
+        with ONE if isinstance(self.emission, Stack) else nullcontext():
+            return self._made(key)
+
+    def _made(self, key: Array) -> list[np.ndarray]:
         data, like, spectra, theta = self.data, self.like, self.spectra, self.response.theta
         noise = data.noise_realisation(key)
-        observed = self.emission + noise
+        observed = computed(noise.shape, lambda at: self.emission[..., at] + noise[..., at])
         moved = self.response.moved(data.likelihood(observed), stream(key, "priors"))
         alone = cleaned_cmb(data, like, like.named(jnp.asarray(theta)), noise)
         both = cleaned_cmb(data, like, like.named(jnp.asarray(moved)), observed)
         nside = healpy.npix2nside(both.shape[-1])
         alm = realisation(stream(key, "cmb"), self.lensed) * expand(jnp.asarray(self.window))
-        sky, E = synthesis(alm, nside), synthesis(alm.at[1].set(0.0), nside)
-        every = (alone, both - alone, both, both + sky, E)
-        powers = [band_powers(spectra, jnp.asarray(maps))[1] for maps in every]
+        # Made one by one, since they may be large.
+        every = (
+            lambda: alone,
+            lambda: both - alone,
+            lambda: both,
+            lambda: both + synthesis(alm, nside),
+            lambda: synthesis(alm.at[1].set(0.0), nside),
+        )
+        powers = [band_powers(spectra, jnp.asarray(maps()))[1] for maps in every]
         return [moved - theta, *powers, mean_spectrum(spectra.mask, both, spectra.lmax)]
 
 
@@ -291,7 +311,7 @@ def simulated_noise(
     data: PixelData | FullSkyData,
     like: SpectralLikelihood,
     response: Response,
-    emission: Float[np.ndarray, "band stokes _"],
+    emission: Maps,
     spectra: MaskedSpectra,
     window: Float[np.ndarray, " ell"],
     lensed: Float[np.ndarray, "4 ell"],
@@ -302,7 +322,8 @@ def simulated_noise(
     `response` is that of the best fit to noise, `emission` the foregrounds in the bands, `window`
     the beam of the maps, and `lensed` C_l of a CMB without tensors up to its end [uK_CMB^2].
     """
-    make = _NoiseSimulation(data, like, response, emission, spectra, window, lensed)
+    bare = dataclasses.replace(like, source=None)  # the noise of other data takes its place
+    make = _NoiseSimulation(data, bare, response, emission, spectra, window, lensed)
     return kept_realisations(make, SimulatedNoise, *kept)
 
 

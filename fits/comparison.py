@@ -243,7 +243,7 @@ class _Fluctuation:
     lmax: int
 
     def __call__(self, key: Array) -> tuple[Array, ...]:
-        noise = self.fluctuations.noise_realisation(key)
+        noise = jnp.asarray(self.fluctuations.noise_realisation(key))
         cmb = self.fluctuations.cmb_realisation(key)
         noise_alms = polarization_alms(noise, self.lmax)
         alms = self.foregrounds + noise_alms + polarization_alms(cmb, self.lmax)

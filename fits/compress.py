@@ -9,14 +9,14 @@ of D replace the pixels. Everything else is streamed over pixels, from disk if n
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from fits.regions import Cells
 from fits.systems import Pixels, square_root
 from jaxsky.checks import UNSEEN, Numeric
+from jaxsky.io.stacks import Stack, ranges
 from jaxsky.mesh import as_double, module_of, spread, typed
 from jaxsky.public import refuse_unit, takes_quantities
 
@@ -32,14 +32,18 @@ LEAST_SHARE = 1e-6
 
 def chunks(npix: int, size: int = PIECE) -> Iterator[slice]:
     """Yield slices that cover the pixels."""
-    for start in range(0, npix, size):
-        yield slice(start, min(start + size, npix))
+    return ranges(npix, size)
 
 
 @takes_quantities
 def bare(name: str, value: object) -> np.ndarray:
-    """Return a numeric array without a copy, in its own precision; distributed ones as they are."""
+    """Return a numeric array without a copy, in its own precision.
+
+    Distributed arrays, and those on disk, are returned as they are.
+    """
     refuse_unit(name, value)
+    if isinstance(value, Stack):
+        return value  # type: ignore[return-value]
     array: Any = typed(value) if spread(value) else np.asarray(value)
     if array.dtype.kind not in "fiu":
         raise TypeError(f"Argument `{name}` must be a real array, but is {array.dtype}.")
@@ -178,25 +182,28 @@ def as_noise(
 
 
 def _check_positive(name: str, sigma: np.ndarray) -> None:
-    if bad := int(sigma.size - (sigma > 0).sum()):
+    parts = chunks(sigma.shape[-1]) if isinstance(sigma, Stack) else [slice(None)]
+    if bad := int(sigma.size - sum((sigma[..., part] > 0).sum() for part in parts)):
         raise ValueError(f"Argument `{name}` has {bad} of {sigma.size} values that are not > 0.")
 
 
 def _separated(sigma: np.ndarray) -> Noise | None:
     """Return separable noise, or None if the noise is not separable."""
-    first = sigma[0, 0]
+    first = np.empty(sigma.shape[-1])
+    for part in chunks(first.size):
+        first[part] = sigma[..., part][0, 0]
     finite = np.isfinite(first)
     if not finite.any():
         return None
     at = int(np.argmax(finite))
-    ratio = (sigma[:, :, at] / first[at])[..., None]
+    ratio = sigma[..., at : at + 1] / first[at]
     if not np.isfinite(ratio).all():
         return None
     for part in chunks(sigma.shape[-1]):
-        expected = ratio * first[part]
+        expected, own = ratio * first[part], sigma[..., part]
         with np.errstate(invalid="ignore"):
-            off = np.abs(sigma[..., part] - expected) > ROUNDING * expected
-        if off.any() or np.any(np.isfinite(sigma[..., part]) != finite[part]):
+            off = np.abs(own - expected) > ROUNDING * expected
+        if off.any() or np.any(np.isfinite(own) != finite[part]):
             return None
     return Noise(ratio, first)
 
@@ -272,7 +279,7 @@ def used_pixels(noise: Noise, npix: int, components: int) -> np.ndarray:
     return used
 
 
-def _refuse(data: np.ndarray, noise: Noise) -> None:
+def refuse_data(data: np.ndarray, noise: Noise) -> None:
     """Raise the error for data that are not finite in used pixels."""
     bad = 0
     for part in chunks(data.shape[-1]):
@@ -298,13 +305,14 @@ def band_covariance(
     total = np.zeros((cells.number, len(groups), size, size))
     for part in chunks(data.shape[-1]):
         root = np.sqrt(noise.pixel_weights(part))
+        values = np.asarray(data[..., part], float)
         for g, group in enumerate(groups):
-            rows = [data[:, s, part].astype(float, copy=False) for s in group]
+            rows = [values[:, s] for s in group]
             x = rows[0] if len(rows) == 1 else np.concatenate(rows)
             if noise.pixel_sigma is not None:
                 x = np.where(used[part], x * root, 0)
             if x.min() < UNSEEN:
-                _refuse(data, noise)
+                refuse_data(data, noise)
             if cells.of_pixel is None:
                 total[0, g] += x @ x.T
                 continue
@@ -317,7 +325,7 @@ def band_covariance(
                 piece = x[:, begin:end]
                 total[own[order[begin]], g] += piece @ piece.T
     if not np.isfinite(total).all():
-        _refuse(data, noise)
+        refuse_data(data, noise)
     return total
 
 
@@ -347,42 +355,3 @@ def pixel_rows(
     cross = noise.cross(pixels) if layout.joint else None
     cross = None if cross is None else xp.where(used, cross, 0.0)[None]
     return layout.rows(values), layout.rows(weights), cross
-
-
-def gathered(
-    data: np.ndarray, noise: Noise, cells: Cells, used: np.ndarray, layout: Layout
-) -> tuple[Pixels, Array | None]:
-    """Return the pixels in blocks, each of a single cell and padded with zeros of unit weight.
-
-    Also the cell of each block, None if they are in order.
-    """
-    pixels = np.flatnonzero(used)
-    own = np.zeros(len(pixels), np.int32) if cells.of_pixel is None else cells.of_pixel[pixels]
-    order = np.argsort(own, kind="stable")
-    pixels, own = pixels[order], own[order]
-    counts = np.bincount(own, minlength=cells.number)
-    size = int(min(BLOCK, np.median(counts)))
-    blocks = -(-counts // size)
-    first = np.concatenate([[0], np.cumsum(blocks * size)[:-1]])
-    place = first[own] + np.arange(len(own)) - (np.cumsum(counts) - counts)[own]
-    flat = np.full(int(blocks.sum()) * size, -1)
-    flat[place] = pixels
-    where = flat.reshape(-1, size)
-
-    shape = (len(where), len(layout.groups), len(data) * len(layout.groups[0]), size)
-    correlated = layout.joint and noise.covariance is not None
-    cross = np.empty((len(where), 1, len(data), size)) if correlated else None
-    every = np.empty(shape), np.empty(shape), cross
-    step = max(1, BLOCK // size)
-    for begin in range(0, len(where), step):
-        block, index = slice(begin, begin + step), where[begin : begin + step].ravel()
-        found = pixel_rows(data, noise, layout, index, index >= 0)
-        if not np.isfinite(found[0]).all() or found[0].min() < UNSEEN:
-            _refuse(data, noise)
-        for target, rows in zip(every, found, strict=True):
-            if target is not None and rows is not None:
-                rows = np.broadcast_to(rows, (*rows.shape[:2], index.size))
-                target[block] = np.moveaxis(rows.reshape(*rows.shape[:2], -1, size), 2, 0)
-    in_order = bool(np.all(blocks == 1))
-    cell = None if in_order else jnp.asarray(np.repeat(np.arange(cells.number), blocks))
-    return Pixels(*jax.tree.map(jnp.asarray, every)), cell

@@ -7,7 +7,6 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import healpy
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -17,7 +16,7 @@ from jaxsky.checks import Numeric, listed
 from jaxsky.components import component_class
 from jaxsky.experiment import SimulationInputs, cmb_spectra, simulation_inputs
 from jaxsky.galaxy import EmbeddedSky
-from jaxsky.harmonics import Preparation, gaussian_beam
+from jaxsky.harmonics import gaussian_beam
 from jaxsky.inputs import (
     Template,
     bandpass_of,
@@ -31,6 +30,7 @@ from jaxsky.inputs import (
     uK_RJ_per,
 )
 from jaxsky.io import MissingFileError
+from jaxsky.io.stacks import Maps, stored
 from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum, realisation_key
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import Observation, ObservedBand
@@ -63,15 +63,26 @@ class Band(NamedTuple):
     the covariance of Q and U in each pixel; `correlated` is the spectrum of additional noise, if
     any [uK_RJ^2].
     `leakage` is in the maps, and is subtracted when they are brought to a common resolution.
+    Large maps of many bands lie on disk (`jaxsky.io.stacks`).
     """
 
-    maps: Float[Array, "stokes pix"]
+    maps: Float[Array, "stokes pix"] | Maps
     used: Bool[np.ndarray, " pix"]
     bandpass: Bandpass
     beam: float | Float[Array, " ell"]
-    noise: Numeric
+    noise: Numeric | Maps
     correlated: Float[Array, " ell"] | None = None
     leakage: Leakage | None = None
+
+    def of_many(self, number: int) -> "Band":
+        """Return the band, of which there are as many, with its maps on disk if all are large."""
+        noise = stored(self.noise, number) if np.ndim(self.noise) else self.noise
+        used = np.broadcast_to(True, self.used.shape) if self.used.all() else self.used
+        band = self._replace(maps=stored(self.maps, number), used=used, noise=noise)
+        if band.leakage is None:
+            return band
+        leaked = band.leakage._replace(maps=stored(band.leakage.maps, number))
+        return band._replace(leakage=leaked)
 
 
 class TemplateNoise(NamedTuple):
@@ -98,7 +109,8 @@ class Inputs(NamedTuple):
     `cmb` gives spectra TT, EE, BB, TE of the CMB up to a multipole, None where there is no CMB.
     `truth` are the parameters of a simulated sky that are numbers, including "r"; None where maps
     are not simulated. `description` says what the maps are. Templates whose noise is not known are
-    missing from `template_noise`. `foregrounds` are maps of simulated bands with nothing else.
+    missing from `template_noise`. `foregrounds` are maps of simulated bands with nothing else. What
+    all bands have of large maps lies on disk.
     """
 
     templates: dict[str, Template]
@@ -107,7 +119,7 @@ class Inputs(NamedTuple):
     truth: dict[str, float] | None
     description: str
     template_noise: Mapping[str, TemplateNoise] = MappingProxyType({})
-    foregrounds: dict[str, Float[Array, "stokes pix"]] | None = None
+    foregrounds: dict[str, Float[Array, "stokes pix"] | Maps] | None = None
 
 
 def inputs_of(
@@ -135,7 +147,9 @@ def inputs_of(
     truths: list[Mapping[str, float] | None] = []
     for spec in settings.bands:
         if spec.file is not None or settings.common.maps is not None:
-            bands[str(spec.name)], truth = _from_file(settings, spec)
+            band, truth = _from_file(settings, spec)
+            bands[str(spec.name)] = band.of_many(len(settings.bands))
+            del band  # or its maps stay in memory while the next one is read
             truths.append(truth)
     alone = None
     missing = [str(spec.name) for spec in settings.bands if str(spec.name) not in bands]
@@ -226,12 +240,14 @@ def _simulated(
         if (leakage := _leakage_of(observed, used)) is not None:
             total = total + leakage.maps
         band, beam = observed.bandpass, observed.beam
-        bands[name] = Band(total, used, band, beam, noise, correlated, leakage)
+        made = Band(total, used, band, beam, noise, correlated, leakage)
+        bands[name] = made.of_many(len(settings.bands))
     if not foregrounds or not sky:
         return bands, None
     quiet = {n: ObservedBand(c.band, c.beam, c.target) for n, c in observation.channels.items()}
     alone = Observation(quiet, observation.nside, lmax=observation.lmax)
-    return bands, {name: maps["total"] for name, maps in observe_bands(key, sky, alone)}
+    seen = observe_bands(key, sky, alone)
+    return bands, {name: stored(maps["total"], len(settings.bands)) for name, maps in seen}
 
 
 def _noise_of(
@@ -348,26 +364,6 @@ def _estimated_noise(noise, maps, used):
     white, knee, slope = fit_knee(maps, quiet, 2 * nside)
     excess = knee_spectrum(white, knee, slope, 4 * nside) - white
     return float(np.degrees(np.sqrt(white)) * 60), excess.at[:2].set(0.0)
-
-
-def prepare_component(
-    component: Component, preparation: Preparation, kept: Bool[np.ndarray, " pix"] | None = None
-) -> Component:
-    """Bring a component's amplitude, and parameters that are maps, to the common resolution.
-
-    Pixels of the amplitude that are not kept are set to zero; by default all are kept.
-    """
-
-    def brought(leaf):
-        if leaf.ndim not in (1, 2):
-            return leaf
-        values = jnp.atleast_2d(jnp.asarray(leaf, float))
-        if leaf.ndim == 2:
-            values = values if kept is None else values * kept
-        prepared = preparation(values).block_until_ready()
-        return prepared if leaf.ndim == 2 else prepared[0]
-
-    return jax.tree.map(brought, component)
 
 
 def modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:

@@ -22,6 +22,7 @@ from jaxtyping import Array
 from jaxsky.checks import check_seed
 from jaxsky.io import InputError, whole
 from jaxsky.io.files import cache_folder
+from jaxsky.io.stacks import Stack, ranges
 from jaxsky.noise import realisation_key, stream
 from jaxsky.programs import QUIET
 from jaxsky.workers import realised
@@ -40,6 +41,10 @@ def fingerprint(tree: Any) -> str:
     """Return a hash of all arrays of a tree; functions are left out."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(tree):
+        if isinstance(leaf, Stack):
+            for part in ranges(leaf.shape[-1]):
+                digest.update(leaf[..., part].tobytes())
+            continue
         array = np.ascontiguousarray(leaf)
         if array.dtype != object:
             digest.update(array.tobytes())

@@ -19,6 +19,7 @@ from matplotlib.axis import Axis
 from fits.results import FitResult
 from jaxsky.components import parameter_declaration
 from jaxsky.io import whole
+from jaxsky.io.stacks import Maps
 
 STYLE: Any = {
     "font.size": 9,
@@ -34,6 +35,8 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#22
 TRUTH = {"color": COLORS[3], "linewidth": 1.6}
 #: Width of a column of a paper [inch].
 COLUMN = 3.5
+#: Largest nside of a map that is drawn.
+FINEST = 512
 #: Height of a map in it, with its title [inch].
 MAP_HEIGHT = 1.85
 UNITS = {"uK_RJ": r"$\mu{\rm K}_{\rm RJ}$", "uK_CMB": r"$\mu{\rm K}_{\rm CMB}$"}
@@ -209,6 +212,15 @@ def stokes_panels(
         MapPanel(plain(f"{name}: {stokes}"), values, f"{stokes} [{UNITS[unit]}]", middle, limit)
         for values, stokes in zip(maps, "QU", strict=True)
     ]
+
+
+def thinned(maps: Maps) -> np.ndarray:
+    """Return maps as they are, or of nside 512, which is what a picture resolves, if finer."""
+    nside = healpy.npix2nside(maps.shape[-1])
+    if nside <= FINEST:
+        return np.asarray(maps)
+    directions = healpy.pix2ang(FINEST, np.arange(healpy.nside2npix(FINEST)))
+    return maps[..., healpy.ang2pix(nside, *directions)]
 
 
 def plot_maps(path: Path, rows: Sequence[Sequence[MapPanel]], title: str = "") -> None:

@@ -6,7 +6,8 @@ parameters is assembled from these. A likelihood without regions is a single cel
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+import operator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -17,98 +18,14 @@ import scipy.sparse
 from jaxtyping import Array, Bool, Float, Int
 
 from fits.distributed import counted
+from fits.priors import Gaussian, Prior, Uniform, check_priors
 from fits.systems import Derivatives, assembled
 from jaxsky.checks import Numeric, as_array
-from jaxsky.settings import Experiment
 
 #: Dense matrix, or sparse for many parameters.
 Matrix: TypeAlias = np.ndarray | scipy.sparse.csc_matrix
 #: A value this close to the edge of a uniform prior, in units of its width, is at the edge.
 EDGE = 1e-4
-
-
-class Prior(eqx.Module):
-    """Base class of priors on a parameter."""
-
-    def log_density(self, value: Numeric) -> Array:
-        """Return the log-density up to a constant; -inf outside the range."""
-        raise TypeError(f"{type(self).__name__} must define `log_density`.")
-
-
-class Uniform(Prior):
-    """Constant density in low <= value <= high.
-
-    Raises
-    ------
-    ValueError
-        If low is not below high.
-
-    Examples
-    --------
-    >>> float(Uniform(1.0, 2.0).log_density(1.5))
-    0.0
-    """
-
-    low: float
-    high: float
-
-    def __init__(self, low: float, high: float) -> None:
-        self.low, self.high = float(low), float(high)
-        if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
-            raise ValueError(f"A uniform prior needs finite low < high, not {low} and {high}.")
-
-    def log_density(self, value):
-        return jnp.where((value >= self.low) & (value <= self.high), 0.0, -jnp.inf)
-
-
-class Gaussian(Prior):
-    """Gaussian density with a mean and a standard deviation.
-
-    Raises
-    ------
-    ValueError
-        If the mean is not finite, or sigma not positive.
-
-    Examples
-    --------
-    >>> float(Gaussian(1.0, 0.5).log_density(2.0))
-    -2.0
-    """
-
-    mean: float
-    sigma: float
-
-    def __init__(self, mean: float, sigma: float) -> None:
-        self.mean, self.sigma = float(mean), float(sigma)
-        if not (np.isfinite([self.mean, self.sigma]).all() and self.sigma > 0):
-            raise ValueError(
-                f"A Gaussian prior needs a finite mean and positive sigma, not {mean} and {sigma}."
-            )
-
-    def log_density(self, value):
-        return -0.5 * ((value - self.mean) / self.sigma) ** 2
-
-
-def priors_of(settings: Experiment, command: str) -> dict[str, Prior]:
-    """Return the priors of the free parameters of a command."""
-    priors: dict[str, Prior] = {}
-    for name, one in settings.free_in(command).items():
-        if one.uniform:
-            priors[name] = Uniform(*one.uniform)
-        elif one.gaussian:
-            priors[name] = Gaussian(*one.gaussian)
-    return priors
-
-
-def check_priors(priors: Mapping[str, Prior] | None, free: Iterable[str]) -> dict[str, Prior]:
-    """Return the priors, after checking that each belongs to a free parameter."""
-    free = list(free)
-    for name in priors or {}:
-        if name not in free:
-            raise KeyError(
-                f"There is a prior for {name!r}, which is not free; free are {', '.join(free)}."
-            )
-    return dict(priors or {})
 
 
 class Likelihood(eqx.Module):
@@ -170,6 +87,10 @@ class Likelihood(eqx.Module):
         """Return -2 ln L for parameters of each cell."""
         return jnp.sum(self.residuals(self.named(local[0])) ** 2)
 
+    def pieces(self) -> Iterator["Likelihood"]:
+        """Yield likelihoods that add up to this one, each with its data in memory."""
+        yield self
+
     def derivatives(self, local: Float[Array, "cell free"]) -> Derivatives:
         """Return -ln L of each cell, and its derivatives in the parameters of the cell."""
 
@@ -195,14 +116,32 @@ def _chi2(like, params):
 
 
 @jax.jit
-def value_and_gradient(like, theta):
-    """Return -ln L and its gradient."""
+def _value_and_gradient(like, theta):
     return jax.value_and_grad(lambda t: like.total(t[like.cells()]) / 2)(theta)
 
 
 @jax.jit
-def _cell_derivatives(like, theta) -> Derivatives:
+def _of_cells(like, theta) -> Derivatives:
     return like.derivatives(theta[like.cells()])
+
+
+def _summed(function: Callable, like: Likelihood, theta: Numeric) -> Any:
+    """Return the sum over the pieces of a likelihood of a function that is additive."""
+    total, *others = (function(piece, theta) for piece in like.pieces())
+    for part in others:
+        total = jax.tree.map(operator.add, total, part)
+    return total
+
+
+def value_and_gradient(
+    like: Likelihood, theta: Float[Array | np.ndarray, " par"]
+) -> tuple[Float[np.ndarray, ""], Float[np.ndarray, " par"]]:
+    """Return -ln L and its gradient."""
+    return _summed(_value_and_gradient, like, theta)
+
+
+def _cell_derivatives(like: Likelihood, theta: Float[Array, " par"]) -> Derivatives:
+    return _summed(_of_cells, like, theta)
 
 
 def hessian(like: Likelihood, params: Mapping[str, Numeric]) -> Float[np.ndarray, "par par"]:

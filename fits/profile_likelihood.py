@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from fits import distributed, regions, systems
-from fits.compress import Layout, Noise, as_noise, bare, compressed, gathered, layouts, used_pixels
+from fits.blocks import Blocks, gathered
+from fits.compress import Layout, Noise, as_noise, bare, compressed, layouts, used_pixels
 from fits.mixing import Mixing, named_bands, spectral_names, unit_sky
 from fits.posterior import Likelihood
 from fits.regions import Cells, check_labels
@@ -30,6 +31,7 @@ from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.bandpass import parse_unit
 from jaxsky.checks import Numeric, as_array, check_double, check_finite, check_shape
+from jaxsky.io.stacks import Stack
 from jaxsky.mesh import SUMS, at_once, in_place, maps_of, over_pixels, spread
 from jaxsky.mesh import total as over_devices
 from jaxsky.sky import check_parameter, unknown_parameter
@@ -56,6 +58,8 @@ class SpectralLikelihood(Likelihood):
     stokes: str = eqx.field(static=True)
     #: bands that carry no weight next to the others, and are not counted
     weightless: tuple[str, ...] = eqx.field(static=True)
+    #: where `pixels` and `block_cell` are read from, piece by piece, if they are too many
+    source: Blocks | None = eqx.field(static=True, default=None)
 
     profiled = True
 
@@ -98,8 +102,20 @@ class SpectralLikelihood(Likelihood):
             self.mixing.rotated(matrix, values) if each.joint else matrix for each in self.layout
         )
 
+    def pieces(self):
+        if self.source is None:
+            yield self
+            return
+        for pixels, cells in self.source.pieces(self.layout):
+            yield dataclasses.replace(self, pixels=pixels, block_cell=cells, source=None)
+
     def _mapped(self, function, matrices):
         """Apply a function of (matrices, pixels) to all blocks, for each of `layout`."""
+        if self.source is not None:
+            raise ValueError(
+                "Maps on disk whose noise differs from pixel to pixel and from band to band can be "
+                'fitted by fits.Newton() only, and not sampled (separate.sampler = "none").'
+            )
         results = []
         for of_cell, pixels in zip(matrices, self.pixels, strict=True):
             blocks, *_, size = pixels.data.shape
@@ -326,7 +342,7 @@ def spectral_likelihood(
     fewer = cells.number * max(rows) < pixels_used
     if compress and not noise.separable:
         raise ValueError("Only noise that is separable into bands and pixels can be compressed.")
-    block_cell = None
+    block_cell = source = None
     parts = []
     few = noise.separable and (fewer if compress is None else compress)
     blocks = None
@@ -342,6 +358,8 @@ def spectral_likelihood(
             block_cell = blocks.cell
         elif few:
             parts.append(compressed(data, noise, cells, used, layout))
+        elif isinstance(data, Stack):
+            source = Blocks(data, noise, cells, used)
         else:
             pixels, block_cell = gathered(data, noise, cells, used, layout)
             parts.append(pixels)
@@ -349,6 +367,7 @@ def spectral_likelihood(
         like,
         pixels=tuple(parts),
         block_cell=block_cell,
+        source=source,
         values=number - components * data.shape[1] * pixels_used,
         weightless=tuple(name for name, some in zip(bands, heavy, strict=True) if not some),
     )
@@ -363,9 +382,14 @@ def _index(values: Mapping[str, Array], cells: Cells) -> Array:
     return jnp.asarray(np.stack(columns, axis=1) if columns else np.zeros((cells.number, 0), int))
 
 
-@jax.jit
 def matrices_at(like: SpectralLikelihood, params: Mapping[str, Array]) -> tuple[Array, ...]:
     """Return mixing matrices (cell, row, unknown) for parameters, for each of `layout`."""
+    # Without data: compiled programs keep what is static, such as the source.
+    return _matrices(dataclasses.replace(like, pixels=(), block_cell=None, source=None), params)
+
+
+@jax.jit
+def _matrices(like, params):
     return like.matrices(like.flat(params)[like.index])
 
 

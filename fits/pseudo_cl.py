@@ -16,12 +16,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.stats
-from ducc0.misc import wigner3j_int
-from ducc0.misc.experimental import coupling_matrix_rect
 from jaxtyping import Array, Float
 
+from fits.coupling import (
+    coupling_matrices,
+    derivative_factors,
+    pure_coupling_matrices,
+    pure_factors,
+)
 from jaxsky.checks import Numeric, check_finite, is_concrete
 from jaxsky.harmonics import analysis, expand, lmax_of, power_spectrum, synthesis
+from jaxsky.io.stacks import Maps, Stack, empty
 
 #: Multipole of amplitudes: that of the recombination peak of primordial B modes.
 PIVOT = 80
@@ -50,7 +55,7 @@ class MaskedSpectra(NamedTuple):
     mask: Float[np.ndarray, " pix"]
     edges: tuple[int, ...]
     lmax: int
-    derivatives: Float[np.ndarray, "4 pix"] | None
+    derivatives: Float[np.ndarray, "4 pix"] | Maps | None
     inverse: Float[np.ndarray, "2 bin 2 ell"]
     windows: Float[np.ndarray, "2 bin 2 ell"]
     spread: Float[np.ndarray, "2 ell ell"]
@@ -79,70 +84,6 @@ def bin_edges(lmin: int, lmax: int, width: int) -> tuple[int, ...]:
             raise ValueError(f"Argument `{name}` must be at least {least}, but is {value}.")
     count = max(1, (lmax + 1 - lmin) // width)
     return (*(lmin + width * i for i in range(count)), lmax + 1)
-
-
-def coupling_matrices(
-    power: Float[np.ndarray, " ell"], lmax: int
-) -> Float[np.ndarray, "2 ell ell"]:
-    """Return the effect of a mask: pseudo-EE = M[0] EE + M[1] BB, and with E and B exchanged.
-
-    `power` is C_l of the mask, at best up to 2 lmax, with lmax that of the spectra.
-    """
-    spectrum = np.zeros(2 * lmax + 1)
-    kept = min(len(power), len(spectrum))
-    spectrum[:kept] = power[:kept]
-    matrices = np.empty((2, lmax + 1, lmax + 1))
-    coupling_matrix_rect(spectrum[None], (4,), matrices, nthreads=0)
-    matrices[:, :2] = matrices[:, :, :2] = 0  # a field of spin 2 has no multipoles below 2
-    return matrices * (2 * np.arange(lmax + 1) + 1)
-
-
-def pure_factors(lmax: int) -> Float[np.ndarray, "3 ell"]:
-    """Return the factors of the three terms of a purified harmonic."""
-    ell = np.maximum(np.arange(lmax + 1), 2.0)
-    return np.stack(
-        [
-            np.ones_like(ell),
-            2 / np.sqrt((ell - 1) * (ell + 2)),
-            1 / np.sqrt((ell - 1) * ell * (ell + 1) * (ell + 2)),
-        ]
-    )
-
-
-def derivative_factors(count: int) -> Float[np.ndarray, "3 ell"]:
-    """Return sqrt((l + n)! / (l - n)!), for n-th derivatives in harmonics of spin n = 0, 1, 2."""
-    ell = np.arange(count, dtype=float)
-    second = (ell - 1) * ell * (ell + 1) * (ell + 2)
-    return np.stack([np.ones(count), np.sqrt(ell * (ell + 1)), np.sqrt(np.maximum(second, 0))])
-
-
-def pure_coupling_matrices(
-    power: Float[np.ndarray, " ell"], lmax: int
-) -> Float[np.ndarray, "2 ell ell"]:
-    """Return `coupling_matrices` of a purified field (Smith 2006).
-
-    The mask times a harmonic of spin 2 is replaced by the second derivative of the mask times a
-    scalar harmonic, three terms with a Wigner symbol each. M[1] is zero to rounding if all
-    multipoles of the mask are given: that is the purpose of purifying.
-    """
-    count = min(len(power), 2 * lmax + 1)
-    weights = power[:count] * (2 * np.arange(count) + 1) / (4 * math.pi)
-    factors, rises = pure_factors(lmax), derivative_factors(count)
-    matrices = np.zeros((2, lmax + 1, lmax + 1))
-    degree = np.arange(count)
-    for ell in range(2, lmax + 1):
-        others = np.arange(max(2, ell - count + 1), min(lmax, ell + count - 1) + 1)
-        symbols = np.zeros((len(others), count))
-        for row, other in zip(symbols, others, strict=True):
-            for n in range(3):
-                first, values = wigner3j_int(int(other), ell, -2, 2 - n)
-                stop = min(first + len(values), count)
-                row[first:stop] += factors[n, ell] * rises[n, first:stop] * values[: stop - first]
-        squares = symbols**2 * weights
-        odd = (ell + others[:, None] + degree) % 2 == 1
-        matrices[0, ell, others] = np.where(odd, 0, squares).sum(axis=1)
-        matrices[1, ell, others] = np.where(odd, squares, 0).sum(axis=1)
-    return matrices * (2 * np.arange(lmax + 1) + 1)
 
 
 def _all_edges(edges: Sequence[int], lmax: int) -> np.ndarray:
@@ -247,32 +188,56 @@ def _derivatives(alm: Float[Array, "1 alm"], nside: int) -> Float[np.ndarray, "4
     rises = derivative_factors(lmax_of(alm) + 1)
     zero = jnp.zeros_like(alm[0])
     first, second = (jnp.stack([alm[0] * expand(jnp.asarray(rise)), zero]) for rise in rises[1:])
-    return np.concatenate([synthesis(first, nside, spin=1), synthesis(second, nside)])
+    found = empty((4, healpy.nside2npix(nside)))
+    found[:2] = np.asarray(synthesis(first, nside, spin=1))
+    found[2:] = np.asarray(synthesis(second, nside))
+    return found
+
+
+def _masked_alm(spectra: MaskedSpectra, maps: Float[Array, "2 pix"]) -> Float[Array, "2 alm"]:
+    """Return E and B of masked maps, with B purified if the mask's derivatives are given."""
+    mask, derivatives, lmax = spectra.mask, spectra.derivatives, spectra.lmax
+    if not isinstance(derivatives, Stack):
+        return _in_memory_alm(mask, derivatives, maps, lmax)
+    E, B = _in_memory_alm(mask, None, maps, lmax)
+    once = _once(mask, derivatives[:2], maps, lmax)
+    return jnp.stack([E, B + once + _twice(mask, derivatives[2:], maps, lmax)])
 
 
 @partial(jax.jit, static_argnames="lmax")
-def _masked_alm(
+def _in_memory_alm(
     mask: Float[Array, " pix"],
     derivatives: Float[Array, "4 pix"] | None,
     maps: Float[Array, "2 pix"],
     lmax: int,
 ) -> Float[Array, "2 alm"]:
-    """Return E and B of masked maps, with B purified if the mask's derivatives are given."""
-    # Unused pixels may contain anything, and a purified harmonic reaches a little beyond the mask.
-    maps = jnp.where(mask > 0, maps, 0.0)
-    E, B = analysis(mask * maps, lmax, 0)
+    E, B = analysis(mask * jnp.where(mask > 0, maps, 0.0), lmax, 0)
     if derivatives is not None:
-        (Q, U), first, second = maps, derivatives[:2], derivatives[2:]
-        # (Q + iU) times the conjugate of a derivative; its maps are minus the real and imaginary
-        # part, as Q and U are of E + iB.
-        once = analysis(-_turned_back(Q, U, *first), lmax, 0, spin=1)[1]
-        twice = -analysis(-_turned_back(Q, U, *second)[1:], lmax, 0)[0]
-        _, of_once, of_twice = jnp.asarray(pure_factors(lmax))
-        B = B + expand(of_once) * once + expand(of_twice) * twice
+        B = B + _once(mask, derivatives[:2], maps, lmax) + _twice(mask, derivatives[2:], maps, lmax)
     return jnp.stack([E, B])
 
 
-def _turned_back(Q, U, real, imaginary):
+@partial(jax.jit, static_argnames="lmax")
+def _once(mask, first, maps, lmax):
+    """Return what the first derivatives of the mask add to B."""
+    alm = analysis(-_turned_back(mask, maps, first), lmax, 0, spin=1)[1]
+    return expand(jnp.asarray(pure_factors(lmax)[1])) * alm
+
+
+@partial(jax.jit, static_argnames="lmax")
+def _twice(mask, second, maps, lmax):
+    """Return what the second derivatives of the mask add to B."""
+    alm = -analysis(-_turned_back(mask, maps, second)[1:], lmax, 0)[0]
+    return expand(jnp.asarray(pure_factors(lmax)[2])) * alm
+
+
+def _turned_back(mask, maps, derivative):
+    """Return Q + iU times the conjugate of a derivative.
+
+    Its maps are minus the real and imaginary part, as Q and U are of E + iB.
+    """
+    # Unused pixels may contain anything, and a purified harmonic reaches a little beyond the mask.
+    (Q, U), (real, imaginary) = jnp.where(mask > 0, maps, 0.0), derivative
     return jnp.stack([Q * real + U * imaginary, U * real - Q * imaginary])
 
 
@@ -297,10 +262,8 @@ def band_powers(
     for name, values in {"maps": maps, "other": maps if other is None else other}.items():
         if is_concrete(values):
             check_finite(name, np.where(np.asarray(spectra.mask) > 0, np.asarray(values), 0))
-    alms = [
-        _masked_alm(spectra.mask, spectra.derivatives, jnp.asarray(m), spectra.lmax)
-        for m in (maps, maps if other is None else other)
-    ]
+    alms = [_masked_alm(spectra, jnp.asarray(maps))]
+    alms.append(alms[0] if other is None else _masked_alm(spectra, jnp.asarray(other)))
     return np.einsum("ibjl,jl->ib", spectra.inverse, power_spectrum(*alms))
 
 

@@ -3,6 +3,7 @@
 Regions are maps of labels 0, 1, ..., one map per parameter; cells are their intersections.
 """
 
+import itertools
 import operator
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -69,12 +70,11 @@ def common_holes(maps: Sequence[Bool[np.ndarray, " pix"]]) -> dict[int, np.ndarr
     if all(used.all() for used in maps):
         return {}
     nsides = {healpy.npix2nside(used.size) for used in maps}
-    return {
-        nside: np.logical_and.reduce(
-            [healpy.ud_grade(u.astype(float), nside) > 0.999 for u in maps]
-        )
-        for nside in nsides
-    }
+    holed = [used for used in maps if not used.all()]
+    found = {nside: np.ones(healpy.nside2npix(nside), bool) for nside in nsides}
+    for (nside, kept), used in itertools.product(found.items(), holed):
+        kept &= healpy.ud_grade(used.astype(float), nside) > 0.999
+    return found
 
 
 def region_words(settings: Experiment, name: str) -> str:

@@ -27,6 +27,7 @@ from fits.separated_maps import (
 from jaxsky import Bandpass, Sky
 from jaxsky.checks import Numeric
 from jaxsky.harmonics import Preparation, expand, gaussian_beam, lmax_of, low_multipoles, synthesis
+from jaxsky.io.stacks import Maps, computed, empty
 from jaxsky.settings import Experiment, SettingsError
 
 
@@ -45,8 +46,8 @@ class _Data:
     unit: str
     used: Bool[np.ndarray, " pix"]
     mask: Float[np.ndarray, " pix"]
-    observed: Float[np.ndarray, "band stokes _"]
-    foregrounds: Float[np.ndarray, "band stokes _"] | None
+    observed: Float[np.ndarray, "band stokes _"] | Maps
+    foregrounds: Float[np.ndarray, "band stokes _"] | Maps | None
     truth: dict[str, float] | None
     description: str
 
@@ -76,10 +77,11 @@ class PixelData(_Data):
             self.sky, self.bands, data, self.noise, self.start, labels=self.labels, unit=self.unit
         )
 
-    def noise_realisation(self, key: Array) -> Float[np.ndarray, "band stokes pix"]:
+    def noise_realisation(self, key: Array) -> Maps:
         """Return noise like that of the data."""
         noise = self.fluctuations.noise_realisation(key)
-        return np.asarray(noise) * self.factors[:, None, None]
+        factors = self.factors[:, None, None]
+        return computed(noise.shape, lambda part: noise[..., part] * factors)
 
     def components(self, like: SpectralLikelihood, params: Mapping, data, **options):
         """Return amplitudes of the components with their errors, and their maps."""
@@ -88,11 +90,16 @@ class PixelData(_Data):
 
     def residuals(self, like: SpectralLikelihood, params: Mapping, amplitude):
         """Return maps (band, stokes, pix) of the data minus the components; NaN where masked."""
-        return self.observed - emission_maps(like, params, amplitude)
+        emission = emission_maps(like, params, amplitude)
+        shape = self.observed.shape
+        return computed(shape, lambda part: self.observed[..., part] - emission[..., part])
 
     def emission(self, like: SpectralLikelihood, params: Mapping, amplitude):
         """Return the emission of components in the bands; zero in masked pixels."""
-        return emission_maps(like, params, np.where(self.used, amplitude, 0.0))
+        inside = computed(
+            amplitude.shape, lambda part: np.where(self.used[part], amplitude[..., part], 0.0)
+        )
+        return emission_maps(like, params, inside)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +144,8 @@ class MaskedSkyData(_Multipoles, PixelData):
 
     def alm(self, data):
         """Return the coefficients of maps times the mask."""
-        seen, lmax = np.where(self.mask > 0, data, 0.0) * self.mask, self.spectra.shape[-1] - 1
+        lmax = self.spectra.shape[-1] - 1
+        seen = (np.where(self.mask > 0, data[i], 0.0) * self.mask for i in range(len(data)))
         return np.stack([np.asarray(low_multipoles(jnp.asarray(rows), lmax)) for rows in seen])
 
     def components(self, like, params, data, **options):
@@ -243,12 +251,18 @@ def _pixel_data(
     mask, fluctuations = _mask(settings, used), prepared.fluctuations
 
     def scaled(maps):
-        return np.where(used, np.asarray(maps) * factors[:, None, None], 0.0)
+        def inside(part):
+            return np.where(used[part], np.asarray(maps[..., part]) * factors[:, None, None], 0.0)
+
+        return computed(maps.shape, inside)
 
     alone = None
     if inputs.foregrounds is not None:
+        maps = empty(prepared.data.shape)
         pairs = zip(fluctuations.preparations, inputs.foregrounds.values(), strict=True)
-        alone = scaled(jnp.stack([operator(maps) for operator, maps in pairs]))
+        for i, (operator, own) in enumerate(pairs):
+            maps[i] = np.asarray(operator(jnp.asarray(np.asarray(own))))
+        alone = scaled(maps)
     by_pixel = settings.separate.domain == "pixel"
     left = used if by_pixel else mask > 0
     shared |= {

@@ -2,14 +2,14 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from fits import systems
 from fits.compress import PIECE, Noise, as_noise, bare, chunks, pixel_rows, used_pixels
@@ -24,6 +24,7 @@ from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.checks import Numeric, as_array, check_finite, check_names, check_shape
 from jaxsky.components import component_class
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
+from jaxsky.io.stacks import Maps, computed, empty, ranges
 from jaxsky.mesh import along, at_once, in_place, maps_of, module_of, over_pixels, spread
 from jaxsky.observation import Instrument
 
@@ -58,11 +59,27 @@ class ComponentMaps(NamedTuple):
         i = self.components.index(name)
         return module_of(self.covariance).sqrt(self.covariance[i, i])
 
+    def sigmas(self, pixels: slice) -> list[np.ndarray]:
+        """Return the standard deviations of all amplitudes in some pixels."""
+        if self.covariance is None:
+            raise ValueError("The covariance of the maps was not asked for.")
+        block = self.covariance[..., pixels if self.covariance.shape[-1] > 1 else slice(1)]
+        return [np.sqrt(block[i, i]) for i in range(len(block))]
+
     def degradation(self, name: str) -> Float[np.ndarray, "stokes ..."]:
         """Return the noise of a component over that without other components; at least 1."""
         sigma = self.sigma(name)
         assert self.alone is not None  # made with the covariance
         return sigma / module_of(sigma).sqrt(self.alone[self.components.index(name)])
+
+    def mean_degradation(self, name: str) -> float:
+        """Return the mean of `degradation` over the pixels that are not masked."""
+        assert self.alone is not None  # made with the covariance
+        i, total = self.components.index(name), np.zeros(2)
+        for part in ranges(self.alone.shape[-1]):
+            ratio = self.sigmas(part)[i] / np.sqrt(self.alone[..., part][i])
+            total += np.nansum(ratio), np.isfinite(ratio).sum()
+        return float(total[0] / total[1])
 
 
 @partial(jax.jit, static_argnames="errors")
@@ -88,13 +105,17 @@ def _separated(matrix, pixels, errors):
     return jax.tree.map(lambda x: jnp.moveaxis(x[..., 0], 0, -1), results)
 
 
+def _own(like: SpectralLikelihood, matrix: Array, part: Any) -> Array:
+    """Return the matrix (1, row, unknown) of all cells, or that of each pixel."""
+    return matrix if like.of_pixel is None else matrix[jnp.maximum(like.of_pixel[part], 0)]
+
+
 def _passes(like: SpectralLikelihood, params: Mapping[str, Numeric], npix: int) -> Iterator:
     """Yield (layout, slice of pixels, matrix (1, row, unknown) of all or of each) for all maps."""
     known = matrices_at(like, like.check(params) if like.start else {})
     for layout, matrix in zip(like.layout, known, strict=True):
         for part in chunks(npix):
-            own = matrix if like.of_pixel is None else matrix[jnp.maximum(like.of_pixel[part], 0)]
-            yield layout, part, own
+            yield layout, part, _own(like, matrix, part)
 
 
 @partial(jax.jit, static_argnames=("layouts", "errors"))
@@ -175,32 +196,36 @@ def component_maps(
         found = ComponentMaps(names, *_on_devices(*args, like.layout, covariance))
         return found if covariance else found._replace(covariance=None, alone=None)
     used = used_pixels(noise, npix, len(names))
-    amplitude = np.empty((len(names), stokes, npix))
-    square, count = np.zeros(npix), np.zeros(npix)
+    amplitude = empty((len(names), stokes, npix))
+    square, count, probability = (empty((npix,), copies=3) for _ in range(3))
     uniform = noise.separable and noise.pixel_sigma is None and like.of_pixel is None
-    blocks = np.empty((len(names), len(names), stokes, 1 if uniform else npix))
-    alone = np.empty(blocks.shape[1:])
+    shape = (len(names), stokes, 1 if uniform or not covariance else npix)
+    blocks, alone = empty((len(names), *shape)), empty(shape)
     for layout, part, matrix in _passes(like, params, npix):
         own = list(layout.stokes)
         errors = covariance and not (uniform and part.start)
         rows = pixel_rows(data, noise, layout, part, used[part])
         pixels = Pixels(*jax.tree.map(jnp.asarray, rows))
         solved, squares, *variances = map(np.asarray, _separated(matrix, pixels, errors))
-        amplitude[:, own, part] = layout.maps(solved)
-        square[part] += squares
-        count[part] += (noise.weights(part) > 0)[:, own].sum(axis=(0, 1)) - len(names) * len(own)
+        masked = ~used[part]
+        amplitude[:, own, part] = np.where(masked, np.nan, layout.maps(solved))
+        number = (noise.weights(part) > 0)[:, own].sum(axis=(0, 1)) - len(names) * len(own)
+        first = layout is like.layout[0]
+        square[part] = np.where(masked, np.nan, squares + (0 if first else square[part]))
+        count[part] = np.where(masked, np.nan, number + (0 if first else count[part]))
         if not errors:
             continue
         inverse, single = variances
+        if not uniform:
+            inverse, single = (np.where(masked, np.nan, each) for each in variances)
         where = slice(0, 1) if uniform else part
         for k, s in enumerate(own):
-            group, first = (0, k * len(names)) if layout.joint else (k, 0)
-            cut = slice(first, first + len(names))
+            group, begin = (0, k * len(names)) if layout.joint else (k, 0)
+            cut = slice(begin, begin + len(names))
             blocks[:, :, s, where] = inverse[group, cut, cut]
             alone[:, s, where] = single[group, cut]
-    for values in (amplitude, square, count, *(() if uniform else (blocks, alone))):
-        values[..., ~used] = np.nan
-    probability = scipy.special.chdtrc(count, square)
+    for part in chunks(npix):
+        probability[part] = scipy.special.chdtrc(count[part], square[part])
     found = ComponentMaps(names, amplitude, blocks, alone, square, count, probability)
     return found if covariance else found._replace(covariance=None, alone=None)
 
@@ -208,18 +233,23 @@ def component_maps(
 def emission_maps(
     like: SpectralLikelihood,
     params: Mapping[str, Numeric],
-    amplitude: Float[np.ndarray, "component stokes pix"],
-) -> Float[np.ndarray, "band stokes pix"]:
+    amplitude: Maps,
+) -> Maps:
     """Return the emission in the bands, in the unit of the data, from maps or coefficients."""
-    result = np.empty((len(like.mixing.names), *amplitude.shape[1:]))
-    for layout, part, matrix in _passes(like, params, amplitude.shape[-1]):
-        rows = layout.rows(amplitude[..., part])
-        if len(matrix) == 1:
-            model = np.einsum("ru,kup->krp", np.asarray(matrix[0]), rows, optimize=True)
-        else:
-            model = np.einsum("pru,kup->krp", np.asarray(matrix), rows)
-        result[:, list(layout.stokes), part] = layout.maps(model)
-    return result
+    shape = (len(like.mixing.names), *amplitude.shape[1:])
+    known = matrices_at(like, like.check(params) if like.start else {})
+
+    def emission(part):
+        maps = amplitude[..., part]
+        result = np.empty((*shape[:2], maps.shape[-1]))
+        for layout, matrix in zip(like.layout, known, strict=True):
+            rows, own = layout.rows(maps), np.asarray(_own(like, matrix, part))
+            one, sums = len(own) == 1, "ru,kup->krp"
+            model = np.einsum(*(sums, own[0]) if one else ("p" + sums, own), rows, optimize=one)
+            result[:, list(layout.stokes)] = layout.maps(model)
+        return result
+
+    return computed(shape, emission)
 
 
 class HarmonicMaps(ComponentMaps):

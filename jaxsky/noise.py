@@ -53,12 +53,15 @@ def stokes_noise(key: Array, stokes: int, size: int, dtype: Any) -> Float[Array,
     return jnp.roll(white, 1, axis=0) if stokes == 3 else white
 
 
-@partial(jax.jit, static_argnames=("nside", "stokes"))
+@partial(jax.jit, static_argnames=("nside", "stokes", "pixels"))
 def uniform_covariance(
-    noise: Numeric, nside: int, stokes: int = 2
+    noise: Numeric, nside: int, stokes: int = 2, pixels: int | None = None
 ) -> Float[Array, "stokes stokes pix"]:
-    """Return the covariance of each pixel for a level, the same for all Stokes parameters."""
-    npix, pixel = healpy.nside2npix(nside), healpy.nside2resol(nside, arcmin=True)
+    """Return the covariance of each pixel for a level, the same for all Stokes parameters.
+
+    By default of all pixels, else of as many.
+    """
+    npix, pixel = pixels or healpy.nside2npix(nside), healpy.nside2resol(nside, arcmin=True)
     return jnp.eye(stokes)[..., None] * jnp.full(npix, (noise / pixel) ** 2)
 
 
@@ -94,7 +97,7 @@ def uniform_alm(
     return stokes_noise(key, stokes, (lmax + 1) ** 2, noise.dtype) * expand(levels)
 
 
-def white_alm(key: Array, noise: Numeric, lmax: int) -> Float[Array, "2 alm"]:
+def white_alm(key: Array, noise: Any, lmax: int) -> Float[Array, "2 alm"]:
     """Draw coefficients E and B of noise given as a level or as a covariance of each pixel.
 
     A level needs no pixels. A covariance is drawn in pixels and analysed without iterations or
@@ -102,7 +105,7 @@ def white_alm(key: Array, noise: Numeric, lmax: int) -> Float[Array, "2 alm"]:
     """
     if not jnp.ndim(noise):
         return uniform_alm(key, noise, lmax)
-    return analysis(draw(key, jnp.asarray(noise, float)), lmax, 0)
+    return analysis(draw_in_pieces(key, noise), lmax, 0)
 
 
 @jax.jit
@@ -144,6 +147,19 @@ def draw(
     _, stokes, npix = covariance.shape
     white = stokes_noise(key, stokes, npix, covariance.dtype)
     return _correlated(covariance, white, diagonal)
+
+
+def draw_in_pieces(key: Array, covariance: Any) -> Float[Array, "stokes pix"]:
+    """Return the same as `draw` in double precision; a covariance on disk stays there."""
+    _, stokes, npix = covariance.shape
+    white = stokes_noise(key, stokes, npix, float)
+    found = np.empty(white.shape)
+    for start in range(0, npix, PIECE):
+        part = slice(start, start + PIECE)
+        found[:, part] = _correlated(
+            jnp.asarray(covariance[..., part], float), white[:, part], False
+        )
+    return jnp.asarray(found)
 
 
 def estimate_variance(

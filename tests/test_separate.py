@@ -16,7 +16,7 @@ from fits.commands import separate as command
 from fits.commands.run import DEFAULTS
 from fits.commands.separate import separation_warnings
 from fits.optimize import best_fit
-from fits.posterior import priors_of
+from fits.priors import priors_of
 from fits.pseudo_cl import band_powers
 from fits.separated_data import separation_data
 from fits.tensor_ratio import fit_tensors

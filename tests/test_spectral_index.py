@@ -11,8 +11,8 @@ import pytest
 
 from commands import jaxsky
 from fits.commands.run import DEFAULTS
-from fits.common import Fluctuations, common_maps
-from fits.inputs import Band, Inputs, inputs_of, prepare_component
+from fits.common import Fluctuations, common_maps, prepare_component
+from fits.inputs import Band, Inputs, inputs_of
 from fits.optimize import best_fit
 from fits.regions import region_masks
 from fits.spectral_index import fit_regions

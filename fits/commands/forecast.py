@@ -12,8 +12,8 @@ from jaxtyping import Float
 from fits import fisher, plots
 from fits.commands.report import ResultTable, Row
 from fits.commands.run import Command, Report, Run
+from fits.common import prepare_component
 from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors
-from fits.inputs import prepare_component
 from fits.mixing import Mixing, unit_sky
 from fits.pseudo_cl import (
     FIELDS,

@@ -33,6 +33,7 @@ from fits.commands.report import (
 )
 from fits.results import write_json, write_log
 from jaxsky.io.files import ALL, Folder, occupied
+from jaxsky.io.stacks import scratch
 from jaxsky.settings import Experiment, check_log, load, of_file
 from jaxsky.workers import raised_in, workers_of
 
@@ -150,6 +151,7 @@ def run_command(
             overwrite=overwrite,
             part=ALL if overwrite else part,
         ) as folder,
+        scratch(out),
         Steps() as steps,
         workers_of(workers, warn) as executor,
     ):

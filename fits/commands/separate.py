@@ -1,5 +1,6 @@
 """`jaxsky separate`: separate components and measure r; numbers, maps, warnings, pictures."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,13 @@ from fits.results import FitError, probability, two_digits, with_error
 from fits.separated_data import separation_data
 from jaxsky.components import parameter_declaration
 from jaxsky.io import write_maps
+from jaxsky.io.stacks import Maps, Stack, computed, ranges
 from jaxsky.settings import Experiment
 
 #: Probabilities below this get a warning.
 UNLIKELY = 1e-3
 #: E in B above this fraction of a band power's standard deviation gets a warning.
 LEAKED = 0.5
-#: Name, unit and values of a column of a map file.
-Column = tuple[str, str, np.ndarray]
 #: Number of bands whose residuals are drawn.
 SHOWN = 4
 CLEANED, NOISE, RESIDUAL, LEFT, LENSING, TRUTH = (*plots.COLORS[:4], "0.5", plots.COLORS[3])
@@ -32,7 +32,8 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
     bands, truth, simulated = list(found.data.bands), found.data.truth or {}, found.simulated
     small = None
     if found.data.by_pixel:
-        values = found.found.probability[np.isfinite(found.found.probability)]
+        values = np.asarray(found.found.probability)
+        values = values[np.isfinite(values)]
         small = {f"below_{p:g}": float(np.mean(values < p)) for p in (0.05, 0.01, 0.001)}
     results: dict[str, Any] = {
         "domain": settings.separate.domain,
@@ -53,7 +54,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
         "solver": {key: fit.details[key] for key in ("solver", "steps", "distance")},
         "pixels_with_small_probability": small,
         "cmb_noise_degradation": found.degradation,
-        "residual_rms": dict(zip(bands, np.nanstd(found.residuals, axis=(1, 2)), strict=True)),
+        "residual_rms": dict(zip(bands, _rms(found.residuals), strict=True)),
         "r": {
             "best_fit": ratio.r,
             "sigma": ratio.sigma,
@@ -86,6 +87,19 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
             "message": chain.message,
         }
     return results
+
+
+def _rms(maps: Maps) -> np.ndarray:
+    """Return the standard deviation of each band's maps, without masked pixels."""
+    if not isinstance(maps, Stack):
+        return np.nanstd(maps, axis=(1, 2))
+    sums = np.zeros((3, len(maps)))
+    for part in ranges(maps.shape[-1]):
+        values = maps[..., part]
+        powers = np.isfinite(values).astype(float), values, values**2
+        sums += [np.nansum(each, axis=(1, 2)) for each in powers]
+    number, first, second = sums
+    return np.sqrt(second / number - (first / number) ** 2)
 
 
 def _table(found: Separation) -> ResultTable:
@@ -143,6 +157,11 @@ def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
         sentences.append(
             f"The posterior was not sampled: {len(fit.labels)} parameters are more than {SAMPLED}."
         )
+    elif settings.separate.sampler != "none" and found.like.source is not None:
+        sentences.append(
+            "The posterior was not sampled: the maps are too large for memory, and their noise "
+            "differs from pixel to pixel and from band to band."
+        )
     if found.chain is not None and not found.chain.converged:
         sentences.append(f"posterior: {found.chain.message}")
     if settings.cmb.A_lens != 1:
@@ -151,46 +170,66 @@ def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
     return sentences
 
 
-def _stokes(name: str, unit: str, maps: np.ndarray) -> list[Column]:
-    return [(f"{name}_{s}", unit, values) for s, values in zip("QU", maps[-2:], strict=True)]
+def _of_components(found: Separation) -> tuple[list[tuple[str, str]], Callable]:
+    """Return names and units of the columns of components, and their values in some pixels."""
+    columns, by_pixel = list[tuple[str, str]](), found.data.by_pixel
+    for name in found.components:
+        unit, head = "uK_CMB" if name == "cmb" else "uK_RJ", name.upper()
+        heads = (head, f"{head}_SIGMA") if by_pixel else (head,)
+        columns += [(f"{each}_{s}", unit) for each in heads for s in "QU"]
+
+    def values(part: slice) -> list[np.ndarray]:
+        rows, maps = list[np.ndarray](), found.maps[..., part]
+        errors = found.found.sigmas(part) if by_pixel else []
+        for i in range(len(found.components)):
+            rows += list(maps[i, -2:])
+            rows += list(errors[i][-2:]) if by_pixel else []
+        return [*rows, found.found.chi2[part], found.found.probability[part]] if by_pixel else rows
+
+    return [*columns, ("CHI2", ""), ("PROBABILITY", "")] if by_pixel else columns, values
 
 
 def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path]:
     """Write maps of components, residuals, and parameters with regions; return the paths."""
-    components, residuals = list[Column](), list[Column]()
-    for name, maps in zip(found.components, found.maps, strict=True):
-        unit, head = "uK_CMB" if name == "cmb" else "uK_RJ", name.upper()
-        components += _stokes(head, unit, maps)
-        if found.data.by_pixel:
-            components += _stokes(f"{head}_SIGMA", unit, found.found.sigma(name))
-    if found.data.by_pixel:
-        components.append(("CHI2", "", found.found.chi2))
-        components.append(("PROBABILITY", "", found.found.probability))
-    for band, maps in zip(found.data.bands, found.residuals, strict=True):
-        residuals += _stokes(band, settings.separate.unit, maps)
-    parameters: list[Column] = [
-        (
-            name.upper() + end,
-            parameter_declaration(name).get("unit", ""),
-            found.of_pixel(name, values),
-        )
+    parameters = [
+        (name.upper() + end, parameter_declaration(name).get("unit", ""), name, values)
         for name in found.fit.free
         if np.ndim(found.fit.best_fit[name])
         for end, values in (("", found.fit.best_fit), ("_SIGMA", found.sigma))
     ]
-    mask, written = np.isfinite(found.maps).all(axis=(0, 1)), []
-    for file, columns in zip(MAPS, (components, residuals, parameters), strict=True):
+    bands, unit = found.data.bands, settings.separate.unit
+    files: tuple[tuple[list[tuple[str, str]], Callable], ...] = (
+        _of_components(found),
+        (
+            [(f"{band}_{s}", unit) for band in bands for s in "QU"],
+            lambda part: found.residuals[..., part][:, -2:].reshape(2 * len(bands), -1),
+        ),
+        (
+            [(name, unit) for name, unit, *_ in parameters],
+            lambda part: [found.of_pixel(n, values, part) for *_, n, values in parameters],
+        ),
+    )
+    npix, written = found.maps.shape[-1], list[Path]()
+    beam = {"FWHM": (settings.common.fwhm, "[arcmin]")}
+    mask = np.empty(npix, bool)
+    for part in ranges(npix):
+        mask[part] = np.isfinite(found.maps[..., part]).all(axis=(0, 1))
+    for file, (columns, values) in zip(MAPS, files, strict=True):
         if columns:
-            names, units, values = zip(*columns, strict=True)
-            beam = {"FWHM": (settings.common.fwhm, "[arcmin]")} if file == MAPS[0] else None
+
+            def read(part, values=values):
+                rows = values(part)
+                return np.stack([np.broadcast_to(row, mask[part].shape) for row in rows])
+
+            names, units = map(list, zip(*columns, strict=True))
             written.append(out / file)
             write_maps(
                 written[-1],
-                np.stack([np.broadcast_to(each, mask.shape) for each in values]),
+                computed((len(names), npix), read),
                 names=names,
                 unit=units,
                 mask=mask,
-                extra_header=beam,
+                extra_header=beam if file == MAPS[0] else None,
                 overwrite=True,
                 single=True,
             )
@@ -200,7 +239,7 @@ def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path
 def plot_components(path: Path, found: Separation, settings: Experiment) -> None:
     """Draw Q and U of the components, one row per component."""
     rows = []
-    for name, maps in zip(found.components, found.maps[:, -2:], strict=True):
+    for name, maps in zip(found.components, plots.thinned(found.maps)[:, -2:], strict=True):
         component = found.like.mixing.sky[name]
         nu_ref = getattr(component, "nu_ref", None)
         title = "CMB" if name == "cmb" else name
@@ -212,8 +251,9 @@ def plot_components(path: Path, found: Separation, settings: Experiment) -> None
 def plot_residuals(path: Path, found: Separation, settings: Experiment) -> None:
     """Draw data minus components in a few bands, Q next to U."""
     names, rows, unit = list(found.data.bands), [], settings.separate.unit
+    residuals = plots.thinned(found.residuals)
     for name in plots.spread(names, SHOWN):
-        maps = found.residuals[names.index(name), -2:]
+        maps = residuals[names.index(name), -2:]
         limit = 3 * float(np.nanstd(maps))
         rows.append(plots.stokes_panels(f"{name}, data less components", maps, limit, unit, 0.0))
     plots.plot_maps(path, rows, settings.title)

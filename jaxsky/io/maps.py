@@ -1,20 +1,18 @@
-"""Read HEALPix maps and masks into the package's conventions, and write maps."""
+"""Read HEALPix maps and masks into the package's conventions."""
 
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import healpy
 import numpy as np
-from astropy.io import fits as pyfits
 from jaxtyping import Bool, Float
 
 from jaxsky.bandpass import Bandpass
-from jaxsky.checks import Numeric, check_shape
+from jaxsky.checks import Numeric
 from jaxsky.io.columns import column_stokes, default_fields, mark_missing, read_columns, stacked
-from jaxsky.io.files import InputError, UnfitError, check_file, in_file, whole
+from jaxsky.io.files import InputError, UnfitError, check_file, in_file
 from jaxsky.io.quantities import unit_factor, unit_name
 from jaxsky.io.tables import equals, in_ring, open_table, spelled
 from jaxsky.public import takes_quantities
@@ -199,89 +197,6 @@ def read_maps(
     if blocks is not None:
         maps, mask = _to_galactic(maps, mask, blocks, first.coordinates)
     return Maps(maps, mask, first.unit, names, kinds)
-
-
-def write_maps(
-    path: str | Path,
-    maps: Float[np.ndarray, "field pix"],
-    *,
-    names: str | Sequence[str],
-    unit: str | Sequence[str],
-    mask: Bool[np.ndarray, " pix"] | None = None,
-    overwrite: bool = False,
-    extra_header: Mapping[str, Any] | None = None,
-    single: bool = False,
-    tables: Sequence[pyfits.BinTableHDU] = (),
-) -> None:
-    """Write maps as a HEALPix table in a FITS file, with a complete header; the write is atomic.
-
-    Parameters
-    ----------
-    path : FITS file
-    maps : RING, Galactic, COSMO, shape (field, pix) or (pix,)
-    names : names of the columns
-    unit : unit of all maps or of each, in any spelling `unit_name` accepts; "" for pure numbers
-    mask : True in used pixels, shape (pix,); the others are written as UNSEEN
-    overwrite : replace an existing file
-    extra_header : further header keywords and their values, or values and comments
-    single : write single precision instead of double
-    tables : further tables of the file, after the maps
-
-    Raises
-    ------
-    FileExistsError
-        If the file exists and `overwrite` is not set.
-    ValueError
-        If an argument is wrong, or the folder does not exist.
-    """
-    path = Path(path)
-    maps = np.atleast_2d(np.asarray(maps, dtype=np.float32 if single else np.float64))
-    names = [names] if isinstance(names, str) else list(names)
-    units = [unit_name(x) for x in ([unit] * len(maps) if isinstance(unit, str) else unit)]
-    mask = None if mask is None else np.asarray(mask, dtype=bool)
-    npix = maps.shape[-1]
-    good = maps.ndim == 2 and healpy.isnpixok(npix)
-    check_shape("maps", maps, good, "have shape (field, pix) with 12 nside^2 pixels")
-    for name, values in {"names": names, "unit": units}.items():
-        if len(values) != len(maps):
-            raise ValueError(f"Argument `{name}` has {len(values)} entries for {len(maps)} maps.")
-    if mask is not None:
-        check_shape("mask", mask, mask.shape == (npix,), f"have shape ({npix},)")
-    used = maps if mask is None else maps[:, mask]
-    if bad := int(np.sum(~np.isfinite(used))):
-        counted = f"{bad} of {used.size} values that are not finite"
-        raise ValueError(f"Argument `maps` has {counted}; leave pixels out with `mask`.")
-    if path.exists() and not overwrite:
-        raise FileExistsError(f"{path}: file exists, and `overwrite` is not set.")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: folder {path.parent} does not exist.")
-    if mask is not None:
-        maps = np.where(mask, maps, healpy.UNSEEN)
-    # A blank TUNIT cannot be told from a missing one, so a pure number is written as "1".
-    columns = [
-        pyfits.Column(name=name, format="E" if single else "D", array=values, unit=text or "1")
-        for name, values, text in zip(names, maps, units, strict=True)
-    ]
-    table = pyfits.BinTableHDU.from_columns(columns, name="MAPS")
-    required = {
-        "PIXTYPE": ("HEALPIX", "HEALPIX pixelisation"),
-        "ORDERING": ("RING", "pixel ordering"),
-        "NSIDE": (healpy.npix2nside(npix), "resolution"),
-        "FIRSTPIX": (0, "first pixel"),
-        "LASTPIX": (npix - 1, "last pixel"),
-        "INDXSCHM": ("IMPLICIT", "indexing"),
-        "OBJECT": ("FULLSKY", "sky coverage"),
-        "COORDSYS": ("G", "Galactic coordinates"),
-        "POLCCONV": ("COSMO", "HEALPix sign of U"),
-        "BAD_DATA": (healpy.UNSEEN, "value of pixels without data"),
-    }
-    for key, value in (extra_header or {}).items():
-        if key.upper() in table.header or key.upper() in required:
-            raise ValueError(f"Argument `extra_header` must not set {key}: it is written anyway.")
-        table.header[key] = value
-    table.header.update(required)
-    with whole(path) as beside:
-        pyfits.HDUList([pyfits.PrimaryHDU(), table, *tables]).writeto(beside, overwrite=True)
 
 
 def _read_npz(path: Path, field: str | int | None, ordering: str | None) -> np.ndarray:

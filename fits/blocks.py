@@ -1,0 +1,89 @@
+"""Pixels in blocks of one cell each, for likelihoods whose noise cannot be compressed.
+
+They are gathered in memory, or read anew whenever they are needed if the maps are on disk.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from fits.compress import BLOCK, Layout, Noise, pixel_rows, refuse_data
+from fits.regions import Cells
+from fits.systems import Pixels
+from jaxsky.checks import UNSEEN
+from jaxsky.io.stacks import Maps
+
+#: Pixels in memory at once if the maps are on disk.
+STREAM = 1 << 17
+
+
+class Blocks:
+    """Used pixels in blocks, each of a single cell and padded with zeros of unit weight.
+
+    `where` are the pixels of each block, -1 for padding, and `cell` is the cell of each block.
+    """
+
+    def __init__(self, data: Maps, noise: Noise, cells: Cells, used: np.ndarray) -> None:
+        self._data, self._noise = data, noise
+        pixels = np.flatnonzero(used)
+        own = np.zeros(len(pixels), np.int32) if cells.of_pixel is None else cells.of_pixel[pixels]
+        order = np.argsort(own, kind="stable")
+        pixels, own = pixels[order], own[order]
+        counts = np.bincount(own, minlength=cells.number)
+        size = int(min(BLOCK, np.median(counts)))
+        blocks = -(-counts // size)
+        first = np.concatenate([[0], np.cumsum(blocks * size)[:-1]])
+        place = first[own] + np.arange(len(own)) - (np.cumsum(counts) - counts)[own]
+        flat = np.full(int(blocks.sum()) * size, -1, np.int32)
+        flat[place] = pixels
+        self.where = flat.reshape(-1, size)
+        self.cell = np.repeat(np.arange(cells.number), blocks)
+        self.in_order = bool(np.all(blocks == 1))
+
+    def read(self, layout: Layout, blocks: slice) -> list[np.ndarray | None]:
+        """Return the fields of `Pixels` for some blocks, (block, group, row, pix)."""
+        index = self.where[blocks].ravel()
+        used, size = index >= 0, self.where.shape[1]
+        whole = used.all() and index[-1] - index[0] == len(index) - 1 and np.all(np.diff(index) > 0)
+        where = slice(int(index[0]), int(index[-1]) + 1) if whole else index
+        found = pixel_rows(self._data, self._noise, layout, where, used)
+        if not np.isfinite(found[0]).all() or found[0].min() < UNSEEN:
+            refuse_data(self._data, self._noise)
+        shaped = []
+        for rows in found:
+            if rows is not None:
+                rows = np.broadcast_to(rows, (*rows.shape[:2], index.size))
+                rows = np.moveaxis(rows.reshape(*rows.shape[:2], -1, size), 2, 0)
+            shaped.append(rows)
+        return shaped
+
+    def pieces(self, every: Sequence[Layout]) -> Iterator[tuple[tuple[Pixels, ...], Array]]:
+        """Yield pixels and their cells, a few blocks at a time; all but the last as many."""
+        step = max(1, STREAM // self.where.shape[1])
+        for begin in range(0, len(self.where), step):
+            blocks = slice(begin, begin + step)
+            parts = (Pixels(*jax.tree.map(jnp.asarray, self.read(each, blocks))) for each in every)
+            yield tuple(parts), jnp.asarray(self.cell[blocks])
+
+
+def gathered(
+    data: np.ndarray, noise: Noise, cells: Cells, used: np.ndarray, layout: Layout
+) -> tuple[Pixels, Array | None]:
+    """Return the pixels in blocks, and the cell of each block, None if they are in order."""
+    blocks = Blocks(data, noise, cells, used)
+    number, size = blocks.where.shape
+    shape = (number, len(layout.groups), len(data) * len(layout.groups[0]), size)
+    correlated = layout.joint and noise.covariance is not None
+    cross = np.empty((number, 1, len(data), size)) if correlated else None
+    every = np.empty(shape), np.empty(shape), cross
+    step = max(1, BLOCK // size)
+    for begin in range(0, number, step):
+        block = slice(begin, begin + step)
+        for target, rows in zip(every, blocks.read(layout, block), strict=True):
+            if target is not None and rows is not None:
+                target[block] = rows
+    cell = None if blocks.in_order else jnp.asarray(blocks.cell)
+    return Pixels(*jax.tree.map(jnp.asarray, every)), cell

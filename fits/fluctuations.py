@@ -1,0 +1,210 @@
+"""Noise and CMB in maps at a common resolution: realisations, and covariances of products.
+
+There the noise of a band is a linear operator applied to white noise, and the CMB is synthesised
+from independent coefficients, one set for all bands. The inner products of rows with the data
+therefore have a covariance that follows exactly from a few transposed transforms of the rows; no
+simulation, no matrix over pixels.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import healpy
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jaxtyping import Array, Float
+
+from fits.compress import chunks
+from jaxsky.checks import Numeric
+from jaxsky.cmb import realisation
+from jaxsky.harmonics import (
+    Preparation,
+    adjoint_synthesis,
+    alm_ell,
+    average_pixels,
+    expand,
+    map_variance,
+    synthesis,
+)
+from jaxsky.io.stacks import Maps, empty
+from jaxsky.noise import draw, pixel_covariance, stream, uniform_covariance, white_alm
+
+#: Pixels whose products are summed at once; few enough to stay in cache.
+CHUNK = 1 << 16
+
+
+def of_pixels(noise: Numeric | Maps, nside: int) -> Any:
+    """Return the covariance of each pixel; a level takes no memory."""
+    if np.ndim(noise):
+        return noise
+    one = np.asarray(uniform_covariance(noise, nside, pixels=1))
+    return np.broadcast_to(one, (2, 2, healpy.nside2npix(nside)))
+
+
+class MapNoise(NamedTuple):
+    """Noise of Q and U of a map, with the preparation for the common resolution.
+
+    `noise` is that of its own pixels, a level [uK_RJ arcmin] or the covariance of Q and U in each
+    [uK_RJ^2]; `correlated` C_l of noise that is correlated between pixels, the same for E and B, in
+    the prepared map [uK_RJ^2], None where there is none.
+    """
+
+    preparation: Preparation
+    noise: Numeric
+    correlated: Float[Array, " ell"] | None
+
+    def covariance(self, rows: Float[Array, "row stokes pix"]) -> Float[np.ndarray, "row row"]:
+        """Return the covariance of the inner products of rows with the prepared noise.
+
+        Rows at the resolution of the noise are stored in its precision.
+        """
+        count = len(rows)
+        block = np.zeros((count, count))
+        if np.ndim(self.noise) or self.noise:
+            covariance = of_pixels(self.noise, self.preparation.nside_in)
+            npix = covariance.shape[-1]
+            before = empty((count, 2, npix), covariance.dtype)
+            for own, row in zip(range(count), rows, strict=True):
+                before[own] = np.asarray(self.preparation.transpose(row).block_until_ready())
+            for cut in chunks(npix, CHUNK):
+                maps = before[..., cut].astype(float)
+                pixels = np.ascontiguousarray(covariance[..., cut], float)
+                seen = np.einsum("stp,jtp->jsp", pixels, maps)
+                block += maps.reshape(count, -1) @ seen.reshape(count, -1).T
+            block = (block + block.T) / 2
+        if self.correlated is None:
+            return block
+        modes = np.asarray(_modes(rows, np.stack([self.correlated] * 2)))
+        return block + modes @ modes.T
+
+    def alm(self, key: Array, name: str) -> Float[Array, "2 alm"]:
+        """Return E and B of a realisation of smoothed noise; the map's name is in its key."""
+        window = self.preparation.window
+        assert window is not None  # there is a common beam
+        white = white_alm(stream(key, "noise", name), self.noise, window.size - 1) * expand(window)
+        return white if self.correlated is None else white + self._correlated_alm(key, name)
+
+    def _correlated_alm(self, key: Array, name: str) -> Float[Array, "2 alm"]:
+        spectrum = jnp.asarray(self.correlated)
+        white = jax.random.normal(stream(key, "correlated", name), (2, spectrum.size**2))
+        return white * expand(jnp.sqrt(spectrum))
+
+    def realisation(self, key: Array, name: str) -> Float[Array, "stokes pix"]:
+        """Return noise at the common resolution [uK_RJ], with random numbers by name."""
+        nside = self.preparation.nside
+        if self.preparation.window is not None:
+            return synthesis(self.alm(key, name), nside)
+        pixels = jnp.asarray(pixel_covariance(self.noise, self.preparation.nside_in), float)
+        total = average_pixels(draw(stream(key, "noise", name), pixels), nside)
+        if self.correlated is None:
+            return total
+        return total + synthesis(self._correlated_alm(key, name), nside)
+
+    def variance(self) -> Float[np.ndarray, "stokes pix"]:
+        """Return the variance in each prepared pixel [uK_RJ^2]; see `Fluctuations.sigma`."""
+        if np.ndim(self.noise):
+            pixels: Any = self.noise
+            total = np.asarray(self.preparation.variance([pixels[s, s] for s in range(2)]))
+        else:
+            shape = (2, healpy.nside2npix(self.preparation.nside))
+            total = np.broadcast_to(self.preparation.uniform_variance(float(self.noise)), shape)
+        return total if self.correlated is None else total + map_variance(self.correlated)
+
+
+class Fluctuations(eqx.Module):
+    """Noise and CMB: what Q, U maps in several bands contain besides the model.
+
+    Parameters
+    ----------
+    preparations, noise, correlated : per band; see `MapNoise`
+    cmb_spectra : C_l of EE and BB [uK_CMB^2], shape (2, ell); None without CMB
+    cmb_windows : beam and pixel window of the prepared maps of each band, shape (band, ell)
+    cmb_factors : uK_RJ per uK_CMB in each band, shape (band,)
+    names : names of the bands, from which the random numbers of each are derived
+    """
+
+    preparations: tuple[Preparation, ...]
+    noise: tuple[Numeric, ...]
+    correlated: tuple[Float[Array, " ell"] | None, ...]
+    cmb_spectra: Float[Array, "stokes ell"] | None
+    cmb_windows: Float[Array, "band ell"] | None
+    cmb_factors: Float[Array, " band"]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def noises(self) -> dict[str, MapNoise]:
+        """The noise of each band by name."""
+        each = map(MapNoise, self.preparations, self.noise, self.correlated)
+        return dict(zip(self.names, each, strict=True))
+
+    # Not one program: XLA would keep the maps of all rows and bands in memory at once.
+    def covariance(
+        self, rows: Float[Array, "band row stokes pix"]
+    ) -> Float[np.ndarray, "bandrow bandrow"]:
+        """Return the covariance of the inner products of rows with the fluctuations."""
+        blocks = [one.covariance(own) for one, own in zip(self.noises.values(), rows, strict=True)]
+        total = scipy.linalg.block_diag(*blocks)
+        if self.cmb_spectra is None or self.cmb_windows is None:
+            return total
+        spectra = np.asarray(self.cmb_spectra)
+        bands = zip(self.cmb_factors, self.cmb_windows, rows, strict=True)
+        modes = np.concatenate(
+            [
+                np.asarray(factor) * _modes(own, spectra * np.asarray(window) ** 2)
+                for factor, window, own in bands
+            ]
+        )
+        return total + modes @ modes.T
+
+    # Not one program: there XLA would draw the normals anew for each row.
+    def noise_realisation(self, key: Array) -> Maps:
+        """Return noise of all bands at the common resolution [uK_RJ]."""
+        found = empty((len(self.names), 2, healpy.nside2npix(self.preparations[0].nside)))
+        for i, (name, noise) in enumerate(self.noises.items()):
+            found[i] = np.asarray(noise.realisation(key, name))
+        return found
+
+    @eqx.filter_jit
+    def cmb_realisation(self, key: Array) -> Float[Array, "band stokes pix"]:
+        """Return the CMB in all bands at the common resolution [uK_RJ]; zero without CMB."""
+        nside = self.preparations[0].nside
+        if self.cmb_spectra is None or self.cmb_windows is None:
+            return jnp.zeros((len(self.preparations), 2, healpy.nside2npix(nside)))
+        EE, BB = self.cmb_spectra
+        zero = jnp.zeros_like(EE)
+        alm = realisation(stream(key, "cmb"), jnp.stack([zero, EE, BB, zero]))
+        seen = self.cmb_factors[:, None] * self.cmb_windows
+        return jnp.stack([synthesis(alm * expand(window), nside) for window in seen])
+
+    def cmb_power(self) -> Float[np.ndarray, "band 2 ell"]:
+        """Return mean spectra EE and BB of the CMB in the maps of each band [uK_RJ^2]."""
+        if self.cmb_spectra is None or self.cmb_windows is None:
+            return np.zeros((len(self.preparations), 2, 1))
+        seen = np.asarray(self.cmb_factors)[:, None] * np.asarray(self.cmb_windows)
+        return seen[:, None] ** 2 * np.asarray(self.cmb_spectra)
+
+    def sigma(self) -> Maps:
+        """Return the standard deviation of the noise in each prepared pixel [uK_RJ].
+
+        NaN where it is unknown: next to steps of the noise by more than a factor of about 100,
+        where the smoothed map of variances rings below zero.
+        """
+        shape = len(self.names), 2, healpy.nside2npix(self.preparations[0].nside)
+        uniform = not any(map(np.ndim, self.noise))
+        found = empty((*shape[:2], 1)) if uniform else empty(shape)
+        for i, noise in enumerate(self.noises.values()):
+            total = noise.variance()[:, : found.shape[-1]]
+            found[i] = np.sqrt(np.where(total > 0, total, np.nan))
+        return np.broadcast_to(found[...], shape) if uniform else found
+
+
+@jax.jit
+def _modes(
+    rows: Float[Array, "row stokes pix"], spectra: Float[Array, "stokes ell"]
+) -> Float[Array, "row mode"]:
+    """Project rows on independent modes of unit variance, with the spectra of E and B."""
+    lmax = spectra.shape[-1] - 1
+    root = jnp.sqrt(spectra)[:, alm_ell(lmax)]
+    return jnp.stack([(root * adjoint_synthesis(row, lmax)).ravel() for row in rows])

@@ -46,6 +46,7 @@ fwhm = 90.0
 "dust.T_dust" = {{ start = 19.0, uniform = [10.0, 40.0] }}
 "synchrotron.beta_syn" = {{ start = 3.0, uniform = [2.0, 4.5] }}
 [separate]
+lmax = 120
 sampler = "none"
 """
 LITEBIRD = '[[bands]]\ninstrument = "litebird"'

@@ -24,7 +24,8 @@ from jaxsky.harmonics import (
     gaussian_beam,
     pixel_window,
 )
-from jaxsky.io.stacks import Maps, Stack, computed, empty, ranges
+from jaxsky.io.stacks import Maps, Stack, computed, empty, is_large, ranges
+from jaxsky.programs import return_memory
 from jaxsky.settings import Experiment, at_key
 
 #: Largest fraction of missing input, smoothed or averaged, in a pixel that is used.
@@ -151,6 +152,8 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
     }
     holes = common_holes([used for used, _ in given.values()]) if fwhm else {}
     many, npix = len(inputs.bands), healpy.nside2npix(nside)
+    if is_large((many, 2, npix)) or any(isinstance(b.maps, Stack) for b in bands.values()):
+        return_memory()
     kept = {what: holes.get(own) for what, own in nsides.items()}
 
     used = np.ones(npix, bool)

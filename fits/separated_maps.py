@@ -204,21 +204,17 @@ def component_maps(
     for layout, part, matrix in _passes(like, params, npix):
         own = list(layout.stokes)
         errors = covariance and not (uniform and part.start)
-        rows = pixel_rows(data, noise, layout, part, used[part])
-        pixels = Pixels(*jax.tree.map(jnp.asarray, rows))
-        solved, squares, *variances = map(np.asarray, _separated(matrix, pixels, errors))
-        masked = ~used[part]
+        rows = jax.tree.map(jnp.asarray, pixel_rows(data, noise, layout, part, used[part]))
+        solved, squares, *variances = map(np.asarray, _separated(matrix, Pixels(*rows), errors))
+        masked, first = ~used[part], layout is like.layout[0]
         amplitude[:, own, part] = np.where(masked, np.nan, layout.maps(solved))
         number = (noise.weights(part) > 0)[:, own].sum(axis=(0, 1)) - len(names) * len(own)
-        first = layout is like.layout[0]
         square[part] = np.where(masked, np.nan, squares + (0 if first else square[part]))
         count[part] = np.where(masked, np.nan, number + (0 if first else count[part]))
         if not errors:
             continue
-        inverse, single = variances
-        if not uniform:
-            inverse, single = (np.where(masked, np.nan, each) for each in variances)
-        where = slice(0, 1) if uniform else part
+        where, hidden = (slice(0, 1), False) if uniform else (part, masked)
+        inverse, single = (np.where(hidden, np.nan, x) for x in variances)
         for k, s in enumerate(own):
             group, begin = (0, k * len(names)) if layout.joint else (k, 0)
             cut = slice(begin, begin + len(names))

@@ -121,7 +121,7 @@ def _value_and_gradient(like, theta):
 
 
 @jax.jit
-def _of_cells(like, theta) -> Derivatives:
+def _cell_derivatives(like, theta) -> Derivatives:
     return like.derivatives(theta[like.cells()])
 
 
@@ -140,8 +140,8 @@ def value_and_gradient(
     return _summed(_value_and_gradient, like, theta)
 
 
-def _cell_derivatives(like: Likelihood, theta: Float[Array, " par"]) -> Derivatives:
-    return _summed(_of_cells, like, theta)
+def _derivatives_of(like: Likelihood, theta: Float[Array, " par"]) -> Derivatives:
+    return _summed(_cell_derivatives, like, theta)
 
 
 def hessian(like: Likelihood, params: Mapping[str, Numeric]) -> Float[np.ndarray, "par par"]:
@@ -160,7 +160,7 @@ def fisher_matrix(like: Likelihood, params: Mapping[str, Numeric]) -> Float[np.n
 
 def _dense(which, like, params):
     theta = like.flat(like.check(params))
-    local = np.asarray(getattr(_cell_derivatives(like, theta), which))
+    local = np.asarray(getattr(_derivatives_of(like, theta), which))
     matrix = assembled(local, np.asarray(like.cells()), len(theta), np.zeros(len(theta)))
     return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
 
@@ -282,7 +282,7 @@ class Posterior:
         """Return -ln L of each cell and its derivatives as numpy arrays, without priors."""
         key = theta.tobytes()
         if self._last is None or self._last[0] != key:
-            found = _cell_derivatives(self.like, jnp.asarray(theta))
+            found = _derivatives_of(self.like, jnp.asarray(theta))
             self._last = (key, jax.tree.map(np.asarray, found))
         return self._last[1]
 

@@ -105,7 +105,9 @@ def white_alm(key: Array, noise: Any, lmax: int) -> Float[Array, "2 alm"]:
     """
     if not jnp.ndim(noise):
         return uniform_alm(key, noise, lmax)
-    return analysis(draw_in_pieces(key, noise), lmax, 0)
+    in_memory = isinstance(noise, jax.Array)
+    pixels = draw(key, noise.astype(float)) if in_memory else draw_in_pieces(key, noise)
+    return analysis(pixels, lmax, 0)
 
 
 @jax.jit

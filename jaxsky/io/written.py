@@ -1,5 +1,7 @@
 """Write HEALPix maps, which may be larger than memory."""
 
+import gzip
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -103,7 +105,9 @@ def write_maps(
     table.header.update(required)
     table.header["NAXIS2"] = npix
     with whole(path) as beside:
-        with beside.open("wb") as file:
+        packed = path.suffix == ".gz"
+        plain = beside.with_suffix("") if packed else beside
+        with plain.open("wb") as file:
             for header in (pyfits.PrimaryHDU().header, table.header):
                 file.write(header.tostring().encode("ascii"))
             for part in ranges(npix):  # the whole table may be larger than memory
@@ -112,5 +116,9 @@ def write_maps(
                 file.write(rows.T.astype(dtype.newbyteorder(">"), order="C").tobytes())
             file.write(bytes(-npix * len(maps) * dtype.itemsize % BLOCK))
         if tables:
-            with pyfits.open(beside, mode="append") as hdus:
+            with pyfits.open(plain, mode="append") as hdus:
                 hdus.extend(tables)
+        if packed:
+            with plain.open("rb") as file, gzip.open(beside, "wb") as smaller:
+                shutil.copyfileobj(file, smaller)
+            plain.unlink()

@@ -28,7 +28,7 @@ from jaxsky.harmonics import (
     map_variance,
     synthesis,
 )
-from jaxsky.io.stacks import Maps, empty
+from jaxsky.io.stacks import Maps, empty, is_large
 from jaxsky.noise import draw, pixel_covariance, stream, uniform_covariance, white_alm
 
 #: Pixels whose products are summed at once; few enough to stay in cache.
@@ -161,9 +161,13 @@ class Fluctuations(eqx.Module):
     # Not one program: there XLA would draw the normals anew for each row.
     def noise_realisation(self, key: Array) -> Maps:
         """Return noise of all bands at the common resolution [uK_RJ]."""
-        found = empty((len(self.names), 2, healpy.nside2npix(self.preparations[0].nside)))
-        for i, (name, noise) in enumerate(self.noises.items()):
-            found[i] = np.asarray(noise.realisation(key, name))
+        shape = len(self.names), 2, healpy.nside2npix(self.preparations[0].nside)
+        each = (noise.realisation(key, name) for name, noise in self.noises.items())
+        if not is_large(shape):
+            return jnp.stack(list(each))
+        found = empty(shape)
+        for i, maps in enumerate(each):
+            found[i] = np.asarray(maps)
         return found
 
     @eqx.filter_jit

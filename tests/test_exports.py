@@ -24,7 +24,6 @@ from jax.interpreters import mlir
 import fits
 import jaxsky
 from fits import (
-    common,
     comparison,
     compress,
     distributed,
@@ -42,6 +41,9 @@ from fits import (
     systems,
     tensor_ratio,
     unbounded,
+)
+from fits import (
+    fluctuations as of_maps,
 )
 from jaxsky import (
     bandpass,
@@ -186,7 +188,7 @@ def correlations() -> Calls:
 
 def fluctuations() -> Calls:
     prepared = harmonics.Preparation.smoothing(NSIDE, 0.0, NSIDE, 2000.0, LMAX)
-    found = common.Fluctuations(
+    found = of_maps.Fluctuations(
         (prepared,),
         (jnp.eye(2)[..., None] * jnp.ones(NPIX),),
         (jnp.asarray(FALLING),),
@@ -195,7 +197,7 @@ def fluctuations() -> Calls:
         jnp.ones(1),
         ("44",),
     )
-    yield common._modes, MAPS[None], np.stack([FALLING] * 2)
+    yield of_maps._modes, MAPS[None], np.stack([FALLING] * 2)
     yield found.cmb_realisation, KEY
     yield found.noise_realisation, KEY
 
@@ -336,8 +338,10 @@ def forecasts() -> Calls:
 
 def masked() -> Calls:
     maps = random_maps(3, npix=NPIX)
-    yield partial(pseudo_cl._masked_alm, lmax=LMAX), MASK, np.ones((4, NPIX)), maps
-    yield partial(pseudo_cl._masked_alm, lmax=LMAX), MASK, None, maps
+    yield partial(pseudo_cl._in_memory_alm, lmax=LMAX), MASK, np.ones((4, NPIX)), maps
+    yield partial(pseudo_cl._in_memory_alm, lmax=LMAX), MASK, None, maps
+    yield partial(pseudo_cl._once, lmax=LMAX), MASK, np.ones((2, NPIX)), maps
+    yield partial(pseudo_cl._twice, lmax=LMAX), MASK, np.ones((2, NPIX)), maps
     yield partial(pseudo_cl.mean_spectrum, lmax=LMAX), MASK, maps
 
 
@@ -372,7 +376,7 @@ CALLS: dict[str, Callable[[], Calls]] = {
     "jaxsky.galaxy": galaxies,
     "jaxsky.simulation": simulations,
     "jaxsky.templates": correlations,
-    "fits.common": fluctuations,
+    "fits.fluctuations": fluctuations,
     "fits.posterior": posteriors,
     "fits.products": template_passes,
     "fits.comparison": comparisons,

@@ -3,7 +3,9 @@
 They are gathered in memory, or read anew whenever they are needed if the maps are on disk.
 """
 
-from collections.abc import Iterator, Sequence
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +20,10 @@ from jaxsky.io.stacks import Maps
 
 #: Pixels in memory at once if the maps are on disk.
 STREAM = 1 << 17
+ON_DISK = (
+    "Maps on disk whose noise differs from pixel to pixel and from band to band can be fitted by "
+    'fits.Newton() only, and not sampled (separate.sampler = "none").'
+)
 
 
 class Blocks:
@@ -60,13 +66,14 @@ class Blocks:
             shaped.append(rows)
         return shaped
 
-    def pieces(self, every: Sequence[Layout]) -> Iterator[tuple[tuple[Pixels, ...], Array]]:
-        """Yield pixels and their cells, a few blocks at a time; all but the last as many."""
+    def pieces(self, like: Any) -> Iterator[Any]:
+        """Yield a `SpectralLikelihood` with a few blocks at a time, as many but for the last."""
         step = max(1, STREAM // self.where.shape[1])
         for begin in range(0, len(self.where), step):
             blocks = slice(begin, begin + step)
-            parts = (Pixels(*jax.tree.map(jnp.asarray, self.read(each, blocks))) for each in every)
-            yield tuple(parts), jnp.asarray(self.cell[blocks])
+            rows = [jax.tree.map(jnp.asarray, self.read(each, blocks)) for each in like.layout]
+            pixels, cells = tuple(Pixels(*own) for own in rows), jnp.asarray(self.cell[blocks])
+            yield dataclasses.replace(like, pixels=pixels, block_cell=cells, source=None)
 
 
 def gathered(

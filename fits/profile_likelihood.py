@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from fits import distributed, regions, systems
-from fits.blocks import Blocks, gathered
+from fits.blocks import ON_DISK, Blocks, gathered
 from fits.compress import Layout, Noise, as_noise, bare, compressed, layouts, used_pixels
 from fits.mixing import Mixing, named_bands, spectral_names, unit_sky
 from fits.posterior import Likelihood
@@ -103,19 +103,12 @@ class SpectralLikelihood(Likelihood):
         )
 
     def pieces(self):
-        if self.source is None:
-            yield self
-            return
-        for pixels, cells in self.source.pieces(self.layout):
-            yield dataclasses.replace(self, pixels=pixels, block_cell=cells, source=None)
+        yield from (self,) if self.source is None else self.source.pieces(self)
 
     def _mapped(self, function, matrices):
         """Apply a function of (matrices, pixels) to all blocks, for each of `layout`."""
         if self.source is not None:
-            raise ValueError(
-                "Maps on disk whose noise differs from pixel to pixel and from band to band can be "
-                'fitted by fits.Newton() only, and not sampled (separate.sampler = "none").'
-            )
+            raise ValueError(ON_DISK)
         results = []
         for of_cell, pixels in zip(matrices, self.pixels, strict=True):
             blocks, *_, size = pixels.data.shape

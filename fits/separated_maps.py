@@ -56,13 +56,11 @@ class ComponentMaps(NamedTuple):
         """Return the standard deviation of the amplitude of a component."""
         if self.covariance is None:
             raise ValueError("The covariance of the maps was not asked for.")
-        i = self.components.index(name)
-        return module_of(self.covariance).sqrt(self.covariance[i, i])
+        return module_of(self.covariance).sqrt(self.covariance[(self.components.index(name),) * 2])
 
     def sigmas(self, pixels: slice) -> list[np.ndarray]:
         """Return the standard deviations of all amplitudes in some pixels."""
-        if self.covariance is None:
-            raise ValueError("The covariance of the maps was not asked for.")
+        assert self.covariance is not None  # of maps with errors
         block = self.covariance[..., pixels if self.covariance.shape[-1] > 1 else slice(1)]
         return [np.sqrt(block[i, i]) for i in range(len(block))]
 

@@ -11,10 +11,12 @@ from benchmarks import (
     band_averages,
     command,
     comparisons,
+    large_maps,
     likelihoods,
     realisations,
     separation,
     simulations,
+    stacked_maps,
 )
 from benchmarks.table import Row, conditions, markdown, rich_table
 
@@ -46,10 +48,20 @@ BENCHMARKS = {
     "coupling": comparisons.coupling,
     "patches": comparisons.patches,
     "commands": comparisons.commands,
+    "bands-on-disk": stacked_maps.separation,
+    "separate-large": large_maps.separation,
     "workers": realisations.workers,
 }
 #: These take minutes: they are run by name, and when the table is kept.
-LONG = ("planck", "nside-2048", "separation-pixels", "commands", "workers")
+LONG = (
+    "planck",
+    "nside-2048",
+    "separation-pixels",
+    "commands",
+    "workers",
+    "bands-on-disk",
+    "separate-large",
+)
 
 
 def _arguments() -> argparse.Namespace:

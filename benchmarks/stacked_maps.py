@@ -34,8 +34,8 @@ START = {"dust.beta_dust": 1.6, "dust.T_dust": 19.0, "synchrotron.beta_syn": 3.0
 SIZES = (50.0, 100.0, 60.0)
 
 
-def _laws(pixels: Any) -> Sky:
-    amplitudes = [jnp.full((2, pixels), size) for size in SIZES]
+def _laws() -> Sky:
+    amplitudes = [jnp.full((2, 1), size) for size in SIZES]
     kinds = (CMB, Dust, Synchrotron)
     made = [kind(amplitude) for kind, amplitude in zip(kinds, amplitudes, strict=True)]
     return Sky(dict(zip(("cmb", "dust", "synchrotron"), made, strict=True)))
@@ -59,8 +59,7 @@ def run(nside: int, noise: str, folder: Path) -> dict[str, tuple[float, float]]:
     bands, sigma = experiment = litebird(nside)
     npix, rng = healpy.nside2npix(nside), np.random.default_rng(0)
     factors = np.asarray(experiment.conversion)[:, None]
-    matrix = np.asarray(observe(_laws(1), list(bands.values())))[:, :1, 0] * factors
-    laws = _laws(1)
+    laws = _laws()
     single = [
         np.asarray(observe(Sky({name: laws[name]}), list(bands.values())))[:, 0, 0] for name in laws
     ]

@@ -19,7 +19,7 @@ from matplotlib.axis import Axis
 from fits.results import FitResult
 from jaxsky.components import parameter_declaration
 from jaxsky.io import whole
-from jaxsky.io.stacks import Maps
+from jaxsky.io.stacks import Maps, ranges
 
 STYLE: Any = {
     "font.size": 9,
@@ -214,13 +214,17 @@ def stokes_panels(
     ]
 
 
-def thinned(maps: Maps) -> np.ndarray:
-    """Return maps as they are, or of nside 512, which is what a picture resolves, if finer."""
+def thinned(maps: Maps, rows: Sequence[int]) -> np.ndarray:
+    """Return some maps, those that are finer than a picture resolves at nside 512."""
     nside = healpy.npix2nside(maps.shape[-1])
-    if nside <= FINEST:
-        return np.asarray(maps)
-    directions = healpy.pix2ang(FINEST, np.arange(healpy.nside2npix(FINEST)))
-    return maps[..., healpy.ang2pix(nside, *directions)]
+    least = min(nside, FINEST)
+    parts = []
+    for part in ranges(healpy.nside2npix(least)):
+        at: Any = part
+        if nside > least:
+            at = healpy.ang2pix(nside, *healpy.pix2ang(least, np.arange(part.start, part.stop)))
+        parts.append(maps[..., at][list(rows)])
+    return np.concatenate(parts, axis=-1)
 
 
 def plot_maps(path: Path, rows: Sequence[Sequence[MapPanel]], title: str = "") -> None:

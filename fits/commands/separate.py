@@ -239,7 +239,8 @@ def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path
 def plot_components(path: Path, found: Separation, settings: Experiment) -> None:
     """Draw Q and U of the components, one row per component."""
     rows = []
-    for name, maps in zip(found.components, plots.thinned(found.maps)[:, -2:], strict=True):
+    drawn = plots.thinned(found.maps, range(len(found.components)))[:, -2:]
+    for name, maps in zip(found.components, drawn, strict=True):
         component = found.like.mixing.sky[name]
         nu_ref = getattr(component, "nu_ref", None)
         title = "CMB" if name == "cmb" else name
@@ -251,9 +252,9 @@ def plot_components(path: Path, found: Separation, settings: Experiment) -> None
 def plot_residuals(path: Path, found: Separation, settings: Experiment) -> None:
     """Draw data minus components in a few bands, Q next to U."""
     names, rows, unit = list(found.data.bands), [], settings.separate.unit
-    residuals = plots.thinned(found.residuals)
-    for name in plots.spread(names, SHOWN):
-        maps = residuals[names.index(name), -2:]
+    shown = plots.spread(names, SHOWN)
+    drawn = plots.thinned(found.residuals, [names.index(name) for name in shown])[:, -2:]
+    for name, maps in zip(shown, drawn, strict=True):
         limit = 3 * float(np.nanstd(maps))
         rows.append(plots.stokes_panels(f"{name}, data less components", maps, limit, unit, 0.0))
     plots.plot_maps(path, rows, settings.title)

@@ -65,11 +65,13 @@ def run(nside: int, noise: str, folder: Path) -> dict[str, tuple[float, float]]:
     ]
     matrix = np.stack(single, axis=1) * factors
     shape = (len(bands), 2, npix)
-    patterns = [1 + 0.5 * np.cos(np.arange(npix) * (k + 1) * 6 / npix) for k in range(3)]
 
-    def scatter(part: slice) -> np.ndarray:
-        each = [sigma[b] / np.sqrt(patterns[b % 3][part]) for b in range(len(bands))]
-        return np.broadcast_to(np.stack(each)[:, None], (len(bands), 2, each[0].size))
+    def scatter(part: Any) -> np.ndarray:
+        pixels = np.arange(part.start, part.stop) if isinstance(part, slice) else part
+        # One of three patterns of hits, so that ratios of noise between bands vary.
+        hits = [1 + 0.5 * np.cos(pixels * (k + 1) * 6 / npix) for k in range(3)]
+        each = [sigma[b] / np.sqrt(hits[b % 3]) for b in range(len(bands))]
+        return np.broadcast_to(np.stack(each)[:, None], (len(bands), 2, pixels.size))
 
     def filled() -> Any:
         maps = empty(shape)

@@ -13,6 +13,7 @@ from benchmarks import (
     comparisons,
     large_maps,
     likelihoods,
+    pixels,
     realisations,
     separation,
     simulations,
@@ -51,6 +52,9 @@ BENCHMARKS = {
     "bands-on-disk": stacked_maps.separation,
     "separate-large": large_maps.separation,
     "workers": realisations.workers,
+    "pixels-moved": pixels.exchanged,
+    "pixels-times": pixels.times,
+    "pixels-memory": pixels.memory,
 }
 #: These take minutes: they are run by name, and when the table is kept.
 LONG = (
@@ -61,6 +65,7 @@ LONG = (
     "workers",
     "bands-on-disk",
     "separate-large",
+    "pixels-memory",
 )
 
 

@@ -141,7 +141,8 @@ def _on_devices(of_pixel, known, data, noise, layouts, errors):
         count = (weights > 0).sum(axis=(0, 1)) - 1.0 * size * stokes
         exceeding = jax.scipy.special.gammaincc(jnp.maximum(count, 1) / 2, square / 2)
         probability = jnp.where(count > 0, exceeding, 0.0)
-        found = amplitude, blocks, alone, square, count, probability
+        variances = (blocks, alone) if errors else (None, None)
+        found = amplitude, *variances, square, count, probability
         return jax.tree.map(lambda x: jnp.where(used, x, jnp.nan), found)
 
     @over_pixels((maps_of(3), maps_of(4), maps_of(3), maps_of(1), maps_of(1), maps_of(1)))
@@ -154,8 +155,11 @@ def _on_devices(of_pixel, known, data, noise, layouts, errors):
             return separated(of_pixel, known, data, noise, own)
 
         parts = jax.lax.map(some, jnp.arange(0, npix, size))
-        every = [jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1) for x in parts]
-        return tuple(x[..., :npix] for x in every)
+
+        def joined(x):
+            return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :npix]
+
+        return jax.tree.map(joined, parts)
 
     return on_device(of_pixel, known, data, noise)
 
@@ -191,8 +195,12 @@ def component_maps(
     if spread(data):
         known = matrices_at(like, like.check(params) if like.start else {})
         args = along(data, like.of_pixel), known, data, noise_like(data, noise)
-        found = ComponentMaps(names, *_on_devices(*args, like.layout, covariance))
-        return found if covariance else found._replace(covariance=None, alone=None)
+        uniform = noise.separable and noise.pixel_sigma is None and like.of_pixel is None
+        found = ComponentMaps(names, *_on_devices(*args, like.layout, covariance and not uniform))
+        if not (covariance and uniform):
+            return found
+        one = component_maps(like, params, np.zeros((*data.shape[:2], 1)), noise)
+        return found._replace(covariance=one.covariance, alone=one.alone)
     used = used_pixels(noise, npix, len(names))
     amplitude = empty((len(names), stokes, npix))
     square, count, probability = (empty((npix,), copies=3) for _ in range(3))

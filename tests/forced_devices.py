@@ -1,6 +1,5 @@
 """Tests on eight devices that XLA makes of this machine's cores; `test_mesh.py` runs them."""
 
-import re
 from functools import partial
 
 import jax
@@ -11,16 +10,12 @@ import pytest
 from jax.sharding import AxisType, Mesh, NamedSharding
 
 import pixels
-from fits import distributed
+from benchmarks.pixel_programs import ALONE, moved, programs
 from fits.optimize import best_fit
-from fits.posterior import _cell_derivatives, value_and_gradient
-from fits.products import gram
 from fits.profile_likelihood import spectral_likelihood
-from fits.separated_maps import _on_devices
 from fits.template_likelihood import likelihood
 from jaxsky import Synchrotron, mesh, observe
 from jaxsky.mesh import along, distribute, maps_of
-from jaxsky.sky import _observe, interpolation_nodes
 from refusals import raises
 
 
@@ -51,7 +46,7 @@ def test_template_likelihoods_are_those_of_one_device(place, npix, varying):
 @pytest.mark.parametrize(
     ("place", "npix", "kind", "regions", "compress"),
     [
-        (explicit, 192, "factor", False, None),
+        (explicit, 192, "bands", False, None),
         (explicit, 50, "factor", True, False),
         (explicit, 50, "pixels", True, None),
         (automatic, 192, "pixels", False, None),
@@ -161,56 +156,10 @@ def test_what_only_distributed_pixels_refuse():
     raises(ValueError, "'dust.beta_dust' is a map", call, sky, data=data, start=start)
 
 
-COLLECTIVES = ("all-reduce", "all-gather", "all-to-all", "collective-permute", "reduce-scatter")
-BYTES = {"f64": 8, "f32": 4, "s64": 8, "s32": 4, "u32": 4, "u8": 1, "pred": 1}
-
-
-def moved(program: jax.stages.Lowered) -> int:
-    """Bytes that the collectives of a compiled program move."""
-    text = program.compile().as_text()
-    found = re.findall(rf"= (\(?[^=]*?) (?:{'|'.join(COLLECTIVES)})(?:-start)?\(", text)
-    shapes = [shape for result in found for shape in re.findall(r"(\w+)\[([\d,]*)\]", result)]
-    assert sum(text.count(f" {word}(") for word in COLLECTIVES) == len(found)
-    return sum(
-        BYTES[kind] * int(np.prod([int(n) for n in axes.split(",") if n])) for kind, axes in shapes
-    )
-
-
-def programs(nside: int) -> dict[str, jax.stages.Lowered]:
-    """The passes over pixels as they are compiled for distributed maps."""
-    npix = 12 * nside**2
-    data, sigma = map(explicit, pixels.data_of(npix, True))
-    sky = pixels.placed(pixels.sky_of(npix, True), explicit)
-    bands = tuple(pixels.BANDS.values())
-    templates = explicit(np.ones((2, 2, npix)))
-    nodes = interpolation_nodes(sky, bands, 1e-10)
-    noise, labels = pixels.noise_of("factor", npix, explicit), np.arange(npix) // 5 % 3
-    like = spectral_likelihood(
-        *(pixels.sky_of(1, False), pixels.BANDS, data, noise, pixels.START),
-        labels={"dust.beta_dust": labels},
-        compress=False,
-    )
-    used = distributed.look(data, noise, 2).used
-    labels = distributed.check_labels("labels", labels, used)
-    blocks = distributed.blocks(distributed.intersections({"labels": labels}, used), used)
-    (layout,) = like.layout
-    return {
-        "observe": _observe.lower(sky, bands, nodes, False),
-        "gram": jax.jit(gram).lower(data, templates, sigma),
-        "likelihood": _cell_derivatives.lower(like, like.flat({})),
-        "gradient": jax.jit(value_and_gradient).lower(like, like.flat({})),
-        "band covariance": distributed._covariance.lower(data, noise, blocks, layout, 3),
-        "blocks": jax.jit(partial(distributed.gathered, layout=layout)).lower(data, noise, blocks),
-        "used pixels": distributed._look.lower(data, noise, 2),
-        "maps": _on_devices.lower(None, (np.ones((1, 5, 2)),), data, noise, (layout,), True),
-    }
-
-
 def test_nothing_that_grows_with_nside_is_moved():
     small, large = programs(4), programs(16)
     for name, program in small.items():
-        # Maps of components and blocks take nothing from other devices.
-        assert (moved(program) == 0) == (name in ("maps", "blocks")), name
+        assert (moved(program) == 0) == (name in ALONE), name
         assert moved(program) == moved(large[name]), name
 
 

@@ -16,6 +16,7 @@ from fits.profile_likelihood import spectral_likelihood
 from fits.separated_maps import component_maps
 from fits.template_likelihood import likelihood
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe, observe_components
+from jaxsky.mesh import spread
 
 BANDS = {
     "30": Bandpass.top_hat(30.0, 8.0, samples=9),
@@ -55,8 +56,9 @@ def data_of(npix: int, varying: bool) -> tuple[np.ndarray, np.ndarray]:
 
 def whole(maps: Any, npix: int) -> np.ndarray:
     """All pixels of maps without their padding, from all processes."""
-    gathered = maps if jax.process_count() == 1 else process_allgather(maps, tiled=True)
-    return np.asarray(gathered)[..., :npix]
+    if spread(maps) and jax.process_count() > 1:
+        maps = process_allgather(maps, tiled=True)
+    return np.asarray(maps)[..., :npix]
 
 
 #: Few bands are enough for templates, and are compiled sooner.
@@ -88,10 +90,12 @@ def of_templates(npix: int, place: Place, varying: bool) -> dict[str, np.ndarray
 
 
 def noise_of(kind: str, npix: int, place: Place) -> Any:
-    """Noise with a factor in each pixel, in all pixels, or with covariances of Q and U."""
+    """Noise of bands alone, with a factor or all in pixels, or with covariances of Q and U."""
     rng = np.random.default_rng(3)
     factor = np.where(rng.uniform(size=npix) < 0.1, np.inf, rng.uniform(0.8, 1.2, npix))
     level = np.linspace(0.5, 1.5, len(BANDS))
+    if kind == "bands":
+        return level
     if kind == "factor":
         factor = place(factor, np.inf)
         return as_noise(level, (len(BANDS), 2, factor.size), factor)

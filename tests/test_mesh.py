@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 import pixels
+from benchmarks.launched import ended, launch
 from jaxsky.mesh import processes
-from launched import ended, launch
 from refusals import raises
+
+SCRIPT = Path(__file__).with_name("processes.py")
 
 
 def test_on_eight_devices():
@@ -28,7 +30,7 @@ def test_on_eight_devices():
 
 
 def test_two_processes_find_what_one_does(tmp_path):
-    run = launch(2, tmp_path, "templates", "50")
+    run = launch(2, tmp_path, [str(SCRIPT), str(tmp_path), "templates", "50"])
     expected = pixels.of_templates(50, lambda maps, fill=None: maps, False)
     assert ended(run) == [0, 0]
     for index in range(2):

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 import pixels
-from launched import ended, launch
+from benchmarks.launched import ended, launch
 
-pytestmark = pytest.mark.slow
+SCRIPT = str(Path(pixels.__file__).with_name("processes.py"))
 
 
 # 3068 pixels are padded for 3 processes.
 @pytest.mark.parametrize(("number", "npix"), [(2, 3072), (3, 3068), (4, 3072)])
 def test_processes_find_what_one_does(number, npix, tmp_path):
-    run = launch(number, tmp_path, "every", str(npix))
+    run = launch(number, tmp_path, [SCRIPT, str(tmp_path), "every", str(npix)])
     codes = ended(run, 600.0)
     assert codes == [0] * number, (tmp_path / "0.log").read_text()
     expected = pixels.every(npix, lambda maps, fill=None: maps)
@@ -34,7 +34,7 @@ def begun(folder: Path, number: int) -> None:
 
 @pytest.mark.parametrize("lost", [0, 1])
 def test_one_that_dies_ends_the_others(lost, tmp_path):
-    run = launch(3, tmp_path, "endless")
+    run = launch(3, tmp_path, [SCRIPT, str(tmp_path), "endless"])
     begun(tmp_path, 3)
     run[lost].kill()
     killed = time.monotonic()

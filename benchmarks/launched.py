@@ -4,13 +4,12 @@ import os
 import socket
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-SCRIPT = Path(__file__).with_name("processes.py")
 
-
-def launch(number: int, folder: Path, *arguments: str) -> list[subprocess.Popen]:
-    """Start processes of `processes.py`; what they say is in files of the folder."""
+def launch(number: int, folder: Path, arguments: Sequence[str]) -> list[subprocess.Popen]:
+    """Start Python with arguments as so many processes; what they say is in files of the folder."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
@@ -19,8 +18,9 @@ def launch(number: int, folder: Path, *arguments: str) -> list[subprocess.Popen]
         own = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": str(number)}
         own |= {"JAX_PROCESS_ID": str(index), "XLA_FLAGS": ""}
         with (folder / f"{index}.log").open("w") as log:
-            command = [sys.executable, str(SCRIPT), str(folder), *arguments]
-            started.append(subprocess.Popen(command, env=os.environ | own, stdout=log, stderr=log))
+            command = [sys.executable, *arguments]
+            one = subprocess.Popen(command, env=os.environ | own, stdout=log, stderr=log)
+        started.append(one)
     return started
 
 

@@ -18,7 +18,7 @@ from fits.compress import as_noise
 from fits.posterior import _cell_derivatives, value_and_gradient
 from fits.products import gram
 from fits.profile_likelihood import spectral_likelihood
-from fits.separated_maps import _on_devices
+from fits.separated_maps import _separated
 from jaxsky import Bandpass, Dust, Sky, Synchrotron
 from jaxsky.mesh import distribute
 from jaxsky.sky import _observe, interpolation_nodes
@@ -74,7 +74,9 @@ def programs(nside: int) -> dict[str, jax.stages.Lowered]:
         ),
         "likelihood with gradient": jax.jit(value_and_gradient).lower(like, theta),
         "second derivatives": _cell_derivatives.lower(like, theta),
-        "maps of components": _on_devices.lower(None, (matrix,), data, noise, (layout,), True),
+        "maps of components": jax.jit(
+            partial(distributed.separated_pixels, _separated, layouts=(layout,), errors=True)
+        ).lower(None, (matrix,), data, noise),
     }
 
 

@@ -223,3 +223,51 @@ def gathered(data: Array, noise: Noise, blocks: Blocks, layout: Layout) -> Pixel
         return Pixels(*jax.lax.map(one, pixels))
 
     return gather(data, noise, blocks.pixels)
+
+
+@partial(jax.jit, static_argnames=("separate", "layouts", "errors"))
+def separated_pixels(separate, of_pixel, known, data, noise, layouts, errors):
+    """Return the fields of `ComponentMaps` but the first; `separate` does so for some pixels."""
+    bands, stokes, _ = data.shape
+
+    def separated(of_pixel, known, data, noise, own):
+        weights = jnp.broadcast_to(noise.weights(own), (bands, stokes, own.size))
+        used = (weights > 0).any(axis=(0, 1))
+        size = known[0].shape[-1] // (1 + layouts[0].joint)
+        amplitude, alone = jnp.zeros((2, size, stokes, own.size))
+        blocks, square = jnp.zeros((size, *alone.shape)), jnp.zeros(own.size)
+        for layout, matrix in zip(layouts, known, strict=True):
+            every = matrix if of_pixel is None else matrix[jnp.maximum(of_pixel[own], 0)]
+            pixels = Pixels(*pixel_rows(data, noise, layout, own, used))
+            solved, squares, *variances = separate(every, pixels, errors)
+            amplitude = amplitude.at[:, np.array(layout.stokes)].set(layout.maps(solved))
+            square = square + squares
+            for k, s in enumerate(layout.stokes if errors else ()):
+                group, first = (0, k * size) if layout.joint else (k, 0)
+                cut = slice(first, first + size)
+                blocks = blocks.at[:, :, s].set(variances[0][group, cut, cut])
+                alone = alone.at[:, s].set(variances[1][group, cut])
+        count = (weights > 0).sum(axis=(0, 1)) - 1.0 * size * stokes
+        exceeding = jax.scipy.special.gammaincc(jnp.maximum(count, 1) / 2, square / 2)
+        probability = jnp.where(count > 0, exceeding, 0.0)
+        variances = (blocks, alone) if errors else (None, None)
+        found = amplitude, *variances, square, count, probability
+        return jax.tree.map(lambda x: jnp.where(used, x, jnp.nan), found)
+
+    @over_pixels((maps_of(3), maps_of(4), maps_of(3), maps_of(1), maps_of(1), maps_of(1)))
+    def on_device(of_pixel, known, data, noise):
+        npix = data.shape[-1]
+        size = min(at_once(PIECE), npix)
+
+        def some(start):
+            own = jnp.minimum(start + np.arange(size), npix - 1)
+            return separated(of_pixel, known, data, noise, own)
+
+        parts = jax.lax.map(some, jnp.arange(0, npix, size))
+
+        def joined(x):
+            return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :npix]
+
+        return jax.tree.map(joined, parts)
+
+    return on_device(of_pixel, known, data, noise)

@@ -191,7 +191,8 @@ def best_fit(
         values at the start for the first, and of their standard deviations there for the second;
         with uniform priors, those of numbers without bounds. Or `fits.Newton()`: damped
         steps of Newton's method with exact second derivatives, clipped at the bounds. By default
-        that for spectral likelihoods and distributed pixels, else `LevenbergMarquardt`
+        that for spectral likelihoods and distributed pixels, which take no other; else
+        `LevenbergMarquardt`
     max_steps : largest number of steps; by default 100 for Newton's method, 500 for optimistix
     throw : raise if it fails, or the optimum lies at the edge of a uniform prior
 
@@ -226,10 +227,10 @@ def best_fit(
     like = like.at(start)
     posterior = Posterior(like, priors)
     distributed = mesh_of(like) is not None
-    if distributed and isinstance(solver, optx.AbstractLeastSquaresSolver):
+    if distributed and not isinstance(solver, Newton | None):
         raise ValueError(
-            f"Argument `solver` is {type(solver).__name__}, which takes the residuals of all "
-            "pixels to one device; for distributed pixels take a minimiser, or fits.Newton()."
+            f"Argument `solver` is {type(solver).__name__}, and optimistix does not take "
+            "distributed pixels; take fits.Newton()."
         )
     if solver is None and (like.profiled or distributed):
         solver = Newton()

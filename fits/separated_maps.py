@@ -12,8 +12,8 @@ import scipy.special
 from jaxtyping import Array, ArrayLike, Float
 
 from fits import systems
-from fits.compress import PIECE, Noise, as_noise, bare, chunks, pixel_rows, used_pixels
-from fits.distributed import noise_like
+from fits.compress import Noise, as_noise, bare, chunks, pixel_rows, used_pixels
+from fits.distributed import noise_like, separated_pixels
 from fits.mixing import spectral_names
 from fits.multipoles import check_alm, multipoles_of
 from fits.optimize import best_fit
@@ -25,7 +25,7 @@ from jaxsky.checks import Numeric, as_array, check_finite, check_names, check_sh
 from jaxsky.components import component_class
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
 from jaxsky.io.stacks import Maps, computed, empty, ranges
-from jaxsky.mesh import along, at_once, in_place, maps_of, module_of, over_pixels, spread
+from jaxsky.mesh import along, in_place, module_of, spread
 from jaxsky.observation import Instrument
 
 
@@ -116,54 +116,6 @@ def _passes(like: SpectralLikelihood, params: Mapping[str, Numeric], npix: int) 
             yield layout, part, _own(like, matrix, part)
 
 
-@partial(jax.jit, static_argnames=("layouts", "errors"))
-def _on_devices(of_pixel, known, data, noise, layouts, errors):
-    """Return the fields of `ComponentMaps` but the first, for distributed pixels."""
-    bands, stokes, _ = data.shape
-
-    def separated(of_pixel, known, data, noise, own):
-        weights = jnp.broadcast_to(noise.weights(own), (bands, stokes, own.size))
-        used = (weights > 0).any(axis=(0, 1))
-        size = known[0].shape[-1] // (1 + layouts[0].joint)
-        amplitude, alone = jnp.zeros((2, size, stokes, own.size))
-        blocks, square = jnp.zeros((size, *alone.shape)), jnp.zeros(own.size)
-        for layout, matrix in zip(layouts, known, strict=True):
-            every = matrix if of_pixel is None else matrix[jnp.maximum(of_pixel[own], 0)]
-            pixels = Pixels(*pixel_rows(data, noise, layout, own, used))
-            solved, squares, *variances = _separated(every, pixels, errors)
-            amplitude = amplitude.at[:, np.array(layout.stokes)].set(layout.maps(solved))
-            square = square + squares
-            for k, s in enumerate(layout.stokes if errors else ()):
-                group, first = (0, k * size) if layout.joint else (k, 0)
-                cut = slice(first, first + size)
-                blocks = blocks.at[:, :, s].set(variances[0][group, cut, cut])
-                alone = alone.at[:, s].set(variances[1][group, cut])
-        count = (weights > 0).sum(axis=(0, 1)) - 1.0 * size * stokes
-        exceeding = jax.scipy.special.gammaincc(jnp.maximum(count, 1) / 2, square / 2)
-        probability = jnp.where(count > 0, exceeding, 0.0)
-        variances = (blocks, alone) if errors else (None, None)
-        found = amplitude, *variances, square, count, probability
-        return jax.tree.map(lambda x: jnp.where(used, x, jnp.nan), found)
-
-    @over_pixels((maps_of(3), maps_of(4), maps_of(3), maps_of(1), maps_of(1), maps_of(1)))
-    def on_device(of_pixel, known, data, noise):
-        npix = data.shape[-1]
-        size = min(at_once(PIECE), npix)
-
-        def some(start):
-            own = jnp.minimum(start + np.arange(size), npix - 1)
-            return separated(of_pixel, known, data, noise, own)
-
-        parts = jax.lax.map(some, jnp.arange(0, npix, size))
-
-        def joined(x):
-            return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :npix]
-
-        return jax.tree.map(joined, parts)
-
-    return on_device(of_pixel, known, data, noise)
-
-
 def component_maps(
     like: SpectralLikelihood,
     params: Mapping[str, Numeric],
@@ -196,7 +148,8 @@ def component_maps(
         known = matrices_at(like, like.check(params) if like.start else {})
         args = along(data, like.of_pixel), known, data, noise_like(data, noise)
         uniform = noise.separable and noise.pixel_sigma is None and like.of_pixel is None
-        found = ComponentMaps(names, *_on_devices(*args, like.layout, covariance and not uniform))
+        errors = covariance and not uniform
+        found = ComponentMaps(names, *separated_pixels(_separated, *args, like.layout, errors))
         if not (covariance and uniform):
             return found
         one = component_maps(like, params, np.zeros((*data.shape[:2], 1)), noise)

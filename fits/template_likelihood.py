@@ -36,7 +36,7 @@ from fits.systems import square_root
 from jaxsky import Bandpass, Sky, observe_components, parameter_names
 from jaxsky.checks import Numeric, as_array, check_double, check_shape
 from jaxsky.interpolation import NodeCounts, Nodes
-from jaxsky.mesh import SUMS, along, maps_of, of_own, over_pixels, total, typed
+from jaxsky.mesh import SUMS, along, maps_of, of_own, over_pixels, spread, total, typed
 from jaxsky.sky import OFFSET, interpolation_nodes, unknown_parameter
 
 #: Covariance of the inner products <rows, data>: (band, row, stokes, pix) -> square matrix over
@@ -209,6 +209,12 @@ def likelihood(
     if not stokes or set(stokes) - set(labels):
         raise ValueError(f"Argument `stokes` must be among {labels!r}, not {stokes!r}.")
     keep = np.array([labels.index(s) for s in stokes])
+    if spread(data) and not (covariance_of is template_errors is None):
+        raise ValueError(
+            f"Argument `{'covariance_of' if covariance_of else 'template_errors'}` takes the whole "
+            "sky, which distributed pixels do not have together; leave it out, or do not "
+            "distribute."
+        )
     mixing = Mixing.of(sky, bands, "uK_RJ", on_cmb=True)
     angles = [name for name in start if name.startswith("angle.")]
     params = SkyLikelihood({}, 0, mixing, labels, bool(angles)).check(start)

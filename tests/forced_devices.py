@@ -11,8 +11,11 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 
 import pixels
 from benchmarks.pixel_programs import ALONE, moved, programs
+from fits.grid import grid_fit
 from fits.optimize import best_fit
+from fits.posterior import Uniform
 from fits.profile_likelihood import spectral_likelihood
+from fits.sampling import sample
 from fits.template_likelihood import likelihood
 from jaxsky import Synchrotron, mesh, observe
 from jaxsky.mesh import along, distribute, maps_of
@@ -87,6 +90,23 @@ def test_one_distributed_array_is_enough():
     assert along(data, sigma) is sigma
 
 
+def test_grids_and_chains_take_distributed_pixels():
+    data, noise = pixels.data_of(48, False)[0], pixels.noise_of("pixels", 48, ordinary)
+    ranges = {"dust.beta_dust": Uniform(1.4, 1.7), "synchrotron.beta_syn": Uniform(2.8, 3.4)}
+
+    def errors(place):
+        given = pixels.sky_of(1, False), pixels.BANDS, place(data), place(noise, np.inf)
+        like = spectral_likelihood(*given, pixels.START)
+        grid = grid_fit(like, priors=ranges, points=20)
+        options = {"nsteps": 20, "progress": False, "throw": False}
+        chain = sample(like, priors=ranges, **options)
+        return [grid.sigma[name] for name in ranges], chain.sigma.keys()
+
+    (grid, chain), (expected, names) = errors(explicit), errors(ordinary)
+    np.testing.assert_allclose(grid, expected, rtol=1e-9)
+    assert chain == names
+
+
 def test_gradients_through_a_distributed_sky():
     sky = pixels.sky_of(192, True)
 
@@ -106,7 +126,11 @@ def test_what_cannot_be_distributed_is_refused():
     data, sigma = map(explicit, pixels.data_of(48, True))
     like = likelihood(pixels.sky_of(48, True), pixels.BANDS, data, sigma, {"offset.70.Q": 0.0})
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-    raises(ValueError, "takes the residuals of all pixels to one", best_fit, like, solver=solver)
+    words = "is LevenbergMarquardt, and optimistix does not take distributed pixels"
+    raises(ValueError, words, best_fit, like, solver=solver)
+    call = partial(likelihood, pixels.sky_of(48, False), pixels.BANDS, data, sigma, pixels.START)
+    raises(ValueError, "`covariance_of` takes the whole sky", call, covariance_of=np.asarray)
+    raises(ValueError, "`template_errors` takes the whole sky", call, template_errors=(1,))
     law = partial(Synchrotron, explicit(np.ones((2, 48))))
     words = "`beta_syn` must be from .* but its mean is -3"
     raises(ValueError, words, law, explicit(np.full(48, -3.0)))

@@ -261,6 +261,12 @@ def shared_pixels() -> Calls:
     yield distributed._numbered, np.arange(3), np.arange(NPIX), used
     yield partial(distributed._covariance, layout=layout, number=2), data, noise, blocks
     yield partial(distributed.gathered, layout=layout), data, noise, blocks
+    matrix = np.random.default_rng(1).normal(size=(1, 4, 2))
+    noise = compress.Noise(data)
+    for errors in (False, True):
+        options = {"layouts": (layout,), "errors": errors}
+        maps = partial(distributed.separated_pixels, separated_maps._separated, None, **options)
+        yield maps, (matrix,), jnp.asarray(data), jax.tree.map(jnp.asarray, noise)
 
 
 def separations() -> Calls:
@@ -272,11 +278,7 @@ def separated() -> Calls:
     matrix = np.random.default_rng(1).normal(size=(1, 4, 2))
     pixels = compress.Pixels(np.ones((2, 4, NPIX)), np.ones((2, 4, NPIX)), None)
     each = np.repeat(matrix, NPIX, axis=0)
-    data, noise = np.ones((4, 2, NPIX)), compress.Noise(np.ones((4, 2, NPIX)))
     for errors in (False, True):
-        options = {"layouts": (compress.Layout(False, (0, 1)),), "errors": errors}
-        whole = partial(separated_maps._on_devices, None, **options)
-        yield whole, (matrix,), jnp.asarray(data), jax.tree.map(jnp.asarray, noise)
         yield partial(separated_maps._separated, errors=errors), matrix, pixels
         yield partial(separated_maps._separated, errors=errors), each, pixels
 

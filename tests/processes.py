@@ -40,11 +40,13 @@ def every(folder: Path, npix: str) -> None:
 
 
 @kind
-def endless(folder: Path) -> None:
-    """Add up pixels until another process ends."""
+def endless(folder: Path, failing: str = "") -> None:
+    """Add up pixels until another process ends; that may be one that fails by itself."""
     maps = distribute(np.arange(48.0))
     added = jax.jit(over_pixels(SUMS)(lambda maps: total(jnp.sum(maps))))
     (folder / f"{jax.process_index()}.begun").touch()
+    if failing and jax.process_index() == 1:
+        raise FileNotFoundError("map.fits: no such file.")
     while True:
         added(maps).block_until_ready()
         time.sleep(0.01)

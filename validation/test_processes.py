@@ -42,3 +42,10 @@ def test_one_that_dies_ends_the_others(lost, tmp_path):
     assert time.monotonic() - killed < 30
     said = [(tmp_path / f"{index}.log").read_text() for index in range(3) if index != lost]
     assert any("Another of the 3 processes has ended, and number" in text for text in said)
+
+
+def test_one_that_fails_ends_the_others(tmp_path):
+    run = launch(2, tmp_path, [SCRIPT, str(tmp_path), "endless", "failing"])
+    begun(tmp_path, 2)
+    assert all(ended(run, 30.0))
+    assert "FileNotFoundError: map.fits: no such file." in (tmp_path / "1.log").read_text()

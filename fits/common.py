@@ -173,7 +173,7 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
     def brought(what: str, maps: Array | Maps) -> Array:
         """Bring maps to the common resolution in double precision, zero in holes."""
         own, given = kept[what], jnp.asarray(np.asarray(maps), float)
-        return operators[what].consume(given if own is None else given * own)
+        return operators[what](given if own is None else given * own)
 
     leakage = {
         name: brought(f"leakage of band {name!r}", band.leakage.maps)

@@ -99,8 +99,6 @@ def pixel_window(nside: int, lmax: int) -> Float[np.ndarray, " ell"]:
 
 #: An analysis extends to this times the largest multipole kept, as far as the map resolves it.
 MARGIN = 3
-#: Maps with at least this many pixels are smoothed in place, if they may.
-IN_PLACE = 12 * 1024**2
 #: Up to this fraction of nside, quadrature needs neither iterations nor a margin: a multipole up to
 #: three times as high leaks by some 1e-6 at nside 128, and less with finer pixels. Variances, whose
 #: spectra are steep, allow a larger fraction.
@@ -119,7 +117,8 @@ def low_multipoles(
     return resize(analysis(maps, min(resolved, MARGIN * lmax), iterations), lmax)
 
 
-def _resample(
+@partial(jax.jit, static_argnames=("nside", "iterations", "fine"))
+def resample(
     maps: Float[Array, "stokes pix"],
     window: Float[Array, " ell"],
     nside: int,
@@ -139,11 +138,6 @@ def _resample(
     else:
         alm = low_multipoles(maps, lmax, iterations)
     return synthesis(alm * expand(window), nside)
-
-
-_STATIC = ("nside", "iterations", "fine")
-resample = jax.jit(_resample, static_argnames=_STATIC)
-_resample_in_place = jax.jit(_resample, static_argnames=_STATIC, donate_argnums=0)
 
 
 def smooth(
@@ -231,13 +225,6 @@ class Preparation(eqx.Module):
         if self.window is None:
             return average_pixels(maps, self.nside)
         return resample(maps, self.window, self.nside, fine=FINE)
-
-    def consume(self, maps: Float[Array, "stokes pix"]) -> Float[Array, "stokes pix"]:
-        """Return the same; large maps are lost, as the result takes their memory if nside stays."""
-        large = maps.shape[-1] >= IN_PLACE and self.nside == self.nside_in
-        if self.window is None or not large:
-            return self(maps)
-        return _resample_in_place(maps, self.window, self.nside, fine=FINE)
 
     @eqx.filter_jit
     def transpose(self, maps: Float[Array, "stokes pix"]) -> Float[Array, "stokes pix"]:

@@ -39,6 +39,8 @@ THREADS = (
     *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"),
     *("DUCC0_NUM_THREADS", "PJRT_NPROC"),
 )
+#: A word for this process, on any machine.
+_HERE = uuid.uuid4().hex[:8]
 #: What a worker was given last, by its file, and the lock of that.
 _HELD: dict[Path, Callable[[int], Any]] = {}
 _ONE = threading.Lock()
@@ -119,7 +121,7 @@ def _written(work: Callable[[int], Any], folder: Path) -> Iterator["_Task"]:
                 ) from None
         yield _Task(
             path,
-            os.getpid(),
+            (os.getpid(), _HERE),
             _versions(),
             (*sys.path, os.getcwd()),  # a law of one's own may be in the current folder
             jax.config.jax_enable_x64,  # type: ignore[attr-defined]
@@ -147,12 +149,13 @@ def _check_versions(worker: str, there: Mapping[str, Any], here: Mapping[str, st
 class _Task:
     """Makes realisations in a worker as in the process that asks for them.
 
-    `state` is the file of the function that makes one, `owner` the process that asks. Modules are
-    found in the same folders, and numbers have the same precision; `programs` is the cache.
+    `state` is the file of the function that makes one, `owner` the number and the word of the
+    process that asks. Modules are found in the same folders, and numbers have the same precision;
+    `programs` is the cache.
     """
 
     state: Path
-    owner: int
+    owner: tuple[int, str]
     versions: Mapping[str, str]
     modules: tuple[str, ...]
     double: bool
@@ -177,7 +180,8 @@ class _Task:
             jax.config.update("jax_enable_x64", self.double)
             if self.programs is not None:
                 keep_programs(self.programs)
-            files.writer = f"{self.owner}-{uuid.uuid4().hex[:8]}"
+            if self.owner != (os.getpid(), _HERE):  # and not threads of that process
+                files.writer = f"{self.owner[0]}-{uuid.uuid4().hex[:8]}"
             if not self.state.exists():
                 raise FileNotFoundError(
                     f"{self.state.parent}: {worker} does not see this folder, in which workers "
@@ -300,6 +304,7 @@ def _cluster(address: str, note: Callable[[str], None]) -> Iterator[Executor]:
     """Yield the executor of a Dask cluster, whose workers are checked."""
     try:
         from distributed import Client
+        from distributed.comm.registry import get_backend
     except ImportError:
         raise ValueError(
             f"--workers {address}: takes Dask, which is missing: pip install 'jaxsky[dask]'."
@@ -307,6 +312,7 @@ def _cluster(address: str, note: Callable[[str], None]) -> Iterator[Executor]:
     for name in ("distributed", "distributed.client"):  # what it has to say is said here
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
+        get_backend(address.partition("://")[0])
         client = Client(address, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise ConnectionError(

@@ -23,18 +23,9 @@ def place(maps, fill=np.nan):
 
 
 @kind
-def templates(folder: Path, npix: str) -> None:
-    """Write what each process finds from templates."""
-    import pixels  # which calls JAX
-
-    found = pixels.of_templates(int(npix), place, False)
-    np.savez(folder / f"{jax.process_index()}.npz", **found)
-
-
-@kind
 def every(folder: Path, npix: str) -> None:
     """Write all that each process finds."""
-    import pixels
+    import pixels  # which calls JAX
 
     np.savez(folder / f"{jax.process_index()}.npz", **pixels.every(int(npix), place))
 

@@ -110,6 +110,7 @@ def test_transforms_through_a_callback_are_the_same(name):
         np.testing.assert_allclose(one, other, rtol=0, atol=accuracy * size)
 
 
+@pytest.mark.slow
 def test_the_script_for_a_gpu_runs(monkeypatch, capsys):
     """On small maps; the numbers are right, and there is no verdict on speed."""
     monkeypatch.setattr(sys, "argv", ["benchmarks.gpu", "--nside", "16"])
@@ -136,6 +137,7 @@ def on_an_accelerator(monkeypatch):
         monkeypatch.setattr(module, "on_accelerator", lambda x: isinstance(x, jax.Array))
 
 
+@pytest.mark.slow
 def test_separations_stay_where_the_maps_are(on_an_accelerator):
     """With the same results as for numpy arrays."""
     rng, instrument = np.random.default_rng(3), [30.0, 95.0, 150.0, 220.0, 353.0]

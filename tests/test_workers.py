@@ -13,6 +13,7 @@ from distributed import LocalCluster
 from fits.commands.run import keep_traceback
 from fits.kept import kept_realisations
 from jaxsky import workers
+from jaxsky.io import files
 from jaxsky.settings import SettingsError
 from jaxsky.workers import realised, workers_of
 from realisations import Pair, drawn, failing, mistaken, surroundings
@@ -40,6 +41,7 @@ def test_results_are_the_same_to_the_bit(two, tmp_path):
         assert [array.tobytes() for array in found] == [array.tobytes() for array in expected]
         assert reports == [(done, 9) for done in range(10)]
         reports.clear()
+    assert not files.writer  # threads are no workers with names of their own for files
     assert sorted(os.listdir(tmp_path)) == ["Processes.npz", "ThreadPoolExecutor.npz"]
 
 

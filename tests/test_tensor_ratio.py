@@ -2,11 +2,14 @@
 
 import functools
 
+import healpy
 import numpy as np
 import pytest
 
-from fits.pseudo_cl import masked_spectra
-from fits.tensor_ratio import PowerModel, fit_tensors, power_model
+from fits import tensor_ratio
+from fits.pseudo_cl import bin_edges, masked_spectra
+from fits.regions import apodize
+from fits.tensor_ratio import PowerModel, covariance_terms, fit_tensors, power_model
 from jaxsky.cmb import camb_spectra, tensor_spectra
 from jaxsky.harmonics import gaussian_beam
 from refusals import cases, raises
@@ -99,6 +102,26 @@ def test_powers_of_the_model_give_its_r_and_others_shift_it():
     negative = fit_tensors(one, one.mean(-0.001))
     assert negative.r == pytest.approx(-0.001, rel=1e-6)
     assert 0 < negative.upper_95 < fit_tensors(one, one.mean(0.001)).upper_95
+
+
+def test_products_beyond_the_exact_ones_hardly_count(monkeypatch):
+    """Outside a purified strip: errors to 1 % below the last exact multipole, that of r to 2 %."""
+    nside = 32
+    latitude = healpy.pix2ang(nside, np.arange(12 * nside**2), lonlat=True)[1]
+    mask = apodize(np.abs(latitude) > 20, 20.0)
+    outside = masked_spectra(mask, bin_edges(2, 58, 8), pure=True)
+    fields = np.stack([of(2 * nside)[1:3] for of in (tensor_spectra, camb_spectra)])
+    mean = outside.windows[1, :, 1] @ fields[0, 1]
+    errors, informations = [], []
+    for exact in (99, 24):
+        monkeypatch.setattr(tensor_ratio, "EXACT", exact)
+        terms = covariance_terms(outside, fields)[1, 1, 1, :, 1]
+        errors.append(np.sqrt(np.diagonal(terms)))
+        informations.append(mean @ np.linalg.solve(terms, mean))
+    np.testing.assert_allclose(errors[0][:2], errors[1][:2], rtol=0.01)
+    np.testing.assert_allclose(errors[0], errors[1], rtol=0.05)
+    assert not np.array_equal(*errors)
+    assert informations[0] == pytest.approx(informations[1], rel=0.04)
 
 
 def test_simulations_set_the_errors():

@@ -12,8 +12,8 @@ from benchmarks.launched import ended, launch
 SCRIPT = str(Path(pixels.__file__).with_name("processes.py"))
 
 
-# 3068 pixels are padded for 3 processes.
-@pytest.mark.parametrize(("number", "npix"), [(2, 3072), (3, 3068), (4, 3072)])
+# 3069 pixels are padded for 2 processes.
+@pytest.mark.parametrize(("number", "npix"), [(2, 3069), (4, 3072)])
 def test_processes_find_what_one_does(number, npix, tmp_path):
     run = launch(number, tmp_path, [SCRIPT, str(tmp_path), "every", str(npix)])
     codes = ended(run, 600.0)

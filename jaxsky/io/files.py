@@ -284,6 +284,7 @@ class Folder:
             guards.remove(self.check)
             with suppress(OSError):
                 self.check()
+                self.clean()  # what workers have left that were stopped
                 with alone(self.path):
                     self._place.unlink()
             lock.release()
@@ -311,7 +312,7 @@ class Folder:
                 path.unlink(missing_ok=True)
 
     def clean(self) -> None:
-        """Remove incomplete files left by processes that have died."""
+        """Remove incomplete files left by processes that have died or worked for this one."""
         with alone(self.path) as locked:
             if not locked:
                 return

@@ -123,6 +123,7 @@ def test_the_script_for_a_gpu_runs(monkeypatch, capsys):
     assert "MISS" not in said
 
 
+@pytest.mark.slow
 def test_wrong_numbers_are_missed_by_the_script(monkeypatch):
     monkeypatch.setattr(gpu, "ACCURACY", {np.float64: 1e-20})
     assert gpu.band_average(8, np.float64, trial=True).met is False
@@ -165,6 +166,7 @@ def test_separations_stay_where_the_maps_are(on_an_accelerator):
             np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_passes_of_accelerators_give_the_same(monkeypatch):
     """More pixels are taken at once there."""
     npix, rng = 40_000, np.random.default_rng(4)

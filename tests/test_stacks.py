@@ -160,7 +160,8 @@ def assert_close(found, expected):
         np.testing.assert_allclose(found[name], value, 1e-10, 1e-10 * scale, err_msg=name)
 
 
-@pytest.mark.parametrize("uneven", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("uneven", [False, True])
 def test_separation_from_disk_is_that_in_memory(request, tmp_path, monkeypatch, uneven):
     settings = experiment(tmp_path, uneven)
     expected, _ = separated(settings)

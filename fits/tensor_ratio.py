@@ -34,7 +34,7 @@ ASYMMETRY = 1e-3
 NOTHING = 1e-5
 #: Products of a symmetric mask are exact up to this multipole, with what the next ones add: their
 #: time grows as its cube, and the width of a mask matters less and less.
-EXACT, MARGIN = 320, 32
+EXACT_LMAX, MARGIN = 320, 32
 #: Orders m of harmonics in memory at a time.
 CHUNK = 32
 
@@ -59,14 +59,14 @@ def covariance_terms(
     if profile is None:
         blocks = _narrow_products(spectra, given)
     else:
-        last = min(spectra.lmax, EXACT + MARGIN)
+        last = min(spectra.lmax, EXACT_LMAX + MARGIN)
         factors = None if spectra.derivatives is None else pure_factors(last)
         mask = profile[: 2 * last + 1]  # its higher multipoles couple none up to the last
         blocks = zonal_products(
             mask * derivative_factors(len(mask)), given[..., : last + 1], factors
         )
         if last < spectra.lmax:
-            low, exact = slice(EXACT + 1), blocks
+            low, exact = slice(EXACT_LMAX + 1), blocks
             blocks = _narrow_products(spectra, given)
             blocks[..., low, :, low] = exact[..., low, :, low]
     inverse = spectra.inverse

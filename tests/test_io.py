@@ -177,8 +177,9 @@ def test_bad_output_leaves_nothing(tmp_path, change, words):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_failure_while_writing_leaves_the_old_file(tmp_path):
-    path = tmp_path / "out.fits"
+@pytest.mark.parametrize("name", ["out.fits", "out.fits.gz"])
+def test_failure_while_writing_leaves_the_old_file(tmp_path, name):
+    path = tmp_path / name
     path.write_bytes(b"old")
     looked = []
 

@@ -114,7 +114,7 @@ def test_products_beyond_the_exact_ones_hardly_count(monkeypatch):
     mean = outside.windows[1, :, 1] @ fields[0, 1]
     errors, informations = [], []
     for exact in (99, 24):
-        monkeypatch.setattr(tensor_ratio, "EXACT", exact)
+        monkeypatch.setattr(tensor_ratio, "EXACT_LMAX", exact)
         terms = covariance_terms(outside, fields)[1, 1, 1, :, 1]
         errors.append(np.sqrt(np.diagonal(terms)))
         informations.append(mean @ np.linalg.solve(terms, mean))

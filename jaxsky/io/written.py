@@ -107,18 +107,21 @@ def write_maps(
     with whole(path) as beside:
         packed = path.suffix == ".gz"
         plain = beside.with_suffix("") if packed else beside
-        with plain.open("wb") as file:
-            for header in (pyfits.PrimaryHDU().header, table.header):
-                file.write(header.tostring().encode("ascii"))
-            for part in ranges(npix):  # the whole table may be larger than memory
-                rows = np.asarray(maps[..., part], dtype)
-                rows = rows if mask is None else np.where(mask[part], rows, healpy.UNSEEN)
-                file.write(rows.T.astype(dtype.newbyteorder(">"), order="C").tobytes())
-            file.write(bytes(-npix * len(maps) * dtype.itemsize % BLOCK))
-        if tables:
-            with pyfits.open(plain, mode="append") as hdus:
-                hdus.extend(tables)
-        if packed:
-            with plain.open("rb") as file, gzip.open(beside, "wb") as smaller:
-                shutil.copyfileobj(file, smaller)
-            plain.unlink()
+        try:
+            with plain.open("wb") as file:
+                for header in (pyfits.PrimaryHDU().header, table.header):
+                    file.write(header.tostring().encode("ascii"))
+                for part in ranges(npix):  # the whole table may be larger than memory
+                    rows = np.asarray(maps[..., part], dtype)
+                    rows = rows if mask is None else np.where(mask[part], rows, healpy.UNSEEN)
+                    file.write(rows.T.astype(dtype.newbyteorder(">"), order="C").tobytes())
+                file.write(bytes(-npix * len(maps) * dtype.itemsize % BLOCK))
+            if tables:
+                with pyfits.open(plain, mode="append") as hdus:
+                    hdus.extend(tables)
+            if packed:
+                with plain.open("rb") as file, gzip.open(beside, "wb") as smaller:
+                    shutil.copyfileobj(file, smaller)
+        finally:
+            if packed:  # also after an error
+                plain.unlink(missing_ok=True)

@@ -18,6 +18,7 @@ import threading
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent import futures
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -77,6 +78,9 @@ def realised(
                 try:
                     if not tasks:
                         tasks.extend(executor.submit(task, part) for part in left)
+                    while not futures.wait([tasks[0]], PATIENCE).done:
+                        if _lost(executor):
+                            raise CancelledError
                     done = tasks[0].result()
                 except BrokenExecutor:
                     if broken:
@@ -87,12 +91,12 @@ def realised(
                 left.popleft()
                 tasks.popleft()
                 yield from done
-        except CancelledError:
-            raise ConnectionError(
-                "The connection to the scheduler of the workers was lost. What was complete is "
-                "kept; go on with --resume once it is there again."
-            ) from None
         except Exception as error:
+            if isinstance(error, CancelledError) or _lost(executor):
+                raise ConnectionError(
+                    "The connection to the scheduler of the workers was lost. What was complete is "
+                    "kept; go on with --resume once it is there again."
+                ) from None
             # Dask has tried a task several times before it raises this.
             if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":
                 raise
@@ -103,6 +107,15 @@ def realised(
         finally:
             for future in tasks:
                 future.cancel()
+
+
+def _lost(executor: Executor) -> bool:
+    """Return whether the client of a Dask cluster has lost its scheduler, and what it had asked.
+
+    Tasks whose results were on their way are then neither finished nor cancelled by Dask.
+    """
+    client = getattr(executor, "_client", None)
+    return client is not None and (client.status != "running" or not client.futures)
 
 
 @contextlib.contextmanager
@@ -309,7 +322,8 @@ def _cluster(address: str, note: Callable[[str], None]) -> Iterator[Executor]:
         raise ValueError(
             f"--workers {address}: takes Dask, which is missing: pip install 'jaxsky[dask]'."
         ) from None
-    for name in ("distributed", "distributed.client"):  # what it has to say is said here
+    # What these have to say is said here.
+    for name in ("distributed", "distributed.client", "tornado.application"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         get_backend(address.partition("://")[0])
@@ -318,7 +332,7 @@ def _cluster(address: str, note: Callable[[str], None]) -> Iterator[Executor]:
         raise ConnectionError(
             f"--workers {address}: no Dask scheduler answers there ({error})."
         ) from None
-    with client:
+    try:
         here = _versions()
         found = {
             name: client.run(pkgutil.resolve_name, f"{name}:__version__", on_error="return")
@@ -329,3 +343,6 @@ def _cluster(address: str, note: Callable[[str], None]) -> Iterator[Executor]:
         if not found["jaxsky"]:
             note(f"--workers {address}: there are no workers yet; they are waited for.")
         yield client.get_executor(pure=False)
+    finally:
+        with contextlib.suppress(Exception):  # a scheduler that is lost cannot be told
+            client.close()

@@ -3,8 +3,9 @@
 import logging
 import os
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -113,6 +114,19 @@ def test_workers_have_to_see_the_folder(tmp_path):
     words = f"^{tmp_path}/elsewhere: process .* does not see this folder"
     with Elsewhere(1) as executor, refused(words, FileNotFoundError):
         list(realised(surroundings, [1], executor, tmp_path))
+
+
+def test_a_result_that_was_lost_on_its_way_is_not_waited_for(tmp_path, monkeypatch):
+    class Losing(Executor):
+        _client = SimpleNamespace(status="running", futures={})
+
+        def submit(self, task, part):
+            return Future()
+
+    monkeypatch.setattr(workers, "PATIENCE", 0.1)
+    words = r"^The connection to the scheduler of the workers was lost\..* with --resume"
+    with refused(words, ConnectionError):
+        list(realised(surroundings, range(3), Losing(), tmp_path))
 
 
 @pytest.mark.parametrize(("text", "words"), cases("workers/mistakes"))

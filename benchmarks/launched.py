@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 
-def launch(number: int, folder: Path, arguments: Sequence[str]) -> list[subprocess.Popen]:
+def launch(
+    number: int, folder: Path, arguments: Sequence[str], flags: str = ""
+) -> list[subprocess.Popen]:
     """Start Python with arguments as so many processes; what they say is in files of the folder."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -16,7 +18,7 @@ def launch(number: int, folder: Path, arguments: Sequence[str]) -> list[subproce
     started = []
     for index in range(number):
         own = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": str(number)}
-        own |= {"JAX_PROCESS_ID": str(index), "XLA_FLAGS": ""}
+        own |= {"JAX_PROCESS_ID": str(index), "XLA_FLAGS": flags}
         with (folder / f"{index}.log").open("w") as log:
             command = [sys.executable, *arguments]
             one = subprocess.Popen(command, env=os.environ | own, stdout=log, stderr=log)

@@ -15,7 +15,8 @@ import jax
 import numpy as np
 
 from benchmarks.timing import seconds
-from jaxsky.mesh import distribute, processes
+from jaxsky.job import processes
+from jaxsky.mesh import distribute, pixel_mesh
 
 NAMES = ("files", "empty", "uniform", "pixels")
 
@@ -91,7 +92,8 @@ def main() -> None:
     if arguments.name == "files":
         _files(arguments.folder, arguments.nside)
         return
-    with processes() as mesh:
+    with processes():
+        mesh = pixel_mesh()
         result: dict[str, Any] = {}
         if arguments.name == "empty":
             distribute(np.ones(mesh.size))

@@ -15,7 +15,7 @@ import typer
 
 import jaxsky
 from fits.commands.data import data_commands
-from fits.commands.report import print_written
+from fits.commands.report import console, print_written
 from fits.commands.run import DEFAULTS, Command, interruptible, print_error, run_command
 from jaxsky.io.files import cache_folder
 from jaxsky.programs import keep_programs, return_memory
@@ -216,12 +216,16 @@ def main() -> None:
         with interruptible():
             import jax
 
+            from jaxsky import job
+
             jax.config.update("jax_enable_x64", True)
             keep_programs(cache_folder() / "programs")
             if "--version" in sys.argv:  # after any command
                 print(f"jaxsky {jaxsky.__version__}")
             else:
-                app()
+                with job.processes():
+                    app()
     except Exception as error:
+        console.quiet = job.told and job.index() > 0
         print_error(error)
         sys.exit(2)

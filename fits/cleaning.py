@@ -34,16 +34,18 @@ from fits.pseudo_cl import (
     masked_spectra,
     mean_spectrum,
 )
-from fits.results import Convergence, FitResult
+from fits.results import Convergence, FitResult, widened
 from fits.sampling import sample
 from fits.separated_data import FullSkyData, PixelData
 from fits.systems import Factor
 from fits.tensor_ratio import TensorFit, fit_tensors, power_model
+from jaxsky import job
 from jaxsky.checks import Numeric, check_double
 from jaxsky.cmb import realisation, tensor_spectra
 from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import expand, gaussian_beam, synthesis
 from jaxsky.io.stacks import Maps, Stack, computed
+from jaxsky.mesh import spread
 from jaxsky.noise import stream
 from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
@@ -91,28 +93,6 @@ class Response:
         theta = self.theta.copy()
         theta[self._keep] -= self._factor.solve(gradient[self._keep])
         return np.clip(theta, self._low, self._high)
-
-
-def widened(
-    samples: FitResult,
-    center: Float[np.ndarray, " par"],
-    hessian: Float[np.ndarray, "par par"],
-    errors: Float[np.ndarray, "sim par"],
-) -> FitResult:
-    """Stretch samples of a posterior whose likelihood has wrong errors to the right ones.
-
-    They are stretched about the best fit by S L^-1, with L L^T = H^-1 and S S^T the covariance of
-    the estimates: the open-faced sandwich of Shaby (2014, J. Comput. Graph. Stat. 23, 853); with
-    too few simulations, each parameter by its ratio of standard deviations. `center` is the best
-    fit in the order of the samples, with the `hessian` of -log posterior there.
-    """
-    inverse = np.linalg.inv(hessian)
-    if len(errors) > 4 * len(center):
-        wanted = np.atleast_2d(np.cov(errors.T))
-        turn = np.linalg.cholesky(wanted) @ np.linalg.inv(np.linalg.cholesky(inverse))
-    else:
-        turn = np.diag(errors.std(axis=0, ddof=1) / np.sqrt(np.diagonal(inverse)))
-    return samples.with_chain(center + (samples.details["chain"] - center) @ turn.T)
 
 
 class SimulatedNoise(NamedTuple):
@@ -192,16 +172,22 @@ def separate_data(
     """
     check_double("A separation")
     spec, priors = settings.separate, priors_of(settings, "separate")
+    # Processes of a job each take their own pixels.
+    own = data.distributed()
     progress.step("spectral parameters")
     with at_key("free"):
-        like = data.likelihood(data.observed)
+        like = own.likelihood(own.observed)
     fit = best_fit(like, priors=priors, throw=False)
     # Data that no law describes are separated nevertheless, with a warning.
     fit.checked(throw=fit.converged is not Convergence.misfit)
     response = Response(like, fit.best_fit, priors)
     progress.step("components")
     best = like.named(jnp.asarray(response.theta))
-    found, maps = data.components(like, best, data.observed)
+    found, maps = own.components(like, best, own.observed)
+    whole = like
+    if spread(own.observed):
+        found = job.collected(found, data.observed.shape[-1])
+        maps, whole = found.amplitude, data.likelihood(data.observed)
     amplitude = found.amplitude if data.exact else maps
     row = found.components.index("cmb")
 
@@ -214,10 +200,10 @@ def separate_data(
     lensed = cmb_spectra(settings, highest, r=0.0)
     others = (np.arange(len(found.components)) != row)[:, None, None]
     foregrounds = computed(amplitude.shape, lambda part: amplitude[..., part] * others)
-    emission = data.emission(like, best, foregrounds)
+    emission = data.emission(whole, best, foregrounds)
     path = None if out is None else out / "simulations.npz"
     kept = spec.nsims, settings.seed, path, _mark(settings, data), progress.advance, executor
-    simulated = simulated_noise(data, like, response, emission, spectra, window, lensed, *kept)
+    simulated = simulated_noise(data, whole, response, emission, spectra, window, lensed, *kept)
     progress.step("tensor-to-scalar ratio")
     # The model has the mean E in B that the windows know of; only the rest is added.
     EE = lensed[1, : spectra.lmax + 1]
@@ -233,7 +219,7 @@ def separate_data(
     )
     left = None
     if data.foregrounds is not None:
-        alone = cleaned_cmb(data, like, best, data.foregrounds)
+        alone = cleaned_cmb(data, whole, best, data.foregrounds)
         left = band_powers(spectra, jnp.asarray(alone))[1]
     sigma, covariance = _errors(data, like, fit, simulated)
     chain = None
@@ -243,13 +229,13 @@ def separate_data(
         chain = _chain(settings, data, like, fit, simulated, out, progress)
     return Separation(
         data=data,
-        like=like,
+        like=whole,
         fit=fit,
         sigma=sigma,
         covariance=covariance,
         found=found,
         maps=maps,
-        residuals=data.residuals(like, best, amplitude),
+        residuals=data.residuals(whole, best, amplitude),
         simulated=simulated,
         spectra=spectra,
         tensors=ratio,

@@ -24,7 +24,8 @@ from jaxsky.harmonics import (
     gaussian_beam,
     pixel_window,
 )
-from jaxsky.io.stacks import Maps, Stack, computed, empty, is_large, ranges
+from jaxsky.io.stacks import Maps, Stack, computed, is_large, ranges
+from jaxsky.job import filled
 from jaxsky.programs import return_memory
 from jaxsky.settings import Experiment, at_key
 
@@ -180,12 +181,14 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         for name, band in inputs.bands.items()
         if band.leakage is not None
     }
-    data = empty((many, 2, npix))
-    for i, (name, band) in enumerate(inputs.bands.items()):
-        # Band by band: JAX would otherwise prepare the input of all transforms at once.
-        maps = brought(f"band {name!r}", band.maps)
-        data[i] = np.asarray(maps - leakage[name] if name in leakage else maps)
-        del maps
+    names = list(inputs.bands)
+
+    def observed(i: int) -> Array:
+        maps = brought(f"band {names[i]!r}", inputs.bands[names[i]].maps)
+        return maps - leakage[names[i]] if names[i] in leakage else maps
+
+    # Band by band: JAX would otherwise prepare the input of all transforms at once.
+    data = filled((many, 2, npix), observed)
     # Averaged pixels contain multipoles beyond those they resolve.
     reach = lmax if fwhm else 4 * nside
 

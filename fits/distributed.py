@@ -49,7 +49,7 @@ def _look(data, noise, components):
         used = seen.any(axis=0)
         few = jnp.sum(used & (seen < components).any(axis=0))
         bad = jnp.sum((~jnp.isfinite(data) | (data < UNSEEN)) & (weights > 0))
-        own = weights * used
+        own = jnp.where(used, weights, 0.0)
         sums = used.sum(), few, bad, own.sum(axis=(1, 2)), (own > 0).sum(axis=(1, 2))
         return used, *map(total, sums)
 

@@ -29,6 +29,7 @@ from jaxsky.harmonics import (
     synthesis,
 )
 from jaxsky.io.stacks import Maps, empty, is_large
+from jaxsky.job import filled
 from jaxsky.noise import draw, pixel_covariance, stream, uniform_covariance, white_alm
 
 #: Pixels whose products are summed at once; few enough to stay in cache.
@@ -197,10 +198,13 @@ class Fluctuations(eqx.Module):
         """
         shape = len(self.names), 2, healpy.nside2npix(self.preparations[0].nside)
         uniform = not any(map(np.ndim, self.noise))
-        found = empty((*shape[:2], 1)) if uniform else empty(shape)
-        for i, noise in enumerate(self.noises.values()):
-            total = noise.variance()[:, : found.shape[-1]]
-            found[i] = np.sqrt(np.where(total > 0, total, np.nan))
+        noises, size = list(self.noises.values()), 1 if uniform else shape[-1]
+
+        def of_band(i: int) -> np.ndarray:
+            total = noises[i].variance()[:, :size]
+            return np.sqrt(np.where(total > 0, total, np.nan))
+
+        found = filled((*shape[:2], size), of_band)
         return np.broadcast_to(found[...], shape) if uniform else found
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsky import Bandpass, Component, Sky, set_parameters
+from jaxsky import Bandpass, Component, Sky, job, set_parameters
 from jaxsky.checks import Numeric, listed
 from jaxsky.components import component_class
 from jaxsky.experiment import SimulationInputs, cmb_spectra, simulation_inputs
@@ -31,6 +31,7 @@ from jaxsky.inputs import (
 )
 from jaxsky.io import MissingFileError
 from jaxsky.io.stacks import Maps, stored
+from jaxsky.job import by_turns
 from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum, realisation_key
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import Observation, ObservedBand
@@ -145,12 +146,15 @@ def inputs_of(
         sky, description = read_sky(settings, names=settings.modelled(), galaxy=galaxy)
     bands: dict[str, Band] = {}
     truths: list[Mapping[str, float] | None] = []
-    for spec in settings.bands:
-        if spec.file is not None or settings.common.maps is not None:
-            band, truth = _from_file(settings, spec)
-            bands[str(spec.name)] = band.of_many(len(settings.bands))
-            del band  # or its maps stay in memory while the next one is read
-            truths.append(truth)
+
+    def read(spec: BandTable) -> tuple[Band, Mapping[str, float] | None]:
+        band, truth = _from_file(settings, spec)
+        return band.of_many(len(settings.bands)), truth
+
+    filed = [s for s in settings.bands if s.file is not None or settings.common.maps is not None]
+    for spec, (band, truth) in zip(filed, by_turns(read, filed), strict=True):
+        bands[str(spec.name)] = band
+        truths.append(truth)
     alone = None
     missing = [str(spec.name) for spec in settings.bands if str(spec.name) not in bands]
     if missing:
@@ -233,21 +237,26 @@ def _simulated(
     observation, key = setup.observation, realisation_key(settings.seed)
     sky = harmonic_sources(setup.small_scales_key(key), setup.sources, observation)
     used = np.ones(healpy.nside2npix(observation.nside), bool)
-    bands = {}
-    for name, maps in observe_bands(key, sky, observation, setup.cmb):
-        observed, total = observed_band(setup, name), maps["total"]
+    names = observation.names
+    made = observe_bands(key, sky, observation, setup.cmb, names=names[job.index() :: job.number()])
+
+    def band_of(name: str) -> Band:
+        observed, total = observed_band(setup, name), next(made)[1]["total"]
         noise, correlated = _noise_of(observed, observation.nside, f"bands.{name}.noise")
         if (leakage := _leakage_of(observed, used)) is not None:
             total = total + leakage.maps
         band, beam = observed.bandpass, observed.beam
-        made = Band(total, used, band, beam, noise, correlated, leakage)
-        bands[name] = made.of_many(len(settings.bands))
+        whole = Band(total, used, band, beam, noise, correlated, leakage)
+        return whole.of_many(len(settings.bands))
+
+    bands = dict(zip(names, by_turns(band_of, names), strict=True))
     if not foregrounds or not sky:
         return bands, None
     quiet = {n: ObservedBand(c.band, c.beam, c.target) for n, c in observation.channels.items()}
     alone = Observation(quiet, observation.nside, lmax=observation.lmax)
-    seen = observe_bands(key, sky, alone)
-    return bands, {name: stored(maps["total"], len(settings.bands)) for name, maps in seen}
+    seen = observe_bands(key, sky, alone, names=names[job.index() :: job.number()])
+    each = by_turns(lambda _: stored(next(seen)[1]["total"], len(settings.bands)), names)
+    return bands, dict(zip(names, each, strict=True))
 
 
 def _noise_of(

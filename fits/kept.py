@@ -19,6 +19,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from jaxsky import job
 from jaxsky.checks import check_seed
 from jaxsky.io import InputError, whole
 from jaxsky.io.files import cache_folder
@@ -80,7 +81,7 @@ class KeptChain(emcee.backends.Backend):
         self._written, self._due = 0, time.monotonic() + every
         #: Number of complete steps, acceptance and random state; replaced together.
         self._state: tuple[int, np.ndarray, Any] | None = None
-        held = _load(path, mark, CHAIN, "a chain", alike=2)
+        held = job.of_first(lambda: _load(path, mark, CHAIN, "a chain", alike=2))
         if held is None:
             return
         self.reset(*held[0].shape[1:])
@@ -137,7 +138,7 @@ def kept_realisations(
     """
     check_seed("seed", seed)
     names = kind._fields
-    there = None if path is None else _load(path, mark, names, "realisations")
+    there = None if path is None else job.of_first(lambda: _load(path, mark, names, "realisations"))
     done = [] if there is None else [list(row) for row in zip(*there, strict=True)]
     held, saved = len(done), time.monotonic()
 
@@ -147,6 +148,10 @@ def kept_realisations(
         """Yield realisations in order, made by one thread per processor, or by the executor."""
         if executor is not None:
             yield from realised(one, numbers, executor, path.parent if path else cache_folder())
+            return
+        if (step := job.number()) > 1:
+            for start in range(0, len(numbers), step):
+                yield from job.by_turns(one, numbers[start : start + step])
             return
         yield from map(one, numbers[:1])  # alone, so that each program is compiled once
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -170,6 +175,8 @@ def kept_realisations(
 
 
 def _save(path: Path, mark: str, arrays: Mapping[str, np.ndarray]) -> None:
+    if job.index():
+        return
     with whole(path) as beside, beside.open("wb") as file:
         np.savez(file, mark=mark, **arrays)  # type: ignore[arg-type]
 

@@ -231,6 +231,28 @@ class FitResult(NamedTuple):
         return self
 
 
+def widened(
+    samples: FitResult,
+    center: Float[np.ndarray, " par"],
+    hessian: Float[np.ndarray, "par par"],
+    errors: Float[np.ndarray, "sim par"],
+) -> FitResult:
+    """Stretch samples of a posterior whose likelihood has wrong errors to the right ones.
+
+    They are stretched about the best fit by S L^-1, with L L^T = H^-1 and S S^T the covariance of
+    the estimates: the open-faced sandwich of Shaby (2014, J. Comput. Graph. Stat. 23, 853); with
+    too few simulations, each parameter by its ratio of standard deviations. `center` is the best
+    fit in the order of the samples, with the `hessian` of -log posterior there.
+    """
+    inverse = np.linalg.inv(hessian)
+    if len(errors) > 4 * len(center):
+        wanted = np.atleast_2d(np.cov(errors.T))
+        turn = np.linalg.cholesky(wanted) @ np.linalg.inv(np.linalg.cholesky(inverse))
+    else:
+        turn = np.diag(errors.std(axis=0, ddof=1) / np.sqrt(np.diagonal(inverse)))
+    return samples.with_chain(center + (samples.details["chain"] - center) @ turn.T)
+
+
 def _digits(size: float) -> int:
     """Return decimals that give a positive number two significant digits; 4 for others."""
     usable = np.isfinite(size) and size > 0

@@ -3,11 +3,13 @@
 All kinds have the same methods, so that a separation works on any of them.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import healpy
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -24,10 +26,12 @@ from fits.separated_maps import (
     emission_maps,
     harmonic_component_maps,
 )
-from jaxsky import Bandpass, Sky
+from jaxsky import Bandpass, Sky, job
 from jaxsky.checks import Numeric
 from jaxsky.harmonics import Preparation, expand, gaussian_beam, lmax_of, low_multipoles, synthesis
-from jaxsky.io.stacks import Maps, computed, empty
+from jaxsky.io.stacks import Maps, computed
+from jaxsky.job import by_turns, filled
+from jaxsky.mesh import distribute
 from jaxsky.settings import Experiment, SettingsError
 
 
@@ -56,6 +60,10 @@ class _Data:
     exact: ClassVar[bool] = False
     by_pixel: ClassVar[bool] = True
 
+    def distributed(self) -> Self:
+        """Return the data as a process of a job takes them: its own pixels of maps, or all."""
+        return self
+
 
 @dataclass(frozen=True, kw_only=True)
 class PixelData(_Data):
@@ -70,6 +78,21 @@ class PixelData(_Data):
     noise: Noise
     fluctuations: Fluctuations
     factors: Float[np.ndarray, " band"]
+
+    def distributed(self) -> Self:
+        # Distributed pixels do not take laws with maps of parameters.
+        maps = any(np.ndim(leaf) == 1 for leaf in jax.tree.leaves(self.sky))
+        if job.number() == 1 or not self.by_pixel or maps:
+            return self
+        npix = self.observed.shape[-1]
+
+        def shared(array):
+            return distribute(array) if np.shape(array)[-1:] == (npix,) else array
+
+        noise = Noise(*map(shared, self.noise))
+        labels = {name: shared(each) for name, each in self.labels.items()}
+        observed = shared(self.observed)
+        return dataclasses.replace(self, observed=observed, noise=noise, labels=labels)
 
     def likelihood(self, data: Float[np.ndarray, "band stokes pix"]) -> SpectralLikelihood:
         """Return the likelihood of data."""
@@ -258,11 +281,12 @@ def _pixel_data(
 
     alone = None
     if inputs.foregrounds is not None:
-        maps = empty(prepared.data.shape)
-        pairs = zip(fluctuations.preparations, inputs.foregrounds.values(), strict=True)
-        for i, (operator, own) in enumerate(pairs):
-            maps[i] = np.asarray(operator(jnp.asarray(np.asarray(own))))
-        alone = scaled(maps)
+        each = list(inputs.foregrounds.values())
+
+        def brought(i):
+            return fluctuations.preparations[i](jnp.asarray(np.asarray(each[i])))
+
+        alone = scaled(filled(prepared.data.shape, brought))
     by_pixel = settings.separate.domain == "pixel"
     left = used if by_pixel else mask > 0
     shared |= {
@@ -325,8 +349,12 @@ def _full_sky_data(
         noises[name] = MapNoise(as_observed, noise, correlated)
 
     def coefficients(maps):
-        scaled = [np.asarray(m) * f for m, f in zip(maps, factors, strict=True)]
-        return harmonic_coefficients(scaled, lmax)
+        maps = list(maps)
+
+        def one(i):
+            return harmonic_coefficients([np.asarray(maps[i]) * factors[i]], lmax)[0]
+
+        return np.stack(list(by_turns(one, range(len(maps)))))
 
     alone = inputs.foregrounds
     return FullSkyData(

@@ -5,9 +5,7 @@ pass over pixels is marked with `over_pixels`, and ends in sums over the devices
 not distributed pass through unchanged.
 """
 
-import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial, wraps
 from typing import Any, Final, TypeVar
 
@@ -23,10 +21,6 @@ from jaxsky.public import refuse_unit
 PIX: Final = "pix"
 #: Pixels that are read at a time.
 PIECE: Final = 1 << 18
-#: Seconds after which a process that does not answer is taken to have ended.
-HEARTBEAT: Final = 10
-#: Variables by which JAX knows the processes of SLURM, and of Open MPI up to version 4.
-LAUNCHED: Final = ("SLURM_STEP_NODELIST", "OMPI_MCA_orte_hnp_uri")
 #: Results of passes: sums over all pixels, and maps whose last axis are pixels.
 SUMS: Final = PartitionSpec()
 
@@ -39,68 +33,6 @@ Tree = TypeVar("Tree")
 def maps_of(axes: int) -> PartitionSpec:
     """Return how arrays with this number of axes are distributed if the last one are pixels."""
     return PartitionSpec(*[None] * (axes - 1), PIX)
-
-
-@contextmanager
-def processes(
-    address: str | None = None, number: int | None = None, index: int | None = None
-) -> Iterator[Mesh]:
-    """Join the processes of a job, before anything else is done with JAX, and share their devices.
-
-    Processes that SLURM or Open MPI start find each other. Others are given an address, or find it,
-    their number and their index in the environment variables JAX_COORDINATOR_ADDRESS,
-    JAX_NUM_PROCESSES and JAX_PROCESS_ID. Without any of this there is one process. All have to do
-    the same.
-
-    Parameters
-    ----------
-    address : "host:port" of the first process, where the port is a free one
-    number : number of processes
-    index : which of them this is, from 0
-
-    Yields
-    ------
-    The mesh of all devices (`pixel_mesh`).
-
-    Raises
-    ------
-    RuntimeError
-        If another process has ended, which exchanges of pixels notice at once, and all others
-        after `HEARTBEAT` seconds: then JAX ends the process with a text of its own.
-    ValueError
-        If only some of address, number and index are known.
-    """
-    address = address or os.environ.get("JAX_COORDINATOR_ADDRESS")
-    number, index = (
-        int(os.environ[word]) if value is None and word in os.environ else value
-        for value, word in ((number, "JAX_NUM_PROCESSES"), (index, "JAX_PROCESS_ID"))
-    )
-    given = {"address": address, "number": number, "index": index}
-    lacking = [name for name, value in given.items() if value is None]
-    if 0 < len(lacking) < len(given):
-        raise ValueError(
-            f"Argument `{lacking[0]}` is missing: give all of address, number and index, or none."
-        )
-    if address or any(word in os.environ for word in LAUNCHED):
-        jax.distributed.initialize(
-            address,
-            number,
-            index,
-            heartbeat_timeout_seconds=HEARTBEAT,
-            shutdown_timeout_seconds=HEARTBEAT,
-        )
-    try:
-        yield pixel_mesh()
-    except Exception as error:
-        lost = any(word in str(error) for word in ("Gloo", "NCCL", "coordination service"))
-        if jax.process_count() == 1 or not lost:
-            raise
-        raise RuntimeError(
-            f"Another of the {jax.process_count()} processes has ended, and number "
-            f"{jax.process_index()} cannot go on without it; what it said tells why."
-        ) from error
-    if jax.distributed.is_initialized():
-        jax.distributed.shutdown()
 
 
 def pixel_mesh() -> Mesh:
@@ -127,8 +59,8 @@ def distribute(
 
     Parameters
     ----------
-    maps : array (..., pix), or a function that returns the pixels of a slice, (..., pixels), to
-        read or make no more than a process needs
+    maps : array (..., pix), or one on disk (`jaxsky.io.stacks`), or a function that returns the
+        pixels of a slice, (..., pixels), to read or make no more than a process needs
     mesh : by default `pixel_mesh()`
     shape : shape (..., pix) of all maps, if `maps` is a function
     dtype : type of the numbers, if `maps` is a function
@@ -158,7 +90,9 @@ def distribute(
             raise TypeError("Argument `shape` is missing: `maps` is a function.")
         read: Callable[[slice], Any] = maps
     else:
-        array = np.asarray(maps)
+        # What lies on disk is read in pieces.
+        on_disk = hasattr(maps, "__array__") and not isinstance(maps, jax.Array)
+        array = maps if on_disk else np.asarray(maps)
         shape, dtype, read = array.shape, array.dtype, lambda pixels: array[..., pixels]
     *rows, npix = shape
     if not np.issubdtype(dtype, np.floating):

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsky.mesh import SUMS, distribute, over_pixels, processes, total
+from jaxsky.job import processes
+from jaxsky.mesh import SUMS, distribute, over_pixels, total
 
 KINDS = {}
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from jaxsky.mesh import processes
+from jaxsky.job import processes
+from jaxsky.mesh import pixel_mesh
 from refusals import raises
 
 
@@ -42,7 +43,7 @@ def test_half_an_address_is_refused(monkeypatch):
 
 
 def test_one_process_is_its_own_mesh():
-    with processes() as mesh:
-        assert mesh.size == 1
+    with processes():
+        assert pixel_mesh().size == 1
     with pytest.raises(ZeroDivisionError), processes():
         raise ZeroDivisionError

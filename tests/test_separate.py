@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from fits import cleaning as module
-from fits.cleaning import Response, separate_data, widened
+from fits.cleaning import Response, separate_data
 from fits.commands import separate as command
 from fits.commands.run import DEFAULTS
 from fits.commands.separate import separation_warnings
 from fits.optimize import best_fit
 from fits.priors import priors_of
 from fits.pseudo_cl import band_powers
+from fits.results import widened
 from fits.separated_data import separation_data
 from fits.tensor_ratio import fit_tensors
 from jaxsky.cmb import camb_spectra, realisation

@@ -213,12 +213,12 @@ def test_final_spectra_of_the_embedded_sky():
     known = 600
     original = h.analysis(maps, known) / h.expand(h.gaussian_beam(60.0, known))
     # Many realisations of the multipoles near the joins, one of all.
-    near, part = many(maps, 60.0, SYNCHROTRON, 128, 12)
-    steps = assert_follows(near, part, SYNCHROTRON, original, 0.95 * 256)
+    near, part = many(maps, 60.0, SmallScales(*SYNCHROTRON), 128, 12)
+    steps = assert_follows(near, part, SmallScales(*SYNCHROTRON), original, 0.95 * 256)
     # Just below its join E of this template is 1.35 times its own law, which is not quite one.
     np.testing.assert_allclose(steps, [0.75, 1.1], atol=0.1)
-    alms, part = many(maps, 60.0, SYNCHROTRON, 512, 1)
-    assert_follows(alms, part, SYNCHROTRON, original, 0.95 * 1024, first=(200, 200))
+    alms, part = many(maps, 60.0, SmallScales(*SYNCHROTRON), 512, 1)
+    assert_follows(alms, part, SmallScales(*SYNCHROTRON), original, 0.95 * 1024, first=(200, 200))
 
 
 def test_amplitude_is_that_of_what_is_added(template):

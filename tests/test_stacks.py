@@ -84,7 +84,7 @@ def test_scratch_files_are_gone_after_an_error_and_a_full_disk_is_said(tmp_path,
     assert not any(tmp_path.iterdir())
 
 
-def files(folder, uneven: bool):
+def files(folder, uneven: bool, whole: bool = False):
     """Maps of a small sky with white noise in files, with a hit count of each band, or without."""
     made = Experiment.model_validate(
         {
@@ -97,7 +97,7 @@ def files(folder, uneven: bool):
     )
     bands, npix = [], 12 * NSIDE**2
     z = healpy.pix2vec(NSIDE, np.arange(npix))[2]
-    used = np.abs(z) < 0.98
+    used = np.abs(z) < (2 if whole else 0.98)
     for i, (name, band) in enumerate(inputs_of(made, templates=False).bands.items()):
         maps = np.asarray(band.maps)
         hits = 1 + 0.3 * np.cos((i + 2) * z)

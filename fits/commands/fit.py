@@ -271,4 +271,4 @@ def _work(settings: Experiment, command: Run) -> Report:
     )
 
 
-COMMAND = Command("fit", _work, ("result.json", *PICTURES, CHAINS))
+COMMAND = Command("fit", _work, ("result.json", *PICTURES, CHAINS), shared=True)

@@ -16,7 +16,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +32,8 @@ from fits.commands.report import (
     write_page,
 )
 from fits.results import write_json, write_log
+from jaxsky import job
+from jaxsky.io import files
 from jaxsky.io.files import ALL, Folder, occupied
 from jaxsky.io.stacks import scratch
 from jaxsky.settings import Experiment, check_log, load, of_file
@@ -101,6 +103,9 @@ class Run(NamedTuple):
 
     def begin(self) -> None:
         """Check or remove what is there and begin the log, once the input is known to be good."""
+        job.of_first(self._begin)
+
+    def _begin(self) -> None:
         if self.overwrite:
             self.folder.remove((*self.results, CIRCUMSTANCES))
             self.folder.narrow(self.part)  # others may make the rest
@@ -114,11 +119,13 @@ class Command(NamedTuple):
     """A command; its name is also that of its default experiment file.
 
     `work` calls `Run.begin` before it writes; `results` are patterns of all files but the logs.
+    If `shared`, the processes of a job share out the work.
     """
 
     name: str
     work: Callable[[Experiment, Run], Report]
     results: tuple[str, ...] = ()
+    shared: bool = False
 
 
 def run_command(
@@ -141,16 +148,17 @@ def run_command(
     path, values = settings_file or DEFAULTS / f"{command.name}.toml", list(values or ())
     if maps is not None:
         values.append(f"common.maps={json.dumps(str(maps.resolve()))}")
-    settings = load(path, values)
+    if (count := job.number()) > 1 and not (command.shared and workers is None):
+        raise ValueError(
+            f"jaxsky {command.name} was started as {count} processes of a job, which only fit and "
+            "separate share out, without --workers; start one process."
+        )
+    console.quiet = job.index() > 0
+    settings = job.of_first(lambda: load(path, values))
+    kind: Any = {"resume": resume, "overwrite": overwrite, "part": ALL if overwrite else part}
     with (
         of_file(path),
-        results_folder(
-            out,
-            command.results,
-            resume=resume,
-            overwrite=overwrite,
-            part=ALL if overwrite else part,
-        ) as folder,
+        ExitStack() as stack,
         scratch(out),
         Steps() as steps,
         workers_of(workers, warn) as executor,
@@ -160,12 +168,18 @@ def run_command(
         from jaxsky.montecarlo import other_sky
 
         mpl.use("Agg")  # pictures go to files
+        guarded = results_folder(out, command.results, **kind)
+        folder, owner = job.of_first(lambda: (stack.enter_context(guarded), os.getpid()))
+        if count > 1:
+            files.writer = f"{owner}-{job.index()}"
         options = settings, out, bool(resume), overwrite, command.results
         running = Run(*options, folder, steps, part, executor)
         report = command.work(settings, running)
         report = report._replace(warnings=[*report.warnings, *other_sky(settings)])
-        written = _write(settings, report, running)
+        written = job.of_first(lambda: _write(settings, report, running))
         if_stopped(WRITTEN)
+    if job.index():
+        return
     if report.description:
         console.print(report.description)
     print_tables(report.tables)

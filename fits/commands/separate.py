@@ -15,6 +15,7 @@ from fits.separated_data import separation_data
 from jaxsky.components import parameter_declaration
 from jaxsky.io import write_maps
 from jaxsky.io.stacks import Maps, Stack, computed, ranges
+from jaxsky.job import of_first
 from jaxsky.settings import Experiment
 
 #: Probabilities below this get a warning.
@@ -157,7 +158,7 @@ def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
         sentences.append(
             f"The posterior was not sampled: {len(fit.labels)} parameters are more than {SAMPLED}."
         )
-    elif settings.separate.sampler != "none" and found.like.source is not None:
+    elif settings.separate.sampler != "none" and found.chain is None:
         sentences.append(
             "The posterior was not sampled: the maps are too large for memory, and their noise "
             "differs from pixel to pixel and from band to band."
@@ -374,8 +375,8 @@ def _work(settings: Experiment, command: Run) -> Report:
         separation_warnings(found, settings),
         _numbers(found, settings),
         {name: (plot, found, settings) for name, plot in PICTURES.items()},
-        _write_maps(command.out, found, settings),
+        of_first(lambda: _write_maps(command.out, found, settings)),
     )
 
 
-COMMAND = Command("separate", _work, ("result.json", *MAPS, *PICTURES, *KEPT))
+COMMAND = Command("separate", _work, ("result.json", *MAPS, *PICTURES, *KEPT), shared=True)

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from jaxsky.io import files
 from jaxsky.io.files import PARTIAL, check_guards
 
 #: Arrays of more bytes than this lie on disk.
@@ -39,8 +40,12 @@ def scratch(folder: Path) -> Iterator[None]:
         yield
     finally:
         _place.remove(folder)
-        for path in folder.glob(f"{PARTIAL}{os.getpid()}-*.maps"):
+        for path in folder.glob(f"{PARTIAL}{_writer()}-*.maps"):
             path.unlink(missing_ok=True)
+
+
+def _writer() -> str:
+    return files.writer or str(os.getpid())
 
 
 def ranges(npix: int, size: int = PIECE) -> Iterator[slice]:
@@ -85,7 +90,7 @@ class Stored(Stack):
         super().__init__(shape, dtype)
         check_guards()
         place = _place[-1] if _place else Path(tempfile.gettempdir())
-        self.path = (place / f"{PARTIAL}{os.getpid()}-{next(_number)}.maps").absolute()
+        self.path = (place / f"{PARTIAL}{_writer()}-{next(_number)}.maps").absolute()
         length = self.size * self.dtype.itemsize
         try:
             self._open(os.O_RDWR | os.O_CREAT | os.O_EXCL)

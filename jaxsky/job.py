@@ -1,0 +1,214 @@
+"""Processes of a job that do the same: what they tell each other, and which of them does what.
+
+Without `processes`, and within what a process does alone, there is one.
+"""
+
+import os
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jax.experimental.multihost_utils import process_allgather
+from jaxtyping import Array
+
+from jaxsky.io.stacks import Maps, Stored, empty, ranges
+from jaxsky.mesh import spread
+from jaxsky.workers import raised_in
+
+#: Seconds after which a process that does not answer is taken to have ended.
+HEARTBEAT = 10
+#: Variables of steps of SLURM, and of Open MPI up to version 4, which JAX knows, and the number of
+#: their processes.
+LAUNCHED = {
+    "SLURM_STEP_NODELIST": "SLURM_STEP_NUM_TASKS",
+    "OMPI_MCA_orte_hnp_uri": "OMPI_COMM_WORLD_SIZE",
+}
+Item = TypeVar("Item")
+Made = TypeVar("Made")
+_alone = False
+#: Whether an error was raised in all processes, so that one of them may say it.
+told = False
+
+
+@contextmanager
+def processes(
+    address: str | None = None, number: int | None = None, index: int | None = None
+) -> Iterator[None]:
+    """Join the processes of a job, before anything else is done with JAX.
+
+    `jaxsky.mesh.pixel_mesh` then has the devices of all of them.
+
+    Processes that SLURM or Open MPI start find each other. Others are given an address, or find it,
+    their number and their index in the environment variables JAX_COORDINATOR_ADDRESS,
+    JAX_NUM_PROCESSES and JAX_PROCESS_ID. Without any of this there is one process. All have to do
+    the same.
+
+    Parameters
+    ----------
+    address : "host:port" of the first process, where the port is a free one
+    number : number of processes
+    index : which of them this is, from 0
+
+    Raises
+    ------
+    RuntimeError
+        If another process has ended, which exchanges of pixels notice at once, and all others
+        after `HEARTBEAT` seconds: then JAX ends the process with a text of its own.
+    ValueError
+        If only some of address, number and index are known.
+    """
+    address = address or os.environ.get("JAX_COORDINATOR_ADDRESS")
+    number, index = (
+        int(os.environ[word]) if value is None and word in os.environ else value
+        for value, word in ((number, "JAX_NUM_PROCESSES"), (index, "JAX_PROCESS_ID"))
+    )
+    given = {"address": address, "number": number, "index": index}
+    lacking = [name for name, value in given.items() if value is None]
+    if 0 < len(lacking) < len(given):
+        raise ValueError(
+            f"Argument `{lacking[0]}` is missing: give all of address, number and index, or none."
+        )
+    env = os.environ
+    launched = [int(env.get(count, 2)) for word, count in LAUNCHED.items() if word in env]
+    if address or max(launched, default=1) > 1:
+        jax.distributed.initialize(
+            address,
+            number,
+            index,
+            heartbeat_timeout_seconds=HEARTBEAT,
+            shutdown_timeout_seconds=HEARTBEAT,
+        )
+    try:
+        yield
+    except Exception as error:
+        if told:
+            _end()
+        lost = any(word in str(error) for word in ("Gloo", "NCCL", "coordination service"))
+        if jax.process_count() == 1 or not lost:
+            raise
+        raise RuntimeError(
+            f"Another of the {jax.process_count()} processes has ended, and number "
+            f"{jax.process_index()} cannot go on without it; what it said tells why."
+        ) from error
+    except SystemExit:  # of the command line, in all processes alike
+        _end()
+        raise
+    _end()
+
+
+def _end() -> None:
+    if jax.distributed.is_initialized():
+        jax.distributed.shutdown()
+
+
+def number() -> int:
+    """Return the number of processes."""
+    return 1 if _alone else jax.process_count()
+
+
+def index() -> int:
+    """Return which of them this is; the first, 0, writes the results."""
+    return 0 if _alone else jax.process_index()
+
+
+def exchanged(value: Any) -> list[Any]:
+    """Return the values of all processes, in their order; arrays on disk stay there."""
+    if number() == 1:
+        return [value]
+    own = np.frombuffer(pickle.dumps(value, pickle.HIGHEST_PROTOCOL), np.uint8)
+    sizes = process_allgather(np.array(own.size))
+    rows = process_allgather(np.pad(own, (0, int(sizes.max()) - own.size)))
+    values = [pickle.loads(row[:size].tobytes()) for row, size in zip(rows, sizes, strict=True)]
+    values[index()] = value
+    process_allgather(np.array(0))  # before anyone can remove a file that another has not opened
+    return values
+
+
+@contextmanager
+def _alone_for_now() -> Iterator[None]:
+    global _alone
+    before, _alone = _alone, True
+    try:
+        yield
+    finally:
+        _alone = before
+
+
+def by_turns(make: Callable[[Item], Made], items: Sequence[Item]) -> Iterator[Made]:
+    """Yield `make(item)` for each item, in order; each process makes some, and all get them.
+
+    Raises
+    ------
+    Exception
+        In all processes, what `make` has raised in one of them.
+    """
+    count = number()
+    if count == 1:
+        yield from map(make, items)
+        return
+    made, failed = list[Any](), None
+    with _alone_for_now():
+        try:
+            made = [make(item) for item in items[jax.process_index() :: count]]
+        except Exception as error:
+            error.raised_in = raised_in(error)  # type: ignore[attr-defined]
+            failed = error
+    every = exchanged((made, failed))
+    for _, failed in every:
+        if failed is not None:
+            global told
+            told = True
+            raise failed
+    for k in range(len(items)):
+        yield every[k % count][0][k // count]
+
+
+def of_first(make: Callable[[], Made]) -> Made:
+    """Return what `make` returns in the first process, or raise what it raises there."""
+    return next(iter(by_turns(lambda _: make(), [None])))
+
+
+def filled(
+    shape: tuple[int, ...], make: Callable[[int], Any], dtype: Any = float, copies: int = 1
+) -> Maps:
+    """Return an array whose rows are made by turns; on disk, where all see it, if it is large."""
+    found = of_first(lambda: empty(shape, dtype, copies))
+
+    def row(i: int) -> Any:
+        values = np.asarray(make(i))
+        if not isinstance(found, Stored):
+            return values
+        found[i] = values
+        return None
+
+    for i, values in enumerate(by_turns(row, range(shape[0]))):
+        if values is not None:
+            found[i] = values
+    return found
+
+
+def collected(tree: Any, npix: int) -> Any:
+    """Return distributed maps (..., pix) of a tree as arrays that each process can read whole.
+
+    They lie on disk if they are large; other leaves are unchanged.
+    """
+
+    def one(leaf: Array) -> Any:
+        if not spread(leaf):
+            return leaf
+        shape = (*leaf.shape[:-1], npix)
+        found = of_first(lambda: empty(shape, leaf.dtype))
+        if not isinstance(found, Stored):
+            return process_allgather(leaf, tiled=True)[..., :npix]
+        for shard in leaf.addressable_shards:
+            start, stop, _ = shard.index[-1].indices(npix)
+            values = np.asarray(shard.data)
+            for part in ranges(max(0, stop - start)):
+                found[..., start + part.start : start + part.stop] = values[..., part]
+        exchanged(None)
+        return found
+
+    return jax.tree.map(one, tree)

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fits import distributed
+from fits import distributed, regions
 from fits.compress import as_noise
 from fits.posterior import _cell_derivatives, value_and_gradient
 from fits.products import gram
 from fits.profile_likelihood import spectral_likelihood
-from fits.separated_maps import _separated
+from fits.separated_maps import _over_devices
 from jaxsky import Bandpass, Dust, Sky, Synchrotron
 from jaxsky.mesh import distribute
 from jaxsky.sky import _observe, interpolation_nodes
@@ -57,7 +57,7 @@ def programs(nside: int) -> dict[str, jax.stages.Lowered]:
     noise = as_noise(np.ones(len(BANDS)), data.shape, distribute(rng.uniform(1, 2, npix)))
     used = distributed.look(data, noise, 2).used
     name = "dust.beta_dust"
-    labels = distributed.check_labels(name, np.arange(npix) // 5 % 3, used)
+    labels = regions.check_labels(name, np.arange(npix) // 5 % 3, used)
     blocks = distributed.blocks(distributed.intersections({name: labels}, used), used)
     one = np.ones((2, 1))
     laws = Sky({"dust": Dust(one, 1.55, 21.0), "synchrotron": Synchrotron(one)})
@@ -68,15 +68,15 @@ def programs(nside: int) -> dict[str, jax.stages.Lowered]:
         "observe": _observe.lower(sky, bands, interpolation_nodes(sky, bands, 1e-10), False),
         "inner products": jax.jit(gram).lower(data, templates, jnp.abs(data)),
         "used pixels": distributed._look.lower(data, noise, 2),
-        "band covariances": distributed._covariance.lower(data, noise, blocks, layout, 3),
+        "band covariances": jax.jit(
+            partial(distributed.band_covariance, layout=layout, number=3)
+        ).lower(data, noise, blocks),
         "pixels in blocks": jax.jit(partial(distributed.gathered, layout=layout)).lower(
             data, noise, blocks
         ),
         "likelihood with gradient": jax.jit(value_and_gradient).lower(like, theta),
         "second derivatives": _cell_derivatives.lower(like, theta),
-        "maps of components": jax.jit(
-            partial(distributed.separated_pixels, _separated, layouts=(layout,), errors=True)
-        ).lower(None, (matrix,), data, noise),
+        "maps of components": _over_devices.lower(None, (matrix,), data, noise, (layout,), True),
     }
 
 

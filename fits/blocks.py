@@ -26,6 +26,30 @@ ON_DISK = (
 )
 
 
+def block_size(counts: np.ndarray) -> int:
+    """Return the number of pixels in a block, from those in each cell."""
+    return min(BLOCK, int(np.median(counts[counts > 0]))) if counts.any() else 1
+
+
+def arranged(
+    own: np.ndarray, counts: np.ndarray, size: int, number: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixels of each block, -1 in the padding, and the cell of each block.
+
+    `own` is the cell of each pixel, -1 where not used, and `counts` are the pixels of each cell;
+    there are at least `number` blocks.
+    """
+    blocks = -(-counts // size)
+    order = np.argsort(own, kind="stable")[len(own) - counts.sum() :]
+    own = own[order]
+    begin, first = (np.cumsum(n) - n for n in (blocks * size, counts))
+    cell = np.repeat(np.arange(len(counts)), blocks)
+    cell = np.pad(cell, (0, max(0, number - len(cell))))
+    flat = np.full(len(cell) * size, -1, np.int32)
+    flat[(begin - first)[own] + np.arange(own.size)] = order
+    return flat.reshape(-1, size), cell
+
+
 class Blocks:
     """Used pixels in blocks, each of a single cell and padded with zeros of unit weight.
 
@@ -34,20 +58,10 @@ class Blocks:
 
     def __init__(self, data: Maps, noise: Noise, cells: Cells, used: np.ndarray) -> None:
         self._data, self._noise = data, noise
-        pixels = np.flatnonzero(used)
-        own = np.zeros(len(pixels), np.int32) if cells.of_pixel is None else cells.of_pixel[pixels]
-        order = np.argsort(own, kind="stable")
-        pixels, own = pixels[order], own[order]
-        counts = np.bincount(own, minlength=cells.number)
-        size = int(min(BLOCK, np.median(counts)))
-        blocks = -(-counts // size)
-        first = np.concatenate([[0], np.cumsum(blocks * size)[:-1]])
-        place = first[own] + np.arange(len(own)) - (np.cumsum(counts) - counts)[own]
-        flat = np.full(int(blocks.sum()) * size, -1, np.int32)
-        flat[place] = pixels
-        self.where = flat.reshape(-1, size)
-        self.cell = np.repeat(np.arange(cells.number), blocks)
-        self.in_order = bool(np.all(blocks == 1))
+        own = np.where(used, 0, -1).astype(np.int32) if cells.of_pixel is None else cells.of_pixel
+        counts = np.bincount(own[own >= 0], minlength=cells.number)
+        self.where, self.cell = arranged(own, counts, block_size(counts))
+        self.in_order = np.array_equal(self.cell, np.arange(cells.number))
 
     def read(self, layout: Layout, blocks: slice) -> list[np.ndarray | None]:
         """Return the fields of `Pixels` for some blocks, (block, group, row, pix)."""

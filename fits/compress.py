@@ -6,12 +6,11 @@ the same covariance give the same chi^2, exactly and at all parameters: the colu
 of D replace the pixels. Everything else is streamed over pixels, from disk if need be.
 """
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from fits.regions import Cells
 from fits.systems import Pixels, square_root
@@ -26,13 +25,6 @@ PIECE, BLOCK = 1 << 15, 4096
 #: Ratios of sigma between bands that are constant to this accuracy make noise separable: smoothed
 #: maps of the variance of uniform noise ring by 1e-7.
 ROUNDING = 1e-6
-#: A band with less than this share of the weight of every component counts as weightless.
-LEAST_SHARE = 1e-6
-
-
-def chunks(npix: int, size: int = PIECE) -> Iterator[slice]:
-    """Yield slices that cover the pixels."""
-    return ranges(npix, size)
 
 
 @takes_quantities
@@ -50,17 +42,6 @@ def bare(name: str, value: object) -> np.ndarray:
     return array
 
 
-def carrying(
-    weights: Float[np.ndarray, " band"],
-    counts: Float[np.ndarray, " band"],
-    squares: Float[np.ndarray, "band component"],
-) -> tuple[Bool[np.ndarray, " band"], int]:
-    """Return the bands that carry weight, and the number of data in them; see `Noise.heavy`."""
-    share = weights[:, None] * squares
-    heavy = (share >= LEAST_SHARE * share.sum(axis=0)).any(axis=1)
-    return heavy, int(counts[heavy].sum())
-
-
 class Noise(NamedTuple):
     """Gaussian noise, independent between pixels and bands; see `as_noise`.
 
@@ -76,6 +57,11 @@ class Noise(NamedTuple):
     def separable(self) -> bool:
         """True if it is a number per band and Stokes parameter times a map."""
         return self.sigma is not None and self.sigma.shape[-1] == 1
+
+    def at(self, pixels: Any) -> "Noise":
+        """Return the noise of some of the pixels."""
+        each = (x if x is None or x.shape[-1] == 1 else x[..., pixels] for x in self)
+        return Noise(*each)
 
     def pixel_weights(self, pixels: slice | np.ndarray) -> Float[np.ndarray, " pix"] | float:
         """Return 1 / pixel_sigma^2 in some of the pixels."""
@@ -98,20 +84,6 @@ class Noise(NamedTuple):
             return None
         _, determinant, QU = self._elements(pixels)
         return -QU / determinant
-
-    def heavy(
-        self, used: Bool[np.ndarray, " pix"], squares: Float[np.ndarray, "band component"]
-    ) -> tuple[Bool[np.ndarray, " band"], int]:
-        """Return the bands that carry weight, and the number of data in them.
-
-        `squares` are those of the laws.
-        """
-        weights, counts = np.zeros((2, len(squares)))
-        for part in chunks(used.size):
-            own = self.weights(part) * used[part]
-            weights += own.sum(axis=(1, 2))
-            counts += np.count_nonzero(own, axis=(1, 2))
-        return carrying(weights, counts, squares)
 
     def _elements(self, pixels):
         assert self.covariance is not None
@@ -182,7 +154,7 @@ def as_noise(
 
 
 def _check_positive(name: str, sigma: np.ndarray) -> None:
-    parts = chunks(sigma.shape[-1]) if isinstance(sigma, Stack) else [slice(None)]
+    parts = ranges(sigma.shape[-1], PIECE) if isinstance(sigma, Stack) else [slice(None)]
     if bad := int(sigma.size - sum((sigma[..., part] > 0).sum() for part in parts)):
         raise ValueError(f"Argument `{name}` has {bad} of {sigma.size} values that are not > 0.")
 
@@ -190,7 +162,7 @@ def _check_positive(name: str, sigma: np.ndarray) -> None:
 def _separated(sigma: np.ndarray) -> Noise | None:
     """Return separable noise, or None if the noise is not separable."""
     first = np.empty(sigma.shape[-1])
-    for part in chunks(first.size):
+    for part in ranges(first.size, PIECE):
         first[part] = sigma[..., part][0, 0]
     finite = np.isfinite(first)
     if not finite.any():
@@ -199,7 +171,7 @@ def _separated(sigma: np.ndarray) -> Noise | None:
     ratio = sigma[..., at : at + 1] / first[at]
     if not np.isfinite(ratio).all():
         return None
-    for part in chunks(sigma.shape[-1]):
+    for part in ranges(sigma.shape[-1], PIECE):
         expected, own = ratio * first[part], sigma[..., part]
         with np.errstate(invalid="ignore"):
             off = np.abs(own - expected) > ROUNDING * expected
@@ -211,7 +183,7 @@ def _separated(sigma: np.ndarray) -> Noise | None:
 def _covariance(covariance: np.ndarray) -> Noise:
     noise = Noise(None, None, covariance)
     bad, xp = 0, module_of(covariance)
-    for part in [slice(None)] if spread(covariance) else chunks(covariance.shape[-1]):
+    for part in [slice(None)] if spread(covariance) else ranges(covariance.shape[-1], PIECE):
         (QQ, UU), determinant, _ = noise._elements(part)
         block = covariance[..., part]
         asymmetric = xp.isfinite(determinant) & (block[:, 0, 1] != block[:, 1, 0])
@@ -258,35 +230,19 @@ def layouts(stokes: int, joint: bool) -> tuple[Layout, ...]:
     return (polarized,) if stokes == 2 else (Layout(False, (0,)), polarized)
 
 
-def used_pixels(noise: Noise, npix: int, components: int) -> np.ndarray:
-    """Return True for pixels that are not masked."""
-    used = np.zeros(npix, bool)
-    few = 0
-    for part in chunks(npix):
-        if noise.separable:
-            used[part] = noise.pixel_weights(part) > 0
-            continue
-        seen = (noise.weights(part) > 0).sum(axis=0)
-        used[part] = seen.any(axis=0)
-        few += int(np.sum(used[part] & (seen < components).any(axis=0)))
-    if few:
-        raise ValueError(
-            f"{few} pixels are seen in fewer bands than the {components} components; mask them "
-            "in all bands."
-        )
-    if not used.any():
-        raise ValueError("No pixel is left: the mask, or an infinite `noise`, covers the map.")
-    return used
-
-
 def refuse_data(data: np.ndarray, noise: Noise) -> None:
     """Raise the error for data that are not finite in used pixels."""
     bad = 0
-    for part in chunks(data.shape[-1]):
+    for part in ranges(data.shape[-1], PIECE):
         values = data[..., part]
         wrong = ~np.isfinite(values) | (values < UNSEEN)
         bad += int(np.sum(wrong & (noise.weights(part) > 0)))
-    raise ValueError(
+    raise wrong_data(bad)
+
+
+def wrong_data(bad: int) -> ValueError:
+    """Return the error for a number of data that are not finite."""
+    return ValueError(
         f"Argument `data` has {bad} values that are not finite (or UNSEEN) in pixels that are "
         "used; mask them with an infinite `noise`."
     )
@@ -303,7 +259,7 @@ def band_covariance(
     groups = layout.groups
     size = len(data) * len(groups[0])
     total = np.zeros((cells.number, len(groups), size, size))
-    for part in chunks(data.shape[-1]):
+    for part in ranges(data.shape[-1], PIECE):
         root = np.sqrt(noise.pixel_weights(part))
         values = np.asarray(data[..., part], float)
         for g, group in enumerate(groups):
@@ -330,15 +286,17 @@ def band_covariance(
 
 
 def compressed(
-    data: np.ndarray, noise: Noise, cells: Cells, used: np.ndarray, layout: Layout
+    covariance: Float[np.ndarray, "cell group row row"], noise: Noise, layout: Layout
 ) -> Pixels:
-    """Replace the pixels of each cell by as many vectors as there are rows; exact."""
-    covariance = band_covariance(data, noise, cells, used, layout)
+    """Return as many vectors as there are rows in place of the pixels of each cell; exact.
+
+    `covariance` is that of bands, see `band_covariance`.
+    """
     weights = layout.rows(1 / np.asarray(noise.sigma) ** 2)
     if all(np.array_equal(weights[0], w) for w in weights[1:]):
         covariance, weights = covariance.sum(axis=1, keepdims=True), weights[:1]
     root = jnp.swapaxes(square_root(jnp.asarray(covariance)), -1, -2)
-    return Pixels(root, jnp.broadcast_to(weights, (cells.number, *weights.shape)))
+    return Pixels(root, jnp.broadcast_to(weights, (len(covariance), *weights.shape)))
 
 
 def pixel_rows(
@@ -346,12 +304,13 @@ def pixel_rows(
 ) -> tuple[Any, Any, Any | None]:
     """Return the fields of `Pixels` for some pixels; unused ones are zero with unit weight.
 
-    If noise is the same in all pixels and all are used, the weights are those of a single pixel.
+    If noise is the same in all pixels and all are used, for which `used` is None, the weights are
+    those of a single pixel.
     """
     weights, xp = noise.weights(pixels), module_of(data)
-    if weights.shape[-1] > 1 or xp is jnp or not used.all():
-        weights = xp.where(used, weights, 1.0)
-    values = xp.where(used & (weights > 0), as_double(data[..., pixels]), 0.0)
     cross = noise.cross(pixels) if layout.joint else None
-    cross = None if cross is None else xp.where(used, cross, 0.0)[None]
-    return layout.rows(values), layout.rows(weights), cross
+    values = xp.where(weights > 0, as_double(data[..., pixels]), 0.0)
+    if used is not None:
+        values, weights = xp.where(used, values, 0.0), xp.where(used, weights, 1.0)
+        cross = None if cross is None else xp.where(used, cross, 0.0)
+    return layout.rows(values), layout.rows(weights), None if cross is None else cross[None]

@@ -16,7 +16,6 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
-from fits.compress import chunks
 from jaxsky.checks import Numeric
 from jaxsky.cmb import realisation
 from jaxsky.harmonics import (
@@ -28,7 +27,7 @@ from jaxsky.harmonics import (
     map_variance,
     synthesis,
 )
-from jaxsky.io.stacks import Maps, empty, is_large
+from jaxsky.io.stacks import Maps, empty, is_large, ranges
 from jaxsky.job import filled
 from jaxsky.noise import draw, pixel_covariance, stream, uniform_covariance, white_alm
 
@@ -69,7 +68,7 @@ class MapNoise(NamedTuple):
             before = empty((count, 2, npix), covariance.dtype)
             for own, row in zip(range(count), rows, strict=True):
                 before[own] = np.asarray(self.preparation.transpose(row).block_until_ready())
-            for cut in chunks(npix, CHUNK):
+            for cut in ranges(npix, CHUNK):
                 maps = before[..., cut].astype(float)
                 pixels = np.ascontiguousarray(covariance[..., cut], float)
                 seen = np.einsum("stp,jtp->jsp", pixels, maps)

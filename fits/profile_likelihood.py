@@ -23,7 +23,15 @@ from jaxtyping import Array, Float, Int
 
 from fits import distributed, regions, systems
 from fits.blocks import ON_DISK, Blocks, gathered
-from fits.compress import Layout, Noise, as_noise, bare, compressed, layouts, used_pixels
+from fits.compress import (
+    Layout,
+    Noise,
+    as_noise,
+    band_covariance,
+    bare,
+    compressed,
+    layouts,
+)
 from fits.mixing import Mixing, named_bands, spectral_names, unit_sky
 from fits.posterior import Likelihood
 from fits.regions import Cells, check_labels
@@ -281,21 +289,12 @@ def spectral_likelihood(
         )
     mixing = Mixing.of(unit_sky(sky), bands, unit)
     noise = as_noise(noise, data.shape)
-    looked: distributed.Looked | None = None
-    used: Any
-    maps: dict[str, Any]
-    if spread(data):
-        noise = distributed.noise_like(data, noise)
-        looked = distributed.look(data, noise, components)
-        used = looked.used
-        maps = {n: distributed.check_labels(n, v, used) for n, v in (labels or {}).items()}
-    else:
-        used = used_pixels(noise, data.shape[-1], components)
-        maps = {n: check_labels(n, v, used.size, used) for n, v in (labels or {}).items()}
-    values = _start_values(mixing, start, maps)
-
-    varying = dict(maps)
-    if looked is not None and fixed:
+    noise = distributed.noise_like(data, noise)
+    looked, apart = distributed.look(data, noise, components), spread(data)
+    used: Any = looked.used
+    varying = {n: check_labels(n, v, used) for n, v in (labels or {}).items()}
+    values = _start_values(mixing, start, varying)
+    if apart and fixed:
         raise ValueError(
             f"Parameter {next(iter(fixed))!r} is a map, which distributed pixels do not take; give "
             "a number, or free it with `labels`."
@@ -307,7 +306,7 @@ def spectral_likelihood(
                 f"{used.size}."
             )
         varying[name] = np.unique(value, return_inverse=True)[1]
-    cells = (distributed if looked else regions).intersections(varying, used)
+    cells = (distributed if apart else regions).intersections(varying, used)
     # A pixel of each cell, of which parameters that are maps are taken.
     first = np.flatnonzero(used)[:1] if fixed else np.zeros(0, int)
     if cells.of_pixel is not None and fixed:
@@ -329,28 +328,29 @@ def spectral_likelihood(
     )
     matrix = _check_matrices(like)[:, : len(data), :components]
     squares = np.mean(matrix**2, axis=0)
-    heavy, number = noise.heavy(used, squares) if looked is None else looked.heavy(squares)
-    pixels_used = int(used.sum()) if looked is None else looked.number
+    heavy, number = looked.heavy(squares)
     rows = [len(data) * len(layout.groups[0]) for layout in like.layout]
-    fewer = cells.number * max(rows) < pixels_used
+    fewer = cells.number * max(rows) < looked.number
     if compress and not noise.separable:
         raise ValueError("Only noise that is separable into bands and pixels can be compressed.")
     block_cell = source = None
     parts = []
     few = noise.separable and (fewer if compress is None else compress)
     blocks = None
-    if looked is not None:
+    if apart:
         # A sum over all pixels needs no order.
         ordered = cells.of_pixel is not None or not few
         blocks = distributed.blocks(cells, used) if ordered else distributed.pieces(used)
     for layout in like.layout:
-        if blocks is not None and few:
-            parts.append(distributed.compressed(data, noise, cells, blocks, layout))
+        if few and blocks is not None:
+            summed = distributed.band_covariance(data, noise, blocks, layout, cells.number)
+            parts.append(compressed(np.asarray(summed), noise, layout))
+        elif few:
+            summed = band_covariance(data, noise, cells, used, layout)
+            parts.append(compressed(summed, noise, layout))
         elif blocks is not None:
             parts.append(distributed.gathered(data, noise, blocks, layout))
             block_cell = blocks.cell
-        elif few:
-            parts.append(compressed(data, noise, cells, used, layout))
         elif isinstance(data, Stack):
             source = Blocks(data, noise, cells, used)
         else:
@@ -361,7 +361,7 @@ def spectral_likelihood(
         pixels=tuple(parts),
         block_cell=block_cell,
         source=source,
-        values=number - components * data.shape[1] * pixels_used,
+        values=number - components * data.shape[1] * looked.number,
         weightless=tuple(name for name, some in zip(bands, heavy, strict=True) if not some),
     )
 

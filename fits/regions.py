@@ -7,9 +7,10 @@ import itertools
 import operator
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import healpy
+import jax
 import numpy as np
 import scipy.cluster.vq
 from jaxtyping import Bool, Float, Int
@@ -17,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from jaxsky.checks import Numeric, check_nside, check_seed
 from jaxsky.inputs import one_column, read
 from jaxsky.io import degrade_mask, read_mask
+from jaxsky.mesh import along, module_of
 from jaxsky.settings import (
     Experiment,
     MapFile,
@@ -234,18 +236,18 @@ def _regions(
     return clusters(np.where(used, maps, np.nan), regions.clusters, seed=settings.seed)
 
 
-def check_labels(name: str, labels: object, npix: int, used: np.ndarray) -> np.ndarray:
-    """Return labels as integers of shape (pix,), 0 where a pixel is not used."""
-    array = np.asarray(labels)
+def check_labels(name: str, labels: object, used: Any) -> Any:
+    """Return labels as integers of shape (pix,), 0 where a pixel is not used, in its place."""
+    array: Any = along(used, labels if isinstance(labels, jax.Array) else np.asarray(labels))
     if array.dtype.kind not in "iu":
         raise TypeError(f"Labels of {name!r} must be integers, but are {array.dtype}.")
-    if array.shape != (npix,):
+    if array.shape != used.shape:
         raise ValueError(
-            f"Labels of {name!r} must have shape ({npix},) like a map, but have {array.shape}."
+            f"Labels of {name!r} must have shape {used.shape} like a map, but have {array.shape}."
         )
-    if bad := int(np.sum(array[used] < 0)):
+    if bad := int(((array < 0) & used).sum()):
         raise ValueError(f"Labels of {name!r} are negative in {bad} pixels that are used.")
-    return np.where(used, array, 0)
+    return module_of(used).where(used, array, 0)
 
 
 class Cells(NamedTuple):

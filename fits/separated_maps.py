@@ -1,8 +1,8 @@
 """Maps of components for given spectral parameters, with their errors and chi^2."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import healpy
 import jax
@@ -12,8 +12,8 @@ import scipy.special
 from jaxtyping import Array, ArrayLike, Float
 
 from fits import systems
-from fits.compress import Noise, as_noise, bare, chunks, pixel_rows, used_pixels
-from fits.distributed import noise_like, separated_pixels
+from fits.compress import PIECE, Noise, as_noise, bare, pixel_rows
+from fits.distributed import ALL, look, noise_like
 from fits.mixing import spectral_names
 from fits.multipoles import check_alm, multipoles_of
 from fits.optimize import best_fit
@@ -25,7 +25,7 @@ from jaxsky.checks import Numeric, as_array, check_finite, check_names, check_sh
 from jaxsky.components import component_class
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
 from jaxsky.io.stacks import Maps, computed, empty, ranges
-from jaxsky.mesh import along, in_place, module_of, spread
+from jaxsky.mesh import along, at_once, in_place, maps_of, module_of, over_pixels, spread
 from jaxsky.observation import Instrument
 
 
@@ -80,8 +80,7 @@ class ComponentMaps(NamedTuple):
         return float(total[0] / total[1])
 
 
-@partial(jax.jit, static_argnames="errors")
-def _separated(matrix, pixels, errors):
+def _solved(matrix, pixels, errors):
     """Return amplitudes and chi^2, with one matrix for all pixels or one per pixel.
 
     With `errors` also the covariance of the amplitudes, and the variance of each alone.
@@ -103,17 +102,64 @@ def _separated(matrix, pixels, errors):
     return jax.tree.map(lambda x: jnp.moveaxis(x[..., 0], 0, -1), results)
 
 
-def _own(like: SpectralLikelihood, matrix: Array, part: Any) -> Array:
-    """Return the matrix (1, row, unknown) of all cells, or that of each pixel."""
-    return matrix if like.of_pixel is None else matrix[jnp.maximum(like.of_pixel[part], 0)]
+def _own(of_pixel: Array | None, matrix: Array) -> Array:
+    """Return the matrix (1, row, unknown) of all pixels, or that of each, from those of cells."""
+    return matrix if of_pixel is None else matrix[jnp.maximum(of_pixel, 0)]
 
 
-def _passes(like: SpectralLikelihood, params: Mapping[str, Numeric], npix: int) -> Iterator:
-    """Yield (layout, slice of pixels, matrix (1, row, unknown) of all or of each) for all maps."""
-    known = matrices_at(like, like.check(params) if like.start else {})
-    for layout, matrix in zip(like.layout, known, strict=True):
-        for part in chunks(npix):
-            yield layout, part, _own(like, matrix, part)
+@partial(jax.jit, static_argnames=("layouts", "errors"))
+def _separated(of_pixel, known, data, noise, used, layouts, errors):
+    """Return the fields of `ComponentMaps` from `amplitude` to `dof` in some pixels.
+
+    `known` are the matrices of all cells, for each of `layouts`; `used` is None for all pixels.
+    """
+    stokes, npix = data.shape[1:]
+    size = known[0].shape[-1] // (1 + layouts[0].joint)
+    amplitude, alone = jnp.zeros((2, size, stokes, npix))
+    blocks, square = jnp.zeros((size, *alone.shape)), jnp.zeros(npix)
+    for layout, matrix in zip(layouts, known, strict=True):
+        pixels = Pixels(*pixel_rows(data, noise, layout, ALL, used))
+        solved, squares, *variances = _solved(_own(of_pixel, matrix), pixels, errors)
+        amplitude = amplitude.at[:, np.array(layout.stokes)].set(layout.maps(solved))
+        square = square + squares
+        for k, s in enumerate(layout.stokes if errors else ()):
+            group, first = (0, k * size) if layout.joint else (k, 0)
+            cut = slice(first, first + size)
+            blocks = blocks.at[:, :, s].set(variances[0][group, cut, cut])
+            alone = alone.at[:, s].set(variances[1][group, cut])
+    seen = jnp.broadcast_to(noise.weights(ALL) > 0, data.shape)
+    count = seen.sum(axis=(0, 1)) - 1.0 * size * stokes
+    found = amplitude, *((blocks, alone) if errors else (None, None)), square, count
+    return found if used is None else jax.tree.map(lambda x: jnp.where(used, x, jnp.nan), found)
+
+
+@partial(jax.jit, static_argnames=("layouts", "errors"))
+def _over_devices(of_pixel, known, data, noise, layouts, errors):
+    """Return the fields of `ComponentMaps` but the first, for distributed pixels."""
+
+    @over_pixels((maps_of(3), maps_of(4), maps_of(3), maps_of(1), maps_of(1), maps_of(1)))
+    def on_device(of_pixel, known, data, noise):
+        npix = data.shape[-1]
+        size = min(at_once(PIECE), npix)
+
+        def some(start):
+            own = jnp.minimum(start + np.arange(size), npix - 1)
+            used = (noise.weights(own) > 0).any(axis=(0, 1))
+            cells = None if of_pixel is None else of_pixel[own]
+            maps, kept = data[..., own], noise.at(own)
+            *found, square, count = _separated(cells, known, maps, kept, used, layouts, errors)
+            exceeding = jax.scipy.special.gammaincc(jnp.maximum(count, 1) / 2, square / 2)
+            probability = jnp.where(count > 0, exceeding, 0.0 * count)  # NaN where not used
+            return *found, square, count, probability
+
+        parts = jax.lax.map(some, jnp.arange(0, npix, size))
+
+        def joined(x):
+            return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :npix]
+
+        return jax.tree.map(joined, parts)
+
+    return on_device(of_pixel, known, data, noise)
 
 
 def component_maps(
@@ -142,47 +188,38 @@ def component_maps(
     data, wanted = bare("data", data), (len(like.mixing.names), len(like.stokes))
     good = data.ndim == 3 and data.shape[:2] == wanted
     check_shape("data", data, good, f"have shape (band, stokes, pix) = {(*wanted, 'pix')}")
-    names, (_, stokes, npix) = tuple(like.mixing.sky), data.shape
-    noise = as_noise(noise, data.shape)
-    if spread(data):
-        known = matrices_at(like, like.check(params) if like.start else {})
-        args = along(data, like.of_pixel), known, data, noise_like(data, noise)
-        uniform = noise.separable and noise.pixel_sigma is None and like.of_pixel is None
-        errors = covariance and not uniform
-        found = ComponentMaps(names, *separated_pixels(_separated, *args, like.layout, errors))
-        if not (covariance and uniform):
-            return found
-        one = component_maps(like, params, np.zeros((*data.shape[:2], 1)), noise)
-        return found._replace(covariance=one.covariance, alone=one.alone)
-    used = used_pixels(noise, npix, len(names))
-    amplitude = empty((len(names), stokes, npix))
-    square, count, probability = (empty((npix,), copies=3) for _ in range(3))
+    names, (bands, stokes, npix) = tuple(like.mixing.sky), data.shape
+    noise, known = noise_like(data, as_noise(noise, data.shape)), _matrices(like, params)
     uniform = noise.separable and noise.pixel_sigma is None and like.of_pixel is None
-    shape = (len(names), stokes, 1 if uniform or not covariance else npix)
-    blocks, alone = empty((len(names), *shape)), empty(shape)
-    for layout, part, matrix in _passes(like, params, npix):
-        own = list(layout.stokes)
-        errors = covariance and not (uniform and part.start)
-        rows = jax.tree.map(jnp.asarray, pixel_rows(data, noise, layout, part, used[part]))
-        solved, squares, *variances = map(np.asarray, _separated(matrix, Pixels(*rows), errors))
-        masked, first = ~used[part], layout is like.layout[0]
-        amplitude[:, own, part] = np.where(masked, np.nan, layout.maps(solved))
-        number = (noise.weights(part) > 0)[:, own].sum(axis=(0, 1)) - len(names) * len(own)
-        square[part] = np.where(masked, np.nan, squares + (0 if first else square[part]))
-        count[part] = np.where(masked, np.nan, number + (0 if first else count[part]))
-        if not errors:
-            continue
-        where, hidden = (slice(0, 1), False) if uniform else (part, masked)
-        inverse, single = (np.where(hidden, np.nan, x) for x in variances)
-        for k, s in enumerate(own):
-            group, begin = (0, k * len(names)) if layout.joint else (k, 0)
-            cut = slice(begin, begin + len(names))
-            blocks[:, :, s, where] = inverse[group, cut, cut]
-            alone[:, s, where] = single[group, cut]
-    for part in chunks(npix):
-        probability[part] = scipy.special.chdtrc(count[part], square[part])
-    found = ComponentMaps(names, amplitude, blocks, alone, square, count, probability)
-    return found if covariance else found._replace(covariance=None, alone=None)
+    each, cells = covariance and not uniform, like.of_pixel
+    if spread(data):
+        cells = along(data, cells)
+        found = ComponentMaps(names, *_over_devices(cells, known, data, noise, like.layout, each))
+    else:
+        looked, size = look(data, noise, len(names)), len(names)
+        whole = looked.number == npix
+        rows = [(size,), *([(size, size), (size,)] if each else [])]
+        maps = [empty((*own, stokes, npix)) for own in rows]
+        maps += [empty((npix,), copies=3) for _ in range(3)]
+        for part in ranges(npix, PIECE):
+            own = None if cells is None else np.asarray(cells)[part]
+            given = data[..., part], noise.at(part), None if whole else looked.used[part]
+            *pieces, square, count = _separated(own, known, *given, like.layout, each)
+            pieces = [piece for piece in pieces if piece is not None]
+            pieces += [square, count, scipy.special.chdtrc(count, square)]
+            for values, piece in zip(maps, pieces, strict=True):
+                values[..., part] = piece
+        found = ComponentMaps(names, maps[0], *(maps[1:3] if each else (None, None)), *maps[-3:])
+    if not (covariance and uniform):
+        return found
+    one = np.zeros((bands, stokes, 1)), Noise(np.asarray(noise.sigma)), None
+    _, blocks, alone, *_ = map(np.asarray, _separated(None, known, *one, like.layout, True))
+    return found._replace(covariance=blocks, alone=alone)
+
+
+def _matrices(like: SpectralLikelihood, params: Mapping[str, Numeric]) -> tuple[Array, ...]:
+    """Return the mixing matrices of all cells, for each of `like.layout`."""
+    return matrices_at(like, like.check(params) if like.start else {})
 
 
 def emission_maps(
@@ -192,13 +229,14 @@ def emission_maps(
 ) -> Maps:
     """Return the emission in the bands, in the unit of the data, from maps or coefficients."""
     shape = (len(like.mixing.names), *amplitude.shape[1:])
-    known = matrices_at(like, like.check(params) if like.start else {})
+    known, of_pixel = _matrices(like, params), like.of_pixel
 
     def emission(part):
         maps = amplitude[..., part]
         result = np.empty((*shape[:2], maps.shape[-1]))
         for layout, matrix in zip(like.layout, known, strict=True):
-            rows, own = layout.rows(maps), np.asarray(_own(like, matrix, part))
+            rows = layout.rows(maps)
+            own = np.asarray(_own(None if of_pixel is None else of_pixel[part], matrix))
             one, sums = len(own) == 1, "ru,kup->krp"
             model = np.einsum(*(sums, own[0]) if one else ("p" + sums, own), rows, optimize=one)
             result[:, list(layout.stokes)] = layout.maps(model)

@@ -13,7 +13,6 @@ NSIDE, LMAX = 32, 64
 ROWS = pytest.mark.parametrize(
     "rows", [slice(0, 1), slice(1, 3), slice(0, 3)], ids=["I", "QU", "IQU"]
 )
-TURNS = pytest.mark.parametrize(("source", "target"), ["GE", "EC", "CG", "GC"])
 
 
 def drawn(lmax, stokes=3, seed=4):
@@ -74,28 +73,6 @@ def test_analysis_inverts_the_synthesis(lmax, stokes):
     assert rms(back - alm) < 1e-6 * rms(alm)
 
 
-@TURNS
-def test_rotation_against_healpy(source, target):
-    alm = drawn(LMAX)
-    turned = h.rotate(alm, source, target)
-    rotator = healpy.Rotator(coord=[source, target])
-    expected = [rotator.rotate_alm(row, lmax=LMAX) for row in h.alm_to_healpy(alm, LMAX)]
-    expected = h.alm_from_healpy(np.stack(expected), LMAX)
-    np.testing.assert_allclose(turned, expected, atol=1e-10 * float(alm.std()))
-    np.testing.assert_allclose(h.rotate(turned, target, source), alm, atol=1e-10)
-
-
-def test_the_galactic_pole_has_its_equatorial_coordinates():
-    # A dipole towards the pole, cos theta in Galactic coordinates; the pole is at right ascension
-    # 192.8595 and declination 27.1283 degrees (J2000).
-    alm = jnp.zeros((1, 9)).at[0, 1].set(np.sqrt(4 * np.pi / 3))
-    dipole = h.synthesis(h.rotate(alm, "G", "C"), 16)[0]
-    x, y, z = healpy.pix2vec(16, np.arange(healpy.nside2npix(16)))
-    pole = healpy.ang2vec(192.8595, 27.1283, lonlat=True)
-    # healpy's angles are good to about 1e-4 degrees.
-    np.testing.assert_allclose(dipole, pole @ [x, y, z], atol=1e-5)
-
-
 def test_packing_is_inverse_and_keeps_the_norm(alm):
     packed = h.alm_from_healpy(alm, LMAX)
     np.testing.assert_allclose(h.alm_to_healpy(packed, LMAX), alm, atol=1e-15)
@@ -142,7 +119,6 @@ def test_transposes(rows):
     assert_transpose(lambda a: h.synthesis(a, NSIDE), alm)
     assert_transpose(lambda m: h.adjoint_synthesis(m, LMAX), maps)
     assert_transpose(lambda m: h.analysis(m, LMAX), maps)
-    assert_transpose(lambda a: h.rotate(a, "G", "C"), alm)
     assert_transpose(lambda m: h.resample(m, h.gaussian_beam(300.0, 40), 16), maps)
     np.testing.assert_allclose(
         h.adjoint_synthesis(maps, LMAX),
@@ -157,8 +133,6 @@ def test_vmap_is_a_loop():
     np.testing.assert_allclose(maps, jnp.stack([h.synthesis(a, 8) for a in alms]), atol=1e-12)
     back = jax.vmap(lambda m: h.analysis(m, 16))(maps)
     np.testing.assert_allclose(back, jnp.stack([h.analysis(m, 16) for m in maps]), atol=1e-12)
-    turned = jax.vmap(lambda a: h.rotate(a, "G", "E"))(alms)
-    np.testing.assert_allclose(turned, jnp.stack([h.rotate(a, "G", "E") for a in alms]), atol=1e-12)
 
 
 def test_gradients_of_transforms():
@@ -166,7 +140,6 @@ def test_gradients_of_transforms():
     for function, x in (
         (lambda a: h.synthesis(a, 8), alm),
         (lambda m: h.analysis(m, 16), h.synthesis(alm, 8)),
-        (lambda a: h.rotate(a, "G", "E"), alm),
         (lambda a: h.power_spectrum(h.resize(a, 20)), alm),
     ):
         check_grads(jax.jit(function), (x,), order=1)
@@ -324,8 +297,6 @@ ONES, FEW = jnp.ones((3, 48)), drawn(4)
          "beam table of the dust ends at l = 50, not at 51"),
         (lambda: h.beam_ratio(BEAM[:51], 30.0, 51, what="the dust"),
          "beam table of the target ends at l = 50, not at 51"),
-        (lambda: h.rotate(FEW, "Q", "C"), "`source` must be one of G, E, C, not 'Q'"),
-        (lambda: h.rotate(FEW, "G", "g"), "`target` must be one of G, E, C, not 'g'"),
     ],
 )  # fmt: skip
 def test_refusals(call, words):
@@ -342,7 +313,5 @@ def test_refuses_single_precision_of_the_program():
         # Of sizes that no other test uses: the check is made once for each.
         with pytest.raises(RuntimeError, match="spherical harmonic transform needs double"):
             h.synthesis(jnp.asarray(alm), 1)
-        with pytest.raises(RuntimeError, match="A rotation needs double precision"):
-            h.rotate(jnp.asarray(alm), "G", "C")
     finally:
         jax.config.update("jax_enable_x64", True)

@@ -1,4 +1,4 @@
-"""Spherical harmonics of HEALPix maps: synthesis, analysis, rotation, smoothing, resolution.
+"""Spherical harmonics of HEALPix maps: synthesis, analysis, smoothing, resolution.
 
 The transforms are those of ducc0, called through jaxbind, so they can be jitted and differentiated
 and have exact transposes; healpy supplies the bookkeeping (ring weights, sizes). Coefficients are
@@ -31,6 +31,5 @@ from jaxsky.harmonics.transforms import (
     map_variance,
     power_spectrum,
     resize,
-    rotate,
     synthesis,
 )

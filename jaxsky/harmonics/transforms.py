@@ -1,4 +1,4 @@
-"""Spherical harmonic synthesis, analysis and rotation by ducc0, inside jit and with gradients.
+"""Spherical harmonic synthesis and analysis by ducc0, inside jit and with gradients.
 
 Coefficients are packed as real numbers: for each m the a_lm of l = m ... lmax, and for m > 0 their
 real and imaginary parts times sqrt(2), so that the sum of squares of the packed numbers is the sum
@@ -18,18 +18,17 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import ducc0
 import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
 from astropy.io import fits as pyfits
 from jax.interpreters import mlir
-from jaxbind import get_linear_call, jaxbind, load_kwargs
+from jaxbind import jaxbind
 from jaxbind.contrib.jaxducc0 import get_healpix_sht
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from jaxsky.checks import check_choice, check_double
+from jaxsky.checks import check_double
 
 
 def alm_ell(lmax: int) -> np.ndarray:
@@ -104,10 +103,6 @@ def alm_to_healpy(alm: ArrayLike, lmax: int) -> np.ndarray:
     alm = np.asarray(alm, dtype=float)
     pairs = alm[..., lmax + 1 :] / np.sqrt(2)
     return np.concatenate([alm[..., : lmax + 1], pairs[..., ::2] + 1j * pairs[..., 1::2]], axis=-1)
-
-
-#: Coordinates between which coefficients are rotated.
-COORDINATES = ("G", "E", "C")
 
 
 def _lower(ctx: Any, *operands: Any, **parameters: Any) -> Any:
@@ -230,36 +225,6 @@ def analysis(
         residual = maps - synthesis(alm, nside, spin=spin)
         alm = alm + adjoint_synthesis(weights * residual, lmax, spin)
     return alm
-
-
-def _turn(out, args, kwargs_dump, inverse=False):
-    lmax, angles = (load_kwargs(kwargs_dump)[key] for key in ("lmax", "angles"))
-    if inverse:
-        angles = [-angle for angle in reversed(angles)]
-    alm = ducc0.sht.rotate_alm(alm_to_healpy(args[0], lmax), lmax, *angles, nthreads=0)
-    out[0][:] = alm_from_healpy(alm, lmax)
-
-
-def _same(alm, **_):
-    return ((alm.shape, alm.dtype),)
-
-
-# A rotation keeps the norm, so its transpose is its inverse.
-_rotation = get_linear_call(_turn, partial(_turn, inverse=True), _same, _same)
-
-
-@partial(jax.jit, static_argnames=("source", "target"))
-def rotate(alm: Float[Array, "stokes alm"], source: str, target: str) -> Float[Array, "stokes alm"]:
-    """Rotate packed coefficients to other coordinates; E and B rotate like scalars.
-
-    Coordinates are "G" Galactic, "E" ecliptic or "C" celestial (equatorial), both J2000.
-    """
-    for name, value in {"source": source, "target": target}.items():
-        check_choice(name, value, COORDINATES)
-    check_double("A rotation")
-    _finish_at_exit()
-    angles = tuple(map(float, healpy.rotator.coordsys2euler_zyz((source, target))))
-    return _rotation(alm, lmax=lmax_of(alm), angles=angles)[0]
 
 
 # Ending a Python process in which transforms may still run.

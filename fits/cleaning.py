@@ -50,8 +50,6 @@ from jaxsky.noise import stream
 from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 
-#: Fewest walkers of emcee.
-WALKERS = 32
 #: Most parameters whose posterior is sampled.
 SAMPLED = 500
 #: Held while a simulation of large maps is made.
@@ -361,18 +359,15 @@ def _errors(data, like, fit, simulated):
 def _chain(settings, data, like, fit, simulated, out, progress):
     """Sample the posterior, with the errors of the simulations if it is not exact."""
     spec = settings.separate
-    size = int(np.isfinite(np.asarray(like.flat(fit.best_fit))).sum())
-    nwalkers = max(WALKERS, 2 * size + 2)
     backend = None
     if spec.sampler == "emcee" and out is not None:
-        backend = KeptChain(out / "chain.npz", f"{_mark(settings, data)} {nwalkers} {size}")
+        backend = KeptChain(out / "chain.npz", f"{_mark(settings, data)} {len(fit.labels)}")
     samples = sample(
         like,
         fit.best_fit,
         priors=priors_of(settings, "separate"),
         sampler=spec.sampler,
         nsteps=spec.nsteps,
-        nwalkers=nwalkers if spec.sampler == "emcee" else None,
         seed=settings.seed,
         backend=backend,
         progress=progress.advance,

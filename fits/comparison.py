@@ -171,16 +171,11 @@ def check_comparison(
         return
     others = tuple(f"band {band!r}" for band in prepared.bands if band != how.patches)
     sources = {what: n for what, n in prepared.sources.items() if not what.endswith(others)}
-    coarsest = min(sources, key=sources.__getitem__)
-    if how.patches_nside > sources[coarsest]:
+    coarsest, nside = min(sources.items(), key=lambda pair: pair[1])
+    if 2 * nside < EDGES[-1] - 1:
         raise SettingsError(
-            f"compare.patches_nside: {how.patches_nside} is finer than that of {coarsest}, "
-            f"{sources[coarsest]}."
-        )
-    if 2 * how.patches_nside < EDGES[-1] - 1:
-        raise SettingsError(
-            f"compare.patches_nside: {how.patches_nside} resolves l = {2 * how.patches_nside}, "
-            f"and the patches take {EDGES[-1] - 1}."
+            f"compare.patches: nside {nside} of {coarsest} resolves l = {2 * nside}, and the "
+            f"patches take {EDGES[-1] - 1}."
         )
 
 

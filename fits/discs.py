@@ -20,6 +20,8 @@ from jaxsky.settings import Experiment
 
 #: Radius of the paper's discs: 400 square degrees.
 RADIUS = 11.3
+#: Largest nside of its maps.
+FINEST = 256
 #: FWHM of the Gaussian with which masks are smoothed [deg].
 APODIZATION = 2.0
 #: The field of BICEP2 and Keck: right ascension within +-50 deg, declination -65 to -50 deg.
@@ -173,10 +175,15 @@ def _patch_noise(
 
 
 def compare_patches(settings: Experiment, inputs: Inputs) -> PatchComparison:
-    """Compare the paper's 48 discs and the field of BICEP2, in the band of the settings."""
-    name, nside = str(settings.compare.patches), settings.compare.patches_nside
-    fwhm = settings.common.fwhm
+    """Compare the paper's 48 discs and the field of BICEP2, in the band of the settings.
+
+    They have the nside of the coarsest map, up to 256.
+    """
+    name, fwhm = str(settings.compare.patches), settings.common.fwhm
     band = inputs.bands[name]
+    pixels = [one.used.size for one in inputs.templates.values()]
+    pixels += [one.used.size for one in (band, band.leakage) if one is not None]
+    nside = healpy.npix2nside(min(12 * FINEST**2, *pixels))
     prepared = common_maps(inputs._replace(bands={name: band}), nside, fwhm)
     window = beam_ratio(fwhm or band.beam, 0.0, 2 * nside)
     if not fwhm:  # averages of pixels, with the beam of the map

@@ -29,6 +29,8 @@ from jaxsky.checks import Numeric, check_seed
 
 #: A chain of emcee shorter than this many autocorrelation times is reported as too short.
 ENOUGH = 50
+#: Walkers of an ensemble, or more for many parameters.
+WALKERS = 32
 #: Mean acceptance that the step size of the no-U-turn sampler is tuned to.
 ACCEPTANCE = 0.9
 #: Width of the start positions of its chains, in standard deviations.
@@ -66,11 +68,12 @@ def _ensemble(
     seed: int,
     report: Callable[[int, int], None],
     nsteps: int = 5000,
-    nwalkers: int = 32,
+    nwalkers: int | None = None,
     backend: KeptChain | None = None,
 ) -> dict[str, Any]:
     """Run emcee's ensemble; steps that a file already contains are not made again."""
     size = len(labels)
+    nwalkers = max(WALKERS, 2 * size + 2) if nwalkers is None else nwalkers
     if nwalkers < 2 * size or nsteps < 1:
         raise ValueError(
             f"MCMC needs at least {2 * size} walkers and a step for {size} parameters, "
@@ -292,7 +295,7 @@ def sample(
     nwarmup : "nuts": steps before that (300): half of them to measure the covariance of the
         parameters, if these are few, and all to tune the step size
     nchains : "nuts": number of chains (4)
-    nwalkers : "emcee": size of the ensemble (32)
+    nwalkers : "emcee": size of the ensemble (32, or more for more than 15 parameters)
     seed : seed of the start positions and the moves
     backend : "emcee": file of the chain; one that already has steps is resumed up to `nsteps`,
         with exactly the steps that an uninterrupted run would have made

@@ -119,11 +119,6 @@ def _fit_pixels(
         for name, value in settings.start("fit").items()
         if not name.startswith("offset.") or name[-1] in stokes
     }
-    if "mcmc" in settings.fit.methods and settings.fit.nwalkers < 2 * len(start):
-        raise SettingsError(
-            f"fit.nwalkers: {settings.fit.nwalkers} are too few for {len(start)} free parameters; "
-            "chains take twice as many, at least."
-        )
     priors = {name: prior for name, prior in priors_of(settings, "fit").items() if name in start}
     progress.step(f"{region}, {stokes}: inner products")
     with at_key("free"):
@@ -151,14 +146,12 @@ def _fit_pixels(
         else:
             chain = None
             if out is not None:
-                size = settings.fit.nwalkers, len(start)
-                mark = f"{fingerprint(like)} {settings.free} {settings.seed} {size}"
+                mark = f"{fingerprint(like)} {settings.free} {settings.seed}"
                 chain = KeptChain(out / f"chain_{region}_{stokes}.npz", mark)
             results[method] = sample(
                 like,
                 start,
                 priors=priors,
-                nwalkers=settings.fit.nwalkers,
                 nsteps=settings.fit.nsteps,
                 seed=settings.seed,
                 backend=chain,

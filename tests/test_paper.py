@@ -356,7 +356,7 @@ def small_maps() -> Experiment:
         'bands.0.channels=["44", "70", "353"]',
         'bands.1.channels=["K"]',
         "common={ nside = 32, fwhm = 120.0 }",
-        "compare={ nsims = 30, lmax = 60, patches_nside = 64 }",
+        "compare={ nsims = 30, lmax = 60 }",
     ]
     return load(DEFAULTS / "paper.toml", values)
 

@@ -23,7 +23,7 @@ FILES = {
 }
 TABLES = ["simulate", "fit", "compare", "separate", "forecast", "paper", "common", "cmb"]
 KEYS = {
-    "nside": ["common.nside", "simulate.nside", "sky.embedded.nside", "compare.panel_nside"],
+    "nside": ["common.nside", "simulate.nside", "sky.embedded.nside"],
     "fwhm": ["common.fwhm", "simulate.fwhm", "paper.fwhm"],
     "seed": ["seed", "sky.embedded.seed", "simulate.small_scales_seed"],
     "unknown": ["nonsense", *(f"{table}.nonsense" for table in TABLES)],

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import healpy
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
@@ -29,6 +30,8 @@ OBSERVED, MODEL, FOREGROUNDS, NOISE = plots.COLORS[1], plots.COLORS[2], plots.CO
 UNIT = plots.UNITS["uK_RJ"]
 POWER = rf"$D_\ell$ [{UNIT}$^2$]"
 MULTIPOLE = r"multipole $\ell$"
+#: Largest nside of the maps that are drawn.
+NSIDE = 32
 #: Panels per row.
 COLUMNS = 3
 #: Label, C_l of EE and BB, and style.
@@ -154,12 +157,13 @@ def _draw_scatter(axes: Axes, scatter: Scatter, x: np.ndarray, y: np.ndarray) ->
 
 
 def plot_model_maps(
-    path: Path, comparison: Comparison, stokes: str, bands: Sequence[str], nside: int, title: str
+    path: Path, comparison: Comparison, stokes: str, bands: Sequence[str], title: str
 ) -> None:
     """Draw observed maps next to the model, on the same colour scale (the paper's fig. 6).
 
-    One row per band, two columns per letter of `stokes`, "Q", "U" or "QU"; in pixels of `nside`.
+    One row per band, two columns per letter of `stokes`, "Q", "U" or "QU"; in pixels of nside 32.
     """
+    nside = min(NSIDE, healpy.npix2nside(comparison.prepared.used.size))
     names, rows = list(comparison.prepared.bands), []
     region = "full" if "full" in comparison.regions else next(iter(comparison.regions))
     weights = jnp.asarray(comparison.prepared.used[None], float)
@@ -314,13 +318,12 @@ def _pictures(
 ) -> dict[str, tuple[Any, ...]]:
     """Return the pictures that can be drawn, in the form of `fits.commands.run.Report`."""
     bands, title = list(found.prepared.bands), settings.title
-    nside = min(settings.compare.panel_nside, settings.common.nside)
     drawn: dict[str, tuple[Any, ...]] = {
         f"scatter_{region}.png": (plot_scatter, found, region, bands, f"{title}\n{region}")
         for region in found.regions
     }
     for stokes in "QU":
-        drawn[f"maps_{stokes}.png"] = plot_model_maps, found, stokes, bands, nside, title
+        drawn[f"maps_{stokes}.png"] = plot_model_maps, found, stokes, bands, title
     if found.spectra:
         drawn["spectra.png"] = plot_full_sky, found.spectra, title
     if leaky := [s for s in found.spectra if s.uncorrected is not None]:

@@ -72,8 +72,8 @@ def figure_scatter(paper: PaperSky, picture: Path) -> PaperFigure:
 def figure_maps(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 6: observed maps next to the model."""
     settings, found = paper.settings, paper.comparison
-    nside = min(settings.compare.panel_nside, settings.common.nside)
-    pictures.plot_model_maps(picture, found, "QU", _chosen(found), nside, settings.title)
+    nside = min(pictures.NSIDE, settings.common.nside)
+    pictures.plot_model_maps(picture, found, "QU", _chosen(found), settings.title)
     return paper.described("Figure 6", nside=nside, here=_pixels_here(paper))
 
 

@@ -105,7 +105,6 @@ class FitTable(SettingsTable):
     methods: Several[Literal["grid", "gradient", "mcmc"]] = Field(["grid", "gradient", "mcmc"])
     likelihood: Literal["exact", "diagonal"] = "exact"
     points: int = Field(200, ge=20, le=2000)
-    nwalkers: int = Field(32, ge=4)
     nsteps: int = Field(3000, ge=1)
 
 
@@ -126,9 +125,7 @@ class CompareTable(SimulationsTable):
 
     regions: Several[Word] = Field(["strip", "outside", "full"])
     lmax: int = Field(100, ge=10)
-    panel_nside: Nside = 32
     patches: str | None = None
-    patches_nside: Nside = 256
 
 
 class SeparateTable(SimulationsTable):

@@ -71,10 +71,7 @@ TRANSFORMED = {
     ),
     "adjoint": (lambda maps: harmonics.adjoint_synthesis(maps, LMAX), MAPS),
     "analysis": (lambda maps: harmonics.analysis(maps, LMAX), MAPS),
-    "rotation": (lambda alm: harmonics.rotate(alm, "G", "C"), ALM),
-    "smoothing": (lambda fwhm: harmonics.smooth(jnp.asarray(MAPS), fwhm, lmax=LMAX), 600.0),
     "preparation": (lambda maps: SMOOTHING(maps), MAPS),
-    "its transpose": (lambda maps: SMOOTHING.transpose(maps), MAPS[:, : NPIX // 4]),
     "simulation": (simulated, 1.6),
 }
 

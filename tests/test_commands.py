@@ -88,13 +88,9 @@ def test_page(tmp_path):
 
 
 def test_version(monkeypatch, capsys):
-    printed = subprocess.check_output(
-        [sys.executable, "-m", "jaxsky", "fit", "--version"], text=True
-    )
-    assert re.fullmatch(r"jaxsky \d+\.\d+\.\d+\n", printed)
-    for line in (["--version"], ["data", "fetch", "--version"]):
+    for line in (["--version"], ["fit", "--version"], ["data", "fetch", "--version"]):
         assert jaxsky(monkeypatch, *line) == 0
-        assert capsys.readouterr().out == printed
+        assert re.fullmatch(r"jaxsky \d+\.\d+\.\d+\n", capsys.readouterr().out)
 
 
 @pytest.mark.slow
@@ -152,11 +148,14 @@ def test_wheel_imports_from_an_empty_environment(tmp_path):
         "from jaxsky.observation import load_instrument; from jaxsky.settings import load;"
         f"assert all(p.__file__.startswith({str(site)!r}) for p in (jaxsky, fits));"
         "assert 'fit' in [load(path) and path.stem for path in DEFAULTS.glob('*.toml')];"
-        "load_instrument('litebird')"
+        "load_instrument('litebird');"
+        "import runpy, sys; sys.argv = ['jaxsky', 'fit', '--version'];"
+        "runpy.run_module('jaxsky', run_name='__main__')"
     )
-    subprocess.run(
+    printed = subprocess.check_output(
         [environment / "bin" / "python", "-c", code],
-        check=True,
+        text=True,
         cwd=tmp_path,
         env={"PYTHONPATH": paths, "PATH": os.environ["PATH"], "HOME": str(tmp_path)},
     )
+    assert re.fullmatch(r"jaxsky \d+\.\d+\.\d+\n", printed)

@@ -9,7 +9,7 @@ import importlib
 import inspect
 import pkgutil
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import healpy
@@ -123,8 +123,8 @@ def observed() -> Calls:
     everything, varying = sky.Sky(components()), sky.Sky({"dust": DUST})
     for one in (everything, varying):
         yield jaxsky.observe, one, BANDS
-        yield partial(jaxsky.observe, tolerance=0), one, BANDS
-        yield jax.grad(total), one, BANDS
+    yield partial(jaxsky.observe, tolerance=0), varying, BANDS
+    yield jax.grad(total), varying, BANDS
     yield sky.observe_components, everything, BANDS
 
 
@@ -135,7 +135,6 @@ def transforms() -> Calls:
     yield partial(harmonics.synthesis, nside=NSIDE), ALM
     yield partial(harmonics.adjoint_synthesis, lmax=LMAX), MAPS
     yield partial(harmonics.analysis, lmax=LMAX), MAPS
-    yield partial(harmonics.rotate, source="G", target="C"), ALM
     yield jax.grad(lambda alm: jnp.sum(harmonics.synthesis(alm, NSIDE) ** 3)), ALM
     yield jax.vmap(partial(harmonics.analysis, lmax=LMAX)), MAPS[None]
 
@@ -202,11 +201,13 @@ def fluctuations() -> Calls:
     yield found.noise_realisation, KEY
 
 
+@cache
 def template_fit(**options):
     data = jaxsky.observe(SKY, list(FOUR.values()))
     return fits.likelihood(SKY, FOUR, data, 1.0, START, **options)
 
 
+@cache
 def separation():
     data = jaxsky.observe(SKY, list(FOUR.values())) + random_maps(5, npix=NPIX)
     labels = {"dust.beta_dust": np.arange(NPIX) % 3}
@@ -259,14 +260,8 @@ def shared_pixels() -> Calls:
     yield partial(distributed.counted, number=3), np.arange(NPIX)
     yield distributed.pieces, used
     yield distributed._numbered, np.arange(3), np.arange(NPIX), used
-    yield partial(distributed._covariance, layout=layout, number=2), data, noise, blocks
+    yield partial(distributed.band_covariance, layout=layout, number=2), data, noise, blocks
     yield partial(distributed.gathered, layout=layout), data, noise, blocks
-    matrix = np.random.default_rng(1).normal(size=(1, 4, 2))
-    noise = compress.Noise(data)
-    for errors in (False, True):
-        options = {"layouts": (layout,), "errors": errors}
-        maps = partial(distributed.separated_pixels, separated_maps._separated, None, **options)
-        yield maps, (matrix,), jnp.asarray(data), jax.tree.map(jnp.asarray, noise)
 
 
 def separations() -> Calls:
@@ -275,12 +270,14 @@ def separations() -> Calls:
 
 
 def separated() -> Calls:
+    data, layout = np.ones((4, 2, NPIX)), compress.Layout(False, (0, 1))
     matrix = np.random.default_rng(1).normal(size=(1, 4, 2))
-    pixels = compress.Pixels(np.ones((2, 4, NPIX)), np.ones((2, 4, NPIX)), None)
-    each = np.repeat(matrix, NPIX, axis=0)
     for errors in (False, True):
-        yield partial(separated_maps._separated, errors=errors), matrix, pixels
-        yield partial(separated_maps._separated, errors=errors), each, pixels
+        options = {"layouts": (layout,), "errors": errors}
+        given = (matrix,), data, compress.Noise(data)
+        yield partial(separated_maps._over_devices, None, **options), *given
+        own = partial(separated_maps._separated, used=np.ones(NPIX, bool), **options)
+        yield own, np.zeros(NPIX, int), *given
 
 
 def grids() -> Calls:
@@ -303,19 +300,16 @@ def optimisers() -> Calls:
 
 
 def samplers() -> Calls:
-    for like in (template_fit(), separation()):
-        own, _ = densities(like)
-        z = np.ones((4, own.start.size))
-        numbers, _ = unbounded.unbounded_posterior(own, own.start)
-        leaves, structure = jax.tree.flatten(numbers.density)
-        yield partial(sampling._log_probs, structure=structure), z, leaves
-        yield sampling._values, numbers, z
-        yield sampling._begun, numbers, z
-        tuning = jax.tree.map(
-            lambda x: jnp.asarray(x, float), dual_averaging_adaptation(0.8)[0](0.5)
-        )
-        begun = sampling._begun(numbers, z), tuning
-        yield partial(sampling._advanced, steps=2), numbers, begun, KEY, 0, 10
+    own, _ = densities(separation())
+    z = np.ones((4, own.start.size))
+    numbers, _ = unbounded.unbounded_posterior(own, own.start)
+    leaves, structure = jax.tree.flatten(numbers.density)
+    yield partial(sampling._log_probs, structure=structure), z, leaves
+    yield sampling._values, numbers, z
+    yield sampling._begun, numbers, z
+    tuning = jax.tree.map(lambda x: jnp.asarray(x, float), dual_averaging_adaptation(0.8)[0](0.5))
+    begun = sampling._begun(numbers, z), tuning
+    yield partial(sampling._advanced, steps=2), numbers, begun, KEY, 0, 10
     yield sampling.agreement, np.random.default_rng(1).normal(size=(100, 4, 2))
 
 

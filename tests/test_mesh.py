@@ -15,7 +15,7 @@ from refusals import raises
 @pytest.mark.parametrize(
     "which",
     [
-        "template_likelihoods and 192-False or lie_where or refuse or is_seen",
+        "template_likelihoods and explicit-192-False or lie_where or refuse or is_seen",
         pytest.param("test", marks=pytest.mark.slow),
     ],
 )

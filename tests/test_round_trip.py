@@ -16,7 +16,7 @@ from jaxsky import Bandpass
 from jaxsky.experiment import cmb_spectra, simulation_inputs
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.io import InputError, write_maps
-from jaxsky.montecarlo import run
+from jaxsky.montecarlo import other_sky, run
 from jaxsky.observed import Observed, observed_tables, read_observed
 from jaxsky.settings import SettingsError, load
 from refusals import raises
@@ -127,13 +127,16 @@ def test_commands_find_the_truth_in_simulated_maps(folder, command, monkeypatch)
 
 
 def test_maps_of_other_settings_are_told(folder, monkeypatch, capsys):
-    maps = written(settings_in(folder), folder / "others")
-    arguments = ["fit", folder / "x.toml", "--maps", maps, "--overwrite", "--out", folder / "told"]
-    for value, words in [("seed=7", None), ("bands.0.fwhm=50", "bands"), ("cmb.r=0.1", "cmb")]:
-        assert jaxsky(monkeypatch, *arguments, "--set", value) == 0
-        said = " ".join(capsys.readouterr().err.split())
-        warned = f"were simulated with other settings in the tables {words};"
-        assert (warned in said) if words else ("other settings" not in said)
+    path, maps = settings_in(folder), folder / "sims/sim_00000"
+    words = "were simulated with other settings in the tables {};"
+    for value, table in [("seed=7", None), ("bands.0.fwhm=50", "bands"), ("cmb.r=0.1", "cmb")]:
+        warned = other_sky(load(path, [value, f'common.maps = "{maps}"']))
+        assert (words.format(table) in warned[0]) if table else not warned
+    fewer = 'bands.0.channels=["40", "402"]', 'fit.stokes=["Q"]', "fit.likelihood=diagonal"
+    options = [word for value in fewer for word in ("--set", value)]
+    arguments = ("--maps", maps, *options, "--out", folder / "told")
+    assert jaxsky(monkeypatch, "fit", path, *arguments) == 0
+    assert words.format("bands") in " ".join(capsys.readouterr().err.split())
 
 
 def test_what_a_band_sees_does_not_depend_on_the_others(folder):

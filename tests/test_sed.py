@@ -130,14 +130,13 @@ def test_laws_are_one_at_the_reference(law):
 def test_finite_with_finite_gradients_from_radio_to_terahertz(law, dtype):
     function, params = law
     params = jax.tree.map(lambda v: jnp.asarray(v, dtype), params)
-    for nu in (0.4, 23.0, 353.0, 3000.0):
-        value, gradient = jax.value_and_grad(lambda a, p: function(a, **p), argnums=(0, 1))(
-            jnp.asarray(nu, dtype), params
-        )
-        assert value.dtype == dtype
-        assert bool(jnp.isfinite(value))
-        assert float(value) > 0
-        assert all(bool(jnp.isfinite(g)) for g in jax.tree.leaves(gradient))
+    slope = jax.value_and_grad(lambda nu, p: function(nu, **p), argnums=(0, 1))
+    nu = jnp.asarray([0.4, 23.0, 353.0, 3000.0], dtype)
+    value, gradient = jax.jit(jax.vmap(slope, (0, None)))(nu, params)
+    assert value.dtype == dtype
+    assert bool(jnp.isfinite(value).all())
+    assert bool((value > 0).all())
+    assert all(bool(jnp.isfinite(g).all()) for g in jax.tree.leaves(gradient))
 
 
 def test_cold_dust_at_terahertz_does_not_overflow_single_precision():
@@ -156,15 +155,14 @@ def test_single_precision_agrees_with_double(law):
     )
 
 
-@pytest.mark.parametrize("nu", [0.4, 44.1, 353.0, 3000.0])
-def test_gradients_against_finite_differences(law, nu):
+def test_gradients_against_finite_differences(law):
     function, params = law
 
     def log_sed(log_nu, p):
         return jnp.log(function(jnp.exp(log_nu), **p))
 
-    params = jax.tree.map(jnp.asarray, params)
-    check_grads(log_sed, (jnp.log(nu), params), order=1, modes=["fwd", "rev"], rtol=1e-5, atol=1e-6)
+    params, log_nu = jax.tree.map(jnp.asarray, params), jnp.log(jnp.array([0.4, 44.1, 353, 3000]))
+    check_grads(log_sed, (log_nu, params), order=1, modes=["fwd", "rev"], rtol=1e-5, atol=1e-6)
 
 
 def test_arguments_broadcast(law):

@@ -406,10 +406,10 @@ def test_separate_is_fit_and_component_maps_in_one_call():
     assert found.fit.best_fit == pytest.approx(fit.best_fit)
     expected = component_maps(like, fit.best_fit, data, levels).amplitude
     np.testing.assert_allclose(found.maps.amplitude, expected)
-    again = separate(laws, bands, data, {"dust.beta_dust": 1.5}, noise=levels)
-    assert again.fit.free == ("dust.beta_dust",)
     raises(ValueError, "`noise` is missing", separate, laws, bands, data)
     raises(ValueError, "there is no law 'stars'", separate, ["stars"], instrument, data)
     intensity = np.concatenate([data[:, :1], data], axis=1)
-    maps = separate([*laws, "free_free"], instrument, intensity, free=names).maps
-    assert maps.components == ("cmb", "dust", "free_free", "synchrotron")
+    more = [*laws, "free_free"]
+    again = separate(more, bands, intensity, {"dust.beta_dust": 1.5}, noise=levels)
+    assert again.fit.free == ("dust.beta_dust",)
+    assert again.maps.components == ("cmb", "dust", "free_free", "synchrotron")

@@ -260,6 +260,7 @@ def test_a_cut_posterior_is_that_of_integrals_on_a_grid(sampler):
     assert samples(result)[:, T].min() > priors["dust.T_dust"].low
 
 
+@pytest.mark.slow
 def test_a_cut_through_a_narrow_ridge_is_a_truncated_normal():
     """One standard deviation above the maximum; temperature and index are correlated by 0.99."""
     like = strong(1000.0)

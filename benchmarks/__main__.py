@@ -35,7 +35,7 @@ BENCHMARKS = {
     "simulate-beta-maps": simulations.beta_maps,
     "simulate-constant": simulations.constant,
     "monte-carlo": simulations.monte_carlo,
-    "nside-2048": simulations.nside_2048,
+    "simulate-large": simulations.high_resolution,
     "smoothing": simulations.smoothing,
     "analysis": simulations.transform,
     "smoothing-nside": simulations.growth,
@@ -59,7 +59,7 @@ BENCHMARKS = {
 #: These take minutes: they are run by name, and when the table is kept.
 LONG = (
     "planck",
-    "nside-2048",
+    "simulate-large",
     "separation-pixels",
     "commands",
     "workers",

@@ -232,13 +232,22 @@ def monte_carlo(quick: bool) -> list[Row]:
     ]
 
 
-def nside_2048(quick: bool) -> list[Row]:
-    """All of COrE with small scales at high resolution, one band in memory at a time."""
-    nside, template, finest = (128, 64, 60.0) if quick else (2048, 512, 3.0)
-    small = (20, 60) if quick else (100, 600)
+def high_resolution(quick: bool) -> list[Row]:
+    """COrE with small scales at high resolution, one band in memory at a time."""
+    return (
+        [_core(128, 64, 60.0, 15)]
+        if quick
+        else [_core(2048, 512, 3.0, 15), _core(4096, 512, 3.0, 3)]
+    )
+
+
+def _core(nside: int, template: int, finest: float, number: int) -> Row:
+    """The highest bands of COrE, with beams of `finest` [arcmin] at least."""
+    small = (20, 60) if nside < 512 else (100, 600)
+    channels = list(load_instrument("core").items())[-number:]
     bands = "".join(
         f'[[bands]]\nname = "{n}"\ninstrument = "core"\nfwhm = {max(float(c.beam), finest)}\n'
-        for n, c in load_instrument("core").items()
+        for n, c in channels
     )
     scales = "".join(
         f"[sky.{name}.small_scales]\nEE = {list(small)}\nBB = {list(small)}\n"
@@ -252,17 +261,16 @@ def nside_2048(quick: bool) -> list[Row]:
         )
         run = _command(settings, folder / "out")
         pace = _pace(folder / "out")
-        lmax = pyfits.getval(folder / "out" / "sim_00000" / "45.fits", "LMAX", 1)
-    return [
-        Row(
-            f"`jaxsky simulate`, COrE's 15 bands with beams of at least {finest:g} "
-            f"arcmin, small scales on templates of nside {template}, nside {nside}: peak memory",
-            f"{run.peak:.1f} GiB",
-            "<= 16 GiB",
-            run.peak <= 16,
-            f"{time_text(pace)} a band, {time_text(run.seconds)} in all; l <= {lmax}",
-        )
-    ]
+        file = folder / "out" / "sim_00000" / f"{channels[0][0]}.fits"
+        lmax = pyfits.getval(file, "LMAX", 1)
+    return Row(
+        f"`jaxsky simulate`, {number} bands of COrE with beams of at least {finest:g} "
+        f"arcmin, small scales on templates of nside {template}, nside {nside}: peak memory",
+        f"{run.peak:.1f} GiB",
+        "<= 16 GiB",
+        run.peak <= 16,
+        f"{time_text(pace)} a band, {time_text(run.seconds)} in all; l <= {lmax}",
+    )
 
 
 def _band_limited(nside: int) -> tuple[np.ndarray, np.ndarray]:

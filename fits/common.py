@@ -23,6 +23,7 @@ from jaxsky.harmonics import (
     beam_ratio,
     gaussian_beam,
     pixel_window,
+    shortened,
 )
 from jaxsky.io.stacks import Maps, Stack, computed, is_large, ranges
 from jaxsky.job import filled
@@ -162,7 +163,7 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         if not own_used.all():
             spread = operators[what]
             if fwhm:  # the whole beam, without the ringing that the cut at lmax causes
-                window = gaussian_beam(fwhm, 2 * nsides[what])
+                window = shortened(gaussian_beam(fwhm, 2 * nsides[what]))
                 spread, own_used = Preparation(window, nsides[what], nside), holes[nsides[what]]
             left = spread(jnp.asarray(own_used[None], float))[0]
             used &= np.asarray(left) > 1 - MISSING
@@ -174,7 +175,8 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
     def brought(what: str, maps: Array | Maps) -> Array:
         """Bring maps to the common resolution in double precision, zero in holes."""
         own, given = kept[what], jnp.asarray(np.asarray(maps), float)
-        return operators[what](given if own is None else given * own)
+        given = given if own is None else given * own
+        return operators[what](given)
 
     leakage = {
         name: brought(f"leakage of band {name!r}", band.leakage.maps)
@@ -200,7 +202,8 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
             shape, dtype = whole.shape, whole.dtype
             noise = computed(shape, lambda at: whole[..., at] * own[at], dtype, many)
         if spectrum is not None:
-            spectrum = spectrum[: reach + 1] * window_of(operator, reach) ** 2
+            last = reach if operator.window is None else operator.window.size - 1
+            spectrum = spectrum[: last + 1] * window_of(operator, last) ** 2
         return MapNoise(operator, noise, spectrum)
 
     noises = [noise_of(what, band.noise, band.correlated) for what, band in bands.items()]
@@ -252,6 +255,7 @@ def _cmb(
 def window_of(preparation: Preparation, lmax: int) -> Float[Array, " ell"]:
     """Return the factors by which a preparation multiplies the multipoles of a map."""
     if preparation.window is not None:
-        return preparation.window[: lmax + 1]
+        window = preparation.window[: lmax + 1]
+        return jnp.pad(window, (0, lmax + 1 - window.size))
     pixels = pixel_window(preparation.nside, lmax) / pixel_window(preparation.nside_in, lmax)
     return jnp.asarray(pixels)

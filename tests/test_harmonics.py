@@ -8,6 +8,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxsky import harmonics as h
+from jaxsky.harmonics import primitives
 
 NSIDE, LMAX = 32, 64
 ROWS = pytest.mark.parametrize(
@@ -125,6 +126,27 @@ def test_transposes(rows):
         jax.linear_transpose(lambda a: h.synthesis(a, NSIDE), alm)(maps)[0],
         atol=1e-12,
     )
+
+
+@ROWS
+def test_rings_in_groups_are_those_of_the_sphere(rows, monkeypatch):
+    """As maps are transformed that would take too much memory at once."""
+    alm = drawn(LMAX)[rows]
+    maps = jnp.asarray(np.random.default_rng(1).normal(size=(len(alm), 12 * NSIDE**2)))
+
+    def results():
+        primitives._groups.cache_clear()
+        yield h.synthesis(alm, NSIDE)
+        yield h.adjoint_synthesis(maps, LMAX)
+        yield h.analysis(maps, LMAX, 2)
+        yield jax.linear_transpose(lambda m: h.analysis(m, LMAX, 2), maps)(alm)[0]
+
+    whole = list(map(np.asarray, results()))
+    monkeypatch.setattr(primitives, "GROUP", 1 << 15)
+    for found, expected in zip(results(), whole, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-13 * np.abs(expected).max())
+    assert len(primitives._groups(NSIDE, LMAX, 0, 16, False)) > 3
+    primitives._groups.cache_clear()
 
 
 def test_vmap_is_a_loop():
@@ -259,6 +281,21 @@ def test_low_multipoles_are_free_of_those_above():
     assert rms(h.analysis(maps, 24) - h.resize(alm, 24)) > 100 * rms(kept - h.resize(alm, 24))
     # Above 2 nside a map has nothing to be trusted.
     assert np.all(h.low_multipoles(maps, 80)[:, h.alm_ell(80) > LMAX] == 0)
+
+
+def test_nothing_is_lost_where_the_beam_ends_before_the_pixels():
+    """A beam that leaves a sixth of the multipoles; white noise is worst, and falls as 1/nside."""
+    nside, fwhm, lmax = 64, 2880.0, 128
+    short = h.Preparation.smoothing(nside, 0.0, nside, fwhm, lmax)
+    whole = h.Preparation(h.gaussian_beam(fwhm, lmax), nside, nside)
+    assert short.window.size < lmax / 6
+    white = jnp.asarray(np.random.default_rng(2).normal(size=(2, 12 * nside**2)))
+    assert rms(short(white) - whole(white)) < 3e-4 * rms(whole(white))
+    sky = h.synthesis(drawn(lmax, 2), nside)
+    assert rms(short(sky) - whole(sky)) < 1e-5 * rms(whole(sky))
+    assert short.uniform_variance(1.0) == pytest.approx(whole.uniform_variance(1.0), rel=1e-12)
+    variance = 1 + white**2
+    np.testing.assert_allclose(short.variance(variance), whole.variance(variance), rtol=1e-4)
 
 
 def test_averaging_pixels_is_healpys(alm):

@@ -209,10 +209,11 @@ class Preparation(eqx.Module):
     ) -> "Preparation":
         """Smooth from the maps' own beam to a Gaussian of fwhm [arcmin]; see `beam_ratio`.
 
-        `own` is the FWHM of a Gaussian [arcmin], or a table b_l.
+        `own` is the FWHM of a Gaussian [arcmin], or a table b_l. Multipoles up to lmax are kept, or
+        fewer where the beam leaves nothing.
         """
         _check_nside(nside_in, nside, what)
-        return cls(beam_ratio(fwhm, own, lmax, what), nside_in, nside)
+        return cls(shortened(beam_ratio(fwhm, own, lmax, what)), nside_in, nside)
 
     @classmethod
     def averaging(cls, nside_in: int, nside: int, what: str = "map") -> "Preparation":
@@ -247,8 +248,8 @@ class Preparation(eqx.Module):
         for row in variance:  # one by one: a row may be as large as everything else
             values = jnp.asarray(row[None], float)
             smoothed = resample(values, squared, self.nside, fine=FINE_VARIANCE)
-            rows.append(smoothed[0].block_until_ready())
-        return area * jnp.stack(rows)
+            rows.append((area * smoothed[0]).block_until_ready())
+        return jnp.stack(rows)
 
     def uniform_variance(self, level: float) -> float:
         """Return the variance of prepared white noise of a level [u arcmin]."""

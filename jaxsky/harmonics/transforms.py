@@ -10,25 +10,19 @@ import contextlib
 import ctypes
 import math
 import os
-import pickle
 import threading
 import time
 from functools import cache, partial
-from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
-from astropy.io import fits as pyfits
-from jax.interpreters import mlir
-from jaxbind import jaxbind
-from jaxbind.contrib.jaxducc0 import get_healpix_sht
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.checks import check_double
+from jaxsky.harmonics import primitives
 
 
 def alm_ell(lmax: int) -> np.ndarray:
@@ -105,76 +99,31 @@ def alm_to_healpy(alm: ArrayLike, lmax: int) -> np.ndarray:
     return np.concatenate([alm[..., : lmax + 1], pairs[..., ::2] + 1j * pairs[..., 1::2]], axis=-1)
 
 
-def _lower(ctx: Any, *operands: Any, **parameters: Any) -> Any:
-    """Lower a transform, and tell JAX that it calls Python, so that it is not cached on disk.
-
-    jaxbind writes the address of a Python object into the program; in another process something
-    else may be at that address.
-    """
-    ctx.module_context.add_host_callback(lambda *_: ())
-    return jaxbind._lowering(ctx, *operands, **parameters)
-
-
-def _through_callback(*operands: Any, _func: Any, **parameters: Any) -> Any:
-    """Call a function of jaxbind on the host, where the arrays are on an accelerator.
-
-    The primitive stays jaxbind's, and with it gradients, transposes and batches. JAX does not
-    cache programs with callbacks on disk.
-    """
-    found = jaxbind._exec_abstract(*operands, _func=_func, **parameters)
-    shapes = [jax.ShapeDtypeStruct(one.shape, one.dtype) for one in found]
-    if _func.can_batch:
-        parameters["batch_axes"] = _func.batch_axes
-    dump = np.frombuffer(pickle.dumps(parameters), dtype=np.uint8)
-
-    def call(*arrays: Array) -> list[np.ndarray]:
-        out = [np.empty(shape.shape, shape.dtype) for shape in shapes]
-        _func.f(tuple(out), tuple(map(np.asarray, arrays)), dump)
-        return out
-
-    return jax.pure_callback(call, shapes, *operands)
-
-
-#: How a transform is lowered on an accelerator; jaxbind's own way needs a function for CUDA that
-#: its packages do not have.
-_lower_callback = mlir.lower_fun(_through_callback, multiple_results=True)
-
-mlir.register_lowering(jaxbind._prim, _lower, platform="cpu")
-mlir.register_lowering(jaxbind._prim, _lower_callback, platform="gpu")
-
-
-@cache
-def _ring_weights(nside: int) -> np.ndarray:
-    """Return healpy's ring weights times the area of a pixel [sr], shape (ring,)."""
-    path = files("healpy") / "data" / f"weight_ring_n{nside:05d}.fits"
-    with path.open("rb") as stream, pyfits.open(stream) as hdus:
-        north = 1 + hdus[1].data.field(0).astype(float).ravel()
-    return np.concatenate([north, north[-2::-1]]) * healpy.nside2pixarea(nside)
-
-
-def _rings(nside: int) -> Int[Array, " pix"]:
-    """Return the ring of each pixel, from 0; computed, as a constant would be as large as a map."""
-    npix, cap = 12 * nside**2, 2 * nside * (nside - 1)
-    pixel = jnp.arange(npix)
-    mirrored = jnp.minimum(pixel, npix - 1 - pixel)
-    ring = jnp.floor((jnp.sqrt(1.0 + 2 * mirrored) + 1) / 2).astype(pixel.dtype) - 1
-    ring = jnp.where(pixel < npix // 2, ring, 4 * nside - 2 - ring)
-    belt = (pixel >= cap) & (pixel < npix - cap)
-    return jnp.where(belt, (pixel - cap) // (4 * nside) + nside - 1, ring)
-
-
 def _blocks(stokes: int, spin: int) -> list[tuple[slice, int]]:
     """Return the rows of I, Q, U or I, Q, U maps that are transformed together, and their spin."""
     scalar, polarized = (slice(0, 1), 0), (slice(stokes - 2, stokes), spin)
     return {1: [scalar], 2: [polarized], 3: [scalar, polarized]}[stokes]
 
 
-@cache
-def _transform(nside: int, lmax: int, spin: int):
-    # jaxbind passes the geometry of the rings as 64-bit numbers, whatever the maps are.
+def _transform(
+    alm: Float[Array, "stokes alm"], nside: int, spin: int, weighted: bool = False
+) -> Float[Array, "stokes pix"]:
+    """Return the maps of coefficients, each ring times its weight if `weighted`."""
     check_double("A spherical harmonic transform")
     _finish_at_exit()
-    return get_healpix_sht(nside, lmax, lmax, spin, nthreads=0)
+    how = {"nside": nside, "lmax": lmax_of(alm), "weighted": weighted}
+    return jnp.concatenate(
+        [primitives.synthesis(alm[rows], spin=s, **how)[0] for rows, s in _blocks(len(alm), spin)]
+    )
+
+
+def _transposed(
+    maps: Float[Array, "stokes pix"], lmax: int, spin: int, weighted: bool = False
+) -> Float[Array, "stokes alm"]:
+    nside = healpy.npix2nside(maps.shape[-1])
+    empty = jax.ShapeDtypeStruct((maps.shape[0], (lmax + 1) ** 2), maps.dtype)
+    forward = partial(_transform, nside=nside, spin=spin, weighted=weighted)
+    return jax.linear_transpose(forward, empty)(maps)[0]
 
 
 @partial(jax.jit, static_argnames=("nside", "spin"))
@@ -185,10 +134,7 @@ def synthesis(
 
     With lmax > 3 nside - 1 the maps are undersampled. `spin` is that of the last two rows.
     """
-    lmax = lmax_of(alm)
-    return jnp.concatenate(
-        [_transform(nside, lmax, s)(alm[rows])[0] for rows, s in _blocks(len(alm), spin)]
-    )
+    return _transform(alm, nside, spin)
 
 
 @partial(jax.jit, static_argnames=("lmax", "spin"))
@@ -196,9 +142,7 @@ def adjoint_synthesis(
     maps: Float[Array, "stokes pix"], lmax: int, spin: int = 2
 ) -> Float[Array, "stokes alm"]:
     """Apply the transpose of `synthesis`: inner products of maps with the spherical harmonics."""
-    nside = healpy.npix2nside(maps.shape[-1])
-    empty = jax.ShapeDtypeStruct((len(maps), (lmax + 1) ** 2), maps.dtype)
-    return jax.linear_transpose(partial(synthesis, nside=nside, spin=spin), empty)(maps)[0]
+    return _transposed(maps, lmax, spin)
 
 
 @partial(jax.jit, static_argnames=("lmax", "iterations", "spin"))
@@ -219,12 +163,13 @@ def analysis(
     nside = healpy.npix2nside(maps.shape[-1])
     if iterations is None:
         iterations = 1 + (2 * lmax > 3 * nside) + (nside < 128)
-    weights = jnp.asarray(_ring_weights(nside), maps.dtype)[_rings(nside)]
-    alm = adjoint_synthesis(weights * maps, lmax, spin)
-    for _ in range(iterations):
-        residual = maps - synthesis(alm, nside, spin=spin)
-        alm = alm + adjoint_synthesis(weights * residual, lmax, spin)
-    return alm
+    alm = _transposed(maps, lmax, spin, weighted=True)
+    if not iterations:
+        return alm
+    how = {"nside": nside, "lmax": lmax, "iterations": iterations}
+    return jnp.concatenate(
+        [primitives.refined(alm[rows], spin=s, **how)[0] for rows, s in _blocks(len(alm), spin)]
+    )
 
 
 # Ending a Python process in which transforms may still run.

@@ -22,7 +22,7 @@ from jaxbind.contrib.jaxducc0 import _alm2realalm, _realalm2alm
 from jaxtyping import Array
 
 #: Rings are transformed in groups whose Fourier coefficients take as many bytes at most.
-GROUP = 1 << 28
+GROUP = 1 << 27
 
 
 def _lower(ctx: Any, *operands: Any, **parameters: Any) -> Any:
@@ -97,7 +97,7 @@ def _unpacked(alm: np.ndarray, lmax: int) -> np.ndarray:
 
 def _inner_products(maps: Iterable[np.ndarray], groups: Iterable[dict[str, Any]]) -> np.ndarray:
     """Return the sum over groups of rings of their inner products with the harmonics."""
-    total = None
+    total: Any = None
     for values, rings in zip(maps, groups, strict=True):
         one = ducc0.sht.adjoint_synthesis(map=values, **rings)
         total = one if total is None else np.add(total, one, out=total)
@@ -137,6 +137,7 @@ def _refine(out, args, kwargs_dump):
         change = _inner_products((ducc0.sht.synthesis(alm=found, **r) for r in plain), alone)
         change = _alm2realalm(change, lmax, alm.dtype)
         alm += np.subtract(given, change, out=change)
+        del found, change  # or they would be there twice in the next step
 
 
 def _pixels(alm, *, nside, **_):

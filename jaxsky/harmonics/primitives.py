@@ -7,7 +7,7 @@ those of all rings would take more than a map. Coefficients are packed as in `tr
 import math
 import pickle
 from collections.abc import Iterable
-from functools import cache, partial
+from functools import cache
 from importlib.resources import files
 from typing import Any
 

@@ -19,7 +19,7 @@ from benchmarks import (
     simulations,
     stacked_maps,
 )
-from benchmarks.table import Row, conditions, markdown, rich_table
+from benchmarks.table import Row, conditions, markdown, renewed, rich_table
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
 BENCHMARKS = {
@@ -72,12 +72,19 @@ LONG = (
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser("python -m benchmarks", description="Times against peers.")
     parser.add_argument("--list", action="store_true", help="name the benchmarks and stop")
-    parser.add_argument("--only", choices=BENCHMARKS, help="run one", metavar="NAME")
+    parser.add_argument(
+        "--only",
+        choices=BENCHMARKS,
+        action="append",
+        help="run this one; repeatable",
+        metavar="NAME",
+    )
     parser.add_argument("--quick", action="store_true", help="small maps, no verdicts")
-    parser.add_argument("--write", action="store_true", help=f"write {RESULTS.name}")
+    words = f"write {RESULTS.name}; with --only, these rows of it"
+    parser.add_argument("--write", action="store_true", help=words)
     arguments = parser.parse_args()
-    if arguments.write and (arguments.only or arguments.quick):
-        parser.error("--write keeps the whole table: without --only and --quick")
+    if arguments.write and arguments.quick:
+        parser.error("--write keeps measurements: without --quick")
     return arguments
 
 
@@ -99,12 +106,13 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     every = arguments.write or arguments.quick
     names = [name for name in BENCHMARKS if every or name not in LONG]
-    rows = _measure([arguments.only] if arguments.only else names, arguments.quick)
+    rows = _measure(arguments.only or names, arguments.quick)
     lines = conditions(arguments.quick)
     console.print(rich_table(rows))
     console.print("\n".join(lines), highlight=False)
     if arguments.write:
-        RESULTS.write_text(markdown(rows, lines))
+        text = markdown(rows, lines)
+        RESULTS.write_text(renewed(RESULTS.read_text(), text) if arguments.only else text)
 
 
 if __name__ == "__main__":

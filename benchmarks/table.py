@@ -80,3 +80,16 @@ def markdown(rows: list[Row], lines: list[str]) -> str:
     table = [HEADER, ("---",) * len(HEADER), *(row.cells for row in rows)]
     body = "\n".join("| " + " | ".join(cells) + " |" for cells in table)
     return "# Benchmarks\n\n`python -m benchmarks --write`. " + " ".join(lines) + f"\n\n{body}\n"
+
+
+def renewed(before: str, rows: list[Row], lines: list[str]) -> str:
+    """A Markdown file with rows in place of those of the same work, or at its end.
+
+    Each says when it was measured, as the first line does for all others.
+    """
+    when, own = f"(later: {lines[0].rstrip('.')})", {}
+    for row in rows:
+        cells = *row.cells[:-1], f"{row.remarks} {when}".strip()
+        own[row.work] = "| " + " | ".join(cells) + " |"
+    kept = [own.pop(line[2:].partition(" | ")[0], line) for line in before.splitlines()]
+    return "\n".join([*kept, *own.values()]) + "\n"

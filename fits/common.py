@@ -16,7 +16,7 @@ from fits.kept import remembered
 from fits.mixing import TemplateErrors, template_errors
 from fits.regions import common_holes
 from fits.template_likelihood import CovarianceOf, SkyLikelihood, likelihood
-from jaxsky import Bandpass, Component, Sky, observe
+from jaxsky import Bandpass, Component, Sky, job, observe
 from jaxsky.checks import Numeric
 from jaxsky.harmonics import (
     Preparation,
@@ -27,6 +27,7 @@ from jaxsky.harmonics import (
 )
 from jaxsky.io.stacks import Maps, Stack, computed, is_large, ranges
 from jaxsky.job import filled
+from jaxsky.mesh import distribute, spread
 from jaxsky.programs import return_memory
 from jaxsky.settings import Experiment, at_key
 
@@ -80,13 +81,15 @@ class CommonMaps(NamedTuple):
         """
         if kind not in ("exact", "diagonal"):
             raise ValueError(f"Argument `kind` must be 'exact' or 'diagonal', not {kind!r}.")
-        used = self.used if region is None else self.used & region
+        used: Any = self.used if region is None else self.used & region
         assert self.sky is not None  # there are templates
+        sky, data, sigma = _own_pixels(self.sky, self.data, self.sigma)
+        used = distribute(used) if spread(data) else used
         return likelihood(
-            self.sky,
+            sky,
             self.bands,
-            self.data,
-            jnp.where(used, jnp.asarray(self.sigma), jnp.inf),
+            data,
+            jnp.where(used, jnp.asarray(sigma), jnp.inf),
             start,
             stokes=stokes,
             covariance_of=self.covariance_of if kind == "exact" else None,
@@ -231,6 +234,21 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         remembered(fluctuations.covariance),
         template_errors(list(sky), inputs.template_noise, own_noise, fluctuations.noises),
     )
+
+
+#: The maps that were distributed last, and what they are then.
+_distributed: list[Any] = [(), ()]
+
+
+def _own_pixels(sky: Sky, data: Any, sigma: Any) -> tuple[Sky, Any, Any]:
+    """Return maps distributed over the processes of a job, unless laws have maps of parameters."""
+    maps = sky, data, sigma
+    if job.number() == 1 or any(leaf.ndim == 1 for leaf in jax.tree.leaves(sky)):
+        return maps
+    if list(map(id, _distributed[0])) != list(map(id, maps)):
+        own = jax.tree.map(lambda x: distribute(x, fill=None) if x.ndim == 2 else x, sky)
+        _distributed[:] = maps, (own, distribute(data), distribute(sigma, fill=np.inf))
+    return _distributed[1]
 
 
 def _in_memory(maps: Maps) -> Any:

@@ -6,6 +6,7 @@ therefore have a covariance that follows exactly from a few transposed transform
 simulation, no matrix over pixels.
 """
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -55,29 +56,31 @@ class MapNoise(NamedTuple):
     noise: Numeric
     correlated: Float[Array, " ell"] | None
 
-    def covariance(self, rows: Float[Array, "row stokes pix"]) -> Float[np.ndarray, "row row"]:
-        """Return the covariance of the inner products of rows with the prepared noise.
+    def covariance(
+        self, rows: Iterable[Float[Array, "stokes pix"]], count: int
+    ) -> Float[np.ndarray, "row row"]:
+        """Return the covariance of the inner products of so many rows with the prepared noise.
 
         Rows at the resolution of the noise are stored in its precision.
         """
-        count = len(rows)
-        block = np.zeros((count, count))
-        if np.ndim(self.noise) or self.noise:
-            covariance = of_pixels(self.noise, self.preparation.nside_in)
-            npix = covariance.shape[-1]
-            before = empty((count, 2, npix), covariance.dtype)
-            for own, row in zip(range(count), rows, strict=True):
+        block, modes = np.zeros((count, count)), list[np.ndarray]()
+        white = bool(np.ndim(self.noise) or self.noise)
+        covariance = of_pixels(self.noise, self.preparation.nside_in)
+        npix = covariance.shape[-1]
+        before = empty((count, 2, npix), covariance.dtype) if white else None
+        for own, row in enumerate(rows):
+            if before is not None:
                 before[own] = np.asarray(self.preparation.transpose(row).block_until_ready())
+            if self.correlated is not None:
+                modes.append(np.asarray(_modes(row, np.stack([self.correlated] * 2))))
+        if before is not None:
             for cut in ranges(npix, CHUNK):
                 maps = before[..., cut].astype(float)
                 pixels = np.ascontiguousarray(covariance[..., cut], float)
                 seen = np.einsum("stp,jtp->jsp", pixels, maps)
                 block += maps.reshape(count, -1) @ seen.reshape(count, -1).T
             block = (block + block.T) / 2
-        if self.correlated is None:
-            return block
-        modes = np.asarray(_modes(rows, np.stack([self.correlated] * 2)))
-        return block + modes @ modes.T
+        return block if self.correlated is None else block + np.stack(modes) @ np.stack(modes).T
 
     def alm(self, key: Array, name: str) -> Float[Array, "2 alm"]:
         """Return E and B of a realisation of smoothed noise; the map's name is in its key."""
@@ -144,19 +147,16 @@ class Fluctuations(eqx.Module):
         self, rows: Float[Array, "band row stokes pix"]
     ) -> Float[np.ndarray, "bandrow bandrow"]:
         """Return the covariance of the inner products of rows with the fluctuations."""
-        blocks = [one.covariance(own) for one, own in zip(self.noises.values(), rows, strict=True)]
+        npix = healpy.nside2npix(self.preparations[0].nside)  # without padding
+        blocks, modes = list[np.ndarray](), list[np.ndarray]()
+        for i, noise in enumerate(self.noises.values()):
+            own = rows[i][..., :npix]
+            blocks.append(noise.covariance(own, len(own)))
+            if self.cmb_spectra is not None and self.cmb_windows is not None:
+                seen = np.asarray(self.cmb_spectra) * np.asarray(self.cmb_windows[i]) ** 2
+                modes += [np.asarray(self.cmb_factors[i] * _modes(row, seen)) for row in own]
         total = scipy.linalg.block_diag(*blocks)
-        if self.cmb_spectra is None or self.cmb_windows is None:
-            return total
-        spectra = np.asarray(self.cmb_spectra)
-        bands = zip(self.cmb_factors, self.cmb_windows, rows, strict=True)
-        modes = np.concatenate(
-            [
-                np.asarray(factor) * _modes(own, spectra * np.asarray(window) ** 2)
-                for factor, window, own in bands
-            ]
-        )
-        return total + modes @ modes.T
+        return total + np.stack(modes) @ np.stack(modes).T if modes else total
 
     # Not one program: there XLA would draw the normals anew for each row.
     def noise_realisation(self, key: Array) -> Maps:
@@ -209,9 +209,8 @@ class Fluctuations(eqx.Module):
 
 @jax.jit
 def _modes(
-    rows: Float[Array, "row stokes pix"], spectra: Float[Array, "stokes ell"]
-) -> Float[Array, "row mode"]:
-    """Project rows on independent modes of unit variance, with the spectra of E and B."""
+    row: Float[Array, "stokes pix"], spectra: Float[Array, "stokes ell"]
+) -> Float[Array, " mode"]:
+    """Project a row on independent modes of unit variance, with the spectra of E and B."""
     lmax = spectra.shape[-1] - 1
-    root = jnp.sqrt(spectra)[:, alm_ell(lmax)]
-    return jnp.stack([(root * adjoint_synthesis(row, lmax)).ravel() for row in rows])
+    return (jnp.sqrt(spectra)[:, alm_ell(lmax)] * adjoint_synthesis(row, lmax)).ravel()

@@ -24,6 +24,7 @@ from jaxsky.checks import check_seed
 from jaxsky.io import InputError, whole
 from jaxsky.io.files import cache_folder
 from jaxsky.io.stacks import Stack, ranges
+from jaxsky.mesh import parts_of, spread
 from jaxsky.noise import realisation_key, stream
 from jaxsky.programs import QUIET
 from jaxsky.workers import realised
@@ -45,6 +46,10 @@ def fingerprint(tree: Any) -> str:
         if isinstance(leaf, Stack):
             for part in ranges(leaf.shape[-1]):
                 digest.update(leaf[..., part].tobytes())
+            continue
+        if spread(leaf):  # each process looks at its own pixels
+            for own in parts_of(leaf):
+                digest.update(own.tobytes())
             continue
         array = np.ascontiguousarray(leaf)
         if array.dtype != object:

@@ -18,7 +18,7 @@ coefficients of the best fit.
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -29,8 +29,9 @@ from jaxtyping import Array, Float
 from fits.kept import remembered
 from jaxsky import Bandpass, Sky, parameter_names, set_parameters
 from jaxsky.bandpass import Samples, average, parse_unit, stack_bands
-from jaxsky.checks import Numeric
+from jaxsky.checks import EXACT, Numeric
 from jaxsky.interpolation import band_seds, choose_nodes
+from jaxsky.mesh import SUMS, distribute, mesh_of, over_pixels, total
 from jaxsky.sed import cmb_derivative
 
 if TYPE_CHECKING:
@@ -203,13 +204,14 @@ class TemplateErrors(NamedTuple):
 
     Attributes
     ----------
-    covariances_of : covariance of the products of rows with each source, (source, row, row)
+    covariances_of : covariance of the products of rows (band, row, stokes, pix) with each source,
+        (source, bandrow, bandrow)
     parts : factor of each source in each template, shape (template, source)
     of_band : 1 where a source is the noise of a band, shape (band, source)
     variance : variance of each source in each pixel [uK_RJ^2], shape (source, stokes, pix)
     """
 
-    covariances_of: Callable[[Float[Array, "row stokes pix"]], Float[np.ndarray, "source row row"]]
+    covariances_of: Callable[[Any], Float[np.ndarray, "source bandrow bandrow"]]
     parts: Float[np.ndarray, "template source"]
     of_band: Float[np.ndarray, "band source"]
     variance: Float[Array, "source stokes pix"]
@@ -218,7 +220,10 @@ class TemplateErrors(NamedTuple):
         self, weights: Float[Array, "band stokes pix"]
     ) -> Float[np.ndarray, "band stokes row row"]:
         """Return the mean that noise adds to products of (data, templates, 1), as in `gram`."""
-        power = np.einsum("bsp,usp->bsu", weights, self.variance)
+        variance, mesh = self.variance, mesh_of(weights)
+        if mesh is not None:
+            variance = distribute(variance, mesh, fill=0.0)
+        power = np.asarray(_power(weights, variance))
         bands, stokes, _ = power.shape
         size = len(self.parts) + 2
         total = np.zeros((bands, stokes, size, size))
@@ -229,20 +234,26 @@ class TemplateErrors(NamedTuple):
 
     def covariance(
         self,
-        rows: Float[Array, "band row stokes pix"],
+        rows: Any,
         coefficients: Float[np.ndarray, "band row template"],
     ) -> Float[np.ndarray, "bandrow bandrow"]:
         """Return what noise of templates adds to the covariance of rows times residuals.
 
+        The rows are an array (band, row, stokes, pix), or made when they are read.
         `coefficients` are those of the templates in the residuals that each row multiplies.
         """
-        flat = rows.reshape(-1, *rows.shape[2:])
-        each = self.covariances_of(flat)
+        each = self.covariances_of(rows)
         own = np.repeat(self.of_band, rows.shape[1], axis=0)
-        seen = own - np.asarray(coefficients).reshape(len(flat), -1) @ self.parts
+        seen = own - np.asarray(coefficients).reshape(len(own), -1) @ self.parts
         return np.einsum("umn,mu,nu->mn", each, seen, seen) - np.einsum(
             "umn,mu,nu->mn", each, own, own
         )
+
+
+@jax.jit
+@over_pixels(SUMS)
+def _power(weights, variance):
+    return total(jnp.einsum("bsp,usp->bsu", weights, variance, precision=EXACT))
 
 
 def template_errors(
@@ -266,8 +277,13 @@ def template_errors(
     ]
     of_band = [[0.0] * len(own) + [float(b == name) for b in which] for name in bands]
     variance = np.stack([source.variance() for source in sources])
+
+    def every(source: "MapNoise", rows: Any) -> Float[np.ndarray, "row row"]:
+        flat = (row[..., : variance.shape[-1]] for own in rows for row in own)
+        return source.covariance(flat, rows.shape[0] * rows.shape[1])
+
     return TemplateErrors(
-        remembered(lambda rows: np.stack([source.covariance(rows) for source in sources])),
+        remembered(lambda rows: np.stack([every(source, rows) for source in sources])),
         np.array(parts),
         np.array(of_band),
         jnp.asarray(np.where(variance > 0, variance, 0.0)),

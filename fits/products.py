@@ -1,12 +1,16 @@
 """Passes over the pixels of data and templates: weights, inner products and their rows."""
 
+from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxsky import job
 from jaxsky.checks import EXACT, UNSEEN
 from jaxsky.mesh import SUMS, at_once, maps_of, over_pixels, total
 
@@ -95,3 +99,36 @@ def one_stokes_each(
     bands, templates, stokes, npix = rows.shape
     split = jnp.eye(stokes)[None, :, None, :, None] * rows[:, None]
     return split.reshape(bands, stokes * templates, stokes, npix)
+
+
+class Rows(eqx.Module):
+    """Rows of `one_stokes_each`, an array (band, row, stokes, pix) that is made when it is read.
+
+    One band of it is in memory at a time, with the pixels of all devices.
+    """
+
+    maps: Float[Array, "template stokes pix"]
+    weights: Float[Array, "band stokes pix"]
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Numbers of bands, rows, Stokes parameters and pixels."""
+        bands, stokes, npix = self.weights.shape
+        return bands, stokes * len(self.maps), stokes, npix
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    def __iter__(self) -> Iterator[Any]:
+        return map(self.__getitem__, range(len(self)))
+
+    def __getitem__(self, band: int) -> Any:
+        return job.collected(_of_band(self.maps, self.weights, band), self.shape[-1])
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.stack([np.asarray(own, dtype) for own in self])
+
+
+@partial(jax.jit, static_argnames="band")
+def _of_band(maps, weights, band):
+    return one_stokes_each(maps[None], weights[band : band + 1])[0]

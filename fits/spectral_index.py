@@ -26,7 +26,6 @@ from fits.results import FitResult
 from fits.sampling import sample
 from fits.template_likelihood import SkyLikelihood, TemplateLikelihood
 from jaxsky import observe_components, parameter_names, set_parameters
-from jaxsky.job import by_turns
 from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 
@@ -246,9 +245,8 @@ def fit_regions(
     for region, pixels in used.items():
         if not pixels.any():
             raise SettingsError(f"fit.regions: region {region!r} leaves no pixel.")
-
-    def fitted(region: str) -> list[RegionFit]:
-        given = settings, prepared, used[region], region
-        return [_fit_pixels(*given, stokes, out, progress) for stokes in settings.fit.stokes]
-
-    return [fit for each in by_turns(fitted, list(used)) for fit in each]
+    return [
+        _fit_pixels(settings, prepared, pixels, region, stokes, out, progress)
+        for region, pixels in used.items()
+        for stokes in settings.fit.stokes
+    ]

@@ -21,6 +21,7 @@ added as further templates after the others.
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -31,7 +32,7 @@ from jaxtyping import Array, Float
 
 from fits.mixing import Mixing, TemplateErrors, check_signal, named_bands, unit_sky
 from fits.posterior import Likelihood
-from fits.products import checked_weights, gram, one_stokes_each, swapped
+from fits.products import Rows, checked_weights, gram, one_stokes_each, swapped
 from fits.systems import square_root
 from jaxsky import Bandpass, Sky, observe_components, parameter_names
 from jaxsky.checks import Numeric, as_array, check_double, check_shape
@@ -41,7 +42,7 @@ from jaxsky.sky import OFFSET, interpolation_nodes, unknown_parameter
 
 #: Covariance of the inner products <rows, data>: (band, row, stokes, pix) -> square matrix over
 #: (band, row) flattened. `fits.common.Fluctuations.covariance` is one.
-CovarianceOf = Callable[[Float[Array, "band row stokes pix"]], Float[np.ndarray, "row row"]]
+CovarianceOf = Callable[[Any], Float[np.ndarray, "row row"]]
 
 
 class SkyLikelihood(Likelihood):
@@ -209,12 +210,6 @@ def likelihood(
     if not stokes or set(stokes) - set(labels):
         raise ValueError(f"Argument `stokes` must be among {labels!r}, not {stokes!r}.")
     keep = np.array([labels.index(s) for s in stokes])
-    if spread(data) and not (covariance_of is template_errors is None):
-        raise ValueError(
-            f"Argument `{'covariance_of' if covariance_of else 'template_errors'}` takes the whole "
-            "sky, which distributed pixels do not have together; leave it out, or do not "
-            "distribute."
-        )
     mixing = Mixing.of(sky, bands, "uK_RJ", on_cmb=True)
     angles = [name for name in start if name.startswith("angle.")]
     params = SkyLikelihood({}, 0, mixing, labels, bool(angles)).check(start)
@@ -224,6 +219,11 @@ def likelihood(
             raise ValueError(f"Parameter {name!r} has no effect on Stokes {stokes}.")
     sky = mixing.laws({n: value for n, value in params.items() if not n.endswith(OFFSET)})
     if pixelwise or any(leaf.ndim == 1 for leaf in jax.tree.leaves(sky)):
+        if spread(data) and covariance_of is not None:
+            raise ValueError(
+                "Argument `covariance_of` takes parameters that are numbers where pixels are "
+                "distributed; leave it out, or do not distribute."
+            )
         mixing = dataclasses.replace(mixing, sky=sky)
         like = SkyLikelihood(params, 0, mixing, labels, bool(angles))
         return _on_pixels(like, data, weights, keep, covariance_of)
@@ -246,8 +246,9 @@ def likelihood(
         matrix = _matrix(np.asarray(square_root(products[:, keep])), keep, len(labels))
         return dataclasses.replace(like, matrix=matrix)
     # A constant row tells offsets from templates.
-    maps = [*templates, *([jnp.ones_like(templates[0])] if offsets else [])]
-    rows = one_stokes_each(jnp.stack(maps), weights)
+    ones = [jnp.ones_like(templates[:1])] if offsets else []
+    maps = jnp.concatenate([templates, *ones])
+    rows = Rows(maps, weights)
     used = slice(1, len(maps) + 1)
     if covariance_of is not None:
         covariance = np.asarray(covariance_of(rows))
@@ -285,7 +286,7 @@ def _matrix(blocks, keep, stokes, whitening=None):
 
 def _of_kept(
     covariance: Float[np.ndarray, "row row"],
-    rows: Float[Array, "band row stokes pix"],
+    rows: Float[Array, "band row stokes pix"] | Rows,
     keep: np.ndarray,
 ) -> Float[np.ndarray, "row row"]:
     """Return the covariance of rows of the kept Stokes parameters, a part of that of all rows.

@@ -128,9 +128,9 @@ def test_what_cannot_be_distributed_is_refused():
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
     words = "is LevenbergMarquardt, and optimistix does not take distributed pixels"
     raises(ValueError, words, best_fit, like, solver=solver)
-    call = partial(likelihood, pixels.sky_of(48, False), pixels.BANDS, data, sigma, pixels.START)
-    raises(ValueError, "`covariance_of` takes the whole sky", call, covariance_of=np.asarray)
-    raises(ValueError, "`template_errors` takes the whole sky", call, template_errors=(1,))
+    call = partial(likelihood, pixels.sky_of(48, True), pixels.BANDS, data, sigma)
+    words = "`covariance_of` takes parameters that are numbers where pixels are distributed"
+    raises(ValueError, words, call, {"offset.70.Q": 0.0}, covariance_of=np.asarray)
     law = partial(Synchrotron, explicit(np.ones((2, 48))))
     words = "`beta_syn` must be from .* but its mean is -3"
     raises(ValueError, words, law, explicit(np.full(48, -3.0)))

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 from jax.experimental.multihost_utils import process_allgather
 
 from fits.compress import as_noise
@@ -86,6 +87,13 @@ def of_templates(npix: int, place: Place, varying: bool) -> dict[str, np.ndarray
         templates = jnp.stack([sky[name].amplitude for name in sky])
         weights = jnp.where(jnp.isfinite(sigma), 1 / sigma**2, 0)
         found["inner products"] = np.asarray(gram(data, templates, weights))
+
+        def covariance_of(rows):  # of independent pixels; the whole sky of each row is needed
+            flat = np.asarray(rows).reshape(len(FEW), -1, data.shape[1] * rows.shape[-1])
+            return scipy.linalg.block_diag(*(own @ own.T for own in flat))
+
+        exact = likelihood(sky, FEW, data, sigma, start, covariance_of=covariance_of)
+        found["exact chi2"] = np.asarray(chi2(exact, start))
     return found
 
 

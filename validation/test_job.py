@@ -58,7 +58,7 @@ def said(folder, index=0):
 def numbers(value, name=""):
     """All numbers of a result by name, but for those of the way to it."""
     if isinstance(value, dict):
-        kept = (pair for pair in value.items() if pair[0] not in ("solver", "message"))
+        kept = (pair for pair in value.items() if pair[0] not in ("solver", "message", "steps"))
         return {k: v for key, one in kept for k, v in numbers(one, f"{name}.{key}").items()}
     if isinstance(value, list):
         pairs = enumerate(value)

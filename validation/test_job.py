@@ -13,6 +13,8 @@ from test_stacks import files
 
 #: A busy machine has to end a command in this time [s].
 PATIENCE = 300.0
+#: What rounding changes: the way to a result, and when the steps of a chain are accepted.
+LEFT_OUT = ("solver", "message", "steps", "mcmc")
 #: Ten devices of two processes do not divide the pixels.
 FLAGS = "--xla_force_host_platform_device_count=5"
 COMMAND = "from jaxsky.io import stacks; stacks.LIMIT = {limit}; from fits.app import main; main()"
@@ -58,7 +60,7 @@ def said(folder, index=0):
 def numbers(value, name=""):
     """All numbers of a result by name, but for those of the way to it."""
     if isinstance(value, dict):
-        kept = (pair for pair in value.items() if pair[0] not in ("solver", "message", "steps"))
+        kept = (pair for pair in value.items() if pair[0] not in LEFT_OUT)
         return {k: v for key, one in kept for k, v in numbers(one, f"{name}.{key}").items()}
     if isinstance(value, list):
         pairs = enumerate(value)

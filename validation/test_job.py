@@ -41,7 +41,7 @@ def experiment(folder, kind="regions"):
         "common": {"nside": 16, "fwhm": 480.0},
         "free": free,
         "separate": SEPARATE | separate,
-        "fit": {"nsteps": 100, "nwalkers": 8},
+        "fit": {"nsteps": 100},
     }
     return written(folder / "experiment.toml", settings), large
 

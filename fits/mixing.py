@@ -27,11 +27,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits.kept import remembered
+from fits.products import weighted
 from jaxsky import Bandpass, Sky, parameter_names, set_parameters
 from jaxsky.bandpass import Samples, average, parse_unit, stack_bands
-from jaxsky.checks import EXACT, Numeric
+from jaxsky.checks import Numeric
 from jaxsky.interpolation import band_seds, choose_nodes
-from jaxsky.mesh import SUMS, distribute, mesh_of, over_pixels, total
+from jaxsky.mesh import distribute, mesh_of
 from jaxsky.sed import cmb_derivative
 
 if TYPE_CHECKING:
@@ -223,7 +224,7 @@ class TemplateErrors(NamedTuple):
         variance, mesh = self.variance, mesh_of(weights)
         if mesh is not None:
             variance = distribute(variance, mesh, fill=0.0)
-        power = np.asarray(_power(weights, variance))
+        power = np.asarray(weighted(weights, variance))
         bands, stokes, _ = power.shape
         size = len(self.parts) + 2
         total = np.zeros((bands, stokes, size, size))
@@ -248,12 +249,6 @@ class TemplateErrors(NamedTuple):
         return np.einsum("umn,mu,nu->mn", each, seen, seen) - np.einsum(
             "umn,mu,nu->mn", each, own, own
         )
-
-
-@jax.jit
-@over_pixels(SUMS)
-def _power(weights, variance):
-    return total(jnp.einsum("bsp,usp->bsu", weights, variance, precision=EXACT))
 
 
 def template_errors(

@@ -56,6 +56,15 @@ def gram(
     return total(jax.lax.scan(add, rest, jnp.arange(0, whole, chunk))[0])
 
 
+@jax.jit
+@over_pixels(SUMS)
+def weighted(
+    weights: Float[Array, "band stokes pix"], maps: Float[Array, "source stokes pix"]
+) -> Float[Array, "band stokes source"]:
+    """Return sums of maps over pixels with the weights of each band."""
+    return total(jnp.einsum("bsp,usp->bsu", weights, maps, precision=EXACT))
+
+
 def checked_weights(data: Array, sigma: Array) -> tuple[Array, Int[np.ndarray, "band stokes"]]:
     """Return 1/sigma^2 of all data, and how many are not masked per band and Stokes parameter."""
     weights, used, wrong, unseen = _weights(data, sigma)

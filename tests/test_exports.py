@@ -196,7 +196,7 @@ def fluctuations() -> Calls:
         jnp.ones(1),
         ("44",),
     )
-    yield of_maps._modes, MAPS[None], np.stack([FALLING] * 2)
+    yield of_maps._modes, MAPS, np.stack([FALLING] * 2)
     yield found.cmb_realisation, KEY
     yield found.noise_realisation, KEY
 
@@ -242,6 +242,8 @@ def template_passes() -> Calls:
     yield products.gram, data, MAPS[None], data
     yield products._weights, data, 2 * data
     yield products.one_stokes_each, MAPS[None], data
+    yield partial(products._of_band, band=1), MAPS[None], data
+    yield products.weighted, data, MAPS[None]
 
 
 def comparisons() -> Calls:

@@ -43,8 +43,8 @@ from jaxsky import job
 from jaxsky.checks import Numeric, check_double
 from jaxsky.cmb import realisation, tensor_spectra
 from jaxsky.experiment import cmb_spectra
-from jaxsky.harmonics import expand, gaussian_beam, synthesis
-from jaxsky.io.stacks import Maps, Stack, computed
+from jaxsky.harmonics import expand, gaussian_beam, needed_lmax, resize, synthesis
+from jaxsky.io.stacks import Maps, Stack, computed, stored
 from jaxsky.mesh import spread
 from jaxsky.noise import stream
 from jaxsky.programs import QUIET, Progress
@@ -247,10 +247,10 @@ def cleaned_cmb(
     like: SpectralLikelihood,
     params: Mapping[str, Array],
     observed: np.ndarray,
-) -> Float[np.ndarray, "stokes pix"]:
+) -> Float[np.ndarray, "stokes pix"] | Maps:
     """Return the map of the CMB in `observed`, separated with these parameters."""
     found, maps = data.components(like, params, observed, covariance=False)
-    return maps[found.components.index("cmb")]
+    return stored(maps[found.components.index("cmb")])
 
 
 @dataclass(frozen=True)
@@ -279,16 +279,18 @@ class _NoiseSimulation:
         both = cleaned_cmb(data, like, like.named(jnp.asarray(moved)), observed)
         nside = healpy.npix2nside(both.shape[-1])
         alm = realisation(stream(key, "cmb"), self.lensed) * expand(jnp.asarray(self.window))
+        alm = resize(alm, needed_lmax(self.window))
         # Made one by one, since they may be large.
         every = (
-            lambda: alone,
-            lambda: both - alone,
-            lambda: both,
-            lambda: both + synthesis(alm, nside),
+            lambda: alone[...],
+            lambda: both[...] - alone[...],
+            lambda: both[...],
+            lambda: both[...] + synthesis(alm, nside),
             lambda: synthesis(alm.at[1].set(0.0), nside),
         )
         powers = [band_powers(spectra, jnp.asarray(maps()))[1] for maps in every]
-        return [moved - theta, *powers, mean_spectrum(spectra.mask, both, spectra.lmax)]
+        mean = mean_spectrum(spectra.mask, jnp.asarray(both), spectra.lmax)
+        return [moved - theta, *powers, mean]
 
 
 def simulated_noise(

@@ -200,8 +200,8 @@ def _masked_alm(spectra: MaskedSpectra, maps: Float[Array, "2 pix"]) -> Float[Ar
     if not isinstance(derivatives, Stack):
         return _in_memory_alm(mask, derivatives, maps, lmax)
     E, B = _in_memory_alm(mask, None, maps, lmax)
-    once = _once(mask, derivatives[:2], maps, lmax)
-    return jnp.stack([E, B + once + _twice(mask, derivatives[2:], maps, lmax)])
+    once = _once(mask, jnp.asarray(derivatives[:2]), maps, lmax)
+    return jnp.stack([E, B + once + _twice(mask, jnp.asarray(derivatives[2:]), maps, lmax)])
 
 
 @partial(jax.jit, static_argnames="lmax")

@@ -74,7 +74,7 @@ def _window(beam: Array, lmax: int, what: str) -> Float[Array, " ell"]:
     return beam[: lmax + 1]
 
 
-def needed_lmax(window: Float[Array, " ell"]) -> int:
+def needed_lmax(window: Float[Array | np.ndarray, " ell"]) -> int:
     """Return the last multipole at which a window is not negligible."""
     return int(np.flatnonzero(np.abs(np.asarray(window)) > NEGLIGIBLE).max(initial=0))
 

@@ -154,8 +154,7 @@ def by_turns(make: Callable[[Item], Made], items: Sequence[Item]) -> Iterator[Ma
         try:
             made = [make(item) for item in items[jax.process_index() :: count]]
         except Exception as error:
-            error.raised_in = raised_in(error)  # type: ignore[attr-defined]
-            failed = error
+            failed = _as_sent(error)
     every = exchanged((made, failed))
     for _, failed in every:
         if failed is not None:
@@ -164,6 +163,18 @@ def by_turns(make: Callable[[Item], Made], items: Sequence[Item]) -> Iterator[Ma
             raise failed
     for k in range(len(items)):
         yield every[k % count][0][k // count]
+
+
+def _as_sent(error: Exception) -> Exception:
+    """Return an error that other processes can raise: itself, or its words if it is not pickled."""
+    where = raised_in(error)
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        kind = ValueError if isinstance(error, ValueError) else RuntimeError
+        error = kind(f"{type(error).__name__}: {error}")
+    error.raised_in = where  # type: ignore[attr-defined]
+    return error
 
 
 def of_first(make: Callable[[], Made]) -> Made:

@@ -1,14 +1,19 @@
 """Pixels over several devices give what one device gives; `validation` has several processes."""
 
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from fits.results import FitError
+from jaxsky import job
 from jaxsky.job import processes
-from jaxsky.mesh import pixel_mesh
+from jaxsky.mesh import distribute, pixel_mesh
+from jaxsky.settings import SettingsError
 from refusals import raises
 
 
@@ -40,6 +45,22 @@ def test_half_an_address_is_refused(monkeypatch):
     raises(ValueError, "Argument `number` is missing", begin, "127.0.0.1:1")
     monkeypatch.setenv("JAX_PROCESS_ID", "1")
     raises(ValueError, "Argument `address` is missing", begin)
+
+
+def test_errors_are_sent_to_other_processes_with_their_words():
+    found = pickle.loads(pickle.dumps(job._as_sent(FitError("No maximum.", None))))
+    assert (type(found), str(found)) == (RuntimeError, "FitError: No maximum.")
+    found = pickle.loads(pickle.dumps(job._as_sent(SettingsError("bands: there are none."))))
+    assert (type(found), str(found)) == (SettingsError, "bands: there are none.")
+
+
+def test_one_process_does_all_by_itself():
+    assert list(job.by_turns(str, [1, 2])) == ["1", "2"]
+    with pytest.raises(ZeroDivisionError):
+        job.of_first(lambda: 1 / 0)
+    maps = np.arange(10.0).reshape(2, 5)
+    np.testing.assert_array_equal(job.filled((2, 5), lambda i: maps[i]), maps)
+    np.testing.assert_array_equal(job.collected({"a": distribute(maps)}, 4)["a"], maps[:, :4])
 
 
 def test_one_process_is_its_own_mesh():

@@ -294,6 +294,7 @@ def test_nothing_is_lost_where_the_beam_ends_before_the_pixels():
     sky = h.synthesis(drawn(lmax, 2), nside)
     assert rms(short(sky) - whole(sky)) < 1e-5 * rms(whole(sky))
     assert short.uniform_variance(1.0) == pytest.approx(whole.uniform_variance(1.0), rel=1e-12)
+    assert not h.Preparation.smoothing(nside, 0.0, nside, 1e30, lmax)(white).any()
     variance = 1 + white**2
     np.testing.assert_allclose(short.variance(variance), whole.variance(variance), rtol=1e-4)
 

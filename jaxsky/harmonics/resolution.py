@@ -75,8 +75,9 @@ def _window(beam: Array, lmax: int, what: str) -> Float[Array, " ell"]:
 
 
 def needed_lmax(window: Float[Array | np.ndarray, " ell"]) -> int:
-    """Return the last multipole at which a window is not negligible."""
-    return int(np.flatnonzero(np.abs(np.asarray(window)) > NEGLIGIBLE).max(initial=0))
+    """Return the last multipole at which a window is not negligible, at least 2 if it has that."""
+    last = np.flatnonzero(np.abs(np.asarray(window)) > NEGLIGIBLE).max(initial=0)
+    return int(min(max(last, 2), len(window) - 1))  # Q and U have nothing below
 
 
 def shortened(window: Float[Array, " ell"]) -> Float[Array, " ell"]:

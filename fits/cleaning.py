@@ -279,7 +279,7 @@ class _NoiseSimulation:
         both = cleaned_cmb(data, like, like.named(jnp.asarray(moved)), observed)
         nside = healpy.npix2nside(both.shape[-1])
         alm = realisation(stream(key, "cmb"), self.lensed) * expand(jnp.asarray(self.window))
-        alm = resize(alm, needed_lmax(self.window))
+        alm = resize(alm, max(2, needed_lmax(self.window)))
         # Made one by one, since they may be large.
         every = (
             lambda: alone[...],

@@ -75,14 +75,14 @@ def _window(beam: Array, lmax: int, what: str) -> Float[Array, " ell"]:
 
 
 def needed_lmax(window: Float[Array | np.ndarray, " ell"]) -> int:
-    """Return the last multipole at which a window is not negligible, at least 2 if it has that."""
-    last = np.flatnonzero(np.abs(np.asarray(window)) > NEGLIGIBLE).max(initial=0)
-    return int(min(max(last, 2), len(window) - 1))  # Q and U have nothing below
+    """Return the last multipole at which a window is not negligible."""
+    return int(np.flatnonzero(np.abs(np.asarray(window)) > NEGLIGIBLE).max(initial=0))
 
 
 def shortened(window: Float[Array, " ell"]) -> Float[Array, " ell"]:
     """Cut a window where it becomes negligible for good, unless it is being traced."""
-    return window[: needed_lmax(window) + 1] if is_concrete(window) else window
+    # Q and U have no multipoles below 2.
+    return window[: max(2, needed_lmax(window)) + 1] if is_concrete(window) else window
 
 
 def pixel_window(nside: int, lmax: int) -> Float[np.ndarray, " ell"]:

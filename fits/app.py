@@ -226,6 +226,7 @@ def main() -> None:
                 with job.processes():
                     app()
     except Exception as error:
-        console.quiet = job.told and job.index() > 0
+        if not job.told:  # else the first of several processes says it
+            console.quiet = False
         print_error(error)
         sys.exit(2)

@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
+from jaxsky import job
 from jaxsky.checks import Numeric
 from jaxsky.cmb import realisation
 from jaxsky.harmonics import (
@@ -148,12 +149,20 @@ class Fluctuations(eqx.Module):
     ) -> Float[np.ndarray, "bandrow bandrow"]:
         """Return the covariance of the inner products of rows with the fluctuations."""
         npix = healpy.nside2npix(self.preparations[0].nside)  # without padding
-        blocks, modes = list[np.ndarray](), list[np.ndarray]()
-        for i, noise in enumerate(self.noises.values()):
-            own = rows[i][..., :npix]
-            blocks.append(noise.covariance(own, len(own)))
-            if self.cmb_spectra is not None and self.cmb_windows is not None:
+        blocks, modes, noises = list[np.ndarray](), list[np.ndarray](), list(self.noises.values())
+        for start in range(0, len(noises), job.number()):
+            # As many bands at a time as there are processes, which take turns.
+            bands = range(len(noises))[start : start + job.number()]
+            maps = {i: rows[i] for i in bands}
+
+            def of_band(i: int, maps: dict[int, Any] = maps) -> np.ndarray:
+                return noises[i].covariance(maps[i][..., :npix], len(maps[i]))
+
+            blocks += job.by_turns(of_band, bands)
+            for i in bands if self.cmb_spectra is not None else ():
+                assert self.cmb_windows is not None  # as there is a CMB
                 seen = np.asarray(self.cmb_spectra) * np.asarray(self.cmb_windows[i]) ** 2
+                own = maps[i][..., :npix]
                 modes += [np.asarray(self.cmb_factors[i] * _modes(row, seen)) for row in own]
         total = scipy.linalg.block_diag(*blocks)
         return total + np.stack(modes) @ np.stack(modes).T if modes else total

@@ -108,10 +108,14 @@ def _fit_pixels(
     used: Bool[np.ndarray, " pix"],
     region: str,
     stokes: str,
-    out: Path | None = None,
-    progress: Progress = QUIET,
+    out: Path | None,
+    mark: str,
+    progress: Progress,
 ) -> RegionFit:
-    """Fit one region and choice of Stokes parameters; see `fit_regions`."""
+    """Fit one region and choice of Stokes parameters; see `fit_regions`.
+
+    `mark` stands for the maps, of which chains in `out` are.
+    """
     # An offset of a Stokes parameter that is not fitted has no effect.
     start = {
         name: value
@@ -145,8 +149,9 @@ def _fit_pixels(
         else:
             chain = None
             if out is not None:
-                mark = f"{fingerprint(like)} {settings.free} {settings.seed}"
-                chain = KeptChain(out / f"chain_{region}_{stokes}.npz", mark)
+                said = settings.fit.likelihood, settings.free, settings.seed
+                own = f"{mark} {fingerprint(used)} {stokes} {said}"
+                chain = KeptChain(out / f"chain_{region}_{stokes}.npz", own)
             results[method] = sample(
                 like,
                 start,
@@ -245,8 +250,10 @@ def fit_regions(
     for region, pixels in used.items():
         if not pixels.any():
             raise SettingsError(f"fit.regions: region {region!r} leaves no pixel.")
+    # Not that of a likelihood, whose sums depend on how many processes share the pixels.
+    mark = fingerprint(prepared) if out is not None and "mcmc" in settings.fit.methods else ""
     return [
-        _fit_pixels(settings, prepared, pixels, region, stokes, out, progress)
+        _fit_pixels(settings, prepared, pixels, region, stokes, out, mark, progress)
         for region, pixels in used.items()
         for stokes in settings.fit.stokes
     ]

@@ -104,14 +104,19 @@ def _end() -> None:
         jax.distributed.shutdown()
 
 
+def _joined() -> bool:
+    """Return whether others do the same; JAX, which takes time to begin, is not asked in vain."""
+    return jax.distributed.is_initialized() and not _alone
+
+
 def number() -> int:
     """Return the number of processes."""
-    return 1 if _alone else jax.process_count()
+    return jax.process_count() if _joined() else 1
 
 
 def index() -> int:
     """Return which of them this is; the first, 0, writes the results."""
-    return 0 if _alone else jax.process_index()
+    return jax.process_index() if _joined() else 0
 
 
 def exchanged(value: Any) -> list[Any]:

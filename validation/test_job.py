@@ -108,8 +108,8 @@ def test_a_job_that_was_killed_goes_on_as_one_process_does(name, tmp_path):
         time.sleep(0.05)
     run[1].kill()
     assert all(ended(run, 30.0))
-    run = begun(2, tmp_path, name, settings, out, *options, "--resume")
-    assert ended(run, PATIENCE) == [0, 0], said(tmp_path)
+    run = begun(3, tmp_path, name, settings, out, *options, "--resume")
+    assert ended(run, PATIENCE) == [0, 0, 0], said(tmp_path)
     whole = tmp_path / "whole"
     assert ended(begun(1, tmp_path, name, settings, whole, *options), PATIENCE) == [0]
     same(out, whole)

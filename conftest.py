@@ -15,9 +15,18 @@ CACHE = Path(__file__).parent / ".cache"
 os.environ["JAXSKY_CACHE"] = str(CACHE)
 keep_programs(CACHE / "programs")
 
+#: Tests run many small programs, which take longer to compile than to run. Slow checks are compiled
+#: as they are for users.
+COMPILED_SOON = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
 #: Of memory, from which on programs are forgotten; the programs of so many take about 0.4 GB.
 MOST_PIECES = 2_500
 DATA = Path(os.environ.get("JAXSKY_DATA", Path(__file__).parents[1] / "shared" / "data"))
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile without much optimisation, here and in commands that are started."""
+    if config.option.markexpr == "not slow":
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {COMPILED_SOON}"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

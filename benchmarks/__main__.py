@@ -50,7 +50,7 @@ BENCHMARKS = {
     "patches": comparisons.patches,
     "commands": comparisons.commands,
     "bands-on-disk": stacked_maps.separation,
-    "separate-large": large_maps.separation,
+    "large-maps": large_maps.large_maps,
     "workers": realisations.workers,
     "pixels-moved": pixels.exchanged,
     "pixels-times": pixels.times,
@@ -64,7 +64,7 @@ LONG = (
     "commands",
     "workers",
     "bands-on-disk",
-    "separate-large",
+    "large-maps",
     "pixels-memory",
 )
 

@@ -1,10 +1,11 @@
-"""Maps larger than memory: 15 bands from files, separated at their own resolution.
+"""Maps larger than memory: 15 bands from files, separated and fitted at their own resolution.
 
-`python -m benchmarks.large_maps FOLDER NSIDE uniform|pixel` is one run in a process of its own,
-which prints time and peak memory after each step.
+`python -m benchmarks.large_maps FOLDER NSIDE uniform|pixel separate|fit` is one run in a process of
+its own, which prints time and peak memory after each step.
 """
 
 import argparse
+import itertools
 import json
 import resource
 import shutil
@@ -20,12 +21,16 @@ import numpy as np
 
 from benchmarks.table import Row, time_text
 from fits.cleaning import separate_data
-from fits.commands import separate as command
+from fits.commands import separate
+from fits.common import prepared_maps
+from fits.inputs import inputs_of
+from fits.regions import region_masks
 from fits.separated_data import separation_data
+from fits.spectral_index import fit_regions
 from jaxsky.io import write_maps
 from jaxsky.io.stacks import scratch
 from jaxsky.programs import Progress
-from jaxsky.settings import load
+from jaxsky.settings import Experiment, load
 
 #: Simulations of noise in a run: each takes as long as any other.
 NSIMS = 2
@@ -48,6 +53,10 @@ fwhm = 90.0
 [separate]
 lmax = 120
 sampler = "none"
+[fit]
+regions = ["full"]
+stokes = ["QU"]
+methods = ["gradient", "mcmc"]
 """
 LITEBIRD = '[[bands]]\ninstrument = "litebird"'
 
@@ -113,11 +122,12 @@ class _Steps(Progress):
 
 
 def main() -> None:
-    """Separate the maps of an experiment, with few simulations."""
+    """Separate or fit the maps of an experiment, with few simulations."""
     parser = argparse.ArgumentParser("python -m benchmarks.large_maps")
     parser.add_argument("folder", type=Path)
     parser.add_argument("nside", type=int)
     parser.add_argument("noise", choices=("uniform", "pixel"))
+    parser.add_argument("command", choices=tuple(COMMANDS))
     parser.add_argument("--prepare", action="store_true", help="write the files and stop")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -133,39 +143,54 @@ def main() -> None:
     steps = _Steps()
     with tempfile.TemporaryDirectory(dir=arguments.folder) as name, scratch(Path(name)):
         steps.step("reading and preparing maps")
-        data = separation_data(settings)
-        found = separate_data(settings, data, None, steps)
-        steps.step("writing maps")
-        command._write_maps(Path(name), found, settings)
-        steps.step("drawing")
-        command.plot_components(Path(name) / "a.png", found, settings)
-        command.plot_residuals(Path(name) / "b.png", found, settings)
-        command._numbers(found, settings)
+        COMMANDS[arguments.command](settings, Path(name), steps)
         steps.step("end")
 
 
-def separation(quick: bool) -> list[Row]:
-    """Time and memory of a separation at the resolution of the maps, against nside."""
+def _separate(settings: Experiment, out: Path, steps: Progress) -> None:
+    data = separation_data(settings)
+    found = separate_data(settings, data, None, steps)
+    steps.step("writing maps")
+    separate._write_maps(out, found, settings)
+    steps.step("drawing")
+    separate.plot_components(out / "a.png", found, settings)
+    separate.plot_residuals(out / "b.png", found, settings)
+    separate._numbers(found, settings)
+
+
+def _fit(settings: Experiment, out: Path, steps: Progress) -> None:
+    inputs = inputs_of(settings)
+    prepared = prepared_maps(settings, inputs)
+    del inputs
+    fit_regions(settings, prepared, region_masks(settings, settings.fit.regions), out, steps)
+
+
+COMMANDS = {"separate": _separate, "fit": _fit}
+
+
+def large_maps(quick: bool) -> list[Row]:
+    """Time and memory at the resolution of the maps, against nside."""
     rows, nsides = [], (512,) if quick else (512, 1024, 2048)
-    for noise in ("uniform", "pixel"):
-        for nside in nsides:
-            with tempfile.TemporaryDirectory() as name:
-                line = [sys.executable, "-m", "benchmarks.large_maps", name, str(nside), noise]
-                free = shutil.disk_usage(name).free / 1e9
-                needed = 15 * 12 * nside**2 * 100 / 1e9
-                work = f"`jaxsky separate`, 15 bands at nside {nside}, {noise} noise"
+    for noise, nside in itertools.product(("uniform", "pixel"), nsides):
+        with tempfile.TemporaryDirectory() as name:
+            line = [sys.executable, "-m", "benchmarks.large_maps", name, str(nside), noise]
+            free = shutil.disk_usage(name).free / 1e9
+            needed = 15 * 12 * nside**2 * 100 / 1e9
+            if free >= needed:
+                subprocess.run([*line, "fit", "--prepare"], check=True, capture_output=True)
+            for which in COMMANDS:
+                work = f"`jaxsky {which}`, 15 bands at nside {nside}, {noise} noise"
                 if free < needed:
                     said = f"left out: {needed:.0f} GB of disk are needed, {free:.0f} GB are free"
                     rows.append(Row(work, "", remarks=said))
                     continue
-                subprocess.run([*line, "--prepare"], check=True, capture_output=True)
-                done = subprocess.run(line, check=True, capture_output=True, text=True)
-            steps = {}
-            for said in map(json.loads, done.stdout.splitlines()):
-                steps |= {key: value for key, value in said.items() if key != "done"}
-            peak = max(peak for _, peak in steps.values())
-            each = [f"{key} {time_text(wall)}" for key, (wall, _) in steps.items()]
-            rows.append(Row(work, f"{peak:.2f} GiB", "<= 4 GiB", peak <= 4, ", ".join(each)))
+                done = subprocess.run([*line, which], check=True, capture_output=True, text=True)
+                steps = {}
+                for said in map(json.loads, done.stdout.splitlines()):
+                    steps |= {key: value for key, value in said.items() if key != "done"}
+                peak = max(peak for _, peak in steps.values())
+                each = [f"{key} {time_text(wall)}" for key, (wall, _) in steps.items()]
+                rows.append(Row(work, f"{peak:.2f} GiB", "<= 4 GiB", peak <= 4, ", ".join(each)))
     return rows
 
 

@@ -25,7 +25,7 @@ from jaxsky.harmonics import (
     pixel_window,
     shortened,
 )
-from jaxsky.io.stacks import Maps, Stack, computed, is_large, ranges
+from jaxsky.io.stacks import Computed, Maps, Stack, computed, is_large, ranges, stored
 from jaxsky.job import filled
 from jaxsky.mesh import distribute, spread
 from jaxsky.programs import return_memory
@@ -59,7 +59,7 @@ class CommonMaps(NamedTuple):
     def model(self) -> Float[Array, "band stokes pix"]:
         """Return the emission of the templates in the bands [uK_RJ]."""
         assert self.sky is not None  # there are templates
-        return observe(self.sky, list(self.bands.values()))
+        return observe(jax.tree.map(jnp.asarray, self.sky), list(self.bands.values()))
 
     def likelihood(
         self,
@@ -84,12 +84,17 @@ class CommonMaps(NamedTuple):
         used: Any = self.used if region is None else self.used & region
         assert self.sky is not None  # there are templates
         sky, data, sigma = _own_pixels(self.sky, self.data, self.sigma)
-        used = distribute(used) if spread(data) else used
+        if isinstance(sigma, Stack):
+            masked: Any = Computed(
+                sigma.shape, lambda at: np.where(used[at], sigma[..., at], np.inf)
+            )
+        else:
+            masked = jnp.where(distribute(used) if spread(data) else used, sigma, jnp.inf)
         return likelihood(
             sky,
             self.bands,
             data,
-            jnp.where(used, jnp.asarray(sigma), jnp.inf),
+            masked,
             start,
             stokes=stokes,
             covariance_of=self.covariance_of if kind == "exact" else None,
@@ -109,11 +114,15 @@ class CommonMaps(NamedTuple):
 
 
 def prepare_component(
-    component: Component, preparation: Preparation, kept: Bool[np.ndarray, " pix"] | None = None
+    component: Component,
+    preparation: Preparation,
+    kept: Bool[np.ndarray, " pix"] | None = None,
+    copies: int = 1,
 ) -> Component:
     """Bring a component's amplitude, and parameters that are maps, to the common resolution.
 
-    Pixels of the amplitude that are not kept are set to zero; by default all are kept.
+    Pixels of the amplitude that are not kept are set to zero; by default all are kept. Amplitudes
+    that are large, if there were so many, lie on disk.
     """
 
     def brought(leaf):
@@ -123,7 +132,7 @@ def prepare_component(
         if leaf.ndim == 2:
             values = values if kept is None else values * kept
         prepared = preparation(values).block_until_ready()
-        return prepared if leaf.ndim == 2 else prepared[0]
+        return stored(prepared, copies) if leaf.ndim == 2 else prepared[0]
 
     return jax.tree.map(brought, component)
 
@@ -171,7 +180,7 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
             left = spread(jnp.asarray(own_used[None], float))[0]
             used &= np.asarray(left) > 1 - MISSING
     sky = {
-        name: prepare_component(template.component, operators[what], kept[what])
+        name: prepare_component(template.component, operators[what], kept[what], many)
         for (what, template), name in zip(templates.items(), inputs.templates, strict=True)
     }
 

@@ -27,6 +27,7 @@ from jaxsky.harmonics import (
     average_pixels,
     expand,
     map_variance,
+    shortened,
     synthesis,
 )
 from jaxsky.io.stacks import Maps, empty, is_large, ranges
@@ -64,7 +65,7 @@ class MapNoise(NamedTuple):
 
         Rows at the resolution of the noise are stored in its precision.
         """
-        block, modes = np.zeros((count, count)), list[np.ndarray]()
+        block, modes = np.zeros((count, count)), _Modes(count)
         white = bool(np.ndim(self.noise) or self.noise)
         covariance = of_pixels(self.noise, self.preparation.nside_in)
         npix = covariance.shape[-1]
@@ -73,7 +74,7 @@ class MapNoise(NamedTuple):
             if before is not None:
                 before[own] = np.asarray(self.preparation.transpose(row).block_until_ready())
             if self.correlated is not None:
-                modes.append(np.asarray(_modes(row, np.stack([self.correlated] * 2))))
+                modes.append(_modes(row, np.stack([self.correlated] * 2)))
         if before is not None:
             for cut in ranges(npix, CHUNK):
                 maps = before[..., cut].astype(float)
@@ -81,7 +82,7 @@ class MapNoise(NamedTuple):
                 seen = np.einsum("stp,jtp->jsp", pixels, maps)
                 block += maps.reshape(count, -1) @ seen.reshape(count, -1).T
             block = (block + block.T) / 2
-        return block if self.correlated is None else block + np.stack(modes) @ np.stack(modes).T
+        return block if self.correlated is None else block + modes.products()
 
     def alm(self, key: Array, name: str) -> Float[Array, "2 alm"]:
         """Return E and B of a realisation of smoothed noise; the map's name is in its key."""
@@ -149,23 +150,26 @@ class Fluctuations(eqx.Module):
     ) -> Float[np.ndarray, "bandrow bandrow"]:
         """Return the covariance of the inner products of rows with the fluctuations."""
         npix = healpy.nside2npix(self.preparations[0].nside)  # without padding
-        blocks, modes, noises = list[np.ndarray](), list[np.ndarray](), list(self.noises.values())
+        noises, blocks = list(self.noises.values()), list[np.ndarray]()
+        modes, last = _Modes(rows.shape[0] * rows.shape[1]), 0
+        if self.cmb_windows is not None:  # beyond this the beams leave nothing
+            last = max(len(shortened(window)) for window in self.cmb_windows)
         for start in range(0, len(noises), job.number()):
             # As many bands at a time as there are processes, which take turns.
             bands = range(len(noises))[start : start + job.number()]
             maps = {i: rows[i] for i in bands}
 
             def of_band(i: int, maps: dict[int, Any] = maps) -> np.ndarray:
-                return noises[i].covariance(maps[i][..., :npix], len(maps[i]))
+                return noises[i].covariance((row[..., :npix] for row in maps[i]), len(maps[i]))
 
             blocks += job.by_turns(of_band, bands)
             for i in bands if self.cmb_spectra is not None else ():
                 assert self.cmb_windows is not None  # as there is a CMB
                 seen = np.asarray(self.cmb_spectra) * np.asarray(self.cmb_windows[i]) ** 2
-                own = maps[i][..., :npix]
-                modes += [np.asarray(self.cmb_factors[i] * _modes(row, seen)) for row in own]
+                for row in maps[i]:
+                    modes.append(self.cmb_factors[i] * _modes(row[..., :npix], seen[:, :last]))
         total = scipy.linalg.block_diag(*blocks)
-        return total + np.stack(modes) @ np.stack(modes).T if modes else total
+        return total if self.cmb_spectra is None else total + modes.products()
 
     # Not one program: there XLA would draw the normals anew for each row.
     def noise_realisation(self, key: Array) -> Maps:
@@ -214,6 +218,25 @@ class Fluctuations(eqx.Module):
 
         found = filled((*shape[:2], size), of_band)
         return np.broadcast_to(found[...], shape) if uniform else found
+
+
+class _Modes:
+    """Projections of so many rows on modes; on disk if they are large."""
+
+    def __init__(self, number: int) -> None:
+        self._number, self._done = number, 0
+
+    def append(self, row: Array) -> None:
+        """Add the next row."""
+        if not self._done:
+            self._rows = empty((self._number, row.size))
+        self._rows[self._done] = np.asarray(row)
+        self._done += 1
+
+    def products(self) -> Float[np.ndarray, "row row"]:
+        """Return the inner products of all rows."""
+        parts = (self._rows[..., part] for part in ranges(self._rows.shape[-1]))
+        return sum((part @ part.T for part in parts), np.zeros(2 * (self._number,)))
 
 
 @jax.jit

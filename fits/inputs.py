@@ -144,6 +144,7 @@ def inputs_of(
     description = settings.title
     if templates:
         sky, description = read_sky(settings, names=settings.modelled(), galaxy=galaxy)
+        sky = {name: template.of_many(len(settings.bands)) for name, template in sky.items()}
     bands: dict[str, Band] = {}
     truths: list[Mapping[str, float] | None] = []
 

@@ -27,11 +27,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits.kept import remembered
-from fits.products import weighted
+from fits.products import summed, weighted
 from jaxsky import Bandpass, Sky, parameter_names, set_parameters
 from jaxsky.bandpass import Samples, average, parse_unit, stack_bands
 from jaxsky.checks import Numeric
 from jaxsky.interpolation import band_seds, choose_nodes
+from jaxsky.io.stacks import Maps, computed, stored
 from jaxsky.mesh import distribute, mesh_of
 from jaxsky.sed import cmb_derivative
 
@@ -215,7 +216,7 @@ class TemplateErrors(NamedTuple):
     covariances_of: Callable[[Any], Float[np.ndarray, "source bandrow bandrow"]]
     parts: Float[np.ndarray, "template source"]
     of_band: Float[np.ndarray, "band source"]
-    variance: Float[Array, "source stokes pix"]
+    variance: Float[np.ndarray, "source stokes pix"] | Maps
 
     def mean_products(
         self, weights: Float[Array, "band stokes pix"]
@@ -224,7 +225,7 @@ class TemplateErrors(NamedTuple):
         variance, mesh = self.variance, mesh_of(weights)
         if mesh is not None:
             variance = distribute(variance, mesh, fill=0.0)
-        power = np.asarray(weighted(weights, variance))
+        power = np.asarray(summed(weighted, weights, variance))
         bands, stokes, _ = power.shape
         size = len(self.parts) + 2
         total = np.zeros((bands, stokes, size, size))
@@ -271,17 +272,21 @@ def template_errors(
         for n, one in zip(names, shared, strict=True)
     ]
     of_band = [[0.0] * len(own) + [float(b == name) for b in which] for name in bands]
-    variance = np.stack([source.variance() for source in sources])
+    each = [stored(source.variance(), len(sources)) for source in sources]
+    shape = len(each), *each[0].shape
+
+    def variance(pixels: Any) -> np.ndarray:
+        return np.maximum(np.stack([one[..., pixels] for one in each]), 0.0)
 
     def every(source: "MapNoise", rows: Any) -> Float[np.ndarray, "row row"]:
-        flat = (row[..., : variance.shape[-1]] for own in rows for row in own)
+        flat = (row[..., : shape[-1]] for own in rows for row in own)
         return source.covariance(flat, rows.shape[0] * rows.shape[1])
 
     return TemplateErrors(
         remembered(lambda rows: np.stack([every(source, rows) for source in sources])),
         np.array(parts),
         np.array(of_band),
-        jnp.asarray(np.where(variance > 0, variance, 0.0)),
+        computed(shape, variance),
     )
 
 

@@ -1,7 +1,10 @@
-"""Passes over the pixels of data and templates: weights, inner products and their rows."""
+"""Passes over the pixels of data and templates: weights, inner products and their rows.
 
-from collections.abc import Iterator
-from functools import partial
+Maps that lie on disk are read range by range.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial, reduce
 from typing import Any
 
 import equinox as eqx
@@ -11,11 +14,41 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsky import job
-from jaxsky.checks import EXACT, UNSEEN
+from jaxsky.checks import EXACT, UNSEEN, as_array
+from jaxsky.io.stacks import Computed, Maps, Stack, empty, ranges
 from jaxsky.mesh import SUMS, at_once, maps_of, over_pixels, total
 
 #: Pixels per pass over templates; few enough for the weighted copies to stay in cache.
 CHUNK = 1 << 14
+
+
+def as_maps(name: str, maps: Any) -> Array | Stack:
+    """Return maps as an array, or as they are if they lie on disk."""
+    return maps if isinstance(maps, Stack) else as_array(name, maps)
+
+
+def stacked(maps: Sequence[Any]) -> Array | Maps:
+    """Return maps (stokes, pix) as one array, which is made when it is read if one is on disk."""
+    if not any(isinstance(one, Stack) for one in maps):
+        return jnp.stack(maps)
+
+    def read(pixels: Any) -> np.ndarray:
+        return np.stack([np.asarray(one[..., pixels]) for one in maps])
+
+    return Computed((len(maps), *maps[0].shape), read)
+
+
+def summed(sums: Callable[..., Any], *maps: Any) -> Any:
+    """Return `sums(*maps)`, sums over pixels; of maps on disk, those of all ranges together."""
+    on_disk = [one for one in maps if isinstance(one, Stack)]
+    if not on_disk:
+        return sums(*maps)
+    npix = on_disk[0].shape[-1]
+
+    def of_part(part: slice) -> Any:
+        return sums(*(m[..., part] if m.shape[-1:] == (npix,) else m for m in maps))
+
+    return reduce(partial(jax.tree.map, jnp.add), map(of_part, ranges(npix)))
 
 
 @partial(jax.jit, static_argnames="chunk")
@@ -65,9 +98,9 @@ def weighted(
     return total(jnp.einsum("bsp,usp->bsu", weights, maps, precision=EXACT))
 
 
-def checked_weights(data: Array, sigma: Array) -> tuple[Array, Int[np.ndarray, "band stokes"]]:
+def checked_weights(data: Any, sigma: Any) -> tuple[Any, Int[np.ndarray, "band stokes"]]:
     """Return 1/sigma^2 of all data, and how many are not masked per band and Stokes parameter."""
-    weights, used, wrong, unseen = _weights(data, sigma)
+    used, wrong, unseen = summed(_counts, data, sigma)
     if wrong:
         raise ValueError(f"Argument `sigma` has {wrong} of {sigma.size} values that are not > 0.")
     if unseen:
@@ -77,24 +110,34 @@ def checked_weights(data: Array, sigma: Array) -> tuple[Array, Int[np.ndarray, "
         )
     if not used.any():
         raise ValueError("No pixel is left: the mask, or an infinite `sigma`, covers the map.")
-    return weights, np.asarray(used)
+    if isinstance(data, Stack):
+        return Computed(data.shape, lambda at: 1 / sigma[..., at] ** 2), np.asarray(used)
+    return _weights(data, sigma), np.asarray(used)
 
 
 @jax.jit
-@over_pixels((maps_of(3), SUMS, SUMS, SUMS))
+@over_pixels(maps_of(3))
 def _weights(data, sigma):
-    """Return 1/sigma^2 of all data, and counts of used data, bad sigma and bad data."""
-    weights = jnp.broadcast_to(1 / sigma**2, data.shape)
-    used = weights > 0
+    """Return 1/sigma^2 of all data."""
+    return jnp.broadcast_to(1 / sigma**2, data.shape)
+
+
+@jax.jit
+@over_pixels(SUMS)
+def _counts(data, sigma):
+    """Return counts of used data, bad sigma and bad data."""
+    used = jnp.broadcast_to(1 / sigma**2, data.shape) > 0
     unseen = used & (~jnp.isfinite(data) | (data < UNSEEN))
     # A sigma without pixels is the same on all devices, and counts once.
     wrong = jnp.sum(~(sigma > 0))
     wrong = total(wrong) if sigma.shape[-1:] == data.shape[-1:] else wrong
-    return weights, total(used.sum(axis=-1)), wrong, total(unseen.sum())
+    return total(used.sum(axis=-1)), wrong, total(unseen.sum())
 
 
-def swapped(maps: Float[Array, "*maps stokes x"]) -> Float[Array, "*maps stokes x"]:
-    """Exchange Q and U; in place of I, which no angle changes, put any other."""
+def swapped(maps: Any) -> Any:
+    """Exchange Q and U of maps (..., stokes, pix); put any other for I, which no angle changes."""
+    if isinstance(maps, Stack):
+        return Computed(maps.shape, lambda at: swapped(maps[..., at]))
     return maps[..., [-2, -1, -2][-maps.shape[-2] :], :]
 
 
@@ -113,11 +156,11 @@ def one_stokes_each(
 class Rows(eqx.Module):
     """Rows of `one_stokes_each`, an array (band, row, stokes, pix) that is made when it is read.
 
-    One band of it is in memory at a time, with the pixels of all devices.
+    One band of it exists at a time, with the pixels of all devices; on disk if it is large.
     """
 
-    maps: Float[Array, "template stokes pix"]
-    weights: Float[Array, "band stokes pix"]
+    maps: Float[Array, "template stokes pix"] | Maps
+    weights: Float[Array, "band stokes pix"] | Maps
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
@@ -132,7 +175,12 @@ class Rows(eqx.Module):
         return map(self.__getitem__, range(len(self)))
 
     def __getitem__(self, band: int) -> Any:
-        return job.collected(_of_band(self.maps, self.weights, band), self.shape[-1])
+        if not isinstance(self.weights, Stack):
+            return job.collected(_of_band(self.maps, self.weights, band), self.shape[-1])
+        found = empty(self.shape[1:])
+        for part in ranges(self.shape[-1]):
+            found[..., part] = _of_band(self.maps[..., part], self.weights[..., part], band)
+        return found
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.stack([np.asarray(own, dtype) for own in self])

@@ -8,8 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import scipy.stats
 from jaxtyping import Bool
@@ -26,6 +27,7 @@ from fits.results import FitResult
 from fits.sampling import sample
 from fits.template_likelihood import SkyLikelihood, TemplateLikelihood
 from jaxsky import observe_components, parameter_names, set_parameters
+from jaxsky.io.stacks import ranges
 from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 
@@ -133,7 +135,7 @@ def _fit_pixels(
             kind = settings.fit.likelihood
             make = partial(prepared.likelihood, stokes=stokes, region=used, kind=kind)
             like = make(start) if prepared.template_errors is None else settled(make, start, priors)
-    nothing = weightless(prepared, start, used, stokes)
+    nothing, expected, shares = _look(prepared, start, used, stokes)
     number = len(prepared.bands) - len(nothing)
     if exact:
         values = like.residuals(start).size * number / len(prepared.bands)
@@ -168,69 +170,59 @@ def _fit_pixels(
         )
     chi2s = {method: float(chi2(diagonal, r.best_fit)) for method, r in results.items()}
     dof = int(used.sum()) * number * len(stokes) - len(start)
-    expected = _expected(prepared, used, stokes, nothing)
     results = {
         method: r.judged(chi2s[method], dof, start, expected) for method, r in results.items()
     }
-    noisy = prepared.template_errors is not None
-    shares = _noise_shares(prepared, used, stokes) if noisy else {}
     known = nothing, shares, isinstance(like, TemplateLikelihood)
     return RegionFit(region, stokes, results, chi2s, dof, dof_amplitudes, *known)
 
 
-def _noise_shares(
-    prepared: CommonMaps, used: Bool[np.ndarray, " pix"], stokes: str
-) -> dict[str, float]:
-    """Return the fraction of the weighted power of each template that is noise."""
-    errors = prepared.template_errors
-    assert prepared.sky is not None
-    assert errors is not None  # checked by the caller
-    keep = np.array([s in stokes for s in "QU"])
-    inside = used & np.isfinite(prepared.sigma) & keep[:, None]
-    weights = np.where(inside, 1 / np.asarray(prepared.sigma) ** 2, 0.0)
-    templates = np.stack([c.amplitude for c in prepared.sky.components.values()])
-    templates = np.where(prepared.used, templates, 0.0)
-    noise = np.einsum("bsp,usp,ku->k", weights, errors.variance, errors.parts**2)
-    shares = noise / np.einsum("bsp,ksp,ksp->k", weights, templates, templates)
-    return dict(zip(prepared.sky, shares.tolist(), strict=True))
+def _look(
+    prepared: CommonMaps, params: Mapping[str, float], used: Bool[np.ndarray, " pix"], stokes: str
+) -> tuple[tuple[str, ...], float, dict[str, float]]:
+    """Look at the signal and the noise of all bands in one pass over the pixels.
 
+    Returns
+    -------
+    weightless : bands that carry no weight for any template, compared with the other bands
+    expected : mean square of noise and CMB over that of noise, which alone chi^2 counts
+    shares : fraction of the weighted power of each template that is noise, if any is known
+    """
+    errors, sky = prepared.template_errors, prepared.sky
+    assert sky is not None  # there are templates
+    bands, keep = list(prepared.bands.values()), np.array(["QU".index(s) for s in stokes])
+    known = parameter_names(sky)
+    moved = set_parameters(sky, {name: v for name, v in params.items() if name in known})
+    weight = np.zeros((len(bands), len(keep)))
+    power = np.zeros((len(sky.components), len(bands)))
+    signal = noise = np.zeros(len(sky.components))
+    for part in ranges(used.size):
 
-def _expected(
-    prepared: CommonMaps, used: Bool[np.ndarray, " pix"], stokes: str, left_out: Sequence[str]
-) -> float:
-    """Return the mean square of noise and CMB over that of noise, which alone chi^2 counts."""
-    power = prepared.fluctuations.cmb_power().sum(axis=1)
-    ell = np.arange(power.shape[-1])
-    # Q and U each have half the variance of E and B.
-    variance = power @ (2 * ell + 1) / (8 * np.pi)
-    keep = np.array(["QU".index(s) for s in stokes])
-    ratio = variance[:, None, None] / np.asarray(prepared.sigma)[:, keep][..., used] ** 2
-    counted = [name not in left_out for name in prepared.bands]
-    return 1.0 + float(ratio[counted].mean())
+        def own(maps: Any, part: slice = part) -> Any:
+            return maps[..., part] if np.ndim(maps) else maps
 
-
-def weightless(
-    prepared: CommonMaps,
-    params: Mapping[str, float],
-    used: Bool[np.ndarray, " pix"],
-    stokes: str,
-) -> tuple[str, ...]:
-    """Return bands that carry no weight for any template, compared with the other bands."""
-    assert prepared.sky is not None  # there are templates
-    known = parameter_names(prepared.sky)
-    values = {name: value for name, value in params.items() if name in known}
-    sky = set_parameters(prepared.sky, values)
-    seen = observe_components(sky, list(prepared.bands.values()))
-    keep = np.array(["QU".index(s) for s in stokes])
-    power = np.stack(
-        [
-            np.sum(np.where(used, maps / prepared.sigma, 0.0)[:, keep] ** 2, axis=(1, 2))
-            for maps in seen.values()
-        ]
-    )
+        inside = used[part]
+        weights = np.where(inside, 1 / np.asarray(own(prepared.sigma))[:, keep] ** 2, 0.0)
+        weight += weights.sum(axis=-1)
+        seen = observe_components(jax.tree.map(own, moved), bands)
+        maps = np.where(inside, np.stack([m[:, keep] for m in seen.values()]), 0.0)
+        power += np.einsum("bsp,kbsp,kbsp->kb", weights, maps, maps)
+        if errors is not None:
+            templates = np.stack([own(c.amplitude)[keep] for c in sky.components.values()])
+            templates = np.where(inside, templates, 0.0)
+            signal = signal + np.einsum("bsp,ksp,ksp->k", weights, templates, templates)
+            variance = np.asarray(own(errors.variance))[:, keep]
+            noise = noise + np.einsum("bsp,usp,ku->k", weights, variance, errors.parts**2)
     total = power.sum(axis=1, keepdims=True)
     share = np.max(power / np.where(total > 0, total, 1.0), axis=0)
-    return tuple(n for n, part in zip(prepared.bands, share, strict=True) if part < WEIGHTLESS)
+    weightless = tuple(n for n, s in zip(prepared.bands, share, strict=True) if s < WEIGHTLESS)
+    cmb = prepared.fluctuations.cmb_power().sum(axis=1)
+    # Q and U each have half the variance of E and B.
+    variance = cmb @ (2 * np.arange(cmb.shape[-1]) + 1) / (8 * np.pi)
+    counted = [name not in weightless for name in prepared.bands]
+    ratio = variance[:, None] * weight / used.sum()
+    shares = {} if errors is None else dict(zip(sky, (noise / signal).tolist(), strict=True))
+    return weightless, 1.0 + float(ratio[counted].mean()), shares
 
 
 def fit_regions(

@@ -32,11 +32,21 @@ from jaxtyping import Array, Float
 
 from fits.mixing import Mixing, TemplateErrors, check_signal, named_bands, unit_sky
 from fits.posterior import Likelihood
-from fits.products import Rows, checked_weights, gram, one_stokes_each, swapped
+from fits.products import (
+    Rows,
+    as_maps,
+    checked_weights,
+    gram,
+    one_stokes_each,
+    stacked,
+    summed,
+    swapped,
+)
 from fits.systems import square_root
 from jaxsky import Bandpass, Sky, observe_components, parameter_names
 from jaxsky.checks import Numeric, as_array, check_double, check_shape
 from jaxsky.interpolation import NodeCounts, Nodes
+from jaxsky.io.stacks import Stack
 from jaxsky.mesh import SUMS, along, maps_of, of_own, over_pixels, spread, total, typed
 from jaxsky.sky import OFFSET, interpolation_nodes, unknown_parameter
 
@@ -152,8 +162,8 @@ class PixelLikelihood(SkyLikelihood):
 def likelihood(
     sky: Sky,
     bands: Mapping[str, Bandpass] | Sequence[Bandpass],
-    data: Numeric,
-    sigma: Numeric,
+    data: Numeric | Stack,
+    sigma: Numeric | Stack,
     start: Mapping[str, Numeric],
     *,
     stokes: str | None = None,
@@ -167,7 +177,8 @@ def likelihood(
     ----------
     sky : templates and spectral laws at the resolution of the data, amplitudes in uK_RJ
     bands : the bands by name, or as a list
-    data : observed maps [uK_RJ], shape (band, stokes, pix)
+    data : observed maps [uK_RJ], shape (band, stokes, pix); if they lie on disk
+        (`jaxsky.io.stacks`), they are read range by range, unless pixel by pixel
     sigma : standard deviation of the data [uK_RJ], broadcasting to their shape; infinite where
         a pixel is masked
     start : free parameters by name, with values at which the sky is otherwise expanded; a free
@@ -196,7 +207,7 @@ def likelihood(
     """
     check_double("fits")
     bands = named_bands(bands)
-    data, sigma = typed((as_array("data", data), as_array("sigma", sigma)))
+    data, sigma = typed((as_maps("data", data), as_maps("sigma", sigma)))
     sky, sigma = along(data, (sky, sigma))
     shape = (len(bands), *sky.shape)
     form = f"(band, stokes, pix) = {shape}"
@@ -205,7 +216,7 @@ def likelihood(
     broadcasts = sigma.ndim <= len(shape) and all(n in (1, size) for n, size in pairs)
     check_shape("sigma", sigma, broadcasts, f"broadcast to {form}")
     weights, counts = checked_weights(data, sigma)
-    labels = "QU" if len(data[0]) == 2 else "IQU"
+    labels = "QU" if shape[1] == 2 else "IQU"
     stokes = labels if stokes is None else stokes
     if not stokes or set(stokes) - set(labels):
         raise ValueError(f"Argument `stokes` must be among {labels!r}, not {stokes!r}.")
@@ -219,6 +230,7 @@ def likelihood(
             raise ValueError(f"Parameter {name!r} has no effect on Stokes {stokes}.")
     sky = mixing.laws({n: value for n, value in params.items() if not n.endswith(OFFSET)})
     if pixelwise or any(leaf.ndim == 1 for leaf in jax.tree.leaves(sky)):
+        sky, data, weights = jax.tree.map(jnp.asarray, (sky, data, weights))  # in memory
         if spread(data) and covariance_of is not None:
             raise ValueError(
                 "Argument `covariance_of` takes parameters that are numbers where pixels are "
@@ -234,10 +246,9 @@ def likelihood(
             "not corrected for in bands that are rotated; leave out one of the two."
         )
     mixing = dataclasses.replace(mixing, sky=unit_sky(sky, len(labels)))
-    templates = jnp.stack([c.amplitude for c in sky.components.values()])
-    if angles:
-        templates = jnp.concatenate([templates, swapped(templates)])
-    products = np.asarray(gram(data, templates, weights))
+    templates: list[Any] = [c.amplitude for c in sky.components.values()]
+    templates += [swapped(one) for one in templates] if angles else []
+    products, count = np.asarray(summed(gram, data, stacked(templates), weights)), len(templates)
     values = int(counts[:, keep].sum())
     like = TemplateLikelihood(
         params, jnp.asarray(values), mixing, labels, bool(angles), jnp.zeros((0, 0))
@@ -246,8 +257,11 @@ def likelihood(
         matrix = _matrix(np.asarray(square_root(products[:, keep])), keep, len(labels))
         return dataclasses.replace(like, matrix=matrix)
     # A constant row tells offsets from templates.
-    ones = [jnp.ones_like(templates[:1])] if offsets else []
-    maps = jnp.concatenate([templates, *ones])
+    if offsets:
+        first = templates[0]
+        on_disk = isinstance(first, Stack)
+        templates.append(np.broadcast_to(1.0, first.shape) if on_disk else jnp.ones_like(first))
+    maps = stacked(templates)
     rows = Rows(maps, weights)
     used = slice(1, len(maps) + 1)
     if covariance_of is not None:
@@ -261,7 +275,7 @@ def likelihood(
         seen = np.repeat(np.asarray(like.coefficients(params)), len(maps), axis=1)
         covariance = covariance + template_errors.covariance(rows, seen)
         blocks = blocks - template_errors.mean_products(weights)[:, :, used]
-        check_signal(blocks[:, keep, : len(templates), used][..., : len(templates)])
+        check_signal(blocks[:, keep, :count, used][..., :count])
     whitening = _whitening(_of_kept(covariance, rows, keep))
     matrix = _matrix(blocks[:, keep], keep, len(labels), whitening)
     if covariance_of is not None:

@@ -48,7 +48,7 @@ def listed(words: Iterable[str]) -> str:
     return " and ".join(filter(None, (", ".join(first[:-1]), *first[-1:])))
 
 
-def check_shape(name: str, array: Array | np.ndarray, good: bool, form: str) -> None:
+def check_shape(name: str, array: Any, good: bool, form: str) -> None:
     """Raise ValueError, stating the form that an array must have, unless `good`."""
     if not good:
         raise ValueError(f"Argument `{name}` must {form}, but has shape {array.shape}.")

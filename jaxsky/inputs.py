@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import healpy
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
@@ -25,6 +26,7 @@ from jaxsky.galaxy import EmbeddedSky, GalaxyModel, embedded_sky
 from jaxsky.io import Maps, read_bandpass, read_beam, read_maps, unit_factor
 from jaxsky.io.columns import sentinels
 from jaxsky.io.files import kept
+from jaxsky.io.stacks import stored
 from jaxsky.settings import (
     BandTable,
     ComponentTable,
@@ -98,6 +100,14 @@ class Template(NamedTuple):
     fwhm: float
     used: Bool[np.ndarray, " pix"]
     unit: str = "uK_RJ"
+
+    def of_many(self, number: int) -> "Template":
+        """Return it with its map on disk if it is large, were there so many."""
+
+        def moved(leaf: Array) -> Any:
+            return stored(leaf, number) if leaf.ndim == 2 else leaf
+
+        return self._replace(component=jax.tree.map(moved, self.component))
 
 
 def read(

@@ -241,6 +241,7 @@ def template_passes() -> Calls:
     data = np.ones((4, 2, NPIX))
     yield products.gram, data, MAPS[None], data
     yield products._weights, data, 2 * data
+    yield products._counts, data, 2 * data
     yield products.one_stokes_each, MAPS[None], data
     yield partial(products._of_band, band=1), MAPS[None], data
     yield products.weighted, data, MAPS[None]

@@ -15,6 +15,7 @@ from fits.common import prepared_maps
 from fits.inputs import inputs_of
 from fits.separated_data import separation_data
 from fits.spectral_index import fit_regions
+from jaxsky.galaxy import embedded_sky
 from jaxsky.io import stacks, write_maps
 from jaxsky.settings import Experiment
 
@@ -181,20 +182,53 @@ def test_separation_from_disk_is_that_in_memory(request, tmp_path, monkeypatch, 
     assert not any(on_disk.iterdir())
 
 
-@pytest.mark.parametrize("uneven", [False, True])
-def test_fit_from_disk_is_that_in_memory(request, tmp_path, uneven):
-    settings = experiment(tmp_path, uneven)
+DUST = {"law": "dust", "nu_ref": 353.0, "file": "dust.fits", "noise": {"level": 34.0}}
+NOISE = {"embedded": {"nside": NSIDE}, "dust": DUST | {"fields": ["Q", "U"]}}
+VARYING = {"parameters": {"beta_dust": {"file": "dust.fits", "fields": ["BETA"]}}}
+BAND_PARAMETERS = {"offset.402.Q": {"start": 0.0}, "angle.140": {"start": 0.0}}
+
+
+@pytest.mark.parametrize(
+    ("uneven", "changes"),
+    [
+        (False, {}),
+        (True, {"sky": NOISE}),
+        (False, {"sky": NOISE, "fit": {"likelihood": "diagonal"}}),
+        (True, {"free": FREE | BAND_PARAMETERS}),
+        (
+            True,
+            {
+                "sky": {"embedded": {"nside": NSIDE}, "dust": NOISE["dust"] | VARYING},
+                "free": {"synchrotron.beta_syn": {"start": 3.0}},
+            },
+        ),
+    ],
+    ids=["uniform", "noise of a template", "diagonal", "parameters of bands", "a map of values"],
+)
+def test_fit_from_disk_is_that_in_memory(request, tmp_path, uneven, changes):
+    tables = experiment(tmp_path, uneven).model_dump(mode="json", exclude_unset=True)
+    tables["fit"] |= changes.pop("fit", {})
+    tables["data_dir"] = str(tmp_path)
+    settings = Experiment.model_validate(tables | changes)
+    dust = embedded_sky(NSIDE).sky("QU")["dust"].amplitude
+    columns = [*dust, 1.6 + 0.05 * np.cos(np.arange(12 * NSIDE**2))]
+    units = ["uK_RJ", "uK_RJ", ""]
+    write_maps(tmp_path / "dust.fits", columns, names=["Q", "U", "BETA"], unit=units)
 
     def fitted():
-        prepared = prepared_maps(settings, inputs_of(settings))
+        inputs = inputs_of(settings)
+        prepared = prepared_maps(settings, inputs)
         everywhere = {"full": np.ones(12 * NSIDE**2, bool)}
         (one,) = fit_regions(settings, prepared, everywhere)
         result = one.results["gradient"]
-        values = list(result.best_fit.values()), list(result.sigma.values()), one.chi2["gradient"]
-        return dict(enumerate(map(np.asarray, values))), prepared
+        sums = one.chi2["gradient"], result.chi2, *one.noise_shares.values()
+        values = list(result.best_fit.values()), list(result.sigma.values()), sums
+        return dict(enumerate(map(np.asarray, values))), inputs, prepared
 
-    expected, _ = fitted()
+    expected, *_ = fitted()
     request.getfixturevalue("on_disk")
-    numbers, prepared = fitted()
+    numbers, inputs, prepared = fitted()
     assert isinstance(prepared.data, stacks.Stack)
+    for sky in (inputs.templates["dust"].component, prepared.sky["dust"]):
+        assert isinstance(sky.amplitude, stacks.Stack)
     assert_close(numbers, expected)

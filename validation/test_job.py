@@ -1,6 +1,7 @@
 """Commands that several processes of a job share find what one process does."""
 
 import json
+import signal
 import time
 
 import astropy.io.fits as pyfits
@@ -97,8 +98,8 @@ def test_separate_is_that_of_one_process(kind, number, tmp_path):
     assert "jaxsky" not in said(tmp_path, 1)  # the first alone has something to say
 
 
-@pytest.mark.parametrize("name", ["separate", "fit"])
-def test_a_job_that_was_killed_goes_on_as_one_process_does(name, tmp_path):
+@pytest.mark.parametrize(("name", "killed"), [("separate", True), ("fit", False)])
+def test_a_job_that_was_stopped_goes_on_as_one_process_does(name, killed, tmp_path):
     settings, _ = experiment(tmp_path, "uniform")
     out, options = tmp_path / "out", ("--set", "separate.nsims=40", "--set", "fit.nsteps=4000")
     run = begun(2, tmp_path, name, settings, out, *options)
@@ -106,8 +107,14 @@ def test_a_job_that_was_killed_goes_on_as_one_process_does(name, tmp_path):
     while not any(out.glob("*.npz")):
         assert time.monotonic() < until, said(tmp_path)
         time.sleep(0.05)
-    run[1].kill()
-    assert all(ended(run, 30.0))
+    if killed:
+        run[1].kill()
+        assert all(ended(run, 30.0))
+    else:  # Ctrl-C reaches all
+        for process in run:
+            process.send_signal(signal.SIGINT)
+        assert ended(run, 30.0) == [130, 130]
+        assert "Stopped; resume with --resume." in said(tmp_path)
     run = begun(3, tmp_path, name, settings, out, *options, "--resume")
     assert ended(run, PATIENCE) == [0, 0, 0], said(tmp_path)
     whole = tmp_path / "whole"

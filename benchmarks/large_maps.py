@@ -14,9 +14,11 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import healpy
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.table import Row, time_text
@@ -27,6 +29,8 @@ from fits.inputs import inputs_of
 from fits.regions import region_masks
 from fits.separated_data import separation_data
 from fits.spectral_index import fit_regions
+from jaxsky.galaxy import embedded_sky
+from jaxsky.harmonics import resample
 from jaxsky.io import write_maps
 from jaxsky.io.stacks import scratch
 from jaxsky.programs import Progress
@@ -40,6 +44,7 @@ EXPERIMENT = """
 seed = 1
 [sky]
 embedded = {{ nside = {sky} }}
+{sky_maps}
 [simulate]
 nside = {nside}
 {bands}
@@ -62,11 +67,13 @@ LITEBIRD = '[[bands]]\ninstrument = "litebird"'
 
 
 def experiment(folder: Path, nside: int, noise: str) -> Path:
-    """Write maps of LiteBIRD's bands, unless they are there, and an experiment on them."""
+    """Write maps of LiteBIRD's bands and templates, unless they are there, and an experiment."""
     sky, jaxsky = min(nside, 512), [sys.executable, "-m", "jaxsky"]
     made = folder / f"simulate_{nside}.toml"
     maps = folder / f"maps_{nside}"
-    made.write_text(EXPERIMENT.format(nside=nside, sky=sky, bands=LITEBIRD))
+    made.write_text(EXPERIMENT.format(nside=nside, sky=sky, sky_maps="", bands=LITEBIRD))
+    galaxy = embedded_sky(sky).sky("QU").components.items()
+    templates = [_template(folder, name, component, nside) for name, component in galaxy]
     if not maps.exists():
         subprocess.run(
             [*jaxsky, "simulate", str(made), "--out", str(maps)], check=True, capture_output=True
@@ -89,8 +96,21 @@ def experiment(folder: Path, nside: int, noise: str) -> Path:
         path = folder / f"hits_{nside}_{i}.fits"
         write_maps(path, hits, names="HITS", unit="", single=True, overwrite=True)
     settings = folder / f"{noise}_{nside}.toml"
-    settings.write_text(EXPERIMENT.format(nside=nside, sky=sky, bands="\n".join(tables)))
+    own = {"sky_maps": "\n".join(templates), "bands": "\n".join(tables)}
+    settings.write_text(EXPERIMENT.format(nside=nside, sky=sky, **own))
     return settings
+
+
+def _template(folder: Path, name: str, component: Any, nside: int) -> str:
+    """Write the map of a component of the embedded model at nside, and return its table."""
+    own = healpy.npix2nside(component.amplitude.shape[-1])
+    maps = resample(component.amplitude, jnp.ones(2 * own + 1), nside)
+    path = folder / f"{name}_{nside}.fits"
+    write_maps(path, maps, names=["Q", "U"], unit="uK_RJ", single=True, overwrite=True)
+    return (
+        f'[sky.{name}]\nlaw = "{name}"\nfile = "{path}"\nfields = ["Q", "U"]\n'
+        f"nu_ref = {float(component.nu_ref)}\nnoise = {{ rms = 0.0 }}"
+    )
 
 
 def load_channels():

@@ -42,9 +42,7 @@ NSIMS = 2
 PATTERNS = 3
 EXPERIMENT = """
 seed = 1
-[sky]
-embedded = {{ nside = {sky} }}
-{sky_maps}
+{sky}
 [simulate]
 nside = {nside}
 {bands}
@@ -71,7 +69,8 @@ def experiment(folder: Path, nside: int, noise: str) -> Path:
     sky, jaxsky = min(nside, 512), [sys.executable, "-m", "jaxsky"]
     made = folder / f"simulate_{nside}.toml"
     maps = folder / f"maps_{nside}"
-    made.write_text(EXPERIMENT.format(nside=nside, sky=sky, sky_maps="", bands=LITEBIRD))
+    embedded = f"[sky]\nembedded = {{ nside = {sky} }}"
+    made.write_text(EXPERIMENT.format(nside=nside, sky=embedded, bands=LITEBIRD))
     galaxy = embedded_sky(sky).sky("QU").components.items()
     templates = [_template(folder, name, component, nside) for name, component in galaxy]
     if not maps.exists():
@@ -96,8 +95,8 @@ def experiment(folder: Path, nside: int, noise: str) -> Path:
         path = folder / f"hits_{nside}_{i}.fits"
         write_maps(path, hits, names="HITS", unit="", single=True, overwrite=True)
     settings = folder / f"{noise}_{nside}.toml"
-    own = {"sky_maps": "\n".join(templates), "bands": "\n".join(tables)}
-    settings.write_text(EXPERIMENT.format(nside=nside, sky=sky, **own))
+    own = {"sky": "\n".join(templates), "bands": "\n".join(tables)}
+    settings.write_text(EXPERIMENT.format(nside=nside, **own))
     return settings
 
 

@@ -143,8 +143,8 @@ def inputs_of(
     sky: dict[str, Template] = {}
     description = settings.title
     if templates:
-        sky, description = read_sky(settings, names=settings.modelled(), galaxy=galaxy)
-        sky = {name: template.of_many(len(settings.bands)) for name, template in sky.items()}
+        names, many = settings.modelled(), len(settings.bands)
+        sky, description = read_sky(settings, names=names, galaxy=galaxy, number=many)
     bands: dict[str, Band] = {}
     truths: list[Mapping[str, float] | None] = []
 

@@ -157,12 +157,14 @@ def read_sky(
     *,
     names: Collection[str] | None = None,
     galaxy: EmbeddedSky | None = None,
+    number: int | None = None,
 ) -> tuple[dict[str, Template], str]:
     """Read the components named `names` (default: all) as templates [uK_RJ], in order.
 
     Also returns a sentence that describes them. Templates from files are the last two or three
     columns, in precision `dtype`; parameters that are maps are always in double precision.
-    `galaxy` is the embedded model, if it has been made already.
+    `galaxy` is the embedded model, if it has been made already. With a `number`, maps lie on disk
+    that would be large if there were so many.
     """
     tables, folder = settings.sky.components, Path(settings.data_dir)
     wanted = [name for name in tables if names is None or name in names]
@@ -182,6 +184,8 @@ def read_sky(
         spec = tables[name]
         if spec.file is not None:
             known[name] = _read_template(folder, name, spec, known, stokes, dtype)
+        if number is not None:
+            known[name] = known[name].of_many(number)
     found = {name: known[name] for name in wanted}
     with at_key("fixed"):
         return set_parameters_of(found, settings.fixed, tables), description
@@ -243,12 +247,13 @@ def _read_template(
     check_stokes(f"sky.{name}", found, "I" if spec.angles or padded else stokes)
     parameters, known = read_parameters(folder, name, spec, found.nside)
     factor = uK_RJ_per(found.unit, spec.nu_ref, f"sky.{name}")
-    maps = jnp.asarray((found.maps * factor).astype(dtype))
+    own = found.maps  # as large as everything else
+    maps = jnp.asarray(np.multiply(own, factor, out=own), dtype)
     used = np.asarray(found.mask) & known
     with at_key(f"sky.{name}"):
         if spec.angles:
             component: Component = AME.from_dust_angles(
-                maps[0], others[spec.angles].component.amplitude, **parameters
+                maps[0], jnp.asarray(others[spec.angles].component.amplitude), **parameters
             )
         else:
             if padded:

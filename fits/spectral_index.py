@@ -28,6 +28,7 @@ from fits.sampling import sample
 from fits.template_likelihood import SkyLikelihood, TemplateLikelihood
 from jaxsky import observe_components, parameter_names, set_parameters
 from jaxsky.io.stacks import ranges
+from jaxsky.job import by_turns
 from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 
@@ -193,26 +194,31 @@ def _look(
     bands, keep = list(prepared.bands.values()), np.array(["QU".index(s) for s in stokes])
     known = parameter_names(sky)
     moved = set_parameters(sky, {name: v for name, v in params.items() if name in known})
-    weight = np.zeros((len(bands), len(keep)))
-    power = np.zeros((len(sky.components), len(bands)))
-    signal = noise = np.zeros(len(sky.components))
-    for part in ranges(used.size):
 
-        def own(maps: Any, part: slice = part) -> Any:
+    def of_part(part: slice) -> tuple[np.ndarray, ...]:
+        """Return sums over some pixels: of weights, and of weighted squares of maps."""
+
+        def own(maps: Any) -> Any:
             return maps[..., part] if np.ndim(maps) else maps
 
         inside = used[part]
         weights = np.where(inside, 1 / np.asarray(own(prepared.sigma))[:, keep] ** 2, 0.0)
-        weight += weights.sum(axis=-1)
         seen = observe_components(jax.tree.map(own, moved), bands)
         maps = np.where(inside, np.stack([m[:, keep] for m in seen.values()]), 0.0)
-        power += np.einsum("bsp,kbsp,kbsp->kb", weights, maps, maps)
-        if errors is not None:
-            templates = np.stack([own(c.amplitude)[keep] for c in sky.components.values()])
-            templates = np.where(inside, templates, 0.0)
-            signal = signal + np.einsum("bsp,ksp,ksp->k", weights, templates, templates)
-            variance = np.asarray(own(errors.variance))[:, keep]
-            noise = noise + np.einsum("bsp,usp,ku->k", weights, variance, errors.parts**2)
+        sums = weights.sum(axis=-1), np.einsum("bsp,kbsp,kbsp->kb", weights, maps, maps)
+        if errors is None:
+            return sums
+        templates = np.stack([own(c.amplitude)[keep] for c in sky.components.values()])
+        templates = np.where(inside, templates, 0.0)
+        variance = np.asarray(own(errors.variance))[:, keep]
+        return (
+            *sums,
+            np.einsum("bsp,ksp,ksp->k", weights, templates, templates),
+            np.einsum("bsp,usp,ku->k", weights, variance, errors.parts**2),
+        )
+
+    parts = zip(*by_turns(of_part, list(ranges(used.size))), strict=True)
+    weight, power, *squares = (np.sum(part, axis=0) for part in parts)
     total = power.sum(axis=1, keepdims=True)
     share = np.max(power / np.where(total > 0, total, 1.0), axis=0)
     weightless = tuple(n for n, s in zip(prepared.bands, share, strict=True) if s < WEIGHTLESS)
@@ -221,8 +227,8 @@ def _look(
     variance = cmb @ (2 * np.arange(cmb.shape[-1]) + 1) / (8 * np.pi)
     counted = [name not in weightless for name in prepared.bands]
     ratio = variance[:, None] * weight / used.sum()
-    shares = {} if errors is None else dict(zip(sky, (noise / signal).tolist(), strict=True))
-    return weightless, 1.0 + float(ratio[counted].mean()), shares
+    shares = (squares[1] / squares[0]).tolist() if squares else []
+    return weightless, 1.0 + float(ratio[counted].mean()), dict(zip(sky, shares, strict=False))
 
 
 def fit_regions(

@@ -47,14 +47,14 @@ def _separated(folder: Path, nside: int, name: str) -> dict[str, Any]:
     from fits.posterior import value_and_gradient
     from fits.profile_likelihood import spectral_likelihood
     from fits.separated_maps import component_maps
-    from jaxsky.io.ranges import read_pixels
+    from jaxsky import read_maps
 
     bands, sigma = litebird(nside)
     shape = (len(bands), 2, 12 * nside**2)
     paths = [folder / f"{band}.fits" for band in bands]
 
     def read(part: slice) -> np.ndarray:
-        return np.stack([read_pixels(path, part, missing=[]) for path in paths])
+        return np.stack([read_maps(path, pixels=part, missing=[]).filled() for path in paths])
 
     times: dict[str, float] = {}
     found: dict[str, Any] = {}

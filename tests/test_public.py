@@ -166,7 +166,7 @@ def test_seeds_that_are_right():
 
 def test_what_converts_quantities():
     assert unit_factor("K_CMB", "K_RJ", at=0.1 * u.THz) == unit_factor("K_CMB", "K_RJ", at=100.0)
-    maps = Maps(np.ones((1, 12)), np.ones((1, 12), bool), "K_CMB", ("I",), ("I",))
+    maps = Maps(np.ones((1, 12)), np.ones((1, 12), bool), "K_CMB", ("I",), ("I",), 1)
     expected = maps.to("uK_RJ", at=100.0).maps
     np.testing.assert_array_equal(maps.to("uK_RJ", at=100 * u.GHz).maps, expected)
     raises(TypeError, "Argument `nu` carries the unit MHz", as_array, "nu", 3 * u.MHz)

@@ -108,11 +108,11 @@ class Maps:
     unit: str
     names: tuple[str, ...]
     stokes: tuple[str | None, ...]
+    nside: int
 
-    @property
-    def nside(self) -> int:
-        """Resolution of the maps."""
-        return healpy.npix2nside(self.maps.shape[-1])
+    def filled(self, value: float = np.nan) -> Float[np.ndarray, "field pix"]:
+        """Return the maps with a value in place of 0 where `mask` is False."""
+        return np.where(self.mask, self.maps, value)
 
     @takes_quantities
     def to(
@@ -136,6 +136,7 @@ def read_maps(
     stokes: str | Sequence[str] | None = None,
     missing: float | Iterable[float] | None = None,
     zeros_are_data: bool = False,
+    pixels: slice | None = None,
 ) -> Maps:
     """Read HEALPix maps from FITS files in RING order, Galactic coordinates, COSMO sign of U.
 
@@ -153,6 +154,10 @@ def read_maps(
     BAD_DATA, or to TNULL in columns of integers. Files in which other numbers seem to mark them
     (an extreme such as -999 that is repeated and far from the rest; exact zeros in all columns of
     a brightness in more than 30 % of the pixels) are refused until `missing` says what they are.
+
+    A range of `pixels` is read by itself: the file is mapped into memory, and of RING maps only
+    this part is read, of NESTED ones only the pixels, which lie apart. Numbers that seem to mark
+    missing pixels are then looked for in the range only. Compressed files are unpacked whole.
 
     Parameters
     ----------
@@ -174,29 +179,36 @@ def read_maps(
     missing : number or numbers that mark missing pixels, possibly zero; [] if all values are data
     zeros_are_data : accept exact zeros, for example in a correction that is zero where there is
         nothing to correct
+    pixels : range of RING pixels to read, of maps in Galactic coordinates; default all
 
     Raises
     ------
     InputError
-        If a file is not such a map, or if something needed to use the maps is stated neither by
-        header nor argument, or differently by both or by several files.
+        If a file is not such a map or lacks some of the pixels, or if something needed to use the
+        maps is stated neither by header nor argument, or differently by both or by several files.
     ValueError
         If `unit` is unknown.
     """
     stated = {"ordering": ordering, "coordinates": coordinates, "polarization": polarization}
-    columns = read_columns(path, hdu, fields, None if unit is None else unit_name(unit), stated)
+    given = None if unit is None else unit_name(unit)
+    columns = read_columns(path, hdu, fields, given, stated, pixels)
     first, where, names = columns[0], columns[0].where, tuple(column.name for column in columns)
     if nside not in (None, first.nside):
         raise InputError(f"{where}: nside is {first.nside}, but {nside} is expected.")
+    if pixels is not None and first.coordinates != "G":
+        raise InputError(
+            f"{where}: the maps are in coordinates {first.coordinates}, and a range of pixels "
+            "cannot be rotated; write them in Galactic coordinates first."
+        )
     kinds = column_stokes(columns, stokes)
     blocks = None if first.coordinates == "G" else _blocks(where, names, kinds)
     mark_missing(columns, missing, zeros_are_data)
     maps, mask = stacked(columns, kinds)
-    if not mask.any():
+    if pixels is None and not mask.any():
         raise InputError(f"{where}: no pixel has values in {', '.join(names)}.")
     if blocks is not None:
         maps, mask = _to_galactic(maps, mask, blocks, first.coordinates)
-    return Maps(maps, mask, first.unit, names, kinds)
+    return Maps(maps, mask, first.unit, names, kinds, first.nside)
 
 
 def _read_npz(path: Path, field: str | int | None, ordering: str | None) -> np.ndarray:

@@ -32,7 +32,7 @@ STYLE: Any = {
 }
 #: Okabe & Ito's colours, which the colour-blind can tell apart.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222")
-TRUTH = {"color": COLORS[3], "linewidth": 1.6}
+TRUTH = {"color": COLORS[3], "linewidth": 1.2}
 #: Width of a column of a paper [inch].
 COLUMN = 3.5
 #: Largest nside of a map that is drawn.
@@ -318,7 +318,7 @@ def plot_chains(
     plotter.triangle_plot(
         samples,
         list(rows),
-        filled=True,
+        filled=[True, *[False] * (len(samples) - 1)],  # else one hides the other
         contour_colors=list(COLORS[: len(samples)]),
         title_limit=1 if len(samples) == 1 else 0,
         markers={n: v for n, v in (truth or {}).items() if n in rows},
@@ -328,6 +328,7 @@ def plot_chains(
         for result, color in zip(results.values(), COLORS, strict=False):
             interval = result.of_row(result.interval_68, name)
             plotter.subplots[i, i].axvspan(*interval, color=color, alpha=0.15, linewidth=0)
-    draw_title(plotter.fig, f"{title}; 68 % shaded", fontsize=8, y=1.03)
+    said = "68 % shaded; contours of 68 and 95 %" + ("; lines: truth" if truth else "")
+    draw_title(plotter.fig, f"{title}\n{said}", fontsize=8, y=1.03)
     with mpl.rc_context(STYLE | {"savefig.dpi": 200}):
         save(plotter.fig, path)

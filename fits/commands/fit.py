@@ -181,8 +181,8 @@ def _draw_grid(axes: Axes, result: FitResult, truth: Mapping[str, float] | None)
     held = np.cumsum(np.exp(heights)) / np.exp(heights).sum()
     levels = [heights[np.searchsorted(held, share)] for share in (0.9545, 0.6827)]
     axes.contour(*grid, log_posterior.T, levels, colors=color, linestyles=["--", "-"])
-    axes.plot([], [], color=color, label=r"1$\sigma$")
-    axes.plot([], [], "--", color=color, label=r"2$\sigma$")
+    axes.plot([], [], color=color, label="68 %")
+    axes.plot([], [], "--", color=color, label="95 %")
     axes.plot(result.best_fit[x], result.best_fit[y], "k+", ms=9, mew=1.5, label="best fit")
     if truth and x in truth and y in truth:
         axes.plot(truth[x], truth[y], "o", mfc="none", mec=TRUTH["color"], mew=1.6, label="truth")

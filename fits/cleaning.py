@@ -218,7 +218,7 @@ def separate_data(
     left = None
     if data.foregrounds is not None:
         alone = cleaned_cmb(data, whole, best, data.foregrounds)
-        left = band_powers(spectra, jnp.asarray(alone))[1]
+        left = band_powers(spectra, alone)[1]
     sigma, covariance = _errors(data, like, fit, simulated)
     chain = None
     ratio = fit_tensors(model, band_powers(spectra, maps[row])[1])
@@ -282,14 +282,14 @@ class _NoiseSimulation:
         alm = resize(alm, max(2, needed_lmax(self.window)))
         # Made one by one, since they may be large.
         every = (
-            lambda: alone[...],
+            lambda: alone,
             lambda: both[...] - alone[...],
-            lambda: both[...],
+            lambda: both,
             lambda: both[...] + synthesis(alm, nside),
             lambda: synthesis(alm.at[1].set(0.0), nside),
         )
-        powers = [band_powers(spectra, jnp.asarray(maps()))[1] for maps in every]
-        mean = mean_spectrum(spectra.mask, jnp.asarray(both), spectra.lmax)
+        powers = [band_powers(spectra, maps())[1] for maps in every]
+        mean = mean_spectrum(spectra.mask, both, spectra.lmax)
         return [moved - theta, *powers, mean]
 
 

@@ -30,7 +30,7 @@ from jaxsky.harmonics import (
     shortened,
     synthesis,
 )
-from jaxsky.io.stacks import Maps, empty, is_large, ranges
+from jaxsky.io.stacks import Maps, empty, is_large, loaded, ranges
 from jaxsky.job import filled
 from jaxsky.noise import draw, pixel_covariance, stream, uniform_covariance, white_alm
 
@@ -72,7 +72,9 @@ class MapNoise(NamedTuple):
         before = empty((count, 2, npix), covariance.dtype) if white else None
         for own, row in enumerate(rows):
             if before is not None:
-                before[own] = np.asarray(self.preparation.transpose(row).block_until_ready())
+                before[own] = np.asarray(
+                    self.preparation.transpose(loaded(row)).block_until_ready()
+                )
             if self.correlated is not None:
                 modes.append(_modes(row, np.stack([self.correlated] * 2)))
         if before is not None:

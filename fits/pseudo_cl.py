@@ -8,8 +8,7 @@ inverted in bins that are wide compared with the width of the mask's own spectru
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import healpy
 import jax
@@ -26,7 +25,7 @@ from fits.coupling import (
 )
 from jaxsky.checks import Numeric, check_finite, is_concrete
 from jaxsky.harmonics import analysis, expand, lmax_of, power_spectrum, synthesis
-from jaxsky.io.stacks import Maps, Stack, empty
+from jaxsky.io.stacks import Maps, Stack, aligned, empty, is_large, loaded, ranges
 
 #: Multipole of amplitudes: that of the recombination peak of primordial B modes.
 PIVOT = 80
@@ -194,57 +193,62 @@ def _derivatives(alm: Float[Array, "1 alm"], nside: int) -> Float[np.ndarray, "4
     return found
 
 
-def _masked_alm(spectra: MaskedSpectra, maps: Float[Array, "2 pix"]) -> Float[Array, "2 alm"]:
-    """Return E and B of masked maps, with B purified if the mask's derivatives are given."""
-    mask, derivatives, lmax = spectra.mask, spectra.derivatives, spectra.lmax
-    if not isinstance(derivatives, Stack):
-        return _in_memory_alm(mask, derivatives, maps, lmax)
-    E, B = _in_memory_alm(mask, None, maps, lmax)
-    once = _once(mask, jnp.asarray(derivatives[:2]), maps, lmax)
-    return jnp.stack([E, B + once + _twice(mask, jnp.asarray(derivatives[2:]), maps, lmax)])
-
-
-@partial(jax.jit, static_argnames="lmax")
-def _in_memory_alm(
+def _product(
+    order: int,
     mask: Float[Array, " pix"],
     derivatives: Float[Array, "4 pix"] | None,
-    maps: Float[Array, "2 pix"],
-    lmax: int,
+    maps: Any,
+) -> Float[Array, "2 pix"]:
+    """Return maps (2, pix) times the mask (order 0), or its derivative of an order.
+
+    The latter is Q + iU times the conjugate of the derivative; its maps are minus the real and
+    imaginary part, as Q and U are of E + iB.
+    """
+    # Unused pixels may contain anything, and a purified harmonic reaches a little beyond the mask.
+    maps = jnp.where(mask > 0, maps, 0.0)
+    if derivatives is None or not order:
+        return mask * maps
+    (Q, U), (real, imaginary) = maps, derivatives[2 * order - 2 : 2 * order]
+    return -jnp.stack([Q * real + U * imaginary, U * real - Q * imaginary])
+
+
+def _field(
+    order: int, mask: Any, derivatives: Any, maps: Float[Array, "2 pix"] | Maps
+) -> Float[Array, "2 pix"]:
+    """Return `_product`, made range by range if it is large."""
+    if not is_large(maps.shape):
+        return _product(order, mask, derivatives, maps)
+    found, maps = aligned(maps.shape), maps if isinstance(maps, Stack) else np.asarray(maps)
+    for part in ranges(mask.size):
+        slopes = None if derivatives is None else derivatives[:, part]
+        found[:, part] = _product(order, mask[part], slopes, maps[:, part])
+    return loaded(found)
+
+
+def _alm(
+    mask: Any, derivatives: Any, maps: Float[Array, "2 pix"] | Maps, lmax: int
 ) -> Float[Array, "2 alm"]:
-    E, B = analysis(mask * jnp.where(mask > 0, maps, 0.0), lmax, 0)
+    """Return E and B of masked maps, with B purified if the mask's derivatives are given."""
+    E, B = analysis(_field(0, mask, derivatives, maps), lmax, 0)
     if derivatives is not None:
-        B = B + _once(mask, derivatives[:2], maps, lmax) + _twice(mask, derivatives[2:], maps, lmax)
+        _, once, twice = (expand(jnp.asarray(factors)) for factors in pure_factors(lmax))
+        B = B + once * analysis(_field(1, mask, derivatives, maps), lmax, 0, spin=1)[1]
+        B = B - twice * analysis(_field(2, mask, derivatives, maps)[1:], lmax, 0)[0]
     return jnp.stack([E, B])
 
 
-@partial(jax.jit, static_argnames="lmax")
-def _once(mask, first, maps, lmax):
-    """Return what the first derivatives of the mask add to B."""
-    alm = analysis(-_turned_back(mask, maps, first), lmax, 0, spin=1)[1]
-    return expand(jnp.asarray(pure_factors(lmax)[1])) * alm
+_compiled_alm = jax.jit(_alm, static_argnames="lmax")
 
 
-@partial(jax.jit, static_argnames="lmax")
-def _twice(mask, second, maps, lmax):
-    """Return what the second derivatives of the mask add to B."""
-    alm = -analysis(-_turned_back(mask, maps, second)[1:], lmax, 0)[0]
-    return expand(jnp.asarray(pure_factors(lmax)[2])) * alm
-
-
-def _turned_back(mask, maps, derivative):
-    """Return Q + iU times the conjugate of a derivative.
-
-    Its maps are minus the real and imaginary part, as Q and U are of E + iB.
-    """
-    # Unused pixels may contain anything, and a purified harmonic reaches a little beyond the mask.
-    (Q, U), (real, imaginary) = jnp.where(mask > 0, maps, 0.0), derivative
-    return jnp.stack([Q * real + U * imaginary, U * real - Q * imaginary])
+def _masked_alm(mask: Any, derivatives: Any, maps: Any, lmax: int) -> Float[Array, "2 alm"]:
+    """Return what `_alm` does, field by field if the maps are large."""
+    return (_alm if is_large(maps.shape) else _compiled_alm)(mask, derivatives, maps, lmax=lmax)
 
 
 def band_powers(
     spectra: MaskedSpectra,
-    maps: Float[Array, "2 pix"],
-    other: Float[Array, "2 pix"] | None = None,
+    maps: Float[Array, "2 pix"] | Maps,
+    other: Float[Array, "2 pix"] | Maps | None = None,
 ) -> Float[np.ndarray, "2 bin"]:
     """Return band powers D_b = l (l + 1) C_l / 2 pi of EE and BB, including noise.
 
@@ -259,21 +263,21 @@ def band_powers(
     ValueError
         If values inside the mask are not finite or UNSEEN.
     """
+    mask = np.asarray(spectra.mask)
     for name, values in {"maps": maps, "other": maps if other is None else other}.items():
-        if is_concrete(values):
-            check_finite(name, np.where(np.asarray(spectra.mask) > 0, np.asarray(values), 0))
-    alms = [_masked_alm(spectra, jnp.asarray(maps))]
-    alms.append(alms[0] if other is None else _masked_alm(spectra, jnp.asarray(other)))
-    return np.einsum("ibjl,jl->ib", spectra.inverse, power_spectrum(*alms))
+        for part in ranges(mask.size) if is_concrete(values) else ():
+            check_finite(name, np.where(mask[part] > 0, np.asarray(values[..., part]), 0))
+    every = (maps,) if other is None else (maps, other)
+    alms = [_masked_alm(mask, spectra.derivatives, one, spectra.lmax) for one in every]
+    return np.einsum("ibjl,jl->ib", spectra.inverse, power_spectrum(alms[0], alms[-1]))
 
 
-@partial(jax.jit, static_argnames="lmax")
 def mean_spectrum(
-    mask: Float[Array, " pix"], maps: Float[Array, "2 pix"], lmax: int
-) -> Float[Array, " ell"]:
+    mask: Float[np.ndarray, " pix"], maps: Float[Array, "2 pix"] | Maps, lmax: int
+) -> Float[np.ndarray, " ell"]:
     """Return C_l of a masked map, the mean of EE and BB, over the mean square of the mask."""
-    power = power_spectrum(analysis(mask * jnp.where(mask > 0, maps, 0.0), lmax, 0))
-    return power.mean(axis=0) / jnp.mean(mask**2)
+    power = np.asarray(power_spectrum(_masked_alm(mask, None, maps, lmax)))
+    return power.mean(axis=0) / np.mean(np.square(mask))
 
 
 class PreparedPatches(NamedTuple):

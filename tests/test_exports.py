@@ -337,11 +337,8 @@ def forecasts() -> Calls:
 
 def masked() -> Calls:
     maps = random_maps(3, npix=NPIX)
-    yield partial(pseudo_cl._in_memory_alm, lmax=LMAX), MASK, np.ones((4, NPIX)), maps
-    yield partial(pseudo_cl._in_memory_alm, lmax=LMAX), MASK, None, maps
-    yield partial(pseudo_cl._once, lmax=LMAX), MASK, np.ones((2, NPIX)), maps
-    yield partial(pseudo_cl._twice, lmax=LMAX), MASK, np.ones((2, NPIX)), maps
-    yield partial(pseudo_cl.mean_spectrum, lmax=LMAX), MASK, maps
+    yield partial(pseudo_cl._compiled_alm, lmax=LMAX), MASK, np.ones((4, NPIX)), maps
+    yield partial(pseudo_cl._compiled_alm, lmax=LMAX), MASK, None, maps
 
 
 def patch_laws() -> Calls:

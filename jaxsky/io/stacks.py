@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
@@ -54,6 +54,19 @@ def ranges(npix: int, size: int = PIECE) -> Iterator[slice]:
         yield slice(start, min(start + size, npix))
 
 
+def aligned(shape: tuple[int, ...], dtype: Any = float) -> np.ndarray:
+    """Return an array to be filled, whose memory JAX can use as it is; see `loaded`."""
+    size, edge = int(np.prod(shape)) * np.dtype(dtype).itemsize, 64
+    memory = np.empty(size + edge, np.uint8)
+    start = -memory.ctypes.data % edge
+    return memory[start : start + size].view(dtype).reshape(shape)
+
+
+def loaded(array: ArrayLike) -> Array:
+    """Return an array of JAX, which may use the memory of one that is not changed any more."""
+    return jax.device_put(array, may_alias=True)
+
+
 class Stack:
     """Base class: an array (row ..., pix) of which any pixels can be read into memory."""
 
@@ -77,7 +90,7 @@ class Stack:
         raise TypeError(f"{type(self).__name__} must define `__getitem__`.")
 
     def __jax_array__(self) -> Array:
-        return jnp.asarray(self[...])
+        return loaded(self[...])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return self[...].astype(self.dtype if dtype is None else dtype, copy=False)
@@ -129,8 +142,10 @@ class Stored(Stack):
     def __getitem__(self, index: Any) -> np.ndarray:
         last = index[-1] if isinstance(index, tuple) else index
         with self._mapped(mmap.ACCESS_READ, isinstance(last, np.ndarray)) as values:
-            found = np.array(values[index])
-            del values
+            chosen = values[index]
+            found = aligned(chosen.shape, chosen.dtype)
+            found[...] = chosen
+            del values, chosen
         return found
 
     def __setitem__(self, index: Any, value: ArrayLike) -> None:

@@ -64,6 +64,8 @@ def test_a_range_is_that_of_the_whole_map(kind, tmp_path):
 
     for part in RANGES:
         np.testing.assert_array_equal(read(part), expected[:, part])
+    converted = read_maps(path, pixels=RANGES[2], **options).to("uK_RJ", at=100.0).filled()
+    np.testing.assert_allclose(converted, expected[:, RANGES[2]] * 0.7769, rtol=1e-3)
     maps = distribute(read, shape=(2, NPIX))
     np.testing.assert_array_equal(maps, expected)
 

@@ -98,7 +98,7 @@ def test_separate_is_that_of_one_process(kind, number, tmp_path):
     assert "jaxsky" not in said(tmp_path, 1)  # the first alone has something to say
 
 
-@pytest.mark.parametrize(("name", "killed"), [("separate", True), ("fit", False)])
+@pytest.mark.parametrize(("name", "killed"), [("separate", True), ("fit", True), ("fit", False)])
 def test_a_job_that_was_stopped_goes_on_as_one_process_does(name, killed, tmp_path):
     settings, _ = experiment(tmp_path, "uniform")
     out, options = tmp_path / "out", ("--set", "separate.nsims=40", "--set", "fit.nsteps=4000")

@@ -110,7 +110,7 @@ def checked_weights(data: Any, sigma: Any) -> tuple[Any, Int[np.ndarray, "band s
         )
     if not used.any():
         raise ValueError("No pixel is left: the mask, or an infinite `sigma`, covers the map.")
-    if isinstance(data, Stack):
+    if isinstance(data, Stack) or isinstance(sigma, Stack):
         return Computed(data.shape, lambda at: 1 / sigma[..., at] ** 2), np.asarray(used)
     return _weights(data, sigma), np.asarray(used)
 

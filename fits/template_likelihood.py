@@ -215,6 +215,8 @@ def likelihood(
     pairs = zip(sigma.shape[::-1], shape[::-1], strict=False)
     broadcasts = sigma.ndim <= len(shape) and all(n in (1, size) for n, size in pairs)
     check_shape("sigma", sigma, broadcasts, f"broadcast to {form}")
+    if isinstance(data, Stack) and not isinstance(sigma, Stack):
+        sigma = np.broadcast_to(sigma, shape)
     weights, counts = checked_weights(data, sigma)
     labels = "QU" if shape[1] == 2 else "IQU"
     stokes = labels if stokes is None else stokes

@@ -13,8 +13,11 @@ from fits import cleaning
 from fits.cleaning import separate_data
 from fits.common import prepared_maps
 from fits.inputs import inputs_of
+from fits.posterior import chi2
 from fits.separated_data import separation_data
 from fits.spectral_index import fit_regions
+from fits.template_likelihood import likelihood
+from jaxsky import Bandpass, observe
 from jaxsky.galaxy import embedded_sky
 from jaxsky.io import stacks, write_maps
 from jaxsky.settings import Experiment
@@ -232,3 +235,17 @@ def test_fit_from_disk_is_that_in_memory(request, tmp_path, uneven, changes):
     for sky in (inputs.templates["dust"].component, prepared.sky["dust"]):
         assert isinstance(sky.amplitude, stacks.Stack)
     assert_close(numbers, expected)
+
+
+def test_a_likelihood_takes_maps_on_disk_with_any_standard_deviation(on_disk):
+    sky, bands = embedded_sky(NSIDE).sky("QU"), [Bandpass.delta(nu) for nu in (40.0, 140.0, 402.0)]
+    data = np.array(observe(sky, bands))
+    start = {"dust.beta_dust": 1.55, "synchrotron.beta_syn": 3.05}
+    for sigma in (0.5, np.full((3, 1, 1), 0.5), np.full(data.shape, 0.5)):
+        expected = chi2(likelihood(sky, bands, data, sigma, start), start)
+        for given in (stacks.stored(data), data):
+            own = stacks.stored(sigma) if np.shape(sigma) == data.shape else sigma
+            found = chi2(likelihood(sky, bands, given, own, start), start)
+            np.testing.assert_allclose(found, expected, rtol=1e-10)
+    with pytest.raises(ValueError, match="`sigma` has"):
+        likelihood(sky, bands, stacks.stored(data), -0.5, start)

@@ -88,7 +88,7 @@ def _write_settings(
         f'[[bands]]\ninstrument = "core"\nsamples = {peer.SAMPLES}\n{channels}'
         + _component("dust", "dust", peer.NU_DUST, T_dust=peer.T_DUST, beta_dust=beta_dust)
         + _component("synchrotron", "synchrotron", peer.NU_SYNCHROTRON, beta_syn=beta_syn)
-        + '[cmb]\nspectra = "cmb.fits"\n'
+        + '[cmb]\nfile = "cmb.fits"\n'
     )
     return path
 

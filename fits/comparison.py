@@ -161,7 +161,7 @@ def check_comparison(
         raise SettingsError(
             f"compare.lmax: multipoles reach to 2 nside, {limit}, but {how.lmax} is asked for."
         )
-    bins = len(bin_edges(LMIN, how.lmax, how.width)) - 1
+    bins = len(bin_edges(how.lmin, how.lmax, how.width)) - 1
     if bins > how.nsims / 2:
         raise SettingsError(
             f"compare.width: {how.width} makes {bins} bins up to l = {how.lmax}, and these take "
@@ -223,7 +223,7 @@ def compare(
     scatters = compare_pixels(prepared, model, used, simulated)
     spectra = []
     if prepared.used.all():
-        spectra = compare_spectra(prepared, model, simulated, how.width)
+        spectra = compare_spectra(prepared, model, simulated, how.width, how.lmin)
     return Comparison(prepared, model, used, scatters, spectra)
 
 
@@ -326,11 +326,12 @@ def compare_spectra(
     model: Float[Array, "band stokes pix"],
     simulated: ComparisonRealisations,
     width: int,
+    lmin: int = LMIN,
 ) -> list[BandSpectra]:
     """Compare spectra of the observed maps with those of the complete model.
 
-    They are of the full sky, as in the paper: no E modes leak into B there. `width` is the number
-    of multipoles per bin.
+    They are of the full sky, as in the paper: no E modes leak into B there. The first bin begins at
+    `lmin`, and each has `width` multipoles.
     """
     if missing := int(np.sum(~prepared.used)):
         raise ValueError(
@@ -338,7 +339,7 @@ def compare_spectra(
             "no value."
         )
     lmax = simulated.spectra.shape[-1] - 1
-    edges = bin_edges(LMIN, lmax, width)
+    edges = bin_edges(lmin, lmax, width)
     observed = np.asarray(power_spectrum(polarization_alms(prepared.data, lmax)))
     foregrounds = np.asarray(power_spectrum(polarization_alms(model, lmax)))
     noise = simulated.noise.mean(axis=0)

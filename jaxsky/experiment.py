@@ -66,7 +66,7 @@ def simulation_inputs(
     """
     spec = settings.simulate
     stokes, precision = (spec.stokes, spec.precision) if written else ("QU", "double")
-    target = None if spec.fwhm == "own" else spec.fwhm
+    target = spec.fwhm or None
     included = settings.included()
     tables = settings.sky.components
     foregrounds = [name for name in tables if name in included]
@@ -194,7 +194,7 @@ def _source(settings: Experiment, name: str, template: Template) -> Source:
 
 def _truth(settings: Experiment, sources: Mapping[str, Source], cmb: bool) -> dict[str, float]:
     """Return the scalar parameters of the simulated sky by dotted name, and r where it is known."""
-    numbers = {"r": settings.cmb.r} if cmb and settings.cmb.spectra is None else {}
+    numbers = {"r": settings.cmb.r} if cmb and settings.cmb.file is None else {}
     if not sources:
         return numbers
     sky = Sky({name: source.component for name, source in sources.items()})
@@ -222,7 +222,7 @@ def read_channel(
                 f"{where}.noise: {missing} pixels have no noise; a simulation takes maps of the "
                 "full sky."
             )
-    target = None if settings.simulate.fwhm == "own" else settings.simulate.fwhm
+    target = settings.simulate.fwhm or None
     return ObservedBand(band, jnp.asarray(beam), target, noise, settings.simulate.diagonal_noise)
 
 
@@ -241,7 +241,7 @@ def _noise_unit(spec: BandTable, where: str) -> str:
 def cmb_spectra(settings: Experiment, lmax: int, r: float | None = None) -> np.ndarray:
     """Return TT, EE, BB, TE of the CMB [uK_CMB^2], shape (4, ell); `r` overrides the settings."""
     spec = settings.cmb
-    if spec.spectra is None:
+    if spec.file is None:
         with at_key("cmb.cosmology"):
             total = camb_spectra(lmax, spec.r if r is None else r, **spec.cosmology)
             if spec.A_lens == 1:
@@ -249,10 +249,10 @@ def cmb_spectra(settings: Experiment, lmax: int, r: float | None = None) -> np.n
             lensed = camb_spectra(lmax, **spec.cosmology)
             return total + (spec.A_lens - 1) * np.array([0, 0, 1, 0])[:, None] * lensed
     if r is not None:
-        raise SettingsError("cmb.spectra: here r is changed, which takes spectra of CAMB.")
-    with at_key("cmb.spectra"):
-        path = find_file(Path(settings.data_dir), spec.spectra)
-        return read_spectra(path, lmax, format=spec.format, unit=spec.unit)
+        raise SettingsError("cmb.file: here r is changed, which takes spectra of CAMB.")
+    with at_key("cmb"):
+        path = find_file(Path(settings.data_dir), spec.files[0])
+        return read_spectra(path, lmax, fields=spec.fields, unit=spec.unit)
 
 
 def _leakage(
@@ -262,10 +262,11 @@ def _leakage(
     galaxy: EmbeddedSky | None,
 ) -> dict[str, Float[Array, "2 pix"]]:
     """Return what leaks from the foregrounds' intensity into Q and U of each band [uK_RJ]."""
-    fractions = {n: f for n, f in settings.simulate.leakage.items() if n in observation.channels}
+    given = {band.name: band.leakage for band in settings.bands}
+    fractions = {n: given[n] for n in observation.names if isinstance(given[n], float)}
     if not names or not any(fractions.values()):
         return {}
-    with at_key("simulate.leakage"):
+    with at_key("bands.leakage"):
         whole, _ = read_sky(settings, "IQU", names=names, galaxy=galaxy)
         whole = set_parameters_of(whole, settings.truth, settings.sky.components)
         sky = Sky({name: one.component for name, one in whole.items()})

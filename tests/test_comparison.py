@@ -36,17 +36,17 @@ from systems import small_experiment
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "wmap7_vw.toml"
 COMPARE = {"regions": ["strip", "outside"], "nsims": 30, "lmax": 25, "width": 8}
-PLANCK, WMAP = (
-    {"instrument": "planck", "channels": ["44", "70"]},
-    {"instrument": "wmap", "channels": ["K"]},
-)
+BANDS = [
+    {"instrument": "planck", "name": "44"},
+    {"instrument": "planck", "name": "70", "leakage": 0.2},
+    {"instrument": "wmap", "name": "K"},
+]
 SETTINGS = small_experiment(
     (),
     nside=32,
     seed=3,
-    bands=[PLANCK, WMAP],
+    bands=BANDS,
     common={"nside": 16, "fwhm": 300.0},
-    simulate={"leakage": {"70": 0.2}},
     compare=COMPARE,
 )
 
@@ -232,6 +232,9 @@ def test_spectra_are_healpys(prepared, model, few):
     assert [s.uncorrected is not None for s in found] == [False, True, False]
     # 20 % of the intensity leaked; it is seen, and gone with the correction.
     assert found[1].pte_uncorrected.max() < 1e-3
+    later = compare_spectra(prepared, model, few, 8, 10)
+    assert later[0].edges == (10, 18, 26)
+    np.testing.assert_array_equal(later[0].binned, found[0].binned[:, 1:])
 
 
 def test_spectra_do_not_depend_on_the_common_nside(settings, prepared):
@@ -316,7 +319,8 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     written(tmp_path / "bad.toml", SETTINGS | {"compare": COMPARE | {"lmax": 33}})
     assert jaxsky(monkeypatch, "compare", tmp_path / "bad.toml", "--out", out, "--overwrite") == 2
     assert (out / "comparison.json").exists()
-    tight = {"compare": COMPARE | {"regions": ["outside"]}, "simulate": {}}
+    clean = [{k: v for k, v in band.items() if k != "leakage"} for band in BANDS]
+    tight = {"compare": COMPARE | {"regions": ["outside"]}, "bands": clean}
     written(tmp_path / "b.toml", SETTINGS | tight)
     assert jaxsky(monkeypatch, "compare", tmp_path / "b.toml", "--out", out, "--overwrite") == 0
     assert {p.stem for p in out.glob("*.png")} == pictures - {"scatter_strip", "leakage"}

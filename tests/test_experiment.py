@@ -188,7 +188,7 @@ def test_beams_and_noise_of_all_kinds(folder):
     rms, level = '{ rms = 1.0, unit = "uK_RJ" }', "{ level = 300.0 }"
     path = write(
         folder,
-        ("fwhm = 1200.0", 'fwhm = "own"'),
+        ("fwhm = 1200.0", "fwhm = 0"),
         ("fwhm = 900.0", "fwhm = 700.0"),
         ("fwhm = 900.0", "fwhm = 700.0"),
         (level, '{ covariance = { file = "covariance.fits", '
@@ -456,7 +456,7 @@ def test_keys_of_the_cmb_reach_camb(folder, monkeypatch):
     monkeypatch.setattr(
         experiment, "camb_spectra", lambda *a, **k: asked.append((a, k)) or np.zeros((4, 17))
     )
-    spectra = 'spectra = "cmb.dat"\nformat = "camb"\n'
+    spectra = 'file = "cmb.dat"\nfields = ["L", "TT", "EE", "BB", "TE"]\n'
     for line in ("", "r = 0.05\n", "cosmology = { H0 = 70.0 }\n"):
         simulation_inputs(load(write(folder, (spectra, line))))
     assert asked == [((16, 0.0), {}), ((16, 0.05), {}), ((16, 0.0), {"H0": 70.0})]
@@ -574,7 +574,7 @@ def test_the_default_is_valid():
 def test_titles_of_all_kinds(folder, tmp_path, monkeypatch, capsys):
     title = "Herv\u00edas-Caimap\u00f3 [red] \u00b5K " + 30 * "long "
     path, out = write(folder, ("A small sky", title)), tmp_path / "out"
-    nothing_leaks = "--only", "noise", "--set", 'simulate.leakage={"30"=0.02}'
+    nothing_leaks = "--only", "noise", "--set", "bands.0.leakage=0.02"
     assert command(monkeypatch, path, "--out", out, *nothing_leaks) == 0
     header = pyfits.getheader(out / "sim_00000" / "30.fits", 1)
     assert header["INSTRUME"].startswith("Herv?as-Caimap? [red] ?K long")

@@ -96,8 +96,6 @@ def test_text_that_leaves_something_open(tmp_path):
     for name, columns, header, arguments, words in cases("io_spectra/text_left_open"):
         path = text(tmp_path / name, columns, header)
         refuses(words, read_spectra, path, LMAX, **arguments)
-    with pytest.raises(ValueError, match="`format` must be one of planck, camb, not 'class'"):
-        read_spectra(tmp_path / "p.txt", LMAX, format="class")
 
 
 def test_damaged_text(tmp_path):
@@ -156,7 +154,7 @@ def test_fits_that_leave_something_open(tmp_path):
     for path, arguments, words in [
         (fits(tmp_path / "a.fits"), {}, "column TEMPERATURE has no unit; give `unit`, such as"),
         (fits(tmp_path / "b.fits", **unit), {"unit": "K^2"}, "`unit` is K.2, but .* is in uK"),
-        (tmp_path / "b.fits", {"format": "camb"}, "`format` is for text files, this is FITS"),
+        (tmp_path / "b.fits", {"fields": ["L", "TT"]}, "`fields` is for text files, columns of"),
         (fits(tmp_path / "c.fits", column_units="uK"), {},
          "unit 'uK', which is no square of K_CMB"),
         (fits(tmp_path / "d.fits", column_units="K_RJ^2"), {}, "'K_RJ.2', which is no square"),

@@ -126,6 +126,8 @@ def test_footprints_and_marks_in_settings(tmp_path):
     assert leakage.used.all()
     with pytest.raises(InputError, match=r"marked.fits.*give `missing`"):
         band(tmp_path, {"file": "m.fits", "leakage": {"file": "marked.fits"}})
+    with pytest.raises(SettingsError, match=r"leakage: 0.02 is of a simulation, but m.fits holds"):
+        band(tmp_path, {"file": "m.fits", "leakage": 0.02})
 
 
 @pytest.mark.parametrize(("entry", "words"), cases("map_settings/mistakes_in_map_entries"))

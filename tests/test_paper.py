@@ -60,7 +60,11 @@ def real(data_dir, tmp_path_factory) -> Experiment:
     temperature = np.where(nu < 5, (nu / 5) ** -2.7, (nu / 5) ** -2.83)
     np.savetxt(folder / "spectrum.txt", np.stack([nu, temperature], axis=1))
     # Templates of other names than their laws.
-    (folder / "paper.toml").write_text(EXAMPLE.read_text().replace("[sky.", "[sky.sky_"))
+    text = EXAMPLE.read_text().replace("[sky.", "[sky.sky_")
+    for key in ("angles = ", "components = ["):
+        text = text.replace(f'{key}"dust"', f'{key}"sky_dust"')
+    text = text.replace('"synchrotron"]', '"sky_synchrotron"]')
+    (folder / "paper.toml").write_text(text)
     values = [f'data_dir = "{data_dir.resolve()}"', "free = {}", "fixed = {}", "paper.fwhm = 80.0"]
     steepening = f"paper.beta_syn.steepening = '{folder / 'spectrum.txt'}'"
     return load(folder / "paper.toml", [*values, steepening])
@@ -296,13 +300,6 @@ def test_labels():
     assert [label for label in STEPS if label in LABELS] == LABELS
 
 
-def test_example_is_valid():
-    ame = '{ file = "ame.fits", fields = ["I_ML"], nu_ref = 22.8, fwhm = 60.0 }'
-    text = (DEFAULTS / "experiment.toml").read_text()
-    assert f"ame = {ame}" in text
-    assert load(DEFAULTS / "experiment.toml", [f"paper.ame={ame}"]).paper.ame.nu_ref == 22.8
-
-
 def jaxsky(monkeypatch, capsys, *arguments) -> tuple[int, str]:
     return commands.jaxsky(monkeypatch, "paper", *arguments), capsys.readouterr().err
 
@@ -325,12 +322,14 @@ def test_command_line(monkeypatch, capsys, tmp_path):
 
 def test_settings_that_cannot_work(real):
     raw = real.model_dump()
-    raw["paper"]["ame"] |= {"fields": ["I_STOKES", "Q_STOKES"]}
-    with pytest.raises(ValueError, match=r"paper.ame.fields: must name one intensity map"):
+    raw["sky"]["sky_ame"] |= {"fields": ["I_STOKES", "Q_STOKES"]}
+    with pytest.raises(
+        ValueError, match=r"sky.sky_ame: fields must name I, not I_STOKES, Q_STOKES"
+    ):
         PaperSky(Experiment.model_validate(raw)).ame()
     raw["paper"]["beta_syn"] |= {"steepening": "absent.txt"}
     raises(ValueError, r"absent.txt", PaperSky(Experiment.model_validate(raw)).index, "beta_syn")
-    del raw["sky"]["sky_synchrotron"]
+    del raw["sky"]["sky_synchrotron"], raw["common"]["components"]
     with pytest.raises(Impossible, match="one template of the law 'synchrotron', but there are 0"):
         PaperSky(Experiment.model_validate(raw)).template("synchrotron")
 

@@ -85,8 +85,8 @@ def forecast_inputs(settings: Experiment) -> ForecastInputs:
     spec = settings.forecast
     if not settings.cmb.include:
         raise SettingsError("cmb.include: is false, but a forecast has a CMB.")
-    if settings.cmb.spectra is not None:
-        raise SettingsError("cmb.spectra: a forecast changes r, which takes spectra of CAMB.")
+    if settings.cmb.file is not None:
+        raise SettingsError("cmb.file: a forecast changes r, which takes spectra of CAMB.")
     templates, description = read_sky(settings, names=settings.modelled())
     if not templates:
         raise SettingsError("sky: has no components; a forecast takes some.")

@@ -118,8 +118,9 @@ def figure_leakage(paper: PaperSky, picture: Path) -> PaperFigure:
     leakage = paper.differs
     if paper.simulated:
         fractions = listed(
-            filled(texts["fraction"], percent=100 * fraction, name=name)
-            for name, fraction in settings.simulate.leakage.items()
+            filled(texts["fraction"], percent=100 * band.leakage, name=band.name)
+            for band in settings.bands
+            if isinstance(band.leakage, float)
         )
         leakage = filled(texts["simulated"], fractions=fractions)
     return paper.described("Figure 9", numbers, leakage=leakage)

@@ -16,6 +16,7 @@ from fits.commands.report import ResultTable
 from fits.paper.sky import (
     NSIDE,
     PAPER_FWHM,
+    RANGES,
     SYMBOLS,
     TEXTS,
     Impossible,
@@ -35,13 +36,11 @@ from jaxsky.io import InputError
 from jaxsky.observation import Observation, ObservedBand, Source, band_tables, load_instrument
 from jaxsky.settings import BandTable, Experiment
 from jaxsky.simulation import HarmonicSource, harmonic_sources, observe_bands, plan_terms
-from jaxsky.small_scales import DUST, SYNCHROTRON, Continued
+from jaxsky.small_scales import Continued
 from jaxsky.templates import correlation, polarization_template, preset, steepening
 
 #: nside of blocks for a jackknife that allows for correlated pixels: 15 degrees.
 NSIDE_BLOCKS = 4
-#: The paper's ranges of the fits of power laws.
-RANGES = {"synchrotron": SYNCHROTRON, "dust": DUST}
 #: Change of slope for the steeper spectrum, which the paper does not give.
 TILT = -1.0
 #: Sizes of the patches of figures 13 and 14 [deg].
@@ -155,9 +154,9 @@ def figure_spectra(paper: PaperSky, picture: Path) -> PaperFigure:
 def _ranges(paper: PaperSky) -> str:
     """Return a sentence on the ranges of the fits."""
     texts = TEXTS["Figure 2"]["ranges"]
-    layers, wanted = [paper.template(name) for name in RANGES], paper.settings.paper
+    layers, given = [paper.template(name) for name in RANGES], paper.settings.paper.small_scales
     used = [(one.small_scales.EE, one.small_scales.BB) for one in layers]
-    if used != [(tuple(one.EE), tuple(one.BB)) for one in (wanted.synchrotron, wanted.dust)]:
+    if used != [(one.EE, one.BB) for one in (given.get(n, RANGES[n]) for n in RANGES)]:
         ends = sorted({layer.nside for layer in layers})
         return filled(texts["clipped"], ends=listed(f"l = {2 * n}" for n in ends))
     if used == [(one.EE, one.BB) for one in RANGES.values()]:
@@ -225,7 +224,7 @@ def forecast_settings(paper: PaperSky) -> Experiment:
     fit = (20, min(200, lmax - 10))
     spec = settings.forecast.model_copy(update={"bands": list(BANDS), "lmax": lmax, "fit": fit})
     bands = [BandTable.model_validate(band) for band in band_tables("core")]
-    cmb = settings.cmb.model_copy(update={"include": True, "spectra": None})
+    cmb = settings.cmb.model_copy(update={"include": True, "file": None})
     changes = {"sky": sky, "bands": bands, "cmb": cmb, "free": {}, "forecast": spec}
     return settings.model_copy(update=changes)
 
@@ -300,8 +299,7 @@ def figure_patch(paper: PaperSky, picture: Path) -> PaperFigure:
             limit = plots.color_limit(inside["cmb"] * to_cmb)
             panels = {f"CMB, {beam}": (Q["cmb"] * to_cmb, limit, "uK_CMB"), **panels}
     _draw_patches(picture, panels, center, SIZE_CORE)
-    spectra = settings.cmb.spectra
-    words = f"r = {settings.cmb.r:g}" if spectra is None else f"spectra of {spectra}"
+    words = f"spectra of {settings.cmb.label}" if settings.cmb.file else f"r = {settings.cmb.r:g}"
     return paper.described("Figure 13", numbers, size=SIZE_CORE, cmb=words, nside=observation.nside)
 
 

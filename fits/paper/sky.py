@@ -25,10 +25,12 @@ from jaxsky.cmb import gaussian_fields
 from jaxsky.galaxy import EmbeddedSky
 from jaxsky.harmonics import gaussian_beam, synthesis
 from jaxsky.inputs import (
+    check_stokes,
     default_galaxy,
     embedded_galaxy,
     parameter_map,
     read,
+    read_parameters,
     read_sky,
     uK_RJ_per,
 )
@@ -41,10 +43,11 @@ from jaxsky.settings import (
     Experiment,
     RadioIndexMap,
     SettingsError,
+    SmallScalesTable,
     at_key,
     find_file,
 )
-from jaxsky.small_scales import Continued, SmallScales, continue_templates
+from jaxsky.small_scales import DUST, SYNCHROTRON, Continued, SmallScales, continue_templates
 from jaxsky.templates import dust_index, from_pysm_beta, polarization_template, steepening
 
 #: Titles, captions, differences from the paper, and numbers from its text, by label.
@@ -54,6 +57,8 @@ TEXTS: dict[str, Any] = tomllib.loads(
 WORDS = TEXTS["sky"]
 #: Beams of the paper's templates [arcmin].
 PAPER_FWHM = {"dust": 10.0, "synchrotron": 60.0}
+#: The paper's ranges of the fits of power laws.
+RANGES = {"synchrotron": SYNCHROTRON, "dust": DUST}
 #: Reference frequency [GHz] and resolution [arcmin] of the AME; nside of its correlation with the
 #: dust, of random indices, and of the embedded model next to templates from files.
 NU_AME, AME_FWHM, NSIDE = 23.0, 60.0, 64
@@ -255,13 +260,15 @@ class PaperSky:
         fwhm = max(own.fwhm, PAPER_FWHM[law])
         nside = healpy.npix2nside(own.used.size)
         maps = polarization_template(own.component.template, own.fwhm, fwhm, nside)
-        numbers = getattr(self.settings.paper, law).model_dump(exclude={"correlated_with"})
+        given, ranges = self.settings.paper.small_scales, RANGES[law]
+        spec = given.get(law) or SmallScalesTable(EE=ranges.EE, BB=ranges.BB)
+        numbers = spec.model_dump(exclude={"correlated_with"})
         last = int(KNOWN * nside)
         for kind in ("EE", "BB"):
             first, end = numbers[kind]
             if end > last:
                 numbers[kind] = max(2, round(first * last / end)), last
-        with at_key(f"paper.{law}"):
+        with at_key(f"paper.small_scales.{law}"):
             small = SmallScales(**numbers)
         assert isinstance(own.component, Dust | Synchrotron)  # by its law
         return Layer(dataclasses.replace(own.component, amplitude=maps), fwhm, small)
@@ -291,20 +298,26 @@ class PaperSky:
 
         Then their resolution in words, and the origin of the intensity, as part of a sentence.
         """
-        dust, spec = self.template("dust"), self.settings.paper.ame
-        nu_ref, own, nside = NU_AME, 0.0, dust.nside
-        if spec is not None:
-            found = read(self.folder, spec)
-            if found.stokes not in (("I",), (None,), ("",)):
-                raise SettingsError(
-                    f"paper.ame.fields: must name one intensity map, not {', '.join(found.names)}."
-                )
+        dust = self.template("dust")
+        parameters: dict[str, Any] = {"nu_ref": NU_AME}
+        name, own, nside = "ame", 0.0, dust.nside
+        if any(spec.law == "ame" for spec in self.settings.sky.given.values()):
+            name, spec = self._spec("ame")
+            found, own, where = read(self.folder, spec), spec.fwhm or 0.0, f"sky.{name}"
+            check_stokes(where, found, "I")
             if missing := int(np.sum(~np.asarray(found.mask))):
-                raise SettingsError(f"paper.ame: {missing} pixels have no value.")
-            nu_ref, own = spec.nu_ref, spec.fwhm or 0.0
-            intensity = jnp.asarray(found.maps[0] * uK_RJ_per(found.unit, nu_ref, "paper.ame"))
+                raise SettingsError(f"{where}: {missing} pixels have no value.")
+            parameters, _ = read_parameters(self.folder, name, spec, found.nside)
+            fixed = self.settings.fixed.items()
+            parameters |= {
+                key[len(name) + 1 :]: v for key, v in fixed if key.startswith(f"{name}.")
+            }
+            if any(map(np.ndim, parameters.values())):
+                raise Impossible("It takes parameters of AME that are numbers, not maps.")
+            intensity = jnp.asarray(found.maps[0] * uK_RJ_per(found.unit, spec.nu_ref, where))
             origin = f"the intensity of AME is {spec.label}"
-            origin += f", from {nu_ref:g} to 23 GHz by the paper's law" * (nu_ref != NU_AME)
+            if spec.nu_ref != NU_AME:
+                origin += f", from {spec.nu_ref:g} to 23 GHz by the paper's law"
         else:
             intensity = self.galaxy.dust[0] / 2
             origin = (
@@ -320,7 +333,8 @@ class PaperSky:
         else:
             polarized = polarization_template(polarized, dust.fwhm, fwhm, nside)
             intensity = dust_index(intensity, own, fwhm, nside)
-        ame = AME.from_dust_angles(intensity, polarized, nu_ref=nu_ref)
+        with at_key(f"sky.{name}"):
+            ame = AME.from_dust_angles(intensity, polarized, **parameters)
         return ame.template * ame.sed(NU_AME), polarized, resolution, origin
 
     def index(self, name: str) -> Index:

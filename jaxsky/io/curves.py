@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsky.checks import check_choice
 from jaxsky.io.files import UnfitError, in_file, is_fits
 from jaxsky.io.quantities import unit_factor, unit_name
 from jaxsky.io.tables import TABLES, open_fits, select_hdu
@@ -151,8 +150,8 @@ def _check_commas(rows: list[TextRow]) -> None:
 
 
 SPECTRA = ("TT", "EE", "BB", "TE")
-#: First columns of text files, by format.
-_ORDERS = {"planck": ("L", "TT", "TE", "EE", "BB"), "camb": ("L", "TT", "EE", "BB", "TE")}
+#: First columns of the files that CAMB calls so.
+_CAMB_NAMES = ("L", "TT", "EE", "BB", "TE")
 #: Column names in upper case -> the package's: HEALPix (IDL, Fortran, healpy), HEALPix C++.
 _NAMES = {
     **dict.fromkeys(("ELL", "INDEX", "MULTIPOLE"), "L"),
@@ -201,9 +200,9 @@ def _located(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
 
 
 def _text_order(
-    file: str, header: list[list[str]], columns: int, format: str | None
+    file: str, header: list[list[str]], columns: int, fields: Sequence[str] | None
 ) -> Sequence[str]:
-    """Return the column names of a text file, from its header, `format` or the file name."""
+    """Return the column names of a text file, from its header, `fields` or the file name."""
     named = [names for words in header if "TT" in (names := [_name(word) for word in words])]
     if named:
         words = named[-1]
@@ -212,23 +211,19 @@ def _text_order(
                 f"the header names {len(words)} columns ({' '.join(words)}), "
                 f"but there are {columns}."
             )
-        if format is not None and tuple(words[:5]) != _ORDERS[format]:
-            raise UnfitError(
-                f"argument `format` is {format!r}, but the columns are {' '.join(words)}."
-            )
+        if fields is not None and words[: len(fields)] != list(fields):
+            raise UnfitError(f"`fields` are {' '.join(fields)}, the columns {' '.join(words)}.")
         return words
     if file.endswith("scalCls.dat"):
         raise UnfitError(f"CAMB's scalar spectra have no BB; read {_CAMB}.")
-    if format is None and file.endswith(("lensedCls.dat", "totCls.dat")):
-        format = "camb"
-    if format is None:
-        choices = " or ".join(f"{k!r} for {' '.join(v)}" for k, v in _ORDERS.items())
-        raise UnfitError(f"no header names the columns; give `format`, {choices}.")
-    if columns < 5:
-        raise UnfitError(
-            f"{columns} columns, but format {format!r} has {' '.join(_ORDERS[format])}."
-        )
-    return _ORDERS[format]
+    if fields is None and file.endswith(("lensedCls.dat", "totCls.dat")):
+        fields = _CAMB_NAMES
+    if fields is None:
+        example = ", ".join(f'"{name}"' for name in _CAMB_NAMES)
+        raise UnfitError(f"no header names the columns; give their names, `fields` = [{example}].")
+    if columns < len(fields):
+        raise UnfitError(f"there are {columns} columns, but the names {' '.join(fields)}.")
+    return fields
 
 
 def _fits_factor(name: str, found: str | None, given: str | None) -> float:
@@ -273,14 +268,14 @@ def _first(bad: np.ndarray) -> str:
 
 
 def read_spectra(
-    path: str | Path, lmax: int, *, format: str | None = None, unit: str | None = None
+    path: str | Path, lmax: int, *, fields: Sequence[str] | None = None, unit: str | None = None
 ) -> Float[np.ndarray, "4 ell"]:
     """Read power spectra C_l of TT, EE, BB, TE from a file [uK_CMB^2], l = 0 ... lmax.
 
     * Text with l and D_l = l (l+1) C_l / 2 pi [uK^2]: the theory spectra of the Planck Legacy
       Archive (L TT TE EE BB PP), and the output of CAMB (L TT EE BB TE). The header names the
       columns. Without one, CAMB's order is assumed for file names that end in totCls.dat or
-      lensedCls.dat; for others the order must be given as `format`.
+      lensedCls.dat; for others the names must be given as `fields`.
     * FITS tables with C_l as written by HEALPix and healpy, from l = 0 unless there is a column
       of multipoles. Units are read from the header; a bare K^2 means K_CMB^2.
 
@@ -290,7 +285,8 @@ def read_spectra(
     ----------
     path : text or FITS file
     lmax : largest multipole
-    format : "planck" or "camb", the order of columns in a text file without a header
+    fields : names of the first columns of a text file without a header, in order, for example
+        ["L", "TT", "TE", "EE", "BB"]
     unit : unit of a FITS table that states none, for example "uK_CMB^2" (`healpy.write_cl` writes
         none unless asked to)
 
@@ -300,22 +296,23 @@ def read_spectra(
         If the file lacks a spectrum or multipoles, if neither file nor arguments state columns
         and units, or if values are negative or not finite, or |TE| exceeds sqrt(TT EE).
     ValueError
-        If `format` is unknown or lmax is negative.
+        If lmax is negative.
     """
     path = Path(path)
-    if format is not None:
-        check_choice("format", format, _ORDERS)
     with in_file(path):
+        if fields is not None and len({str(name) for name in fields}) < len(fields):
+            raise UnfitError(f"`fields` must differ, but are {', '.join(map(str, fields))}.")
+        named = None if fields is None else [_name(str(name)) for name in fields]
         if is_fits(path):
-            if format is not None:
-                raise UnfitError("argument `format` is for text files, this is FITS.")
+            if named is not None:
+                raise UnfitError("`fields` is for text files, columns of FITS files have names.")
             ell, values = _spectra_of_fits(path, unit)
         else:
             if unit is not None:
                 raise UnfitError("argument `unit` is for FITS files, text is in uK^2.")
             text = read_text(path)
             table = text.numbers()
-            names = _text_order(path.name, text.words(), text.width, format)
+            names = _text_order(path.name, text.words(), text.width, named)
             at, *columns = _located(names, ("L", *SPECTRA))
             ell = table[:, at]
             factor = np.where(ell > 0, 2 * np.pi / np.maximum(ell * (ell + 1), 1), 0)

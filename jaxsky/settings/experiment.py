@@ -36,11 +36,9 @@ from jaxsky.settings.types import (
     Several,
     Word,
     check_names,
-    check_reference,
     check_signs,
     valid,
 )
-from jaxsky.small_scales import DUST, SYNCHROTRON
 
 #: Regions that are predefined.
 REGIONS: dict[str, str | MapFile] = {"strip": "|b| <= 20", "outside": "|b| > 20", "full": "full"}
@@ -71,7 +69,14 @@ MaskFile = Annotated[MapFile, valid(_mask)]
 Region = Annotated[str, valid(parse_region)] | MaskFile
 
 
-class CommonTable(SettingsTable):
+class ResolutionTable(SettingsTable):
+    """Pixels and the beam [arcmin] of maps; 0 smooths none."""
+
+    nside: Nside | None = None
+    fwhm: float = Field(0.0, ge=0)
+
+
+class CommonTable(ResolutionTable):
     """The common resolution of templates and maps in fit, compare, separate and paper."""
 
     nside: Nside = 64
@@ -81,11 +86,12 @@ class CommonTable(SettingsTable):
     maps: FileName | None = None
 
 
-class SimulateTable(SettingsTable):
-    """How bands without a map are simulated, and what `jaxsky simulate` writes."""
+class SimulateTable(ResolutionTable):
+    """How bands without a map are simulated, and what `jaxsky simulate` writes.
 
-    nside: Nside | None = None
-    fwhm: Positive | Literal["own"] = "own"
+    Without a common beam each band has its own, without nside that of the coarsest map of the sky.
+    """
+
     stokes: Literal["QU", "IQU"] = "QU"
     unit: Literal["uK_RJ", "uK_CMB"] = "uK_RJ"
     components: bool = False
@@ -94,10 +100,21 @@ class SimulateTable(SettingsTable):
     include: Several[Word] | None = None
     diagonal_noise: bool = False
     small_scales_seed: Seed | None = None
-    leakage: dict[str, float] = Field(default={})
 
 
-class FitTable(SettingsTable):
+class ByRegionTable(SettingsTable):
+    """Regions of which fit and compare give results, one after the other."""
+
+    regions: Several[Word] = Field(["strip", "outside", "full"])
+
+
+class ChainsTable(SettingsTable):
+    """Steps of the chains of fit and separate; by default those of the sampler."""
+
+    nsteps: int | None = Field(None, ge=1)
+
+
+class FitTable(ByRegionTable, ChainsTable):
     """How spectral parameters are fitted to templates."""
 
     regions: Several[Word] = Field(["strip", "full"])
@@ -105,50 +122,59 @@ class FitTable(SettingsTable):
     methods: Several[Literal["grid", "gradient", "mcmc"]] = Field(["grid", "gradient", "mcmc"])
     likelihood: Literal["exact", "diagonal"] = "exact"
     points: int = Field(200, ge=20, le=2000)
-    nsteps: int = Field(3000, ge=1)
+    nsteps: int | None = Field(3000, ge=1)
 
 
-class BinsTable(SettingsTable):
+class SpectraTable(SettingsTable):
     """Binned spectra, of compare, separate and forecast."""
 
+    lmin: Multipole = 2
+    lmax: Multipole | None = None
     width: int = Field(10, ge=1)
 
+    @model_validator(mode="after")
+    def _increase(self) -> "SpectraTable":
+        if self.lmax is not None and not self.lmin < self.lmax:
+            raise ValueError(f"lmax, {self.lmax}, must be above lmin, {self.lmin}")
+        return self
 
-class SimulationsTable(BinsTable):
-    """Spectra with errors from simulations: of compare and separate."""
+
+class SimulationsTable(SpectraTable):
+    """Spectra with errors from simulations, of compare and separate."""
 
     nsims: int = Field(100, ge=20)
 
 
-class CompareTable(SimulationsTable):
+class WindowTable(SettingsTable):
+    """A region whose edge is apodized [deg], of separate and forecast."""
+
+    region: Word = "full"
+    apodization: float = Field(15.0, ge=0, lt=90)
+
+
+class CompareTable(SimulationsTable, ByRegionTable):
     """How maps are compared with the model."""
 
-    regions: Several[Word] = Field(["strip", "outside", "full"])
     lmax: int = Field(100, ge=10)
     patches: str | None = None
 
 
-class SeparateTable(SimulationsTable):
+class SeparateTable(SimulationsTable, WindowTable, ChainsTable):
     """How components are separated, and how r is measured from the cleaned BB."""
 
     domain: Literal["pixel", "harmonic"] = "pixel"
-    region: Word = "full"
     unit: Literal["uK_CMB", "uK_RJ"] = "uK_CMB"
     sampler: Literal["nuts", "emcee", "none"] = "nuts"
     nsteps: int | None = Field(None, ge=100)
-    lmin: Multipole = 2
-    lmax: Multipole | None = None
-    apodization: float = Field(15.0, ge=0, lt=90)
     purify: bool = True
 
 
-class ForecastTable(BinsTable):
+class ForecastTable(SpectraTable, WindowTable):
     """Spectra of the foregrounds outside a mask, and the Fisher matrix."""
 
     region: Word = "outside"
     apodization: float = Field(4.0, ge=0, lt=90)
     bands: Annotated[Several[Word], Field(max_length=7)] | None = None
-    lmin: Multipole = 2
     lmax: Multipole = 250
     fit: Pair[Multipole] = (20, 200)
     show_r: Several[Positive] = Field([0.1, 0.01, 0.001], max_length=4)
@@ -160,18 +186,11 @@ class ForecastTable(BinsTable):
 
     @model_validator(mode="after")
     def _ranges(self) -> "ForecastTable":
-        for key in ("lmax", "fisher_lmax"):
-            if not self.lmin < (last := getattr(self, key)):
-                raise ValueError(f"{key}, {last}, must be above lmin, {self.lmin}")
+        if not self.lmin < self.fisher_lmax:
+            raise ValueError(f"fisher_lmax, {self.fisher_lmax}, must be above lmin, {self.lmin}")
         if not self.fit[0] < self.fit[1]:
             raise ValueError(f"fit must increase, but is {self.fit[0]}, {self.fit[1]}")
         return self
-
-
-class IntensityMap(BeamedMap):
-    """An intensity at `nu_ref` [GHz]."""
-
-    nu_ref: Positive
 
 
 class RadioIndexMap(BeamedMap):
@@ -189,17 +208,9 @@ class PaperTable(SettingsTable):
 
     fwhm: Positive = 5.0
     center: Pair[float] = (180.0, 30.0)
-    dust: SmallScalesTable = SmallScalesTable(EE=DUST.EE, BB=DUST.BB)
-    synchrotron: SmallScalesTable = SmallScalesTable(EE=SYNCHROTRON.EE, BB=SYNCHROTRON.BB)
-    ame: IntensityMap | None = None
+    small_scales: dict[Literal["dust", "synchrotron"], SmallScalesTable] = Field(default={})
     beta_dust: BeamedMap | None = None
     beta_syn: RadioIndexMap | None = None
-
-    @model_validator(mode="after")
-    def _plausible(self) -> "PaperTable":
-        if self.ame is not None:
-            check_reference("ame", self.ame.nu_ref)
-        return self
 
 
 class Experiment(SettingsTable):
@@ -262,7 +273,6 @@ class Experiment(SettingsTable):
         known: dict[str, Collection[str]] = {
             "common.components": components,
             "simulate.include": simulated,
-            "simulate.leakage": names,
             "compare.patches": names,
             "fit.regions": self.regions,
             "compare.regions": self.regions,

@@ -1,5 +1,6 @@
 """Tables of settings that name maps, masks, bandpasses and noise in files."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -35,6 +36,13 @@ class TableKeys(SettingsTable):
         """The names of the files without folders, for display."""
         return ", ".join(Path(file).name for file in self.files)
 
+    def check_file(self, keys: Iterable[str], most: int | None = None) -> None:
+        """Raise ValueError for more than `most` files, or keys of a file that is missing."""
+        if most and len(self.files) > most:
+            raise MistakeAt("file", f"must be one file, not {self.label}")
+        if self.file is None and (given := self.changed(keys)):
+            raise ValueError(f"{', '.join(given)}: of a file, but file is missing")
+
 
 class ColumnKeys(TableKeys):
     """Columns of HEALPix maps in one FITS table, or in several with one column each.
@@ -56,8 +64,7 @@ class MapKeys(ColumnKeys):
 
     @model_validator(mode="after")
     def _of_a_file(self) -> "MapKeys":
-        if self.file is None and (of_file := self.changed(MapKeys.model_fields)):
-            raise ValueError(f"{', '.join(of_file)}: of a file, but file is missing")
+        self.check_file(MapKeys.model_fields)
         return self
 
 
@@ -90,11 +97,7 @@ class BandpassSpec(TableKeys):
     def _one_kind(self) -> "BandpassSpec":
         if (self.file is None) == (self.center is None):
             raise ValueError("give a bandpass either as file or as center and width")
-        if len(self.files) > 1:
-            raise MistakeAt("file", f"a bandpass is in one file, not in {self.label}")
-        of_file = self.changed(("band", "detectors", "unit", "fields"))
-        if self.file is None and of_file:
-            raise ValueError(f"{', '.join(of_file)}: of the file of a bandpass, not of center")
+        self.check_file(("band", "detectors", "unit", "fields"), 1)
         return self
 
 
@@ -181,3 +184,9 @@ class NoiseTable(SettingsTable):
         if len(spec.fields or []) not in [len(choice.split(", ")) for choice in choices]:
             named = ", ".join(map(str, spec.fields or [])) or "none"
             raise MistakeAt(f"{kind}.fields", f"name the columns {self.COLUMNS[kind]}, not {named}")
+
+
+class SeenKeys(BeamedKeys):
+    """An optional map as it was seen, with its beam and its noise: of a band or of a component."""
+
+    noise: NoiseTable | None = None

@@ -2,7 +2,6 @@
 
 import re
 from pathlib import Path
-from typing import Literal
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
@@ -10,7 +9,14 @@ from jaxsky.checks import listed
 from jaxsky.components import AME, component_class, declared
 from jaxsky.galaxy import GalaxyModel
 from jaxsky.observation import band_tables
-from jaxsky.settings.files import BandpassSpec, BeamedKeys, BeamedMap, MapFile, MapKeys, NoiseTable
+from jaxsky.settings.files import (
+    BandpassSpec,
+    BeamedMap,
+    MapFile,
+    MapKeys,
+    SeenKeys,
+    TableKeys,
+)
 from jaxsky.settings.types import (
     RESERVED,
     BandName,
@@ -103,7 +109,7 @@ class SmallScalesTable(SettingsTable):
         return self
 
 
-class ComponentTable(BeamedKeys):
+class ComponentTable(SeenKeys):
     """A component: its law, parameters that differ from the defaults, its map at `nu_ref` [GHz].
 
     A parameter may be a map. `angles` names the component along which an intensity is polarized. A
@@ -115,7 +121,6 @@ class ComponentTable(BeamedKeys):
     nu_ref: Positive | None = None
     angles: str | None = None
     parameters: dict[str, float | list[float] | MapFile] = Field(default={})
-    noise: NoiseTable | None = None
     small_scales: SmallScalesTable | None = None
 
     @model_validator(mode="after")
@@ -199,8 +204,8 @@ class SkyTable(SettingsTable):
         return self
 
 
-class CMBTable(SettingsTable):
-    """The CMB: from CAMB, or from a file of spectra.
+class CMBTable(TableKeys):
+    """The CMB: from CAMB, or from a file of spectra, see `jaxsky.io.read_spectra`.
 
     It is part of the simulated sky and of the covariance in fits. `A_lens` multiplies the B modes
     of lensing.
@@ -210,23 +215,23 @@ class CMBTable(SettingsTable):
     r: float = Field(0.0, ge=0, le=1000)  # the largest leaves the tensors far above all else
     A_lens: float = Field(1.0, ge=0)
     cosmology: dict[str, float] = Field(default={})
-    spectra: FileName | None = None
-    format: Literal["camb", "planck"] | None = None
-    unit: str | None = None
 
     @model_validator(mode="after")
     def _one_source(self) -> "CMBTable":
-        if self.spectra is not None and (self.r or self.cosmology or self.A_lens != 1):
-            raise ValueError("r, A_lens and cosmology are for CAMB; leave them out with spectra")
+        if self.file is not None and (self.r or self.cosmology or self.A_lens != 1):
+            raise ValueError("r, A_lens and cosmology are for CAMB; leave them out with a file")
         for name in {"r", "lmax"} & set(self.cosmology):
             raise MistakeAt("cosmology", f"{name!r} is no parameter of the cosmology")
-        if self.spectra is None and (self.format or self.unit):
-            raise ValueError("format and unit are those of spectra, a file")
+        self.check_file(TableKeys.model_fields, 1)
         return self
 
 
-class BandTable(BeamedKeys):
-    """A band: how it observes the sky, and its map; a band without a map is simulated."""
+class BandTable(SeenKeys):
+    """A band: how it observes the sky, and its map; a band without a map is simulated.
+
+    `leakage` is a map that is subtracted from that in the file, or the fraction of the intensity
+    that leaks into Q and U where the band is simulated; known there, and subtracted again.
+    """
 
     name: BandName | None = None
     instrument: str | None = None
@@ -234,8 +239,7 @@ class BandTable(BeamedKeys):
     bandpass: BandpassSpec | None = None
     samples: int = Field(51, ge=2)
     beam: FileName | None = None
-    noise: NoiseTable | None = None
-    leakage: BeamedMap | None = None
+    leakage: float | BeamedMap | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> "BandTable":
@@ -254,11 +258,11 @@ class BandTable(BeamedKeys):
         if self.noise is not None and self.noise.shared:
             raise MistakeAt("noise.shared", "is of templates, which share the noise of bands")
         if self.file is None:
-            if self.leakage is not None:
+            if isinstance(self.leakage, BeamedMap):
                 raise MistakeAt("leakage", "is subtracted from a map, but file is missing")
             if self.noise is not None and self.noise.estimate_above is not None:
                 raise MistakeAt("noise.estimate_above", "is of a map, but file is missing")
-        if self.leakage is not None:
+        elif isinstance(self.leakage, BeamedMap):
             self._check_release(self.leakage)
         return self
 

@@ -334,15 +334,12 @@ def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -
     if (beam := beam_of(folder, spec, 2 * nside)) is None:
         beam = 0.0 if observed is None else observed.beam
     leakage = _leakage_of(observed, used)
-    if isinstance(spec.leakage, float):
-        if spec.leakage and leakage is None:
-            raise SettingsError(
-                f"{where}.leakage: {spec.leakage:g} is of a simulation, but {spec.label} holds "
-                "none that is known; give the map that is to be subtracted."
-            )
-    elif spec.leakage is not None:
-        own = _polarization(folder, spec.leakage, bandpass, f"{where}.leakage", True)
-        leakage = Leakage(*own[:2], spec.leakage.fwhm or 0.0)
+    if isinstance(given := spec.leakage, MapKeys):
+        own = _polarization(folder, given, bandpass, f"{where}.leakage", True)
+        leakage = Leakage(*own[:2], given.fwhm or 0.0)
+    elif given and leakage is None:
+        words = f"{given:g} is of a simulation, but {spec.label} holds none"
+        raise SettingsError(f"{where}.leakage: {words}; give the map that is subtracted.")
     where, correlated = f"{where}.noise", None
     if spec.noise is None:
         if observed is None:

@@ -262,8 +262,11 @@ def _leakage(
     galaxy: EmbeddedSky | None,
 ) -> dict[str, Float[Array, "2 pix"]]:
     """Return what leaks from the foregrounds' intensity into Q and U of each band [uK_RJ]."""
-    given = {band.name: band.leakage for band in settings.bands}
-    fractions = {n: given[n] for n in observation.names if isinstance(given[n], float)}
+    fractions = {
+        str(band.name): band.leakage
+        for band in settings.bands
+        if band.name in observation.names and isinstance(band.leakage, float)
+    }
     if not names or not any(fractions.values()):
         return {}
     with at_key("bands.leakage"):

@@ -154,9 +154,9 @@ def figure_spectra(paper: PaperSky, picture: Path) -> PaperFigure:
 def _ranges(paper: PaperSky) -> str:
     """Return a sentence on the ranges of the fits."""
     texts = TEXTS["Figure 2"]["ranges"]
-    layers, given = [paper.template(name) for name in RANGES], paper.settings.paper.small_scales
+    layers = [paper.template(name) for name in RANGES]
     used = [(one.small_scales.EE, one.small_scales.BB) for one in layers]
-    if used != [(one.EE, one.BB) for one in (given.get(n, RANGES[n]) for n in RANGES)]:
+    if used != [(paper.small_scales[law].EE, paper.small_scales[law].BB) for law in RANGES]:
         ends = sorted({layer.nside for layer in layers})
         return filled(texts["clipped"], ends=listed(f"l = {2 * n}" for n in ends))
     if used == [(one.EE, one.BB) for one in RANGES.values()]:

@@ -164,6 +164,12 @@ class PaperSky:
         return self.settings.common.maps is not None or all(band.file is None for band in bands)
 
     @property
+    def small_scales(self) -> dict[str, SmallScalesTable]:
+        """Small scales by law: those of the settings, or with the paper's ranges."""
+        papers = {law: SmallScalesTable(EE=one.EE, BB=one.BB) for law, one in RANGES.items()}
+        return papers | self.settings.paper.small_scales
+
+    @property
     def description(self) -> str:
         """Description of the sky in a sentence."""
         if self.embedded:
@@ -260,9 +266,7 @@ class PaperSky:
         fwhm = max(own.fwhm, PAPER_FWHM[law])
         nside = healpy.npix2nside(own.used.size)
         maps = polarization_template(own.component.template, own.fwhm, fwhm, nside)
-        given, ranges = self.settings.paper.small_scales, RANGES[law]
-        spec = given.get(law) or SmallScalesTable(EE=ranges.EE, BB=ranges.BB)
-        numbers = spec.model_dump(exclude={"correlated_with"})
+        numbers = self.small_scales[law].model_dump(exclude={"correlated_with"})
         last = int(KNOWN * nside)
         for kind in ("EE", "BB"):
             first, end = numbers[kind]

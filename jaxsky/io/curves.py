@@ -268,7 +268,11 @@ def _first(bad: np.ndarray) -> str:
 
 
 def read_spectra(
-    path: str | Path, lmax: int, *, fields: Sequence[str] | None = None, unit: str | None = None
+    path: str | Path,
+    lmax: int,
+    *,
+    fields: Sequence[str | int] | None = None,
+    unit: str | None = None,
 ) -> Float[np.ndarray, "4 ell"]:
     """Read power spectra C_l of TT, EE, BB, TE from a file [uK_CMB^2], l = 0 ... lmax.
 

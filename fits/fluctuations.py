@@ -65,7 +65,10 @@ class MapNoise(NamedTuple):
 
         Rows at the resolution of the noise are stored in its precision.
         """
-        block, modes = np.zeros((count, count)), _Modes(count)
+        block, modes, spectra = np.zeros((count, count)), None, None
+        if self.correlated is not None:
+            spectra = np.stack([self.correlated] * 2)
+            modes = _modes_of((count,), spectra.shape[-1] - 1)
         white = bool(np.ndim(self.noise) or self.noise)
         covariance = of_pixels(self.noise, self.preparation.nside_in)
         npix = covariance.shape[-1]
@@ -75,8 +78,8 @@ class MapNoise(NamedTuple):
                 before[own] = np.asarray(
                     self.preparation.transpose(loaded(row)).block_until_ready()
                 )
-            if self.correlated is not None:
-                modes.append(_modes(row, np.stack([self.correlated] * 2)))
+            if modes is not None:
+                modes[own] = np.asarray(_modes(row, spectra))
         if before is not None:
             for cut in ranges(npix, CHUNK):
                 maps = before[..., cut].astype(float)
@@ -84,7 +87,7 @@ class MapNoise(NamedTuple):
                 seen = np.einsum("stp,jtp->jsp", pixels, maps)
                 block += maps.reshape(count, -1) @ seen.reshape(count, -1).T
             block = (block + block.T) / 2
-        return block if self.correlated is None else block + modes.products()
+        return block if modes is None else block + _products(modes)
 
     def alm(self, key: Array, name: str) -> Float[Array, "2 alm"]:
         """Return E and B of a realisation of smoothed noise; the map's name is in its key."""
@@ -153,25 +156,35 @@ class Fluctuations(eqx.Module):
         """Return the covariance of the inner products of rows with the fluctuations."""
         npix = healpy.nside2npix(self.preparations[0].nside)  # without padding
         noises, blocks = list(self.noises.values()), list[np.ndarray]()
-        modes, last = _Modes(rows.shape[0] * rows.shape[1]), 0
-        if self.cmb_windows is not None:  # beyond this the beams leave nothing
-            last = max(len(shortened(window)) for window in self.cmb_windows)
+        modes: Any = None
+        spectra = self._cmb_spectra_of_bands()
+        if spectra is not None:
+            modes = _modes_of(rows.shape[:2], spectra.shape[-1] - 1)
         for start in range(0, len(noises), job.number()):
             # As many bands at a time as there are processes, which take turns.
             bands = range(len(noises))[start : start + job.number()]
             maps = {i: rows[i] for i in bands}
 
-            def of_band(i: int, maps: dict[int, Any] = maps) -> np.ndarray:
-                return noises[i].covariance((row[..., :npix] for row in maps[i]), len(maps[i]))
+            def of_band(i: int, maps: dict[int, Any] = maps) -> tuple[np.ndarray, list[np.ndarray]]:
+                own = (row[..., :npix] for row in maps[i])
+                block = noises[i].covariance(own, len(maps[i]))
+                if spectra is None:
+                    return block, []
+                return block, [np.asarray(_modes(row[..., :npix], spectra[i])) for row in maps[i]]
 
-            blocks += job.by_turns(of_band, bands)
-            for i in bands if self.cmb_spectra is not None else ():
-                assert self.cmb_windows is not None  # as there is a CMB
-                seen = np.asarray(self.cmb_spectra) * np.asarray(self.cmb_windows[i]) ** 2
-                for row in maps[i]:
-                    modes.append(self.cmb_factors[i] * _modes(row[..., :npix], seen[:, :last]))
+            for i, (block, projected) in zip(bands, job.by_turns(of_band, bands), strict=True):
+                blocks.append(block)
+                for row, each in enumerate(projected):
+                    modes[i, row] = each
         total = scipy.linalg.block_diag(*blocks)
-        return total if self.cmb_spectra is None else total + modes.products()
+        return total if modes is None else total + _products(modes)
+
+    def _cmb_spectra_of_bands(self) -> Float[np.ndarray, "band 2 ell"] | None:
+        """Return C_l of EE and BB of the CMB in each band, as far as the beams leave some."""
+        if self.cmb_spectra is None or self.cmb_windows is None:
+            return None
+        last = max(len(shortened(window)) for window in self.cmb_windows)
+        return self.cmb_power()[..., :last]
 
     # Not one program: there XLA would draw the normals anew for each row.
     def noise_realisation(self, key: Array) -> Maps:
@@ -222,23 +235,16 @@ class Fluctuations(eqx.Module):
         return np.broadcast_to(found[...], shape) if uniform else found
 
 
-class _Modes:
-    """Projections of so many rows on modes; on disk if they are large."""
+def _modes_of(rows: tuple[int, ...], lmax: int) -> Maps:
+    """Return an array for the projections of so many rows, on disk if it is large."""
+    return empty((*rows, 2 * alm_ell(lmax).size))
 
-    def __init__(self, number: int) -> None:
-        self._number, self._done = number, 0
 
-    def append(self, row: Array) -> None:
-        """Add the next row."""
-        if not self._done:
-            self._rows = empty((self._number, row.size))
-        self._rows[self._done] = np.asarray(row)
-        self._done += 1
-
-    def products(self) -> Float[np.ndarray, "row row"]:
-        """Return the inner products of all rows."""
-        parts = (self._rows[..., part] for part in ranges(self._rows.shape[-1]))
-        return sum((part @ part.T for part in parts), np.zeros(2 * (self._number,)))
+def _products(modes: Maps) -> Float[np.ndarray, "row row"]:
+    """Return the inner products of all rows, projected on modes."""
+    number, size = int(np.prod(modes.shape[:-1])), modes.shape[-1]
+    parts = (modes[..., part].reshape(number, -1) for part in ranges(size))
+    return sum((part @ part.T for part in parts), np.zeros((number, number)))
 
 
 @jax.jit

@@ -138,7 +138,8 @@ def inputs_of(
     folder = Path(settings.data_dir)
     if not settings.bands:
         raise SettingsError("bands: there are none.")
-    if galaxy is None and settings.sky.embedded is not None:
+    components, own = settings.sky.components, settings.sky.templates
+    if galaxy is None and any(components[name].file is None for name in own):
         galaxy = embedded_galaxy(settings)
     sky: dict[str, Template] = {}
     description = settings.title
@@ -166,8 +167,7 @@ def inputs_of(
         bands = {str(s.name): (bands | made)[str(s.name)] for s in settings.bands}
         truths.append(setup.truth)
         description = setup.description
-    laws = settings.sky.components
-    noises = {n: read_template_noise(folder, n, laws[n], template) for n, template in sky.items()}
+    noises = {n: read_template_noise(folder, n, components[n], one) for n, one in sky.items()}
     return Inputs(
         sky,
         bands,

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import cache
 
 import psutil
 import pytest
@@ -76,6 +77,12 @@ def results(name, out, *options):
     return left(out)
 
 
+@pytest.fixture(scope="module")
+def own(tmp_path_factory):
+    """What a command leaves that is not disturbed and has no workers, as a function of its name."""
+    return cache(lambda name: results(name, tmp_path_factory.mktemp("own") / "out"))
+
+
 def left(out):
     found = content(out)
     assert not [path for path in found if "/." in f"/{path}"]
@@ -100,8 +107,8 @@ def working(process, out):
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_commands_find_the_same_with_any_workers(name, cluster, tmp_path):
-    expected = results(name, tmp_path / "own")
+def test_commands_find_the_same_with_any_workers(name, cluster, own, tmp_path):
+    expected = own(name)
     for workers in ("1", "2", cluster.address):
         out = tmp_path / re.sub(r"\W", "", workers)
         found = results(name, out, "--workers", workers)
@@ -110,8 +117,8 @@ def test_commands_find_the_same_with_any_workers(name, cluster, tmp_path):
 
 
 @pytest.mark.parametrize("name", KILLED)
-def test_realisations_of_a_dask_worker_that_dies_are_made_again(name, cluster, tmp_path):
-    expected = results(name, tmp_path / "own")
+def test_realisations_of_a_dask_worker_that_dies_are_made_again(name, cluster, own, tmp_path):
+    expected = own(name)
     process = start(name, tmp_path / "out", *OPTIONS[name], "--workers", cluster.address)
     begun(name, process, tmp_path / "out")
     for _ in range(2):
@@ -122,7 +129,7 @@ def test_realisations_of_a_dask_worker_that_dies_are_made_again(name, cluster, t
 
 
 @pytest.mark.parametrize("name", KILLED)
-def test_a_lost_scheduler_is_said_and_the_rest_is_made_later(name, cluster, tmp_path):
+def test_a_lost_scheduler_is_said_and_the_rest_is_made_later(name, cluster, own, tmp_path):
     out = tmp_path / "out"
     process = start(name, out, *OPTIONS[name], "--workers", cluster.address)
     begun(name, process, out)
@@ -132,7 +139,7 @@ def test_a_lost_scheduler_is_said_and_the_rest_is_made_later(name, cluster, tmp_
     said = said_by(out).read_text()
     assert said.splitlines()[-1].startswith(words), said
     assert "Traceback" not in said
-    assert results(name, out, "--resume") == results(name, tmp_path / "own")
+    assert results(name, out, "--resume") == own(name)
 
 
 @pytest.mark.parametrize("kills", [1, 2])
@@ -153,7 +160,7 @@ def test_a_local_worker_that_dies_is_replaced_once(kills, tmp_path):
 
 
 @pytest.mark.parametrize("name", KILLED)
-def test_local_workers_that_die_again_are_said(name, tmp_path):
+def test_local_workers_that_die_again_are_said(name, own, tmp_path):
     out = tmp_path / "out"
     process = start(name, out, *OPTIONS[name], "--workers", "2")
     begun(name, process, out)
@@ -167,12 +174,12 @@ def test_local_workers_that_die_again_are_said(name, tmp_path):
     said = said_by(out).read_text()
     assert said.splitlines()[-1].startswith("jaxsky: Workers died more than once"), said
     assert "Traceback" not in said
-    assert results(name, out, "--resume", "--workers", "2") == results(name, tmp_path / "own")
+    assert results(name, out, "--resume", "--workers", "2") == own(name)
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 @pytest.mark.parametrize("name", KILLED)
-def test_no_worker_outlives_its_command(name, how, tmp_path):
+def test_no_worker_outlives_its_command(name, how, own, tmp_path):
     out = tmp_path / "out"
     process = start(name, out, *OPTIONS[name], "--workers", "2")
     begun(name, process, out)
@@ -188,4 +195,4 @@ def test_no_worker_outlives_its_command(name, how, tmp_path):
     if how == signal.SIGINT:
         assert "Stopped; resume with --resume" in said_by(out).read_text()
         assert not [path for path in out.rglob("*") if path.name.startswith(".partial")]
-    assert results(name, out, "--resume") == results(name, tmp_path / "own")
+    assert results(name, out, "--resume") == own(name)

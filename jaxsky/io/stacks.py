@@ -127,9 +127,21 @@ class Stored(Stack):
     def __reduce__(self) -> tuple[Any, ...]:
         return _attached, (self.path, self.shape, self.dtype)
 
+    def _block(self, index: Any) -> tuple[int, tuple[int, ...]] | None:
+        """Return the place and shape of what numbers choose on the first axes, else None."""
+        rows = index if isinstance(index, tuple) else (index,)
+        if len(rows) >= self.ndim or not all(isinstance(row, int | np.integer) for row in rows):
+            return None
+        if not all(0 <= row < size for row, size in zip(rows, self.shape, strict=False)):
+            return None
+        shape = self.shape[len(rows) :]
+        first = np.ravel_multi_index(rows, self.shape[: len(rows)])
+        return int(first) * int(np.prod(shape)) * self.dtype.itemsize, shape
+
     @contextmanager
     def _mapped(self, access: int, scattered: bool = False) -> Iterator[np.ndarray]:
         # Mapped anew each time: pages count as memory of the process as long as they are mapped.
+        # Whole rows are not mapped, but copied in pieces: both would be in memory at once.
         whole = mmap.mmap(self._file, self.size * self.dtype.itemsize, access=access)
         if scattered and hasattr(whole, "madvise"):
             whole.madvise(mmap.MADV_RANDOM)  # no pages around those that are read
@@ -140,6 +152,15 @@ class Stored(Stack):
                 whole.close()
 
     def __getitem__(self, index: Any) -> np.ndarray:
+        if block := self._block(index):
+            place, shape = block
+            found = aligned(shape, self.dtype)
+            values = found.reshape(-1)
+            for part in ranges(values.size):
+                piece = values[part]
+                start = place + part.start * self.dtype.itemsize
+                piece[:] = np.frombuffer(os.pread(self._file, piece.nbytes, start), self.dtype)
+            return found
         last = index[-1] if isinstance(index, tuple) else index
         with self._mapped(mmap.ACCESS_READ, isinstance(last, np.ndarray)) as values:
             chosen = values[index]
@@ -149,6 +170,13 @@ class Stored(Stack):
         return found
 
     def __setitem__(self, index: Any, value: ArrayLike) -> None:
+        if block := self._block(index):
+            place, shape = block
+            given = np.broadcast_to(np.asarray(value, self.dtype), shape)
+            values = np.ascontiguousarray(given).reshape(-1)
+            for part in ranges(values.size):
+                os.pwrite(self._file, values[part].data, place + part.start * self.dtype.itemsize)
+            return
         with self._mapped(mmap.ACCESS_WRITE) as values:
             values[index] = value
             del values

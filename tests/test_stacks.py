@@ -50,6 +50,7 @@ def test_an_array_on_disk_is_read_like_one_in_memory(on_disk):
     for index in (
         ...,
         1,
+        -1,
         (2, 1),
         (0, slice(None)),
         (..., slice(3, 900)),
@@ -66,6 +67,12 @@ def test_an_array_on_disk_is_read_like_one_in_memory(on_disk):
     kept[:, 1, 10:20] = 5.0
     assert (again[:, 1, 10:20] == 5.0).all()
     assert (again[:, 1, 9] == values[:, 1, 9]).all()
+    kept[2], kept[1, 0] = values[0], 7.0
+    np.testing.assert_array_equal(again[2], values[0])
+    assert (again[1, 0] == 7.0).all()
+    assert (again[1, 1, 20:] == values[1, 1, 20:]).all()
+    with pytest.raises(IndexError):
+        kept[3]
     del kept, twice, again, twice_again
     assert not any(on_disk.iterdir())
 

@@ -16,8 +16,12 @@ from settings_fuzz import written
 from systems import small_experiment
 
 COMMANDS = ("fit", "simulate", "compare", "separate", "paper")
-#: Small settings of each command, on the embedded sky: most of a run is to start and compile.
-SETTINGS = {name: small_experiment(**given) for name, given in cases("kills/settings").items()}
+#: Small settings of each command, on the embedded sky: most of a run is to start and compile. They
+#: name a folder, as results say which it is.
+SETTINGS = {
+    name: small_experiment(**given, data_dir=str(Path(__file__).parent))
+    for name, given in cases("kills/settings").items()
+}
 OPTIONS = {"simulate": ("--nsims", "4"), "paper": ("--only", "1", "--only", "table 1")}
 #: What says when and how long a run was, and how it was called.
 CIRCUMSTANCES = {"date", "seconds", "command"}

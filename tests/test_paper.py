@@ -320,6 +320,14 @@ def test_command_line(monkeypatch, capsys, tmp_path):
     assert "is not a folder" in said
 
 
+def test_ame_without_a_map_is_that_of_the_dust(small):
+    plain = PaperSky(small).ame()[0]
+    raw = small.model_dump(exclude_unset=True)
+    raw["sky"]["ame"] = {"law": "ame"}
+    raw["common"]["components"] = ["dust", "synchrotron"]
+    np.testing.assert_array_equal(PaperSky(Experiment.model_validate(raw)).ame()[0], plain)
+
+
 def test_settings_that_cannot_work(real):
     raw = real.model_dump()
     raw["sky"]["sky_ame"] |= {"fields": ["I_STOKES", "Q_STOKES"]}

@@ -305,7 +305,7 @@ class PaperSky:
         dust = self.template("dust")
         parameters: dict[str, Any] = {"nu_ref": NU_AME}
         name, own, nside = "ame", 0.0, dust.nside
-        if any(spec.law == "ame" for spec in self.settings.sky.given.values()):
+        if any(one.law == "ame" and one.file for one in self.settings.sky.given.values()):
             name, spec = self._spec("ame")
             found, own, where = read(self.folder, spec), spec.fwhm or 0.0, f"sky.{name}"
             check_stokes(where, found, "I")

@@ -175,7 +175,10 @@ class Stored(Stack):
             given = np.broadcast_to(np.asarray(value, self.dtype), shape)
             values = np.ascontiguousarray(given).reshape(-1)
             for part in ranges(values.size):
-                os.pwrite(self._file, values[part].data, place + part.start * self.dtype.itemsize)
+                piece = values[part]
+                start = place + part.start * self.dtype.itemsize
+                if os.pwrite(self._file, piece.data, start) < piece.nbytes:
+                    raise OSError(f"{self.path}: was not written in full; is the disk full?")
             return
         with self._mapped(mmap.ACCESS_WRITE) as values:
             values[index] = value

@@ -304,9 +304,9 @@ def read_spectra(
     """
     path = Path(path)
     with in_file(path):
-        if fields is not None and len({str(name) for name in fields}) < len(fields):
-            raise UnfitError(f"`fields` must differ, but are {', '.join(map(str, fields))}.")
         named = None if fields is None else [_name(str(name)) for name in fields]
+        if named is not None and len(set(named)) < len(named):
+            raise UnfitError(f"`fields` must differ, but are {', '.join(named)}.")
         if is_fits(path):
             if named is not None:
                 raise UnfitError("`fields` is for text files, columns of FITS files have names.")

@@ -69,15 +69,11 @@ MaskFile = Annotated[MapFile, valid(_mask)]
 Region = Annotated[str, valid(parse_region)] | MaskFile
 
 
-class ResolutionTable(SettingsTable):
-    """Pixels and the beam [arcmin] of maps; 0 smooths none."""
+class CommonTable(SettingsTable):
+    """The common resolution of templates and maps in fit, compare, separate and paper.
 
-    nside: Nside | None = None
-    fwhm: float = Field(0.0, ge=0)
-
-
-class CommonTable(ResolutionTable):
-    """The common resolution of templates and maps in fit, compare, separate and paper."""
+    A beam [arcmin] of 0 smooths none.
+    """
 
     nside: Nside = 64
     fwhm: float = Field(60.0, ge=0)
@@ -86,12 +82,15 @@ class CommonTable(ResolutionTable):
     maps: FileName | None = None
 
 
-class SimulateTable(ResolutionTable):
+class SimulateTable(SettingsTable):
     """How bands without a map are simulated, and what `jaxsky simulate` writes.
 
-    Without a common beam each band has its own, without nside that of the coarsest map of the sky.
+    With a beam of 0 [arcmin] each band has its own; nside is by default that of the sky's coarsest
+    map.
     """
 
+    nside: Nside | None = None
+    fwhm: float = Field(0.0, ge=0)
     stokes: Literal["QU", "IQU"] = "QU"
     unit: Literal["uK_RJ", "uK_CMB"] = "uK_RJ"
     components: bool = False
@@ -102,27 +101,15 @@ class SimulateTable(ResolutionTable):
     small_scales_seed: Seed | None = None
 
 
-class ByRegionTable(SettingsTable):
-    """Regions of which fit and compare give results, one after the other."""
+class FitTable(SettingsTable):
+    """How spectral parameters are fitted to templates, in one region after the other."""
 
-    regions: Several[Word] = Field(["strip", "outside", "full"])
-
-
-class ChainsTable(SettingsTable):
-    """Steps of the chains of fit and separate; by default those of the sampler."""
-
-    nsteps: int | None = Field(None, ge=1)
-
-
-class FitTable(ByRegionTable, ChainsTable):
-    """How spectral parameters are fitted to templates."""
-
+    nsteps: int | None = Field(3000, ge=1)
     regions: Several[Word] = Field(["strip", "full"])
     stokes: Several[Literal["Q", "U", "QU"]] = Field(["Q", "U", "QU"])
     methods: Several[Literal["grid", "gradient", "mcmc"]] = Field(["grid", "gradient", "mcmc"])
     likelihood: Literal["exact", "diagonal"] = "exact"
     points: int = Field(200, ge=20, le=2000)
-    nsteps: int | None = Field(3000, ge=1)
 
 
 class SpectraTable(SettingsTable):
@@ -145,23 +132,22 @@ class SimulationsTable(SpectraTable):
     nsims: int = Field(100, ge=20)
 
 
-class WindowTable(SettingsTable):
-    """A region whose edge is apodized [deg], of separate and forecast."""
+class CompareTable(SimulationsTable):
+    """How maps are compared with the model, in one region after the other."""
 
-    region: Word = "full"
-    apodization: float = Field(15.0, ge=0, lt=90)
-
-
-class CompareTable(SimulationsTable, ByRegionTable):
-    """How maps are compared with the model."""
-
+    regions: Several[Word] = Field(["strip", "outside", "full"])
     lmax: int = Field(100, ge=10)
     patches: str | None = None
 
 
-class SeparateTable(SimulationsTable, WindowTable, ChainsTable):
-    """How components are separated, and how r is measured from the cleaned BB."""
+class SeparateTable(SimulationsTable):
+    """How components are separated, and how r is measured from the cleaned BB.
 
+    The edge of the region is apodized [deg]. The number of steps is by default the sampler's.
+    """
+
+    region: Word = "full"
+    apodization: float = Field(15.0, ge=0, lt=90)
     domain: Literal["pixel", "harmonic"] = "pixel"
     unit: Literal["uK_CMB", "uK_RJ"] = "uK_CMB"
     sampler: Literal["nuts", "emcee", "none"] = "nuts"
@@ -169,8 +155,8 @@ class SeparateTable(SimulationsTable, WindowTable, ChainsTable):
     purify: bool = True
 
 
-class ForecastTable(SpectraTable, WindowTable):
-    """Spectra of the foregrounds outside a mask, and the Fisher matrix."""
+class ForecastTable(SpectraTable):
+    """Spectra of the foregrounds in a region of apodized edge [deg], and the Fisher matrix."""
 
     region: Word = "outside"
     apodization: float = Field(4.0, ge=0, lt=90)

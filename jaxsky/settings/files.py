@@ -74,14 +74,10 @@ class MapFile(MapKeys):
     file: Files
 
 
-class BeamedKeys(MapKeys):
-    """An optional map, and the FWHM of its Gaussian beam [arcmin]."""
+class BeamedMap(MapFile):
+    """A map and the FWHM of its Gaussian beam [arcmin]."""
 
     fwhm: float | None = Field(None, ge=0)
-
-
-class BeamedMap(BeamedKeys, MapFile):
-    """A map and the FWHM of its Gaussian beam [arcmin]."""
 
 
 class BandpassSpec(TableKeys):
@@ -186,7 +182,8 @@ class NoiseTable(SettingsTable):
             raise MistakeAt(f"{kind}.fields", f"name the columns {self.COLUMNS[kind]}, not {named}")
 
 
-class SeenKeys(BeamedKeys):
+class SeenKeys(MapKeys):
     """An optional map as it was seen, with its beam and its noise: of a band or of a component."""
 
+    fwhm: float | None = Field(None, ge=0)
     noise: NoiseTable | None = None

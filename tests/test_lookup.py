@@ -15,7 +15,7 @@ from fits.separated_data import separation_data
 from jaxsky.experiment import simulation_inputs
 from jaxsky.io import InputError, write_maps
 from jaxsky.io.files import cache_folder
-from jaxsky.settings import Experiment, SettingsError, find_file, found_files, load
+from jaxsky.settings import Experiment, SettingsError, circumstances, find_file, load
 from refusals import cases, raises
 from settings_fuzz import changed_at, written
 
@@ -139,7 +139,7 @@ def test_the_log_names_the_paths_that_were_taken(places, tmp_path):
     )
     paths = {"map.fits": str(cache / "map.fits")}
     paths |= {name: str(data / name) for name in ("dust.fits", "mask.fits", "beta.fits")}
-    assert found_files(settings) == paths
+    assert circumstances(settings)["files"] == paths
     write_log(tmp_path / "log.json", settings, 1.0)
     assert '"map.fits": "' + str(cache / "map.fits") in (tmp_path / "log.json").read_text()
 

@@ -22,7 +22,6 @@ from jaxsky.settings.toml import (
     check_log,
     circumstances,
     find_file,
-    found_files,
     load,
     named_files,
     of_file,

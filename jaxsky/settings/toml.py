@@ -7,13 +7,14 @@ import re
 import sys
 import tomllib
 from collections.abc import Container, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+import jax
+from pydantic import ValidationError
 
 from jaxsky.io import InputError, MissingFileError, check_file
 from jaxsky.io.files import cache_folder
@@ -173,26 +174,25 @@ def _missing(path: Path, cache: Path | None) -> str:
     return said
 
 
-def found_files(settings: Experiment) -> dict[str, str]:
-    """Return the existing files that the settings name: name -> path."""
-    found = {}
-    for name in named_files(settings):
-        try:
-            found[str(name)] = str(find_file(Path(settings.data_dir), name))
-        except InputError:
-            continue  # not needed, or a folder of maps
-    return found
+def named_files(settings: Experiment) -> list[str]:
+    """Return every file name among the values of the settings."""
+    values = jax.tree.leaves(settings.model_dump())
+    return [str(value) for value in values if isinstance(value, NamedFile)]
 
 
 def circumstances(settings: Experiment) -> dict[str, Any]:
-    """Record date, command, machine, versions and input files of a run."""
+    """Record date, command, machine, versions and existing input files (name -> path) of a run."""
+    paths = {}
+    for name in named_files(settings):
+        with suppress(InputError):  # not needed, or a folder of maps
+            paths[name] = str(find_file(Path(settings.data_dir), name))
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": sys.argv,
         "python": platform.python_version(),
         "machine": platform.platform(),
         "versions": {name: version(name) for name in PACKAGES.split()},
-        "files": found_files(settings),
+        "files": paths,
     }
 
 
@@ -222,15 +222,3 @@ def check_log(
             f"{log.parent}: holds {what} of other settings ({words}); choose another --out, or "
             "start again with --overwrite."
         )
-
-
-def named_files(value: Any) -> Iterator[str]:
-    """Yield every file name among the values of the settings."""
-    if isinstance(value, NamedFile):
-        yield value
-    elif isinstance(value, BaseModel | dict):
-        for _, entry in value if isinstance(value, BaseModel) else value.items():
-            yield from named_files(entry)
-    elif isinstance(value, list | tuple):
-        for entry in value:
-            yield from named_files(entry)

@@ -15,13 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from jaxsky import galaxy as model_galaxy
 from jaxsky.bandpass import Bandpass
 from jaxsky.checks import listed
-from jaxsky.components import (
-    AME,
-    Component,
-    check_law,
-    component_class,
-    parameter_declaration,
-)
+from jaxsky.components import AME, Component, check_law, component_class, parameter_declaration
 from jaxsky.galaxy import EmbeddedSky, GalaxyModel, embedded_sky
 from jaxsky.io import Maps, read_bandpass, read_beam, read_maps, unit_factor
 from jaxsky.io.columns import sentinels

@@ -1,21 +1,8 @@
 """The experiment file: its tables, error messages, and the files that it names."""
 
 from jaxsky.settings.experiment import CommonTable, Experiment, RadioIndexMap, parse_region
-from jaxsky.settings.files import (
-    BandpassSpec,
-    BeamedMap,
-    ColumnKeys,
-    MapFile,
-    MapKeys,
-    NoiseColumns,
-    NoiseTable,
-)
-from jaxsky.settings.tables import (
-    BandTable,
-    ComponentTable,
-    RegionsTable,
-    SmallScalesTable,
-)
+from jaxsky.settings.files import BeamedMap, ColumnKeys, MapFile, MapKeys, NoiseColumns, NoiseTable
+from jaxsky.settings.tables import BandTable, ComponentTable, RegionsTable, SmallScalesTable
 from jaxsky.settings.toml import (
     at_key,
     changed_settings,

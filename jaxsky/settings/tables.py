@@ -9,14 +9,7 @@ from jaxsky.checks import listed
 from jaxsky.components import AME, component_class, declared
 from jaxsky.galaxy import GalaxyModel
 from jaxsky.observation import band_tables
-from jaxsky.settings.files import (
-    BandpassSpec,
-    BeamedMap,
-    MapFile,
-    MapKeys,
-    SeenKeys,
-    TableKeys,
-)
+from jaxsky.settings.files import BandpassSpec, BeamedMap, MapFile, MapKeys, SeenKeys, TableKeys
 from jaxsky.settings.types import (
     RESERVED,
     BandName,

@@ -1,5 +1,6 @@
 """Tables of an experiment file that describe the sky and the bands in which it is observed."""
 
+import math
 import re
 from pathlib import Path
 
@@ -25,7 +26,6 @@ from jaxsky.settings.types import (
     Word,
     check_name,
     check_names,
-    check_reference,
     check_signs,
     mistakes,
 )
@@ -124,14 +124,23 @@ class ComponentTable(SeenKeys):
         if "nu_ref" in self.parameters:
             given = self.parameters["nu_ref"]
             raise ValueError(f"nu_ref belongs next to law; here parameters have it, {given!r}")
+        reference = declared(component_class(self.law), "nu_ref") if self.law else None
+        if self.law and self.nu_ref is not None:
+            if not reference:
+                raise ValueError(f"the law {self.law!r} has no nu_ref")
+            least, most = reference["within"] or (0, math.inf)
+            if not least <= self.nu_ref <= most:
+                raise ValueError(
+                    f"nu_ref is in GHz, for the law {self.law!r} from {least:g} to {most:g}, "
+                    f"not {self.nu_ref:g}"
+                )
         if self.file is None:
             if named := [key for key in ("fwhm", "angles", "noise") if getattr(self, key)]:
                 verb = "is" if len(named) == 1 else "are"
                 raise ValueError(f"{listed(named)} {verb} of a map, but file is missing")
-            return self
-        if self.law is None:
+        elif self.law is None:
             raise ValueError("law is missing")
-        if self.nu_ref is None and declared(component_class(self.law), "nu_ref"):
+        elif reference and self.nu_ref is None:
             raise ValueError("nu_ref is missing")
         return self
 
@@ -180,20 +189,19 @@ class SkyTable(SettingsTable):
                     raise ValueError("law is missing")
                 if one.law == "cmb":
                     raise MistakeAt("law", "the CMB is described in the table cmb")
-                if one.angles and component_class(one.law) is not AME:
-                    raise ValueError("angles are for the law 'ame' only")
-                check_reference(one.law, one.nu_ref)
                 own = one.file is None and name in self.templates
                 if own and (one.law != name or one.nu_ref is not None):
                     raise ValueError("law and nu_ref are those of the embedded map; give a file")
+                if one.angles is None:
+                    continue
+                if component_class(one.law) is not AME:
+                    raise ValueError("angles are for the law 'ame' only")
+                if one.angles not in self.templates:
+                    raise MistakeAt("angles", f"there is no map of {one.angles}")
+                if self.components[one.angles].angles:
+                    raise MistakeAt("angles", f"{one.angles} has none of its own")
             except ValueError as error:
                 raise MistakeAt(name, error) from None
-            if one.angles is None:
-                continue
-            if one.angles not in self.templates:
-                raise MistakeAt(f"{name}.angles", f"there is no map of {one.angles}")
-            if self.components[one.angles].angles:
-                raise MistakeAt(f"{name}.angles", f"{one.angles} has none of its own")
         return self
 
 

@@ -1,6 +1,5 @@
 """Types of the values in settings, and checks that raise ValueError with a sentence about them."""
 
-import math
 import re
 import reprlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -18,7 +17,7 @@ from pydantic import (
     field_validator,
 )
 
-from jaxsky.components import component_class, declared
+from jaxsky.components import component_class
 from jaxsky.io.columns import parse_stokes
 
 T = TypeVar("T")
@@ -206,20 +205,6 @@ def check_names(kind: str, names: Iterable[str]) -> None:
             raise ValueError(
                 f"the names of the {kind} must differ{more}, but are {', '.join(names)}"
             )
-
-
-def check_reference(law: str, nu_ref: float | None) -> None:
-    """Raise ValueError for a reference frequency that is not in GHz, or if the law has none."""
-    if nu_ref is None:
-        return
-    known = declared(component_class(law), "nu_ref")
-    if not known:
-        raise ValueError(f"the law {law!r} has no nu_ref")
-    least, most = known["within"] or (0, math.inf)
-    if not least <= nu_ref <= most:
-        raise ValueError(
-            f"nu_ref is in GHz, for the law {law!r} from {least:g} to {most:g}, not {nu_ref:g}"
-        )
 
 
 def check_signs(values: Mapping[str, Any], table: str = "") -> None:

@@ -18,7 +18,7 @@ from jaxsky.io.maps import tangents
 from jaxsky.noise import realisation_key
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import DTYPES, Observation, ObservedBand, Source
-from jaxsky.settings import BandTable, ColumnKeys, Experiment, SettingsError, at_key, find_file
+from jaxsky.settings import BandTable, Experiment, NoiseColumns, SettingsError, at_key, find_file
 from jaxsky.sky import Sky, get_parameters, observe_band, parameter_names
 from jaxsky.small_scales import SmallScales
 
@@ -207,35 +207,27 @@ def read_channel(
 ) -> ObservedBand:
     """Read how a band observes the sky from its table; if `noisy`, with its noise [uK_RJ]."""
     folder, where = Path(settings.data_dir), f"bands.{spec.name}"
-    band = bandpass_of(folder, spec)
+    band, given = bandpass_of(folder, spec), spec.noise
     if (beam := beam_of(folder, spec, 2 * nside)) is None:
         raise SettingsError(f"{where}: give the beam either as fwhm or as a window, beam.")
     noise: Array | float | None = None
-    if spec.noise is not None and noisy:
-        unit = _noise_unit(spec, f"{where}.noise")
-        own = None if spec.file is None else spec
-        noise, known = read_noise(
-            folder, spec.noise, band, nside, f"{where}.noise", unit, stokes, own=own
-        )
+    if given is not None and noisy:
+        where, own = f"{where}.noise", None if spec.file is None else spec
+        if given.estimate_above is not None:
+            raise SettingsError(f"{where}.estimate_above: is of a map, but here none is read.")
+        with_unit = isinstance(given.rms, NoiseColumns) or given.covariance or own is None
+        unit = given.unit or spec.unit or ("uK_CMB" if with_unit else None)
+        if unit is None:
+            raise SettingsError(
+                f"{where}.unit: is missing; it is that of the map, which is not read here."
+            )
+        noise, known = read_noise(folder, given, band, nside, where, unit, stokes, own=own)
         if missing := int(np.sum(~known)):
             raise SettingsError(
-                f"{where}.noise: {missing} pixels have no noise; a simulation takes maps of the "
-                "full sky."
+                f"{where}: {missing} pixels have no noise; a simulation takes maps of the full sky."
             )
     target = settings.simulate.fwhm or None
     return ObservedBand(band, jnp.asarray(beam), target, noise, settings.simulate.diagonal_noise)
-
-
-def _noise_unit(spec: BandTable, where: str) -> str:
-    """Return the unit of a band's noise without reading its map."""
-    noise = spec.noise
-    assert noise is not None  # as called
-    if noise.estimate_above is not None:
-        raise SettingsError(f"{where}.estimate_above: is of a map, but here none is read.")
-    own = isinstance(noise.rms, ColumnKeys) or noise.covariance
-    if unit := noise.unit or spec.unit or ("uK_CMB" if own or spec.file is None else None):
-        return unit
-    raise SettingsError(f"{where}.unit: is missing; it is that of the map, which is not read here.")
 
 
 def cmb_spectra(settings: Experiment, lmax: int, r: float | None = None) -> np.ndarray:

@@ -29,6 +29,12 @@ from jaxsky.settings import (
     at_key,
 )
 
+#: Stokes parameters of the columns of a kind of noise, by their number; hits have none.
+COLUMNS: dict[str, dict[int, tuple[str, ...]]] = {
+    "rms": {2: ("QQ", "UU"), 3: ("II", "QQ", "UU")},
+    "covariance": COVARIANCE_COLUMNS,
+    "weights": COVARIANCE_COLUMNS,
+}
 #: Noise outside this range, relative to the rms of its map, is refused unless confirmed.
 PLAUSIBLE = (1e-6, 10.0)
 
@@ -59,17 +65,16 @@ def read_noise(
     unit = noise.unit or unit
     found: Array | float
     with at_key(where):
-        pixel = healpy.nside2resol(nside, arcmin=True)
+        factor, pixel = unit_factor(unit, "uK_RJ", at), healpy.nside2resol(nside, arcmin=True)
         level = noise.rms * pixel if isinstance(noise.rms, float) else noise.level
         if level is None:
-            pixels, known = _covariance(folder, noise, at, nside, stokes, where, unit, own)
+            pixels, known = _covariance(folder, noise, at, nside, stokes, where, factor, own)
             check_covariance("noise", pixels if known.all() else pixels[..., known])
             found = pixels if known.all() else jnp.where(known, pixels, 0.0)
         else:
-            found = float(level * unit_factor(unit, "uK_RJ", at))
+            found = float(level * factor)
             known = np.ones(healpy.nside2npix(nside), bool)
     if maps is not None and not noise.plausible:
-        factor = float(unit_factor(unit, "uK_RJ", at))
         inside = known if used is None else known & used
         _check_plausible(where, found, maps, inside, factor, unit)
     return found, known
@@ -96,17 +101,11 @@ def _check_plausible(where, noise, maps, inside, factor, unit):
             )
 
 
-def _covariance(folder, noise, at, nside, stokes, where, unit, own):
+def _covariance(folder, noise, at, nside, stokes, where, factor, own):
     """Return a covariance as in `read_noise`, with arbitrary values where it is not known."""
-    n, npix = len(stokes), 12 * nside**2
-    kind = next(
-        k for k in ("rms", "covariance", "hits", "weights") if getattr(noise, k) is not None
-    )
+    n, (kind,) = len(stokes), noise.changed(noise.KINDS)
     spec, where = getattr(noise, kind), f"{where}.{kind}"
-    if noise.unit and spec.unit is None and kind in ("rms", "covariance"):
-        squared = "^2" if kind == "covariance" else ""
-        spec = spec.model_copy(update={"unit": noise.unit + squared})
-    found = _read_columns(folder, spec, own, kind, where)
+    found = _read_columns(folder, spec, own, kind, noise.unit, where)
     if found.nside != nside:
         raise SettingsError(f"{where}: nside is {found.nside}, but that of the map is {nside}.")
     given, known = found.unit, np.asarray(found.mask)
@@ -114,18 +113,17 @@ def _covariance(folder, noise, at, nside, stokes, where, unit, own):
     del found  # as large as everything else
     if kind == "rms":
         _check_number(f"{where}.fields", len(maps), stokes)
-        rms = maps[-n:] * float(unit_factor(given, "uK_RJ", at))
-        return rms_covariance(jnp.broadcast_to(rms, (n, npix))), known
+        rms = maps[-n:] * unit_factor(given, "uK_RJ", at)
+        return rms_covariance(jnp.broadcast_to(rms, (n, rms.shape[-1]))), known
     if kind == "covariance":
         if len(maps) == 3 and n == 3:
             raise SettingsError(f"{where}: I, Q and U need six columns, II, IQ, IU, QQ, QU, UU.")
-        columns = maps * float(unit_factor(given, "uK_RJ^2", at))
+        columns = maps * unit_factor(given, "uK_RJ^2", at)
         return covariance_from_columns(columns)[-n:, -n:], known
     if given:
         raise SettingsError(f"{where}.unit: {kind} are pure numbers, but are said to be {given}.")
     _check_number(f"{where}.sigma0", len(spec.sigma0), stokes)
-    sigma0 = jnp.array(spec.sigma0, maps.dtype)[-n:] * float(unit_factor(unit, "uK_RJ", at))
-    sigma0 = jnp.broadcast_to(sigma0, (n,))
+    sigma0 = jnp.broadcast_to(jnp.array(spec.sigma0, maps.dtype)[-n:] * factor, (n,))
     if kind == "weights":
         if n != 2:
             raise SettingsError(f"{where}: weights are those of Q and U, not of {stokes}.")
@@ -137,15 +135,17 @@ def _covariance(folder, noise, at, nside, stokes, where, unit, own):
 
 
 def _read_columns(
-    folder: Path, spec: NoiseColumns, own: MapKeys | None, kind: str, where: str
+    folder: Path, spec: NoiseColumns, own: MapKeys | None, kind: str, unit: str | None, where: str
 ) -> Maps:
     """Read the columns of noise, with Stokes parameters as implied by the kind of noise.
 
     Without a file of their own, they are read from that of the map.
     """
     said = spec.model_dump(exclude={"sigma0"}, exclude_none=True)
-    if kind in ("hits", "weights"):
-        said.setdefault("unit", "")  # a number, whatever the header calls it
+    # Hits and weights are numbers, whatever the header calls them.
+    implied = {"rms": unit, "covariance": unit and f"{unit}^2"}.get(kind, "")
+    if implied is not None:
+        said.setdefault("unit", implied)
     if spec.file is None:
         if own is None:
             raise SettingsError(f"{where}: file is missing.")
@@ -159,11 +159,7 @@ def _read_columns(
     number = max(tables, len(fields))
     if kind == "rms" and not fields and tables == 1:
         number = len(read(folder, columns).names)
-    wanted: tuple[str, ...] = ()
-    if kind == "rms":
-        wanted = {2: ("QQ", "UU"), 3: ("II", "QQ", "UU")}.get(number, ())
-    elif kind == "covariance" or (kind == "weights" and number == 3):
-        wanted = COVARIANCE_COLUMNS.get(number, ())
+    wanted = COLUMNS.get(kind, {}).get(number, ())
     named = [stokes_of(name) if isinstance(name, str) else None for name in fields]
     if any(s is not None and w not in (s, s * 2) for s, w in zip(named, wanted, strict=False)):
         expected = ", ".join(w[0] if kind == "rms" else w for w in wanted)

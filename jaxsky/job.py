@@ -37,20 +37,17 @@ told = False
 def processes(
     address: str | None = None, number: int | None = None, index: int | None = None
 ) -> Iterator[None]:
-    """Join the processes of a job, before anything else is done with JAX.
+    """Join the processes of a job, before anything else is done with JAX; all have to do the same.
 
-    `jaxsky.mesh.pixel_mesh` then has the devices of all of them.
-
-    Processes that SLURM or Open MPI start find each other. Others are given an address, or find it,
-    their number and their index in the environment variables JAX_COORDINATOR_ADDRESS,
-    JAX_NUM_PROCESSES and JAX_PROCESS_ID. Without any of this there is one process. All have to do
-    the same.
+    `jaxsky.mesh.pixel_mesh` then has the devices of all of them. Processes that SLURM or Open MPI
+    start find each other. Others take what is not given from the environment variables
+    JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID. Without any of this there is one
+    process.
 
     Parameters
     ----------
     address : "host:port" of the first process, where the port is a free one
-    number : number of processes
-    index : which of them this is, from 0
+    number, index : number of processes, and which of them this is, from 0
 
     Raises
     ------
@@ -132,38 +129,27 @@ def exchanged(value: Any) -> list[Any]:
     return values
 
 
-@contextmanager
-def _alone_for_now() -> Iterator[None]:
-    global _alone
-    before, _alone = _alone, True
-    try:
-        yield
-    finally:
-        _alone = before
-
-
 def by_turns(make: Callable[[Item], Made], items: Sequence[Item]) -> Iterator[Made]:
     """Yield `make(item)` for each item, in order; each process makes some, and all get them.
 
-    Raises
-    ------
-    Exception
-        In all processes, what `make` has raised in one of them.
+    What `make` raises in one of them is raised in all.
     """
+    global _alone, told
     count = number()
     if count == 1:
         yield from map(make, items)
         return
     made, failed = list[Any](), None
-    with _alone_for_now():
-        try:
-            made = [make(item) for item in items[jax.process_index() :: count]]
-        except Exception as error:
-            failed = _as_sent(error)
+    _alone = True
+    try:
+        made = [make(item) for item in items[jax.process_index() :: count]]
+    except Exception as error:
+        failed = _as_sent(error)
+    finally:
+        _alone = False
     every = exchanged((made, failed))
     for _, failed in every:
         if failed is not None:
-            global told
             told = True
             raise failed
     for k in range(len(items)):

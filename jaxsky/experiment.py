@@ -83,20 +83,21 @@ def simulation_inputs(
     if not channels:
         raise SettingsError("bands: there are none.")
     seen = {name: _width(channel.map_beam) for name, channel in channels.items()}
+    finest = min(seen, key=seen.__getitem__)
     if written:
-        _check_pixels(nside, seen)
+        _check_pixels(nside, finest, seen[finest])
     for name, channel in channels.items():
         if target is not None and target < (own := _width(channel.beam)):
             raise SettingsError(
                 f"simulate.fwhm: {target:g} arcmin is finer than the beam of band {name!r}, "
                 f"{own:g} arcmin."
             )
-    _check_templates(settings, templates, seen, written)
+    _check_templates(settings, templates, finest, seen[finest], written)
     sources = {name: _source(settings, name, template) for name, template in templates.items()}
     # The last multipole that any of the maps shows.
     beams = [c.beam for c in channels.values()] if target is None else [target]
     lmax = int(min(2 * nside, max(2.0, *map(_reach, beams))))
-    observation = Observation(channels, nside, stokes, min(seen.values()), lmax, precision)
+    observation = Observation(channels, nside, stokes, seen[finest], lmax, precision)
     cmb = cmb_spectra(settings, lmax) if "cmb" in included else None
     leakage = _leakage(settings, foregrounds, observation, galaxy)
     return SimulationInputs(
@@ -142,16 +143,15 @@ def _reach(beam: Array | float) -> float:
     return float(np.sqrt(-2 * np.log(UNSEEN_WINDOW)) / max(sigma, 1e-9))
 
 
-def _check_pixels(nside: int, beams: Mapping[str, float]) -> None:
-    name = min(beams, key=beams.__getitem__)
-    pixel, beam = healpy.nside2resol(nside, arcmin=True), beams[name]
+def _check_pixels(nside: int, band: str, beam: float) -> None:
+    pixel = healpy.nside2resol(nside, arcmin=True)
     if beam < PIXELS * pixel:
         needed = nside
         while beam < PIXELS * healpy.nside2resol(needed, arcmin=True) and needed < 2**20:
             needed *= 2
         raise SettingsError(
             f"simulate.nside: pixels of {pixel:.3g} arcmin (nside {nside}) are too wide for the "
-            f"beam of {beam:g} arcmin of band {name!r}; that takes nside {needed}, or a common "
+            f"beam of {beam:g} arcmin of band {band!r}; that takes nside {needed}, or a common "
             f"simulate.fwhm of at least {PIXELS * pixel:.3g} arcmin."
         )
 
@@ -159,10 +159,10 @@ def _check_pixels(nside: int, beams: Mapping[str, float]) -> None:
 def _check_templates(
     settings: Experiment,
     templates: Mapping[str, Template],
-    beams: Mapping[str, float],
+    band: str,
+    beam: float,
     written: bool,
 ) -> None:
-    band = min(beams, key=beams.__getitem__)
     for name, template in templates.items():
         if missing := int(np.sum(~template.used)):
             raise SettingsError(
@@ -172,11 +172,11 @@ def _check_templates(
         nside = healpy.npix2nside(template.used.size)
         pixel = healpy.nside2resol(nside, arcmin=True)
         own = max(template.fwhm, PIXELS * pixel) if written else template.fwhm
-        if settings.sky.components[name].small_scales is None and beams[band] < own:
+        if settings.sky.components[name].small_scales is None and beam < own:
             pixels = f", {PIXELS:g} pixels of nside {nside}" if template.fwhm < own else ""
             raise SettingsError(
                 f"sky.{name}: its resolution, {own:.3g} arcmin{pixels}, is coarser than "
-                f"the {beams[band]:g} arcmin of band {band!r}; add small scales, "
+                f"the {beam:g} arcmin of band {band!r}; add small scales, "
                 f"[sky.{name}.small_scales], or bring the maps to a common simulate.fwhm of at "
                 f"least {own:.3g} arcmin."
             )
@@ -186,9 +186,8 @@ def _source(settings: Experiment, name: str, template: Template) -> Source:
     spec = settings.sky.components[name].small_scales
     if spec is None:
         return Source(template.component, template.fwhm)
-    numbers = spec.model_dump(exclude={"correlated_with"})
     with at_key(f"sky.{name}.small_scales"):
-        small = SmallScales(**numbers)
+        small = SmallScales(**spec.model_dump(exclude={"correlated_with"}))
     return Source(template.component, template.fwhm, small, spec.correlated_with)
 
 

@@ -1,5 +1,6 @@
 """Read what the settings name: templates with their laws and parameters, bandpasses and beams."""
 
+import dataclasses
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
 from importlib.metadata import version
@@ -65,11 +66,10 @@ def parameter_map(
             "from its other values; give `missing`, the numbers that mark pixels without a value, "
             "or `missing = []` if all are data."
         )
-    try:
-        check_signs({name: float(np.median(known))})
-    except ValueError as error:
-        raise SettingsError(f"{where}: {error}.") from None
-    return np.where(used, values, np.median(known)), used
+    middle = np.median(known)
+    with at_key(where):
+        check_signs({name: float(middle)})
+    return np.where(used, values, middle), used
 
 
 def one_column(found: Maps, nside: int, where: str, of: str) -> Float[np.ndarray, " pix"]:
@@ -97,11 +97,10 @@ class Template(NamedTuple):
 
     def of_many(self, number: int) -> "Template":
         """Return it with its map on disk if it is large, were there so many."""
-
-        def moved(leaf: Array) -> Any:
-            return stored(leaf, number) if leaf.ndim == 2 else leaf
-
-        return self._replace(component=jax.tree.map(moved, self.component))
+        component = jax.tree.map(
+            lambda leaf: stored(leaf, number) if leaf.ndim == 2 else leaf, self.component
+        )
+        return self._replace(component=component)
 
 
 def read(
@@ -112,8 +111,7 @@ def read(
     zeros_are_data: bool = False,
 ) -> Maps:
     """Read the maps of a table of settings; `stokes` overrides its Stokes parameters."""
-    keys = {"hdu", "fields", "unit", "ordering", "coordinates", "polarization", "missing", "stokes"}
-    options = spec.model_dump(include=keys, exclude_none=True)
+    options = spec.model_dump(include={*MapKeys.model_fields} - {"file"}, exclude_none=True)
     if stokes is not None:
         options["stokes"] = stokes
     paths = [find_file(folder, name) for name in spec.files]
@@ -216,8 +214,7 @@ def _embedded(folder: Path, name: str, spec: ComponentTable, component: Componen
     parameters, used = read_parameters(folder, name, spec, nside)
     if parameters:
         with at_key(f"sky.{name}"):
-            parameters["nu_ref"] = component.nu_ref  # type: ignore[attr-defined]
-            component = type(component)(component.amplitude, **parameters)
+            component = dataclasses.replace(component, **parameters)
     return Template(component, 0.0, used)
 
 
@@ -237,8 +234,7 @@ def _read_template(
             f"sky.{name}: {law.__name__} is not polarized, and these are maps of Q and U; leave it "
             'out of common.components, or of simulations unless simulate.stokes is "IQU".'
         )
-    padded = not law.polarized and stokes == "IQU"
-    check_stokes(f"sky.{name}", found, "I" if spec.angles or padded else stokes)
+    check_stokes(f"sky.{name}", found, "I" if spec.angles or not law.polarized else stokes)
     parameters, known = read_parameters(folder, name, spec, found.nside)
     factor = uK_RJ_per(found.unit, spec.nu_ref, f"sky.{name}")
     own = found.maps  # as large as everything else
@@ -250,7 +246,7 @@ def _read_template(
                 maps[0], jnp.asarray(others[spec.angles].component.amplitude), **parameters
             )
         else:
-            if padded:
+            if not law.polarized:
                 maps = jnp.pad(maps[:1], ((0, 2), (0, 0)))
             component = law(maps[-len(stokes) :], **parameters)
         if ":" in component.law:  # a class of the user's
@@ -259,9 +255,7 @@ def _read_template(
 
 
 def set_parameters_of(
-    templates: Mapping[str, Template],
-    fixed: Mapping[str, float],
-    components: Collection[str] = (),
+    templates: Mapping[str, Template], fixed: Mapping[str, float], components: Collection[str] = ()
 ) -> dict[str, Template]:
     """Return templates with some of their parameters set, by dotted name.
 

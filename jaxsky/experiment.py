@@ -157,11 +157,7 @@ def _check_pixels(nside: int, band: str, beam: float) -> None:
 
 
 def _check_templates(
-    settings: Experiment,
-    templates: Mapping[str, Template],
-    band: str,
-    beam: float,
-    written: bool,
+    settings: Experiment, templates: Mapping[str, Template], band: str, beam: float, written: bool
 ) -> None:
     for name, template in templates.items():
         if missing := int(np.sum(~template.used)):

@@ -19,15 +19,7 @@ from jaxsky.noise import (
     rms_covariance,
     weights_covariance,
 )
-from jaxsky.settings import (
-    ColumnKeys,
-    MapFile,
-    MapKeys,
-    NoiseColumns,
-    NoiseTable,
-    SettingsError,
-    at_key,
-)
+from jaxsky.settings import MapFile, MapKeys, NoiseColumns, NoiseTable, SettingsError, at_key
 
 #: Stokes parameters of the columns of a kind of noise, by their number; hits have none.
 COLUMNS: dict[str, dict[int, tuple[str, ...]]] = {
@@ -151,7 +143,7 @@ def _read_columns(
             raise SettingsError(f"{where}: file is missing.")
         if len(own.files) > 1 or (isinstance(own.hdu, list) and spec.hdu is None):
             raise SettingsError(f"{where}: the map has several files or HDUs; give file and hdu.")
-        taken = set(ColumnKeys.model_fields) - {"fields", "unit", "missing"}
+        taken = {"file", "hdu", "ordering", "coordinates", "polarization"}
         said = own.model_dump(include=taken, exclude_none=True) | said
     columns = MapFile(**said)
     tables = max(len(columns.files), len(columns.hdu) if isinstance(columns.hdu, list) else 1)

@@ -12,14 +12,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationInfo, model_validator
 
 from jaxsky.settings.files import BeamedMap, MapFile
-from jaxsky.settings.tables import (
-    BandTable,
-    CMBTable,
-    FreeParameter,
-    SkyTable,
-    SmallScalesTable,
-    without_leakage,
-)
+from jaxsky.settings.tables import BandTable, CMBTable, FreeParameter, SkyTable, SmallScalesTable
 from jaxsky.settings.types import (
     WORDS,
     Distinct,
@@ -299,9 +292,7 @@ class Experiment(SettingsTable):
             "bandpasses, and nothing is subtracted; indices fitted to it may be wrong by many "
             f"sigma. {advice}."
             for band in self.bands
-            if band.leakage is None
-            for file in (Path(file).name for file in band.files)
-            if (advice := without_leakage(file)) is not None
+            for file, advice in band.leaking().items()
         ]
 
     def left_out(self, command: str) -> list[str]:

@@ -39,7 +39,7 @@ _LEAKY = re.compile(
 )
 
 
-def without_leakage(name: str) -> str | None:
+def _without_leakage(name: str) -> str | None:
     """Say what to use in place of a map that contains leakage; None if it is not known to."""
     match = _LEAKY.fullmatch(name)
     if match is None or "bpasscorr" in name.lower():
@@ -279,6 +279,11 @@ class BandTable(SeenKeys):
                 f"leakage {leakage.label} is of release {others[-1]}, but the map {self.label} of "
                 f"release {first}"
             )
+
+    def leaking(self) -> dict[str, str]:
+        """Return what to use in place of files with leakage that is not subtracted, by name."""
+        names = [Path(file).name for file in self.files] if self.leakage is None else []
+        return {name: advice for name in names if (advice := _without_leakage(name))}
 
     def bands(self, folder: Path) -> list["BandTable"]:
         """Return the bands of this entry: channels of an instrument, updated by the keys here.

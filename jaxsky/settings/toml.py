@@ -98,14 +98,12 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
         raise SettingsError(f"{path}: is not valid TOML ({error}).") from None
     except RecursionError:
         raise SettingsError(f"{path}: is nested too deeply.") from None
-    options: dict[str, str] = {}
     for assignment in assignments:
-        path_of_key, value = _assigned(assignment)
+        keys, value = _assigned(assignment)
         try:
-            raw = _replaced(raw, path_of_key, value)
+            raw = _replaced(raw, keys, value)
         except ValueError as error:
             raise SettingsError(f"{path}: --set {assignment}: {error}.") from None
-        options[assignment.partition("=")[0].strip()] = " (given with --set)"
     named = raw.get("data_dir", ".")
     try:
         name = _expand(named) if isinstance(named, str) else "."
@@ -114,7 +112,8 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
             raise ValueError(f"{folder} is not a folder")
         settings = Experiment.model_validate(raw, context={"folder": folder})
     except ValidationError as error:
-        raise SettingsError(f"{path}: {mistakes(raw, error, options)}.") from None
+        assigned = [assignment.partition("=")[0].strip() for assignment in assignments]
+        raise SettingsError(f"{path}: {mistakes(raw, error, assigned)}.") from None
     except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: links in a circle
         raise SettingsError(f"{path}: data_dir: {error}.") from None
     return settings.model_copy(update={"data_dir": str(folder)})

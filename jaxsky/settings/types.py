@@ -3,7 +3,6 @@
 import re
 import reprlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Annotated, Any, TypeVar
 
 from pydantic import (
@@ -154,19 +153,15 @@ def _key(raw: Any, place: Sequence[str | int], missing: bool) -> str:
     return ".".join(keys)
 
 
-def mistakes(
-    raw: Any, error: ValidationError, options: Mapping[str, str] = MappingProxyType({})
-) -> str:
-    """Return a sentence about all errors in the tables, with their keys.
-
-    `options` adds a remark to the errors of a key.
-    """
+def mistakes(raw: Any, error: ValidationError, assigned: Collection[str] = ()) -> str:
+    """Return a sentence about all errors in the tables, with their keys, some given with --set."""
     wrong: dict[str, list[str]] = {}
-    types: dict[str, str] = {}
+    types: dict[str, list[str]] = {}
+    inputs: dict[str, str] = {}
     for found in error.errors():
         what = found["msg"].removeprefix("Value error, ").rstrip(".")
         where = _key(raw, found["loc"], found["type"] == "missing")
-        mistake = found.get("ctx", {}).get("error")
+        mistake, given = found.get("ctx", {}).get("error"), reprlib.repr(found["input"])
         if isinstance(mistake, MistakeAt):
             where = f"{where}.{mistake.key}" if where else mistake.key
             what = mistake.words.rstrip(".")
@@ -176,24 +171,22 @@ def mistakes(
             what = "is missing"
         elif found["type"].endswith(("_type", "literal_error")):
             wanted = what.removeprefix("Input should be ").partition(" or instance")[0]
-            wanted = wanted.replace("dictionary", "table")
-            known = types.get(where, "input should be ").partition(", not ")[0]
-            joined = known + ("" if known.endswith("be ") else " or ") + wanted
-            types[where] = f"{joined}, not {reprlib.repr(found['input'])}"
+            types.setdefault(where, []).append(wanted.replace("dictionary", "table"))
+            inputs[where] = given
             continue
         elif found["msg"] == what:
-            value = "" if ", not " in what else f", not {reprlib.repr(found['input'])}"
-            what = f"{what[0].lower()}{what[1:]}{value}"
+            what = f"{what[0].lower()}{what[1:]}" + ("" if ", not " in what else f", not {given}")
         wrong.setdefault(where, []).append(what)
     # Where a value may have one of several types, a mismatch matters only if all of them fail.
     places = [*wrong, *types]
-    for where, what in types.items():
+    for where, kinds in types.items():
         if where not in wrong and not any(place.startswith(f"{where}.") for place in places):
-            wrong[where] = [what]
+            wrong[where] = [f"input should be {' or '.join(kinds)}, not {inputs[where]}"]
     sentences = []
     for where, said in wrong.items():
-        given = [o for key, o in options.items() if f"{where}.".startswith(f"{key}.")]
-        sentences.append(": ".join(filter(None, (where, " or ".join(said)))) + "".join(given[:1]))
+        from_option = any(f"{where}.".startswith(f"{key}.") for key in assigned)
+        remark = " (given with --set)" if from_option else ""
+        sentences.append(": ".join(filter(None, (where, " or ".join(said)))) + remark)
     return "; ".join(sentences)
 
 

@@ -18,16 +18,15 @@ from jaxsky.settings.types import (
     Distinct,
     FileName,
     MistakeAt,
-    Multipole,
     Nside,
     Pair,
     Positive,
-    RegionName,
     Seed,
     SettingsError,
     SettingsTable,
     Several,
     Word,
+    check_name,
     check_names,
     check_signs,
     valid,
@@ -60,6 +59,7 @@ def _mask(value: MapFile) -> None:
 #: A mask, 1 where a pixel is used: a column of a FITS table, or one entry of an .npz file.
 MaskFile = Annotated[MapFile, valid(_mask)]
 Region = Annotated[str, valid(parse_region)] | MaskFile
+Multipole = Annotated[int, Field(ge=2)]
 
 
 class CommonTable(SettingsTable):
@@ -205,7 +205,7 @@ class Experiment(SettingsTable):
     bands: list[BandTable] = Field(default=[])
     cmb: CMBTable = CMBTable()
     common: CommonTable = CommonTable()
-    regions: dict[RegionName, Region] = Field(default={})
+    regions: dict[Annotated[str, valid(check_name)], Region] = Field(default={})
     free: dict[str, FreeParameter] = Field(default={})
     fixed: dict[str, float] = Field(default={})
     truth: dict[str, float] = Field(default={})

@@ -7,16 +7,11 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from jaxsky.bandpass import UNITS
-from jaxsky.settings.types import (
-    Files,
-    Hdus,
-    MistakeAt,
-    Positive,
-    SettingsTable,
-    Several,
-    Stokes,
-    Word,
-)
+from jaxsky.io.columns import parse_stokes
+from jaxsky.settings.types import FileName, MistakeAt, Positive, SettingsTable, Several, Word, valid
+
+Files = FileName | Annotated[list[FileName], Field(min_length=1)]
+_Hdu = Annotated[int, Field(ge=1)]
 
 
 class TableKeys(SettingsTable):
@@ -50,7 +45,7 @@ class ColumnKeys(TableKeys):
     Keys may be left out where the header has the answer; see `jaxsky.io.read_maps`.
     """
 
-    hdu: Hdus | None = None
+    hdu: _Hdu | Annotated[list[_Hdu], Field(min_length=1)] | None = None
     ordering: Literal["RING", "NESTED"] | None = None
     coordinates: Literal["G", "C", "E"] | None = None
     polarization: Literal["COSMO", "IAU"] | None = None
@@ -60,7 +55,7 @@ class ColumnKeys(TableKeys):
 class MapKeys(ColumnKeys):
     """An optional map, and its Stokes parameters if the column names do not tell them."""
 
-    stokes: Stokes | None = None
+    stokes: Annotated[str | list[str], valid(parse_stokes)] | None = None
 
     @model_validator(mode="after")
     def _of_a_file(self) -> "MapKeys":

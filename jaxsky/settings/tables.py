@@ -3,6 +3,7 @@
 import math
 import re
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
@@ -13,9 +14,7 @@ from jaxsky.observation import band_tables
 from jaxsky.settings.files import BandpassSpec, BeamedMap, MapFile, MapKeys, SeenKeys, TableKeys
 from jaxsky.settings.types import (
     RESERVED,
-    BandName,
     FileName,
-    Law,
     MistakeAt,
     Nside,
     Pair,
@@ -28,6 +27,7 @@ from jaxsky.settings.types import (
     check_names,
     check_signs,
     mistakes,
+    valid,
 )
 
 #: Release and correction in the names of Planck's files.
@@ -105,12 +105,12 @@ class SmallScalesTable(SettingsTable):
 class ComponentTable(SeenKeys):
     """A component: its law, parameters that differ from the defaults, its map at `nu_ref` [GHz].
 
-    A parameter may be a map. `angles` names the component along which an intensity is polarized. A
-    component without a map belongs to the embedded model, or is found by a separation from its law
-    alone.
+    A law is a name, or "module:Class" (`jaxsky.components.component_class`). A parameter may be a
+    map. `angles` names the component along which an intensity is polarized. A component without a
+    map belongs to the embedded model, or is found by a separation from its law alone.
     """
 
-    law: Law | None = None
+    law: Annotated[str, valid(component_class)] | None = None
     nu_ref: Positive | None = None
     angles: str | None = None
     parameters: dict[str, float | list[float] | MapFile] = Field(default={})
@@ -234,7 +234,7 @@ class BandTable(SeenKeys):
     that leaks into Q and U where the band is simulated; known there, and subtracted again.
     """
 
-    name: BandName | None = None
+    name: Annotated[str, valid(lambda value: check_name(value, "."))] | None = None
     instrument: str | None = None
     channels: Several[Word] | None = None
     bandpass: BandpassSpec | None = None

@@ -16,9 +16,6 @@ from pydantic import (
     field_validator,
 )
 
-from jaxsky.components import component_class
-from jaxsky.io.columns import parse_stokes
-
 T = TypeVar("T")
 
 #: Names are parts of file names and of columns in FITS files.
@@ -118,24 +115,15 @@ def check_name(value: str, characters: str = "", reserved: Collection[str] = ())
 
 
 Positive = Annotated[float, Field(gt=0)]
-Multipole = Annotated[int, Field(ge=2)]
 Nside = Annotated[int, Field(gt=0, le=8192), valid(_power_of_two)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Word = Annotated[str, Field(min_length=1)]
 FileName = Annotated[Word, AfterValidator(NamedFile)]
-Files = FileName | Annotated[list[FileName], Field(min_length=1)]
-_Hdu = Annotated[int, Field(ge=1)]
-Hdus = _Hdu | Annotated[list[_Hdu], Field(min_length=1)]
-Stokes = Annotated[str | list[str], valid(parse_stokes)]
 #: A list without repetitions, and one that is not empty either.
 Distinct = Annotated[list[T], valid(_distinct)]
 Several = Annotated[list[T], Field(min_length=1), valid(_distinct)]
 #: Two values; a list in TOML.
 Pair = Annotated[tuple[T, T], Strict(False)]
-#: The law of a component: a name, or "module:Class" (`jaxsky.components.component_class`).
-Law = Annotated[str, valid(component_class)]
-BandName = Annotated[str, valid(lambda value: check_name(value, "."))]
-RegionName = Annotated[str, valid(check_name)]
 
 
 def _key(raw: Any, place: Sequence[str | int], missing: bool) -> str:

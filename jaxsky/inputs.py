@@ -187,7 +187,7 @@ def embedded_galaxy(settings: Experiment) -> EmbeddedSky:
     """Make the embedded model of the Galaxy that the settings describe."""
     embedded = settings.sky.embedded
     assert embedded is not None  # callers have checked
-    numbers: dict[str, Any] = embedded.numbers
+    numbers = embedded.model_extra or {}
     with at_key("sky.embedded"):
         model = GalaxyModel(**numbers)
     if numbers or embedded.seed or embedded.nside > KEPT_NSIDE:

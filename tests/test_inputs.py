@@ -293,5 +293,5 @@ def test_bandpasses_with_unit_and_columns_from_settings(tmp_path):
     (tmp_path / "b.txt").write_text("0 28000 1\n1 30000 1\n")
     spec = {"file": "b.txt", "convention": "RJ", "unit": "MHz", "fields": [1, 2]}
     np.testing.assert_allclose(bandpass_of(tmp_path, band(**spec)).nu, [28, 30])
-    with pytest.raises(ValueError, match="unit, fields: of a file, but file is missing"):
+    with pytest.raises(ValueError, match="unit and fields are of a file, but file is missing"):
         band(center=30.0, unit="MHz", fields=[1, 2])

@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from jaxsky.bandpass import UNITS
+from jaxsky.checks import listed
 from jaxsky.io.columns import parse_stokes
 from jaxsky.settings.types import FileName, MistakeAt, Positive, SettingsTable, Several, Word, valid
 
@@ -36,7 +37,8 @@ class TableKeys(SettingsTable):
         if most and len(self.files) > most:
             raise MistakeAt("file", f"must be one file, not {self.label}")
         if self.file is None and (given := self.changed(keys)):
-            raise ValueError(f"{', '.join(given)}: of a file, but file is missing")
+            verb = "is" if len(given) == 1 else "are"
+            raise ValueError(f"{listed(given)} {verb} of a file, but file is missing")
 
 
 class ColumnKeys(TableKeys):

@@ -7,7 +7,6 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
-from jaxsky.checks import listed
 from jaxsky.components import AME, component_class, declared
 from jaxsky.galaxy import GalaxyModel
 from jaxsky.observation import band_tables
@@ -69,15 +68,10 @@ class EmbeddedTable(SettingsTable):
     nside: Nside = 128
     seed: Seed = 0
 
-    @property
-    def numbers(self) -> dict[str, float]:
-        """The numbers of the model that differ from its defaults."""
-        return self.__pydantic_extra__ or {}
-
     @model_validator(mode="after")
     def _known(self) -> "EmbeddedTable":
         known = GalaxyModel.__dataclass_fields__
-        for name in self.numbers:
+        for name in self.model_extra or ():
             if name not in known:
                 raise MistakeAt(name, f"is none of nside, seed, {', '.join(known)}")
         return self
@@ -134,13 +128,10 @@ class ComponentTable(SeenKeys):
                     f"nu_ref is in GHz, for the law {self.law!r} from {least:g} to {most:g}, "
                     f"not {self.nu_ref:g}"
                 )
-        if self.file is None:
-            if named := [key for key in ("fwhm", "angles", "noise") if getattr(self, key)]:
-                verb = "is" if len(named) == 1 else "are"
-                raise ValueError(f"{listed(named)} {verb} of a map, but file is missing")
-        elif self.law is None:
+        self.check_file(("fwhm", "angles", "noise"))
+        if self.file is not None and self.law is None:
             raise ValueError("law is missing")
-        elif reference and self.nu_ref is None:
+        if self.file is not None and reference and self.nu_ref is None:
             raise ValueError("nu_ref is missing")
         return self
 

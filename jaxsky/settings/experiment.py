@@ -17,6 +17,7 @@ from jaxsky.settings.types import (
     WORDS,
     Distinct,
     FileName,
+    Interval,
     MistakeAt,
     Nside,
     Pair,
@@ -155,7 +156,7 @@ class ForecastTable(SpectraTable):
     apodization: float = Field(4.0, ge=0, lt=90)
     bands: Annotated[Several[Word], Field(max_length=7)] | None = None
     lmax: Multipole = 250
-    fit: Pair[Multipole] = (20, 200)
+    fit: Interval[Multipole] = (20, 200)
     show_r: Several[Positive] = Field([0.1, 0.01, 0.001], max_length=4)
     free: Distinct[Literal["r", "A_lens", "amplitude", "slope", "correlation"]] = Field(
         ["r", "amplitude", "slope", "correlation"]
@@ -167,8 +168,6 @@ class ForecastTable(SpectraTable):
     def _ranges(self) -> "ForecastTable":
         if not self.lmin < self.fisher_lmax:
             raise ValueError(f"fisher_lmax, {self.fisher_lmax}, must be above lmin, {self.lmin}")
-        if not self.fit[0] < self.fit[1]:
-            raise ValueError(f"fit must increase, but is {self.fit[0]}, {self.fit[1]}")
         return self
 
 

@@ -14,6 +14,7 @@ from jaxsky.settings.files import BandpassSpec, BeamedMap, MapFile, MapKeys, See
 from jaxsky.settings.types import (
     RESERVED,
     FileName,
+    Interval,
     MistakeAt,
     Nside,
     Pair,
@@ -80,20 +81,13 @@ class EmbeddedTable(SettingsTable):
 class SmallScalesTable(SettingsTable):
     """Small scales of a component; see `jaxsky.small_scales.SmallScales`."""
 
-    EE: Pair[int]
-    BB: Pair[int]
+    EE: Interval[int]
+    BB: Interval[int]
     slope: float | Pair[float] | None = None
     tilt: float = 0.0
     amplitude: float = Field(1.0, ge=0)
     modulation_fwhm: Positive = 180.0
     correlated_with: str | None = None
-
-    @model_validator(mode="after")
-    def _increase(self) -> "SmallScalesTable":
-        for key, (first, last) in {"EE": self.EE, "BB": self.BB}.items():
-            if not first < last:
-                raise MistakeAt(key, f"must increase, but is {first}, {last}")
-        return self
 
 
 class ComponentTable(SeenKeys):
@@ -326,7 +320,7 @@ class FreeParameter(SettingsTable):
     """
 
     start: float | None = None
-    uniform: Pair[float] | None = None
+    uniform: Interval[float] | None = None
     gaussian: Pair[float] | None = None
     regions: RegionsTable | None = None
 
@@ -334,8 +328,6 @@ class FreeParameter(SettingsTable):
     def _one_prior(self) -> "FreeParameter":
         if self.uniform and self.gaussian:
             raise ValueError("give one prior, either uniform or gaussian")
-        if self.uniform and not self.uniform[0] < self.uniform[1]:
-            raise ValueError(f"uniform must increase, but is {self.uniform}")
         start = self.start
         if self.uniform and start is not None and not self.uniform[0] < start < self.uniform[1]:
             raise ValueError(f"start {start:g} is not inside the uniform prior {self.uniform}")

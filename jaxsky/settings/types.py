@@ -90,6 +90,11 @@ def _distinct(values: list[Any]) -> None:
             raise ValueError(f"has {value!r} twice")
 
 
+def _increasing(values: tuple[Any, Any]) -> None:
+    if not values[0] < values[1]:
+        raise ValueError(f"must increase, but is {values[0]}, {values[1]}")
+
+
 def valid(check: Callable[[Any], object]) -> AfterValidator:
     """Make a validator of a function that raises ValueError for a bad value."""
 
@@ -122,8 +127,9 @@ FileName = Annotated[Word, AfterValidator(NamedFile)]
 #: A list without repetitions, and one that is not empty either.
 Distinct = Annotated[list[T], valid(_distinct)]
 Several = Annotated[list[T], Field(min_length=1), valid(_distinct)]
-#: Two values; a list in TOML.
+#: Two values, a list in TOML, and two that increase.
 Pair = Annotated[tuple[T, T], Strict(False)]
+Interval = Annotated[tuple[T, T], Strict(False), valid(_increasing)]
 
 
 def _key(raw: Any, place: Sequence[str | int], missing: bool) -> str:

@@ -98,12 +98,14 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
         raise SettingsError(f"{path}: is not valid TOML ({error}).") from None
     except RecursionError:
         raise SettingsError(f"{path}: is nested too deeply.") from None
+    assigned: list[str] = []
     for assignment in assignments:
         keys, value = _assigned(assignment)
         try:
             raw = _replaced(raw, keys, value)
         except ValueError as error:
             raise SettingsError(f"{path}: --set {assignment}: {error}.") from None
+        assigned.append(".".join(keys))
     named = raw.get("data_dir", ".")
     try:
         name = _expand(named) if isinstance(named, str) else "."
@@ -112,7 +114,6 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Experiment:
             raise ValueError(f"{folder} is not a folder")
         settings = Experiment.model_validate(raw, context={"folder": folder})
     except ValidationError as error:
-        assigned = [assignment.partition("=")[0].strip() for assignment in assignments]
         raise SettingsError(f"{path}: {mistakes(raw, error, assigned)}.") from None
     except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: links in a circle
         raise SettingsError(f"{path}: data_dir: {error}.") from None

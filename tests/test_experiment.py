@@ -568,7 +568,7 @@ def test_the_default_is_valid():
     channels = {b.name: experiment.read_channel(settings, b, 256) for b in settings.bands}
     assert len(channels) == 15
     assert all(c.noise > 0 and c.target == 60.0 for c in channels.values())
-    experiment._check_pixels(256, dict.fromkeys(channels, 60.0))
+    experiment._check_pixels(256, "30", 60.0)
 
 
 def test_titles_of_all_kinds(folder, tmp_path, monkeypatch, capsys):

@@ -64,10 +64,7 @@ Multipole = Annotated[int, Field(ge=2)]
 
 
 class CommonTable(SettingsTable):
-    """The common resolution of templates and maps in fit, compare, separate and paper.
-
-    A beam [arcmin] of 0 smooths none.
-    """
+    """The common resolution of templates and maps in fit, compare, separate and paper."""
 
     nside: Nside = 64
     fwhm: float = Field(60.0, ge=0)
@@ -77,11 +74,7 @@ class CommonTable(SettingsTable):
 
 
 class SimulateTable(SettingsTable):
-    """How bands without a map are simulated, and what `jaxsky simulate` writes.
-
-    With a beam of 0 [arcmin] each band has its own; nside is by default that of the sky's coarsest
-    map.
-    """
+    """How bands without a map are simulated, and what `jaxsky simulate` writes."""
 
     nside: Nside | None = None
     fwhm: float = Field(0.0, ge=0)
@@ -135,10 +128,7 @@ class CompareTable(SimulationsTable):
 
 
 class SeparateTable(SimulationsTable):
-    """How components are separated, and how r is measured from the cleaned BB.
-
-    The edge of the region is apodized [deg]. The number of steps is by default the sampler's.
-    """
+    """How components are separated, and how r is measured from the cleaned BB."""
 
     region: Word = "full"
     apodization: float = Field(15.0, ge=0, lt=90)
@@ -150,7 +140,7 @@ class SeparateTable(SimulationsTable):
 
 
 class ForecastTable(SpectraTable):
-    """Spectra of the foregrounds in a region of apodized edge [deg], and the Fisher matrix."""
+    """Spectra of the foregrounds outside a mask, and the Fisher matrix."""
 
     region: Word = "outside"
     apodization: float = Field(4.0, ge=0, lt=90)
@@ -172,12 +162,9 @@ class ForecastTable(SpectraTable):
 
 
 class RadioIndexMap(BeamedMap):
-    """A map of beta_syn, to which `steepening` is added if it was measured at radio frequencies.
+    """A map of beta_syn, to which `steepening` is added if it was measured at radio frequencies."""
 
-    It is a number, 0.13 in the paper, or the file of a spectrum: frequency [GHz] and antenna
-    temperature.
-    """
-
+    #: A number, or the file of a spectrum: frequency [GHz] and antenna temperature.
     steepening: float | FileName = 0.0
 
 
@@ -192,10 +179,7 @@ class PaperTable(SettingsTable):
 
 
 class Experiment(SettingsTable):
-    """All settings: a sky, the bands in which it is observed, and what the commands do with them.
-
-    `truth` holds parameters of the simulated sky that differ from those of the model.
-    """
+    """All settings: a sky, the bands in which it is observed, and what commands do with them."""
 
     title: str = ""
     data_dir: str = "."

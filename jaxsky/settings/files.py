@@ -99,12 +99,9 @@ def _list(value: Any) -> Any:
 
 
 class NoiseColumns(ColumnKeys):
-    """Columns that describe the noise, by default in the file of the map itself.
+    """Columns that describe the noise, or a list of their names; other keys are the map's own."""
 
-    Keys that are not given are those of the map. A plain list names the columns. `sigma0` is the
-    noise of one observation: a number, or one per Stokes parameter.
-    """
-
+    #: Noise of one observation: a number, or one per Stokes parameter.
     sigma0: Annotated[list[Positive], Field(max_length=3), BeforeValidator(_list)] | None = None
 
     @model_validator(mode="before")
@@ -114,16 +111,10 @@ class NoiseColumns(ColumnKeys):
 
 
 class NoiseTable(SettingsTable):
-    """Noise of a band or of a template, given as exactly one of its kinds.
+    """Noise of a band or of a template, as exactly one of its kinds: a level, or of each pixel.
 
-    `level` is white noise [unit arcmin], which in a template is seen through its beam. The other
-    kinds are per pixel of the map in the file: `rms`, a number or a map; `covariance`; `hits`, the
-    number of observations; `weights`, the inverse covariance of Q and U in units of sigma0, as in
-    the second table of WMAP's maps. `unit` is that of level, rms, covariance (squared) and
-    sigma0, by default that of the map, or uK_CMB where there is no map. `plausible` accepts noise
-    that is far from the rms of its map; `correlated` gives noise that is estimated from a map a
-    spectrum. `shared` is the factor with which the noise of a band, by name, is also in a template,
-    because the template was made from that band.
+    `unit` is that of level, rms, covariance (squared) and sigma0, by default that of the map, or
+    uK_CMB where there is no map. `weights` are the inverse covariance in units of sigma0.
     """
 
     KINDS: ClassVar[tuple[str, ...]] = (

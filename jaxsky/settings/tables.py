@@ -93,9 +93,8 @@ class SmallScalesTable(SettingsTable):
 class ComponentTable(SeenKeys):
     """A component: its law, parameters that differ from the defaults, its map at `nu_ref` [GHz].
 
-    A law is a name, or "module:Class" (`jaxsky.components.component_class`). A parameter may be a
-    map. `angles` names the component along which an intensity is polarized. A component without a
-    map belongs to the embedded model, or is found by a separation from its law alone.
+    A component without a map belongs to the embedded model, or is found by a separation from its
+    law alone. `angles` names the component along which an intensity is polarized.
     """
 
     law: Annotated[str, valid(component_class)] | None = None
@@ -191,11 +190,7 @@ class SkyTable(SettingsTable):
 
 
 class CMBTable(TableKeys):
-    """The CMB: from CAMB, or from a file of spectra, see `jaxsky.io.read_spectra`.
-
-    It is part of the simulated sky and of the covariance in fits. `A_lens` multiplies the B modes
-    of lensing.
-    """
+    """The CMB: from CAMB, or from a file of spectra, see `jaxsky.io.read_spectra`."""
 
     include: bool = True
     r: float = Field(0.0, ge=0, le=1000)  # the largest leaves the tensors far above all else
@@ -213,11 +208,7 @@ class CMBTable(TableKeys):
 
 
 class BandTable(SeenKeys):
-    """A band: how it observes the sky, and its map; a band without a map is simulated.
-
-    `leakage` is a map that is subtracted from that in the file, or the fraction of the intensity
-    that leaks into Q and U where the band is simulated; known there, and subtracted again.
-    """
+    """A band: how it observes the sky, and its map; a band without a map is simulated."""
 
     name: Annotated[str, valid(lambda value: check_name(value, "."))] | None = None
     instrument: str | None = None
@@ -225,6 +216,7 @@ class BandTable(SeenKeys):
     bandpass: BandpassSpec | None = None
     samples: int = Field(51, ge=2)
     beam: FileName | None = None
+    #: Subtracted from the map in the file; a number is the fraction of the intensity that leaks.
     leakage: float | BeamedMap | None = None
 
     @model_validator(mode="after")
@@ -314,10 +306,7 @@ class RegionsTable(MapKeys):
 
 
 class FreeParameter(SettingsTable):
-    """A free parameter: its start value, its prior, and its regions if it has several values.
-
-    The default start is the middle of the prior.
-    """
+    """A free parameter: its start value, its prior, and its regions if it has several values."""
 
     start: float | None = None
     uniform: Interval[float] | None = None

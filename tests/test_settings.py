@@ -91,7 +91,7 @@ def test_instruments_of_ones_own(tmp_path, row):
 
 
 @pytest.mark.parametrize("text", FILES.values(), ids=FILES)
-@pytest.mark.parametrize("name", ["", " ", "a b", "a/b", "..", ".a", "-a", "\u03b2", "a:b", "a$b$"])
+@pytest.mark.parametrize("name", [" ", "a b", "a/b", "..", ".a", "-a", "\u03b2", "a:b", "a$b$"])
 def test_names_that_files_or_columns_cannot_bear(tmp_path, text, name):
     letters = "a name consists of letters, digits and _ + -"
     check_refused(settings_in(tmp_path, text, name), f"bands.0.name: {letters} ., and")

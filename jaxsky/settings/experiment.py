@@ -26,7 +26,6 @@ from jaxsky.settings.types import (
     SettingsError,
     SettingsTable,
     Several,
-    Word,
     check_name,
     check_names,
     check_signs,
@@ -69,7 +68,7 @@ class CommonTable(SettingsTable):
     nside: Nside = 64
     fwhm: float = Field(60.0, ge=0)
     mask: MaskFile | None = None
-    components: Several[Word] | None = None
+    components: Several[str] | None = None
     maps: FileName | None = None
 
 
@@ -83,7 +82,7 @@ class SimulateTable(SettingsTable):
     components: bool = False
     precision: Literal["single", "double"] = "single"
     sheet: bool = True
-    include: Several[Word] | None = None
+    include: Several[str] | None = None
     diagonal_noise: bool = False
     small_scales_seed: Seed | None = None
 
@@ -92,7 +91,7 @@ class FitTable(SettingsTable):
     """How spectral parameters are fitted to templates, in one region after the other."""
 
     nsteps: int | None = Field(3000, ge=1)
-    regions: Several[Word] = Field(["strip", "full"])
+    regions: Several[str] = Field(["strip", "full"])
     stokes: Several[Literal["Q", "U", "QU"]] = Field(["Q", "U", "QU"])
     methods: Several[Literal["grid", "gradient", "mcmc"]] = Field(["grid", "gradient", "mcmc"])
     likelihood: Literal["exact", "diagonal"] = "exact"
@@ -122,7 +121,7 @@ class SimulationsTable(SpectraTable):
 class CompareTable(SimulationsTable):
     """How maps are compared with the model, in one region after the other."""
 
-    regions: Several[Word] = Field(["strip", "outside", "full"])
+    regions: Several[str] = Field(["strip", "outside", "full"])
     lmax: int = Field(100, ge=10)
     patches: str | None = None
 
@@ -130,7 +129,7 @@ class CompareTable(SimulationsTable):
 class SeparateTable(SimulationsTable):
     """How components are separated, and how r is measured from the cleaned BB."""
 
-    region: Word = "full"
+    region: str = "full"
     apodization: float = Field(15.0, ge=0, lt=90)
     domain: Literal["pixel", "harmonic"] = "pixel"
     unit: Literal["uK_CMB", "uK_RJ"] = "uK_CMB"
@@ -142,9 +141,9 @@ class SeparateTable(SimulationsTable):
 class ForecastTable(SpectraTable):
     """Spectra of the foregrounds outside a mask, and the Fisher matrix."""
 
-    region: Word = "outside"
+    region: str = "outside"
     apodization: float = Field(4.0, ge=0, lt=90)
-    bands: Annotated[Several[Word], Field(max_length=7)] | None = None
+    bands: Annotated[Several[str], Field(max_length=7)] | None = None
     lmax: Multipole = 250
     fit: Interval[Multipole] = (20, 200)
     show_r: Several[Positive] = Field([0.1, 0.01, 0.001], max_length=4)
@@ -181,7 +180,7 @@ class PaperTable(SettingsTable):
 class Experiment(SettingsTable):
     """All settings: a sky, the bands in which it is observed, and what commands do with them."""
 
-    title: str = ""
+    title: str = Field("", min_length=0)
     data_dir: str = "."
     seed: Seed = 0
     sky: SkyTable = SkyTable()

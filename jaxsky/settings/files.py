@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 from jaxsky.bandpass import UNITS
 from jaxsky.checks import listed
 from jaxsky.io.columns import parse_stokes
-from jaxsky.settings.types import FileName, MistakeAt, Positive, SettingsTable, Several, Word, valid
+from jaxsky.settings.types import FileName, MistakeAt, Positive, SettingsTable, Several, valid
 
 Files = FileName | Annotated[list[FileName], Field(min_length=1)]
 _Hdu = Annotated[int, Field(ge=1)]
@@ -20,7 +20,7 @@ class TableKeys(SettingsTable):
 
     file: Files | None = None
     fields: list[str | int] | None = None
-    unit: str | None = None
+    unit: str | None = Field(None, min_length=0)
 
     @property
     def files(self) -> list[str]:
@@ -81,7 +81,7 @@ class BandpassSpec(TableKeys):
     """A bandpass: a table in a file, or a top-hat."""
 
     band: str | None = None
-    detectors: Several[Word] | None = None
+    detectors: Several[str] | None = None
     convention: Literal["RJ", "power", "CMB"] | None = None
     center: Positive | None = None
     width: float | None = Field(None, ge=0)

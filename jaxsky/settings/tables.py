@@ -22,7 +22,6 @@ from jaxsky.settings.types import (
     Seed,
     SettingsTable,
     Several,
-    Word,
     check_name,
     check_names,
     check_signs,
@@ -212,7 +211,7 @@ class BandTable(SeenKeys):
 
     name: Annotated[str, valid(lambda value: check_name(value, "."))] | None = None
     instrument: str | None = None
-    channels: Several[Word] | None = None
+    channels: Several[str] | None = None
     bandpass: BandpassSpec | None = None
     samples: int = Field(51, ge=2)
     beam: FileName | None = None

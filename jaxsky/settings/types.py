@@ -5,16 +5,7 @@ import reprlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Annotated, Any, TypeVar
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    Strict,
-    ValidationError,
-    ValidationInfo,
-    field_validator,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError
 
 T = TypeVar("T")
 
@@ -28,6 +19,12 @@ WORDS = {
 }
 #: Names with a meaning of their own in results and columns.
 RESERVED = ("cmb", "noise", "total", "residual", "center", "embedded", *map(str.lower, WORDS))
+#: What is said of some kinds of pydantic's errors.
+PLAINLY = {
+    "extra_forbidden": "unknown key",
+    "missing": "is missing",
+    "string_too_short": "must not be empty",
+}
 
 
 class SettingsError(ValueError):
@@ -50,14 +47,7 @@ class SettingsTable(BaseModel):
     A number in quotes, a boolean in place of a number and an empty string are errors.
     """
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
-
-    @field_validator("*")
-    @classmethod
-    def _not_empty(cls, value: Any, info: ValidationInfo) -> Any:
-        if value == "" and info.field_name not in ("title", "unit"):
-            raise ValueError("must not be empty")
-        return value
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True, str_min_length=1)
 
     def changed(self, keys: Iterable[str]) -> list[str]:
         """Return those of `keys` whose value is not the default (logs contain defaults, too)."""
@@ -122,8 +112,7 @@ def check_name(value: str, characters: str = "", reserved: Collection[str] = ())
 Positive = Annotated[float, Field(gt=0)]
 Nside = Annotated[int, Field(gt=0, le=8192), valid(_power_of_two)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
-Word = Annotated[str, Field(min_length=1)]
-FileName = Annotated[Word, AfterValidator(NamedFile)]
+FileName = Annotated[str, AfterValidator(NamedFile)]
 #: A list without repetitions, and one that is not empty either.
 Distinct = Annotated[list[T], valid(_distinct)]
 Several = Annotated[list[T], Field(min_length=1), valid(_distinct)]
@@ -159,10 +148,8 @@ def mistakes(raw: Any, error: ValidationError, assigned: Collection[str] = ()) -
         if isinstance(mistake, MistakeAt):
             where = f"{where}.{mistake.key}" if where else mistake.key
             what = mistake.words.rstrip(".")
-        elif found["type"] == "extra_forbidden":
-            what = "unknown key"
-        elif found["type"] == "missing":
-            what = "is missing"
+        elif found["type"] in PLAINLY:
+            what = PLAINLY[found["type"]]
         elif found["type"].endswith(("_type", "literal_error")):
             wanted = what.removeprefix("Input should be ").partition(" or instance")[0]
             types.setdefault(where, []).append(wanted.replace("dictionary", "table"))

@@ -100,15 +100,8 @@ def simulation_inputs(
     observation = Observation(channels, nside, stokes, seen[finest], lmax, precision)
     cmb = cmb_spectra(settings, lmax) if "cmb" in included else None
     leakage = _leakage(settings, foregrounds, observation, galaxy)
-    return SimulationInputs(
-        sources,
-        observation,
-        cmb,
-        leakage,
-        _truth(settings, sources, cmb is not None),
-        spec.small_scales_seed,
-        description,
-    )
+    truth, seed = _truth(settings, sources, cmb is not None), spec.small_scales_seed
+    return SimulationInputs(sources, observation, cmb, leakage, truth, seed, description)
 
 
 def map_nside(settings: Experiment, templates: Mapping[str, Template]) -> int:
@@ -243,10 +236,7 @@ def cmb_spectra(settings: Experiment, lmax: int, r: float | None = None) -> np.n
 
 
 def _leakage(
-    settings: Experiment,
-    names: Collection[str],
-    observation: Observation,
-    galaxy: EmbeddedSky | None,
+    settings: Experiment, names: list[str], observation: Observation, galaxy: EmbeddedSky | None
 ) -> dict[str, Float[Array, "2 pix"]]:
     """Return what leaks from the foregrounds' intensity into Q and U of each band [uK_RJ]."""
     fractions = {

@@ -173,11 +173,9 @@ def of_first(make: Callable[[], Made]) -> Made:
     return next(iter(by_turns(lambda _: make(), [None])))
 
 
-def filled(
-    shape: tuple[int, ...], make: Callable[[int], Any], dtype: Any = float, copies: int = 1
-) -> Maps:
+def filled(shape: tuple[int, ...], make: Callable[[int], Any]) -> Maps:
     """Return an array whose rows are made by turns; on disk, where all see it, if it is large."""
-    found = of_first(lambda: empty(shape, dtype, copies))
+    found = of_first(lambda: empty(shape))
 
     def row(i: int) -> Any:
         values = np.asarray(make(i))

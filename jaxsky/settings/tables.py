@@ -108,8 +108,7 @@ class ComponentTable(SeenKeys):
             raise MistakeAt("noise.estimate_above", "is of bands")
         check_signs(self.parameters, "parameters")
         if "nu_ref" in self.parameters:
-            given = self.parameters["nu_ref"]
-            raise ValueError(f"nu_ref belongs next to law; here parameters have it, {given!r}")
+            raise MistakeAt("parameters.nu_ref", "belongs next to law")
         reference = declared(component_class(self.law), "nu_ref") if self.law else None
         if self.law and self.nu_ref is not None:
             if not reference:

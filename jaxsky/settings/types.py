@@ -66,8 +66,6 @@ class SettingsTable(BaseModel):
 class NamedFile(str):
     """The name of a file, as opposed to other text; see `find_file`."""
 
-    __slots__ = ()
-
 
 def _power_of_two(value: int) -> None:
     if value & (value - 1):
@@ -174,11 +172,10 @@ def mistakes(raw: Any, error: ValidationError, assigned: Collection[str] = ()) -
 def check_names(kind: str, names: Iterable[str]) -> None:
     """Raise ValueError if names are the same, or differ by capital letters only."""
     names = list(names)
-    for known, more in ((set(names), ""), ({n.lower() for n in names}, " by more than capitals")):
-        if len(known) < len(names):
-            raise ValueError(
-                f"the names of the {kind} must differ{more}, but are {', '.join(names)}"
-            )
+    if len({name.lower() for name in names}) < len(names):
+        raise ValueError(
+            f"the names of the {kind} must differ by more than capitals, but are {', '.join(names)}"
+        )
 
 
 def check_signs(values: Mapping[str, Any], table: str = "") -> None:

@@ -309,7 +309,7 @@ def test_maps_of_parameters_in_separations(folder):
     words = r"free.dust.beta_dust.regions: 40 of 768 used pixels have no value"
     raises(SettingsError, words, separation_data, separation(folder, free=free))
     dust = {"law": "dust", "nu_ref": 353.0, "parameters": {"nu_ref": 545.0}}
-    with pytest.raises(ValueError, match="parameters.nu_ref: belongs next to law"):
+    with pytest.raises(ValueError, match=r"parameters\.nu_ref: belongs next to law"):
         separation(folder, sky={"dust": dust})
 
 

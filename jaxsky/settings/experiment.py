@@ -4,8 +4,7 @@ What each key means is said in `fits/defaults/experiment.toml`, which `jaxsky in
 """
 
 import re
-from collections.abc import Collection
-from operator import attrgetter
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -225,25 +224,22 @@ class Experiment(SettingsTable):
             raise MistakeAt("forecast.free", "is empty, and so is the table free")
         if "cmb" in (self.simulate.include or ()) and not self.cmb.include:
             raise MistakeAt("simulate.include", "has 'cmb', but cmb.include is false")
-        for name, one in self.sky.given.items():
-            for band in one.noise.shared if one.noise else ():
-                if band not in names:
-                    raise MistakeAt(f"sky.{name}.noise.shared", f"there is no band {band!r}")
-        components = list(self.sky.components)
-        simulated = [*components, "cmb", "noise"]
-        known: dict[str, Collection[str]] = {
-            "common.components": components,
-            "simulate.include": simulated,
-            "compare.patches": names,
-            "fit.regions": self.regions,
-            "compare.regions": self.regions,
-            "separate.region": self.regions,
-            "forecast.region": self.regions,
-            "forecast.bands": names,
-        }
-        for key, allowed in known.items():
-            values = attrgetter(key)(self) or ()
-            for value in [values] if isinstance(values, str) else values:
+        components = self.sky.components
+        known: list[tuple[str, Iterable[str] | None, Collection[str]]] = [
+            ("common.components", self.common.components, components),
+            ("simulate.include", self.simulate.include, [*components, "cmb", "noise"]),
+            ("compare.patches", self.compare.patches, names),
+            ("fit.regions", self.fit.regions, self.regions),
+            ("compare.regions", self.compare.regions, self.regions),
+            ("separate.region", self.separate.region, self.regions),
+            ("forecast.region", self.forecast.region, self.regions),
+            ("forecast.bands", self.forecast.bands, names),
+        ]
+        for name, one in components.items():
+            if one.noise is not None:
+                known.append((f"sky.{name}.noise.shared", one.noise.shared, names))
+        for key, values, allowed in known:
+            for value in [values] if isinstance(values, str) else values or ():
                 if value not in allowed:
                     there = ", ".join(allowed) or "none is there"
                     raise MistakeAt(key, f"{value!r} is none of {there}")
@@ -299,6 +295,3 @@ class Experiment(SettingsTable):
                 raise SettingsError(f"free.{name}: start is missing.")
             values[name] = one.start
         return values
-
-
-Experiment.model_rebuild()

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from jaxsky.bandpass import UNITS
 from jaxsky.checks import listed
@@ -98,6 +98,11 @@ def _list(value: Any) -> Any:
     return value if isinstance(value, list | tuple) else [value]
 
 
+def _temperature(unit: str) -> None:
+    if UNITS.get(unit, (1.0, ""))[1] not in ("K_RJ", "K_CMB"):
+        raise ValueError(f"must be a temperature such as uK_RJ or mK_CMB, not {unit!r}")
+
+
 class NoiseColumns(ColumnKeys):
     """Columns that describe the noise, or a list of their names; other keys are the map's own."""
 
@@ -136,14 +141,7 @@ class NoiseTable(SettingsTable):
     correlated: bool = False
     plausible: bool = False
     shared: dict[str, float] = Field(default={})
-    unit: str | None = None
-
-    @field_validator("unit")
-    @classmethod
-    def _temperature(cls, value: str | None) -> str | None:
-        if value is not None and UNITS.get(value, (1.0, ""))[1] not in ("K_RJ", "K_CMB"):
-            raise ValueError(f"must be a temperature such as uK_RJ or mK_CMB, not {value!r}")
-        return value
+    unit: Annotated[str, valid(_temperature)] | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> "NoiseTable":

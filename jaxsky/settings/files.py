@@ -13,6 +13,7 @@ from jaxsky.settings.types import FileName, MistakeAt, Positive, SettingsTable, 
 
 Files = FileName | Annotated[list[FileName], Field(min_length=1)]
 _Hdu = Annotated[int, Field(ge=1)]
+_Stokes = Annotated[str, Field(min_length=0)]  # a column may have none
 
 
 class TableKeys(SettingsTable):
@@ -57,7 +58,7 @@ class ColumnKeys(TableKeys):
 class MapKeys(ColumnKeys):
     """An optional map, and its Stokes parameters if the column names do not tell them."""
 
-    stokes: Annotated[str | list[str], valid(parse_stokes)] | None = None
+    stokes: Annotated[str | list[_Stokes], valid(parse_stokes)] | None = None
 
     @model_validator(mode="after")
     def _of_a_file(self) -> "MapKeys":

@@ -26,6 +26,8 @@ LAUNCHED = {
     "SLURM_STEP_NODELIST": "SLURM_STEP_NUM_TASKS",
     "OMPI_MCA_orte_hnp_uri": "OMPI_COMM_WORLD_SIZE",
 }
+#: Environment variables: address of the first process, their number, and which of them this is.
+VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 _alone = False
@@ -34,20 +36,13 @@ told = False
 
 
 @contextmanager
-def processes(
-    address: str | None = None, number: int | None = None, index: int | None = None
-) -> Iterator[None]:
+def processes() -> Iterator[None]:
     """Join the processes of a job, before anything else is done with JAX; all have to do the same.
 
     `jaxsky.mesh.pixel_mesh` then has the devices of all of them. Processes that SLURM or Open MPI
-    start find each other. Others take what is not given from the environment variables
-    JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID. Without any of this there is one
-    process.
-
-    Parameters
-    ----------
-    address : "host:port" of the first process, where the port is a free one
-    number, index : number of processes, and which of them this is, from 0
+    start find each other. Others are told by the environment, `VARIABLES`: the "host:port" of the
+    first one, where the port is a free one, their number, and which of them this is, from 0.
+    Without any of this there is one process.
 
     Raises
     ------
@@ -55,26 +50,19 @@ def processes(
         If another process has ended, which exchanges of pixels notice at once, and all others
         after `HEARTBEAT` seconds: then JAX ends the process with a text of its own.
     ValueError
-        If only some of address, number and index are known.
+        If only some of the environment variables are set.
     """
-    address = address or os.environ.get("JAX_COORDINATOR_ADDRESS")
-    number, index = (
-        int(os.environ[word]) if value is None and word in os.environ else value
-        for value, word in ((number, "JAX_NUM_PROCESSES"), (index, "JAX_PROCESS_ID"))
-    )
-    given = {"address": address, "number": number, "index": index}
-    lacking = [name for name, value in given.items() if value is None]
-    if 0 < len(lacking) < len(given):
-        raise ValueError(
-            f"Argument `{lacking[0]}` is missing: give all of address, number and index, or none."
-        )
     env = os.environ
+    lacking = [word for word in VARIABLES if word not in env]
+    if 0 < len(lacking) < len(VARIABLES):
+        raise ValueError(f"{lacking[0]} is missing: set all of {', '.join(VARIABLES)}, or none.")
     launched = [int(env.get(count, 2)) for word, count in LAUNCHED.items() if word in env]
-    if address or max(launched, default=1) > 1:
+    if not lacking or max(launched, default=1) > 1:
+        # JAX looks up the address itself, and the rest where a scheduler has it.
+        number, index = (None if lacking else int(env[word]) for word in VARIABLES[1:])
         jax.distributed.initialize(
-            address,
-            number,
-            index,
+            num_processes=number,
+            process_id=index,
             heartbeat_timeout_seconds=HEARTBEAT,
             shutdown_timeout_seconds=HEARTBEAT,
         )

@@ -13,7 +13,6 @@ from jaxsky import job
 from jaxsky.job import processes
 from jaxsky.mesh import distribute, pixel_mesh
 from jaxsky.settings import SettingsError
-from refusals import raises
 
 
 @pytest.mark.parametrize(
@@ -37,13 +36,14 @@ def test_on_eight_devices(which):
 
 
 def test_half_an_address_is_refused(monkeypatch):
-    def begin(*arguments):
-        with processes(*arguments):
-            pass
-
-    raises(ValueError, "Argument `number` is missing", begin, "127.0.0.1:1")
-    monkeypatch.setenv("JAX_PROCESS_ID", "1")
-    raises(ValueError, "Argument `address` is missing", begin)
+    for known, words in (
+        ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES is missing: set all of"),
+        ("JAX_PROCESS_ID", "JAX_COORDINATOR_ADDRESS is missing: set all of"),
+    ):
+        with monkeypatch.context() as environment:
+            environment.setenv(known, "1")
+            with pytest.raises(ValueError, match=words), processes():
+                pass
 
 
 def test_errors_are_sent_to_other_processes_with_their_words():

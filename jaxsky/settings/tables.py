@@ -106,6 +106,8 @@ class ComponentTable(SeenKeys):
     def _plausible(self) -> "ComponentTable":
         if self.noise is not None and self.noise.estimate_above is not None:
             raise MistakeAt("noise.estimate_above", "is of bands")
+        if self.law == "cmb":
+            raise MistakeAt("law", "the CMB is described in the table cmb")
         check_signs(self.parameters, "parameters")
         if "nu_ref" in self.parameters:
             raise MistakeAt("parameters.nu_ref", "belongs next to law")
@@ -169,8 +171,6 @@ class SkyTable(SettingsTable):
                 check_name(name, "", RESERVED)
                 if one.law is None:
                     raise ValueError("law is missing")
-                if one.law == "cmb":
-                    raise MistakeAt("law", "the CMB is described in the table cmb")
                 own = one.file is None and name in self.templates
                 if own and (one.law != name or one.nu_ref is not None):
                     raise ValueError("law and nu_ref are those of the embedded map; give a file")

@@ -61,7 +61,14 @@ Region = Annotated[str, valid(parse_region)] | MaskFile
 Multipole = Annotated[int, Field(ge=2)]
 
 
-class CommonTable(SettingsTable):
+class ResolutionTable(SettingsTable):
+    """Pixels and the beam [arcmin] of maps; 0 smooths none."""
+
+    nside: Nside | None = None
+    fwhm: float = Field(0.0, ge=0)
+
+
+class CommonTable(ResolutionTable):
     """The common resolution of templates and maps in fit, compare, separate and paper."""
 
     nside: Nside = 64
@@ -71,11 +78,9 @@ class CommonTable(SettingsTable):
     maps: FileName | None = None
 
 
-class SimulateTable(SettingsTable):
+class SimulateTable(ResolutionTable):
     """How bands without a map are simulated, and what `jaxsky simulate` writes."""
 
-    nside: Nside | None = None
-    fwhm: float = Field(0.0, ge=0)
     stokes: Literal["QU", "IQU"] = "QU"
     unit: Literal["uK_RJ", "uK_CMB"] = "uK_RJ"
     components: bool = False
@@ -86,8 +91,20 @@ class SimulateTable(SettingsTable):
     small_scales_seed: Seed | None = None
 
 
-class FitTable(SettingsTable):
-    """How spectral parameters are fitted to templates, in one region after the other."""
+class ByRegionTable(SettingsTable):
+    """Regions of which fit and compare give results, one after the other."""
+
+    regions: Several[str] = Field(["strip", "outside", "full"])
+
+
+class ChainsTable(SettingsTable):
+    """Steps of the chains of fit and separate; by default those of the sampler."""
+
+    nsteps: int | None = Field(None, ge=1)
+
+
+class FitTable(ByRegionTable, ChainsTable):
+    """How spectral parameters are fitted to templates."""
 
     nsteps: int | None = Field(3000, ge=1)
     regions: Several[str] = Field(["strip", "full"])
@@ -117,19 +134,23 @@ class SimulationsTable(SpectraTable):
     nsims: int = Field(100, ge=20)
 
 
-class CompareTable(SimulationsTable):
-    """How maps are compared with the model, in one region after the other."""
+class WindowTable(SettingsTable):
+    """A region whose edge is apodized [deg], of separate and forecast."""
 
-    regions: Several[str] = Field(["strip", "outside", "full"])
+    region: str = "full"
+    apodization: float = Field(15.0, ge=0, lt=90)
+
+
+class CompareTable(SimulationsTable, ByRegionTable):
+    """How maps are compared with the model."""
+
     lmax: int = Field(100, ge=10)
     patches: str | None = None
 
 
-class SeparateTable(SimulationsTable):
+class SeparateTable(SimulationsTable, WindowTable, ChainsTable):
     """How components are separated, and how r is measured from the cleaned BB."""
 
-    region: str = "full"
-    apodization: float = Field(15.0, ge=0, lt=90)
     domain: Literal["pixel", "harmonic"] = "pixel"
     unit: Literal["uK_CMB", "uK_RJ"] = "uK_CMB"
     sampler: Literal["nuts", "emcee", "none"] = "nuts"
@@ -137,7 +158,7 @@ class SeparateTable(SimulationsTable):
     purify: bool = True
 
 
-class ForecastTable(SpectraTable):
+class ForecastTable(SpectraTable, WindowTable):
     """Spectra of the foregrounds outside a mask, and the Fisher matrix."""
 
     region: str = "outside"

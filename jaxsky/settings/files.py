@@ -72,10 +72,14 @@ class MapFile(MapKeys):
     file: Files
 
 
-class BeamedMap(MapFile):
-    """A map and the FWHM of its Gaussian beam [arcmin]."""
+class BeamedKeys(MapKeys):
+    """An optional map, and the FWHM of its Gaussian beam [arcmin]."""
 
     fwhm: float | None = Field(None, ge=0)
+
+
+class BeamedMap(MapFile, BeamedKeys):
+    """A map and the FWHM of its Gaussian beam [arcmin]."""
 
 
 class BandpassSpec(TableKeys):
@@ -169,8 +173,7 @@ class NoiseTable(SettingsTable):
             raise MistakeAt(f"{kind}.fields", f"name the columns {self.COLUMNS[kind]}, not {named}")
 
 
-class SeenKeys(MapKeys):
+class SeenKeys(BeamedKeys):
     """An optional map as it was seen, with its beam and its noise: of a band or of a component."""
 
-    fwhm: float | None = Field(None, ge=0)
     noise: NoiseTable | None = None

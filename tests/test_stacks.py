@@ -198,14 +198,18 @@ VARYING = {"parameters": {"beta_dust": {"file": "dust.fits", "fields": ["BETA"]}
 BAND_PARAMETERS = {"offset.402.Q": {"start": 0.0}, "angle.140": {"start": 0.0}}
 
 
+def slow(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize(
     ("uneven", "changes"),
     [
         (False, {}),
         (True, {"sky": NOISE}),
-        (False, {"sky": NOISE, "fit": {"likelihood": "diagonal"}}),
-        (True, {"free": FREE | BAND_PARAMETERS}),
-        (
+        slow(False, {"sky": NOISE, "fit": {"likelihood": "diagonal"}}),
+        slow(True, {"free": FREE | BAND_PARAMETERS}),
+        slow(
             True,
             {
                 "sky": {"embedded": {"nside": NSIDE}, "dust": NOISE["dust"] | VARYING},

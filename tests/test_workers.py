@@ -146,6 +146,7 @@ def test_without_dask(monkeypatch):
 def test_more_workers_than_processors_are_said(monkeypatch):
     notes = []
     monkeypatch.setattr(workers, "processors", lambda: 2)
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", lambda *_: ThreadPoolExecutor())
     with workers_of("3", notes.append) as three, workers_of("2", notes.append) as two:
         assert (three._threads["OMP_NUM_THREADS"], two._threads["OMP_NUM_THREADS"]) == ("1", "1")
     assert notes == ["--workers 3: more than the 2 processors there are."]

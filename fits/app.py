@@ -11,12 +11,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
+import jax
 import typer
 
 import jaxsky
 from fits.commands.data import data_commands
 from fits.commands.report import console, print_written
 from fits.commands.run import DEFAULTS, Command, interruptible, print_error, run_command
+from jaxsky import job
 from jaxsky.io.files import cache_folder
 from jaxsky.programs import keep_programs, return_memory
 
@@ -24,12 +26,14 @@ from jaxsky.programs import keep_programs, return_memory
 TEMPLATE = "experiment"
 #: What `jaxsky simulate` may be restricted to.
 ONLY = ("noise", "signal", "foregrounds", "cmb")
-#: Commands that analyse observed maps, or simulated ones.
+#: Commands with the same options, but for those that some lack.
 ANALYSES = {
     "fit": "Fit spectral indices to polarization maps: on a grid, by gradient and by MCMC.",
     "compare": "Compare observed maps with the model of foregrounds, CMB and noise.",
     "separate": "Separate CMB and foregrounds by their laws, and measure r from cleaned B modes.",
+    "forecast": "Forecast B modes: foregrounds against primordial ones, and errors on r and laws.",
 }
+LACKING = {"fit": {"workers"}, "forecast": {"maps", "workers", "resume"}}
 
 SettingsPath = Annotated[
     Path | None,
@@ -93,7 +97,7 @@ def _init(
 
 @app.command("simulate")
 def _simulate(
-    settings_file: SettingsPath = None,
+    file: SettingsPath = None,
     out: Annotated[Path, typer.Option(help="Folder for the maps.")] = Path("results/simulate"),
     nsims: Annotated[int, typer.Option(min=1, help="Number of realisations.")] = 1,
     first: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Number of the first one.")] = 0,
@@ -111,23 +115,18 @@ def _simulate(
     if only is not None and only not in ONLY:
         raise ValueError(f"--only must be one of {', '.join(ONLY)}, not {only!r}.")
     command = Command("simulate", partial(make_realisations, only=only))
+    part = range(first, first + nsims)
     run_command(
-        command,
-        settings_file,
-        out,
-        values,
-        resume=resume,
-        overwrite=overwrite,
-        part=range(first, first + nsims),
-        workers=workers,
+        command, file, out, values, part=part, resume=resume, overwrite=overwrite, workers=workers
     )
 
 
 def _analysis(name: str) -> Callable[..., None]:
-    """Return a command with the options shared by those that work on maps."""
+    """Return the command of a name, with its options."""
+    lacking = LACKING.get(name, set())
 
     def command(
-        settings_file: SettingsPath = None,
+        file: SettingsPath = None,
         out: Out = Path(f"results/{name}"),
         maps: Annotated[
             Path | None,
@@ -140,21 +139,15 @@ def _analysis(name: str) -> Callable[..., None]:
         resume: Resume = False,
         overwrite: Overwrite = False,
     ) -> None:
+        own = import_module(f"fits.commands.{name}").COMMAND
+        again = None if "resume" in lacking else resume
         run_command(
-            import_module(f"fits.commands.{name}").COMMAND,
-            settings_file,
-            out,
-            values,
-            resume=resume,
-            overwrite=overwrite,
-            maps=maps,
-            workers=workers,
+            own, file, out, values, maps=maps, resume=again, overwrite=overwrite, workers=workers
         )
 
-    if name == "fit":  # it has no realisations
-        given = inspect.signature(command)
-        kept = [one for one in given.parameters.values() if one.name != "workers"]
-        command.__signature__ = given.replace(parameters=kept)  # type: ignore[attr-defined]
+    given = inspect.signature(command)
+    kept = [one for one in given.parameters.values() if one.name not in lacking]
+    command.__signature__ = given.replace(parameters=kept)  # type: ignore[attr-defined]
     return command
 
 
@@ -162,22 +155,9 @@ for _name, _help in ANALYSES.items():
     app.command(_name, help=_help)(_analysis(_name))
 
 
-@app.command("forecast")
-def _forecast(
-    settings_file: SettingsPath = None,
-    out: Out = Path("results/forecast"),
-    values: Values = None,
-    overwrite: Overwrite = False,
-) -> None:
-    """Forecast B modes: foregrounds against primordial ones, and errors on r and the laws."""
-    from fits.commands.forecast import COMMAND
-
-    run_command(COMMAND, settings_file, out, values, overwrite=overwrite)
-
-
 @app.command("paper")
 def _paper(
-    settings_file: SettingsPath = None,
+    file: SettingsPath = None,
     out: Out = Path("results/paper"),
     only: Annotated[
         list[str] | None,
@@ -192,15 +172,7 @@ def _paper(
     from fits.commands.paper import KEPT, report_figures
 
     command = Command("paper", partial(report_figures, only=only or ()), (KEPT,))
-    run_command(
-        command,
-        settings_file,
-        out,
-        values,
-        resume=resume,
-        overwrite=overwrite,
-        workers=workers,
-    )
+    run_command(command, file, out, values, resume=resume, overwrite=overwrite, workers=workers)
 
 
 app.add_typer(data_commands, name="data")
@@ -214,10 +186,6 @@ def main() -> None:
             stream.reconfigure(errors="replace")
     try:
         with interruptible():
-            import jax
-
-            from jaxsky import job
-
             jax.config.update("jax_enable_x64", True)
             keep_programs(cache_folder() / "programs")
             if "--version" in sys.argv:  # after any command

@@ -181,5 +181,4 @@ def report_figures(settings: Experiment, command: Run, *, only: Sequence[str]) -
     sections = {figure.label: figure.section for figure in figures}
     missing = [f"{n}: {s.note}" for n, s in sections.items() if not (s.picture or s.table)]
     remark = f"{len(figures)} figures and tables ({command.steps.seconds:.1f} s)."
-    page = [command.out / PAGE]
-    return Report("", warnings=missing, written=page, remark=remark, page=False)
+    return Report("", warnings=missing, written=[command.out / PAGE], remark=remark)

@@ -62,11 +62,12 @@ MOMENT = 0.1
 
 
 class Report(NamedTuple):
-    """Results of a command, printed on the terminal and shown on a page unless `page` is False.
+    """Results of a command, printed on the terminal and shown on a page.
 
-    `numbers` go to the first of the command's result files, with description and warnings.
-    `pictures` maps file names to a function and its arguments after the path; the function returns
-    False if there is nothing to draw. `written` are other files that were written.
+    Without a description there is no page, as the command has written its own. `numbers` go to the
+    first of its result files, with description and warnings. `pictures` maps file names to a
+    function and its arguments after the path; the function returns False if there is nothing to
+    draw. `written` are other files that were written.
     """
 
     description: str
@@ -76,7 +77,6 @@ class Report(NamedTuple):
     pictures: Mapping[str, tuple[Any, ...]] = {}
     written: Sequence[Path] = ()
     remark: str = ""
-    page: bool = True
 
 
 class Run(NamedTuple):
@@ -140,11 +140,7 @@ def run_command(
     part: range = ALL,
     workers: str | None = None,
 ) -> None:
-    """Run a command with the options of the command line; `resume` is None if it has no --resume.
-
-    Only `part` of the results is made, see `jaxsky.io.files.occupied`; but `overwrite` replaces
-    all of them, so no other process may be making any.
-    """
+    """Run a command with the options of the command line, see `results_folder`."""
     path, values = settings_file or DEFAULTS / f"{command.name}.toml", list(values or ())
     if maps is not None:
         values.append(f"common.maps={json.dumps(str(maps.resolve()))}")
@@ -155,7 +151,6 @@ def run_command(
         )
     console.quiet = job.index() > 0
     settings = job.of_first(lambda: load(path, values))
-    kind: Any = {"resume": resume, "overwrite": overwrite, "part": ALL if overwrite else part}
     with (
         of_file(path),
         ExitStack() as stack,
@@ -168,12 +163,15 @@ def run_command(
         from jaxsky.montecarlo import other_sky
 
         mpl.use("Agg")  # pictures go to files
-        guarded = results_folder(out, command.results, **kind)
+        guarded = results_folder(
+            out, command.results, resume=resume, overwrite=overwrite, part=part
+        )
         folder, owner = job.of_first(lambda: (stack.enter_context(guarded), os.getpid()))
         if count > 1:
             files.writer = f"{owner}-{job.index()}"
-        options = settings, out, bool(resume), overwrite, command.results
-        running = Run(*options, folder, steps, part, executor)
+        running = Run(
+            settings, out, bool(resume), overwrite, command.results, folder, steps, part, executor
+        )
         report = command.work(settings, running)
         report = report._replace(warnings=[*report.warnings, *other_sky(settings)])
         written = job.of_first(lambda: _write(settings, report, running))
@@ -205,15 +203,15 @@ def _write(settings: Experiment, report: Report, command: Run) -> list[Path]:
                 (out / name).unlink(missing_ok=True)
         write_log(written[1], settings, command.steps.seconds)
     written += report.written
-    if report.page:
-        numbered = enumerate(report.tables, 1)
-        tables = [Section(f"Results {i}", table.caption, table=table) for i, table in numbered]
-        drawn = [path for path in written if path.suffix == ".png"]
-        pictures = [Section(path.stem.replace("_", " "), picture=path.name) for path in drawn]
+    if report.description:
         intro = [report.description, *(f"(!) {sentence}" for sentence in report.warnings)]
-        called, seconds = " ".join(["jaxsky", *sys.argv[1:2]]), command.steps.seconds
-        end = f"Written by `{called}` in {seconds:.0f} s,"
-        write_page(out / PAGE, settings.title or "jaxsky", intro, [*tables, *pictures], end)
+        numbered = enumerate(report.tables, 1)
+        shown = [Section(f"Results {i}", table.caption, table=table) for i, table in numbered]
+        drawn = [path for path in written if path.suffix == ".png"]
+        shown += [Section(path.stem.replace("_", " "), picture=path.name) for path in drawn]
+        called = " ".join(["jaxsky", *sys.argv[1:2]])
+        end = f"Written by `{called}` in {command.steps.seconds:.0f} s,"
+        write_page(out / PAGE, settings.title or "jaxsky", intro, shown, end)
         written.insert(0, out / PAGE)
     return written
 
@@ -231,14 +229,15 @@ def results_folder(
 
     It is made if missing, and removed again if nothing was written. Existing files that match
     `results` are an error unless `resume` or `overwrite` is set; `resume` is None for commands that
-    cannot be resumed. Only `part` of the results is made, see `jaxsky.io.files.occupied`.
+    cannot be resumed. Only `part` of the results is made, see `jaxsky.io.files.occupied`; but
+    `overwrite` replaces all of them, so no other process may be making any.
     """
     if resume and overwrite:
         raise ValueError("--resume and --overwrite exclude each other.")
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is not a folder; choose another --out.")
     if_stopped("" if resume is None else "; resume with --resume")
-    with occupied(out, part) as folder:
+    with occupied(out, ALL if overwrite else part) as folder:
         if not folder.locked:
             warn(
                 f"{out}: this file system has no locks, so see to it that no other command writes "

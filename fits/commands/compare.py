@@ -56,14 +56,10 @@ def _numbers(comparison: Comparison, patches: PatchComparison | None) -> dict[st
             "band": patches.band,
             "observed": patches.observed._asdict(),
             "model": patches.model._asdict(),
-        } | {
-            name: {
-                "ratio": patches.ratio(i),
-                "slope_difference": patches.slope_difference(i),
-                "correlation": patches.correlation(i),
-            }
-            for i, name in enumerate(FIELDS)
         }
+        means = ("ratio", "slope_difference", "correlation")
+        for i, name in enumerate(FIELDS):
+            found["patches"][name] = {key: getattr(patches, key)(i) for key in means}
     return found
 
 
@@ -286,10 +282,7 @@ def _plot_patch_pairs(
 
 
 def plot_patches(path: Path, patches: PatchComparison, title: str) -> bool:
-    """Draw A and alpha of the patches, observed against model (the paper's fig. 10).
-
-    Return False, without a picture, if no patch is detected.
-    """
+    """Draw A and alpha of detected patches, if any, map against model (the paper's fig. 10)."""
     if not patches.any_detected:
         return False
     title = f"{title}\n{patches.band}: patches of 400 square degrees"

@@ -82,15 +82,10 @@ def _fetch(
     wanted = find(products)
     if len(wanted) > 1:
         console.print(f"{len(wanted)} files, {total_size(wanted)}.")
-    bar = Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        DownloadColumn(),
-        TransferSpeedColumn(),
-        console=console,
-    )
     if_stopped("; fetch it again to resume")
-    with bar as progress:
+    name = TextColumn("{task.description}", markup=False)
+    shown = name, BarColumn(), DownloadColumn(), TransferSpeedColumn()
+    with Progress(*shown, console=console) as progress:
         for product in wanted:
             report = partial(progress.update, progress.add_task(product.name, total=product.size))
             words = f"{product.name}: another process fetches it; waiting."

@@ -124,10 +124,7 @@ def _by_region(fits: Sequence[RegionFit]) -> dict[str, list[RegionFit]]:
 def plot_grids(
     path: Path, fits: Sequence[RegionFit], truth: Mapping[str, float] | None, title: str
 ) -> bool:
-    """Draw the probability on the grid, Q next to U, one row per region (the paper's fig. 11).
-
-    Return False, without a picture, if no fit has a grid of two parameters.
-    """
+    """Draw two-parameter grids, if any, Q next to U, a row per region (the paper's fig. 11)."""
     with_grid = [f for f in fits if "grid" in f.results and len(f.results["grid"].free) == 2]
     if not with_grid:
         return False
@@ -151,15 +148,11 @@ def plot_grids(
 
 
 def _drawable(fits: Sequence[RegionFit], name: str) -> list[tuple[RegionFit, FitResult]]:
-    """Return the fits with a finite error on a parameter, each with its most detailed result.
-
-    That is the result of a grid, else of a chain, else of the first method.
-    """
-    found = []
+    """Return the fits with a finite error on a parameter, each with its most detailed result."""
+    found, details = [], ("axes", "chain")
     for fit in fits:
-        results = list(fit.results.values())
-        known = [r for r in results if "axes" in r.details or "chain" in r.details]
-        best = min(known, key=lambda r: "chain" in r.details, default=results[0])
+        # That of a grid, else of a chain, else of the first method.
+        best = min(fit.results.values(), key=lambda r: [key not in r.details for key in details])
         if name in best.free and np.isfinite(best.sigma[name]):
             found.append((fit, best))
     return found
@@ -230,18 +223,14 @@ def _draw_marginal(axes: Axes, stokes: str, result: FitResult, name: str) -> Non
 def plot_posterior(
     path: Path, fits: Sequence[RegionFit], truth: Mapping[str, float] | None, title: str
 ) -> bool:
-    """Draw the posterior of the chains with the most Stokes parameters, one colour per region.
-
-    Return False, without a picture, if no fit has a chain.
-    """
+    """Draw the chains, if any, with the most Stokes parameters, one colour per region."""
     with_chain = [f for f in fits if "mcmc" in f.results and "chain" in f.results["mcmc"].details]
-    if not with_chain:
-        return False
-    most = max(with_chain, key=lambda f: len(f.stokes)).stokes
+    most = max((f.stokes for f in with_chain), key=len, default="")
     shown = [f for f in with_chain if f.stokes == most]
     results = {f"{f.region}, {' + '.join(most)}": f.results["mcmc"] for f in shown}
-    plot_chains(path, results, truth, title)
-    return True
+    if shown:
+        plot_chains(path, results, truth, title)
+    return bool(shown)
 
 
 #: Pictures and the functions that draw them.

@@ -9,21 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from fits import fisher, plots
+from fits import fisher, plots, pseudo_cl
 from fits.commands.report import ResultTable, Row
 from fits.commands.run import Command, Report, Run
 from fits.common import prepare_component
-from fits.fisher import Errors, ForecastModel, fiducial, fisher_errors
 from fits.mixing import Mixing, unit_sky
-from fits.pseudo_cl import (
-    FIELDS,
-    LEAST_WINDOW,
-    PIVOT,
-    MaskedSpectra,
-    bin_edges,
-    masked_spectra,
-    sky_fraction,
-)
+from fits.pseudo_cl import FIELDS, LEAST_WINDOW, PIVOT
 from fits.regions import apodize, region_mask
 from fits.results import with_error
 from jaxsky import Sky
@@ -69,29 +60,29 @@ class Forecast(NamedTuple):
     """
 
     inputs: ForecastInputs
-    spectra: MaskedSpectra
+    spectra: pseudo_cl.MaskedSpectra
     powers: dict[str, Float[np.ndarray, "2 bin"]]
     laws: dict[str, fisher.BandLaw]
     equal_r: dict[str, dict[str, float]]
     tensors: Float[np.ndarray, "4 ell"]
     lensed: Float[np.ndarray, "4 ell"]
     parameters: dict[str, float]
-    errors: Errors
+    errors: fisher.Errors
     without_foregrounds: float | None
 
 
 def forecast_inputs(settings: Experiment) -> ForecastInputs:
     """Read templates, bands and mask, bring the templates to one resolution, and check them."""
     spec = settings.forecast
-    if not settings.cmb.include:
-        raise SettingsError("cmb.include: is false, but a forecast has a CMB.")
-    if settings.cmb.file is not None:
-        raise SettingsError("cmb.file: a forecast changes r, which takes spectra of CAMB.")
+    for wrong, sentence in (
+        (not settings.cmb.include, "cmb.include: is false, but a forecast has a CMB."),
+        (settings.cmb.file, "cmb.file: a forecast changes r, which takes spectra of CAMB."),
+        (not settings.modelled(), "sky: has no components; a forecast takes some."),
+        (not settings.bands, "bands: there are none."),
+    ):
+        if wrong:
+            raise SettingsError(sentence)
     templates, description = read_sky(settings, names=settings.modelled())
-    if not templates:
-        raise SettingsError("sky: has no components; a forecast takes some.")
-    if not settings.bands:
-        raise SettingsError("bands: there are none.")
     pixels = map_nside(settings, templates)
     bands = {str(one.name): read_channel(settings, one, pixels) for one in settings.bands}
     if silent := [name for name, band in bands.items() if band.noise is None]:
@@ -127,10 +118,7 @@ def forecast_inputs(settings: Experiment) -> ForecastInputs:
 def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
     """Compare foreground B modes with primordial ones, and find errors by the Fisher matrix.
 
-    Parameters
-    ----------
-    settings : the experiment
-    progress : is told each step of the work
+    `progress` is told each step of the work.
 
     Raises
     ------
@@ -144,9 +132,9 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
     progress.step("reading templates and mask")
     inputs, spec = forecast_inputs(settings), settings.forecast
     progress.step("spectra outside the mask")
-    edges = bin_edges(spec.lmin, spec.lmax, spec.width)
+    edges = pseudo_cl.bin_edges(spec.lmin, spec.lmax, spec.width)
     window = np.asarray(gaussian_beam(inputs.fwhm, 2 * edges[-1]))
-    spectra = masked_spectra(inputs.mask, edges, window=window)
+    spectra = pseudo_cl.masked_spectra(inputs.mask, edges, window=window)
     bands = {name: inputs.bands[name].band for name in inputs.shown}
     powers = fisher.foreground_powers(inputs.sky, bands, spectra)
     with at_key("forecast.fit"):
@@ -166,17 +154,17 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
     ell, rows = np.arange(spec.lmin, spec.fisher_lmax + 1), [1 + FIELDS.index(f) for f in fields]
     weights = [fisher.noise_weights(b, spec.fisher_lmax)[ell] for b in inputs.bands.values()]
     bandpasses = {name: band.band for name, band in inputs.bands.items()}
-    model = ForecastModel(
+    model = fisher.ForecastModel(
         Mixing.of(unit_sky(inputs.sky, mask=inputs.mask), bandpasses, "uK_CMB"),
         jnp.asarray(np.stack(weights, axis=1)),
         jnp.asarray(tensors[rows][:, ell]),
         jnp.asarray(lensed[rows][:, ell]),
         jnp.asarray(ell, float),
-        jnp.asarray(sky_fraction(inputs.mask)),
+        jnp.asarray(pseudo_cl.sky_fraction(inputs.mask)),
         fields,
     )
     foregrounds = fisher.foreground_laws(inputs.sky, spectra, fields, spec.fit)
-    parameters = fiducial(model.sky, foregrounds, settings.cmb.r, settings.cmb.A_lens)
+    parameters = fisher.fiducial(model.sky, foregrounds, settings.cmb.r, settings.cmb.A_lens)
     errors, without = _errors(settings, model, parameters)
     return Forecast(
         inputs, spectra, powers, laws, equal, tensors, lensed, parameters, errors, without
@@ -184,8 +172,8 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
 
 
 def _errors(
-    settings: Experiment, model: ForecastModel, parameters: dict[str, float]
-) -> tuple[Errors, float | None]:
+    settings: Experiment, model: fisher.ForecastModel, parameters: dict[str, float]
+) -> tuple[fisher.Errors, float | None]:
     """Return errors on the free parameters, and the error on r without foregrounds or None."""
     spec = settings.forecast
     nuisance = [
@@ -200,11 +188,11 @@ def _errors(
     own = [name for name in spec.free if name in parameters]
     free = list(dict.fromkeys((*own, *spectral, *nuisance)))
     with at_key("free"):
-        errors = fisher_errors(model, parameters, free, widths)
+        errors = fisher.fisher_errors(model, parameters, free, widths)
     if "r" not in free:
         return errors, None
     none = {n: 0.0 if n.endswith(".amplitude") else v for n, v in parameters.items()}
-    return errors, fisher_errors(model, none, ["r"]).sigma["r"]
+    return errors, fisher.fisher_errors(model, none, ["r"]).sigma["r"]
 
 
 def _numbers(found: Forecast, settings: Experiment) -> dict[str, Any]:
@@ -212,7 +200,7 @@ def _numbers(found: Forecast, settings: Experiment) -> dict[str, Any]:
     errors, spectra, lmax = found.errors, found.spectra, settings.forecast.lmax
     results: dict[str, Any] = {
         "bands": list(found.inputs.bands),
-        "sky_fraction": sky_fraction(found.inputs.mask),
+        "sky_fraction": pseudo_cl.sky_fraction(found.inputs.mask),
         "bins": {"first": spectra.edges[:-1], "last": [e - 1 for e in spectra.edges[1:]]},
         "foregrounds": {
             name: {
@@ -266,8 +254,7 @@ def _tables(found: Forecast) -> list[ResultTable]:
 
 def forecast_warnings(found: Forecast) -> list[str]:
     """Return warnings to users of the numbers, one sentence each."""
-    sentences = []
-    errors, sky = found.errors, found.inputs.sky
+    sentences, errors, sky = list[str](), found.errors, found.inputs.sky
     for name in errors.free:
         component, *field = name.split(".")
         positive = component in sky and declared(type(sky[component]), field[0])["positive"]
@@ -312,8 +299,7 @@ def plot_b_modes(path: Path, found: Forecast, settings: Experiment) -> None:
 def plot_errors(path: Path, found: Forecast) -> None:
     """Draw values with errors and their correlations, without those of foreground spectra in l."""
     errors = found.errors
-    laws = [name for name in errors.free if not name.startswith(("EE.", "BB."))]
-    names = laws or errors.free
+    names = [n for n in errors.free if not n.startswith(("EE.", "BB."))] or errors.free
     count = len(names)
     matrix = np.array([[errors.correlation(a, b) for b in names] for a in names])
     matrix[np.triu_indices(count)] = np.nan
@@ -343,7 +329,7 @@ def _symbol(name: str) -> tuple[str, str]:
     return symbol, rf"\ {unit.rstrip(']')}" if unit else ""
 
 
-def _value(errors: Errors, name: str) -> str:
+def _value(errors: fisher.Errors, name: str) -> str:
     """Return TeX for a parameter, its value, and two digits of its error."""
     value, sigma = errors.fiducial[name], errors.sigma[name]
     symbol, unit = _symbol(name)
@@ -362,10 +348,7 @@ def _work(settings: Experiment, command: Run) -> Report:
         _tables(found),
         [*forecast_warnings(found), *settings.left_out("forecast")],
         _numbers(found, settings),
-        {
-            "bb.png": (plot_b_modes, found, settings),
-            "fisher.png": (plot_errors, found),
-        },
+        {"bb.png": (plot_b_modes, found, settings), "fisher.png": (plot_errors, found)},
     )
 
 

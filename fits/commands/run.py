@@ -66,8 +66,8 @@ class Report(NamedTuple):
 
     Without a description there is no page, as the command has written its own. `numbers` go to the
     first of its result files, with description and warnings. `pictures` maps file names to a
-    function and its arguments after the path; the function returns False if there is nothing to
-    draw. `written` are other files that were written.
+    function and its arguments after the path; it returns False if there is nothing to draw, and
+    then no picture is there. `written` are other files that were written.
     """
 
     description: str

@@ -262,10 +262,7 @@ def plot_residuals(path: Path, found: Separation, settings: Experiment) -> None:
 
 
 def plot_parameters(path: Path, found: Separation, settings: Experiment) -> bool:
-    """Draw maps of the parameters that have regions, with their errors next to them.
-
-    Return False, without a picture, if no parameter has regions.
-    """
+    """Draw maps of the parameters that have regions, if any, with their errors next to them."""
     rows = []
     for name in found.fit.free:
         if not np.ndim(found.fit.best_fit[name]):
@@ -341,7 +338,7 @@ def plot_ratio(path: Path, found: Separation, settings: Experiment) -> None:
 
 
 def plot_posterior(path: Path, found: Separation, settings: Experiment) -> bool:
-    """Draw the posterior of the chain. Return False, without a picture, if there is none."""
+    """Draw the posterior of the chain, if there is one."""
     if found.chain is not None:
         chains = {found.chain.method: found.chain}
         plots.plot_chains(path, chains, found.data.truth, settings.title)

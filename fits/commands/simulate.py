@@ -68,12 +68,9 @@ def make_realisations(settings: Experiment, command: Run, *, only: str | None) -
     middle = statistics.median if command.executor is None else statistics.mean
     rate = f"{middle(seconds):.2g} s a band, " if seconds else ""
     took = f"{rate}{steps.seconds:.1f} s in all"
-    return Report(
-        setup.description,
-        warnings=list(dict.fromkeys(notes)),
-        written=sorted(out.glob("sim_*.png")),
-        remark=f"{len(seconds)} maps in {out / 'sim_*'}{there} ({took}).",
-    )
+    remark = f"{len(seconds)} maps in {out / 'sim_*'}{there} ({took})."
+    sheets, warnings = sorted(out.glob("sim_*.png")), list(dict.fromkeys(notes))
+    return Report(setup.description, warnings=warnings, written=sheets, remark=remark)
 
 
 def _draw_sheet(path: Path, files: Mapping[str, Path], lmax: int, settings: Experiment) -> None:

@@ -19,21 +19,11 @@ from fits.common import prepared_maps
 from fits.comparison import Comparison, compare
 from fits.inputs import Inputs, inputs_of
 from fits.regions import region_masks
-from jaxsky import AME, Dust, Synchrotron
+from jaxsky import AME, Dust, Synchrotron, inputs
 from jaxsky.checks import listed
 from jaxsky.cmb import gaussian_fields
 from jaxsky.galaxy import EmbeddedSky
 from jaxsky.harmonics import gaussian_beam, synthesis
-from jaxsky.inputs import (
-    check_stokes,
-    default_galaxy,
-    embedded_galaxy,
-    parameter_map,
-    read,
-    read_parameters,
-    read_sky,
-    uK_RJ_per,
-)
 from jaxsky.io import InputError
 from jaxsky.io.curves import read_text
 from jaxsky.noise import realisation_key, stream
@@ -225,8 +215,8 @@ class PaperSky:
     def galaxy(self) -> EmbeddedSky:
         """The embedded model; where templates come from files, at low resolution."""
         if self.settings.sky.embedded is not None:
-            return embedded_galaxy(self.settings)
-        return default_galaxy(NSIDE)
+            return inputs.embedded_galaxy(self.settings)
+        return inputs.default_galaxy(NSIDE)
 
     @cached_property
     def inputs(self) -> Inputs:
@@ -257,7 +247,7 @@ class PaperSky:
         """
         name, _ = self._spec(law)
         galaxy = None if self.settings.sky.embedded is None else self.galaxy
-        own = read_sky(self.settings, names=[name], galaxy=galaxy)[0][name]
+        own = inputs.read_sky(self.settings, names=[name], galaxy=galaxy)[0][name]
         if missing := int(np.sum(~own.used)):
             raise SettingsError(
                 f"sky.{name}: {missing} pixels have no value; the figures of the paper take "
@@ -307,18 +297,17 @@ class PaperSky:
         name, own, nside = "ame", 0.0, dust.nside
         if any(one.law == "ame" and one.file for one in self.settings.sky.given.values()):
             name, spec = self._spec("ame")
-            found, own, where = read(self.folder, spec), spec.fwhm or 0.0, f"sky.{name}"
-            check_stokes(where, found, "I")
+            found, own, where = inputs.read(self.folder, spec), spec.fwhm or 0.0, f"sky.{name}"
+            inputs.check_stokes(where, found, "I")
             if missing := int(np.sum(~np.asarray(found.mask))):
                 raise SettingsError(f"{where}: {missing} pixels have no value.")
-            parameters, _ = read_parameters(self.folder, name, spec, found.nside)
-            fixed = self.settings.fixed.items()
-            parameters |= {
-                key[len(name) + 1 :]: v for key, v in fixed if key.startswith(f"{name}.")
-            }
+            parameters, _ = inputs.read_parameters(self.folder, name, spec, found.nside)
+            fixed = [(key.partition("."), value) for key, value in self.settings.fixed.items()]
+            parameters |= {key: value for (component, _, key), value in fixed if component == name}
             if any(map(np.ndim, parameters.values())):
                 raise Impossible("It takes parameters of AME that are numbers, not maps.")
-            intensity = jnp.asarray(found.maps[0] * uK_RJ_per(found.unit, spec.nu_ref, where))
+            factor = inputs.uK_RJ_per(found.unit, spec.nu_ref, where)
+            intensity = jnp.asarray(found.maps[0] * factor)
             origin = f"the intensity of AME is {spec.label}"
             if spec.nu_ref != NU_AME:
                 origin += f", from {spec.nu_ref:g} to 23 GHz by the paper's law"
@@ -370,14 +359,14 @@ def _drawn_index(key: Array, name: str, nside: int) -> Index:
 def _read_index(folder: Path, name: str, spec: BeamedMap) -> Index:
     """Read an index from a file and smooth it; beta_syn is made steeper if the settings say so."""
     pure = spec if spec.unit is not None else spec.model_copy(update={"unit": ""})
-    where, found = f"paper.{name}", read(folder, pure, stokes="", zeros_are_data=True)
+    where, found = f"paper.{name}", inputs.read(folder, pure, stokes="", zeros_are_data=True)
     own, by = spec.fwhm or 0.0, 0.0
     origin, fwhm = f"{SYMBOLS[name]} is that of {spec.label}", max(FWHM[name], own)
     if name == "beta_syn" and bool(np.all(found.maps[:, found.mask] < 0)):
         found = dataclasses.replace(found, maps=np.asarray(from_pysm_beta(found.maps)))
         origin = f"{origin} with the other sign"
     stated = spec.missing is not None
-    values, used = parameter_map(found, name, found.nside, where, stated=stated)
+    values, used = inputs.parameter_map(found, name, found.nside, where, stated=stated)
     smooth = dust_index(values, own, fwhm, found.nside, None if used.all() else used)
     if isinstance(spec, RadioIndexMap):
         given = spec.steepening

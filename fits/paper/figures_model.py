@@ -294,10 +294,10 @@ def figure_patch(paper: PaperSky, picture: Path) -> PaperFigure:
         numbers.append(_brightest(name, inside))
         limit, beam = plots.color_limit(inside["total"]), f"{float(channel.beam):g}'"
         panels[f"{name} GHz, {beam}"] = Q["total"], limit, "uK_RJ"
-        if name == observation.names[-1]:
-            to_cmb = float(channel.band.conversion("uK_RJ", "uK_CMB"))
-            limit = plots.color_limit(inside["cmb"] * to_cmb)
-            panels = {f"CMB, {beam}": (Q["cmb"] * to_cmb, limit, "uK_CMB"), **panels}
+    # The CMB is that of the last band, which has the finest beam.
+    to_cmb = float(channel.band.conversion("uK_RJ", "uK_CMB"))
+    limit = plots.color_limit(inside["cmb"] * to_cmb)
+    panels = {f"CMB, {beam}": (Q["cmb"] * to_cmb, limit, "uK_CMB"), **panels}
     _draw_patches(picture, panels, center, SIZE_CORE)
     words = f"spectra of {settings.cmb.label}" if settings.cmb.file else f"r = {settings.cmb.r:g}"
     return paper.described("Figure 13", numbers, size=SIZE_CORE, cmb=words, nside=observation.nside)

@@ -107,8 +107,7 @@ def comparison_warnings(comparison: Comparison, settings: Experiment) -> list[st
                 f"than in any of {round(1 / s.floor) - 1} realisations of noise and CMB."
             )
     for one in comparison.spectra:
-        unlikely = [n for n, p in zip(FIELDS, one.pte, strict=True) if p < UNLIKELY]
-        if unlikely:
+        if unlikely := [n for n, p in zip(FIELDS, one.pte, strict=True) if p < UNLIKELY]:
             sentences.append(
                 f"{one.band}: {' and '.join(unlikely)} differ from the model by more than noise "
                 f"and CMB do (PTE below {UNLIKELY:g})."
@@ -286,10 +285,8 @@ def plot_patches(path: Path, patches: PatchComparison, title: str) -> bool:
     if not patches.any_detected:
         return False
     title = f"{title}\n{patches.band}: patches of 400 square degrees"
-    series: list[Series] = [
-        (name, patches.detected(i), (patches.model, i), (patches.observed, i))
-        for i, name in enumerate(FIELDS)
-    ]
+    model, observed = patches.model, patches.observed
+    series = [(n, patches.detected(i), (model, i), (observed, i)) for i, n in enumerate(FIELDS)]
     found = {"observed / model": patches.ratio, "observed - model": patches.slope_difference}
     several = [i for i in range(len(FIELDS)) if patches.detected(i).sum() > 1]
     heads = [
@@ -315,8 +312,7 @@ def _pictures(
         f"scatter_{region}.png": (plot_scatter, found, region, bands, f"{title}\n{region}")
         for region in found.regions
     }
-    for stokes in "QU":
-        drawn[f"maps_{stokes}.png"] = plot_model_maps, found, stokes, bands, title
+    drawn |= {f"maps_{s}.png": (plot_model_maps, found, s, bands, title) for s in "QU"}
     if found.spectra:
         drawn["spectra.png"] = plot_full_sky, found.spectra, title
     if leaky := [s for s in found.spectra if s.uncorrected is not None]:

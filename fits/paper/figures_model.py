@@ -66,7 +66,7 @@ def figure_templates(paper: PaperSky, picture: Path) -> PaperFigure:
 
 def figure_indices(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 3: maps of both spectral indices."""
-    rows, origins, numbers = [], [], []
+    rows, origins, numbers, texts = [], [], [], TEXTS["Figure 3"]
     for name, word, symbol in (("beta_dust", "dust", "d"), ("beta_syn", "synchrotron", "s")):
         index, fwhm, steeper, origin = paper.index(name)
         values = np.asarray(index)
@@ -79,22 +79,14 @@ def figure_indices(paper: PaperSky, picture: Path) -> PaperFigure:
             Number(f"mean of {SYMBOLS[name]}", f"{mean:.3f}", note),
             Number(f"scatter of {SYMBOLS[name]}", f"{spread:.3f}", note),
         ]
-        if name == "beta_syn":
-            numbers.append(_steepening(steeper))
+    # How much steeper beta_syn, the last, was made, next to a published law with a curvature.
+    nu, curved = jnp.geomspace(0.4, 40.0, 200), preset("s3", np.zeros((2, 12)), beta_syn=3.0)
+    said = filled(texts["steepening"], curved=float(steepening(nu, curved.sed(nu))))
+    note = said if steeper is not None else texts["drawn"] + said
+    what = "steepening of β_syn from 0.49 ... 2.12 to 20 ... 30 GHz"
+    numbers.append(Number(what, f"{steeper:.2f}" if steeper else "none", note))
     plots.plot_maps(picture, rows)
     return paper.described("Figure 3", numbers, origins=" and ".join(origins))
-
-
-def _steepening(by: float | None) -> Number:
-    """Return how much steeper beta_syn was made, next to the value of a published curved law."""
-    curved, text = preset("s3", np.zeros((2, 12)), beta_syn=3.0), TEXTS["Figure 3"]
-    nu = jnp.geomspace(0.4, 40.0, 200)
-    said = filled(text["steepening"], curved=float(steepening(nu, curved.sed(nu))))
-    return Number(
-        "steepening of β_syn from 0.49 ... 2.12 to 20 ... 30 GHz",
-        f"{by:.2f}" if by else "none",
-        (text["drawn"] if by is None else "") + said,
-    )
 
 
 def figure_ame(paper: PaperSky, picture: Path) -> PaperFigure:
@@ -113,7 +105,6 @@ def figure_ame(paper: PaperSky, picture: Path) -> PaperFigure:
         note = f"jackknife over pixels of nside {nside}; over blocks of 15° the error is {wide:.2g}"
         what = f"correlation of dust and AME, {stokes}"
         numbers.append(Number(what, with_error(r, error), note))
-    origin = origin[:1].upper() + origin[1:]
     return paper.described("Figure 4", numbers, origin=origin, resolution=resolution)
 
 

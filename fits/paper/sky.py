@@ -290,7 +290,7 @@ class PaperSky:
     def ame(self) -> tuple[Float[Array, "2 pix"], Float[Array, "2 pix"], str, str]:
         """Return Q, U of AME at 23 GHz and 1 degree, 1 % polarized along the dust, and of dust.
 
-        Then their resolution in words, and the origin of the intensity, as part of a sentence.
+        Then words on their resolution and on the origin of the intensity.
         """
         dust = self.template("dust")
         parameters: dict[str, Any] = {"nu_ref": NU_AME}
@@ -308,13 +308,13 @@ class PaperSky:
                 raise Impossible("It takes parameters of AME that are numbers, not maps.")
             factor = inputs.uK_RJ_per(found.unit, spec.nu_ref, where)
             intensity = jnp.asarray(found.maps[0] * factor)
-            origin = f"the intensity of AME is {spec.label}"
+            origin = f"The intensity of AME is {spec.label}"
             if spec.nu_ref != NU_AME:
                 origin += f", from {spec.nu_ref:g} to 23 GHz by the paper's law"
         else:
             intensity = self.galaxy.dust[0] / 2
             origin = (
-                "there is no intensity of AME, and half of that of the embedded model's dust at "
+                "There is no intensity of AME, and half of that of the embedded model's dust at "
                 "353 GHz takes its place"
             )
         fwhm, pixel = max(AME_FWHM, own, dust.fwhm), healpy.nside2resol(nside, arcmin=True)

@@ -13,18 +13,7 @@ from jaxtyping import Float
 from fits import plots
 from fits.commands.forecast import forecast, plot_b_modes
 from fits.commands.report import ResultTable
-from fits.paper.sky import (
-    NSIDE,
-    PAPER_FWHM,
-    RANGES,
-    SYMBOLS,
-    TEXTS,
-    Impossible,
-    Number,
-    PaperFigure,
-    PaperSky,
-    filled,
-)
+from fits.paper.sky import RANGES, TEXTS, Impossible, Number, PaperFigure, PaperSky, filled
 from fits.pseudo_cl import PIVOT, sky_fraction
 from fits.regions import region_words, superpixels
 from fits.results import with_error
@@ -39,8 +28,9 @@ from jaxsky.simulation import HarmonicSource, harmonic_sources, observe_bands, p
 from jaxsky.small_scales import Continued
 from jaxsky.templates import correlation, polarization_template, preset, steepening
 
-#: nside of blocks for a jackknife that allows for correlated pixels: 15 degrees.
-NSIDE_BLOCKS = 4
+#: nside of the correlation of AME with dust, and of blocks of 15 degrees for a jackknife that
+#: allows for correlated pixels.
+NSIDE_CORRELATION, NSIDE_BLOCKS = 64, 4
 #: Change of slope for the steeper spectrum, which the paper does not give.
 TILT = -1.0
 #: Sizes of the patches of figures 13 and 14 [deg].
@@ -70,14 +60,14 @@ def figure_indices(paper: PaperSky, picture: Path) -> PaperFigure:
     for name, word, symbol in (("beta_dust", "dust", "d"), ("beta_syn", "synchrotron", "s")):
         index, fwhm, steeper, origin = paper.index(name)
         values = np.asarray(index)
-        mean, spread = float(values.mean()), float(values.std())
+        beta, mean, spread = name.replace("beta", "β"), float(values.mean()), float(values.std())
         title, label = f"{word}, {fwhm / 60:g}° beam", rf"$\beta_{{\rm {symbol}}}$"
         rows.append([plots.MapPanel(title, values, label, round(mean, 2))])
-        origins.append(origin)
+        origins.append(f"{beta} {origin}")
         note = "by construction" if steeper is None else ""
         numbers += [
-            Number(f"mean of {SYMBOLS[name]}", f"{mean:.3f}", note),
-            Number(f"scatter of {SYMBOLS[name]}", f"{spread:.3f}", note),
+            Number(f"mean of {beta}", f"{mean:.3f}", note),
+            Number(f"scatter of {beta}", f"{spread:.3f}", note),
         ]
     # How much steeper beta_syn, the last, was made, next to a published law with a curvature.
     nu, curved = jnp.geomspace(0.4, 40.0, 200), preset("s3", np.zeros((2, 12)), beta_syn=3.0)
@@ -95,7 +85,7 @@ def figure_ame(paper: PaperSky, picture: Path) -> PaperFigure:
     title = "AME, $Q$, 23 GHz, 1 % polarized"
     plots.plot_maps(picture, [[plots.MapPanel(title, np.asarray(ame[0]), UNIT)]])
     own, numbers = healpy.npix2nside(ame.shape[-1]), []
-    nside = min(NSIDE, own)
+    nside = min(NSIDE_CORRELATION, own)
     if nside != own:
         dust, ame = (polarization_template(each, 0.0, 0.0, nside) for each in (dust, ame))
     blocks = superpixels(nside, NSIDE_BLOCKS)
@@ -254,7 +244,7 @@ def core_observation(paper: PaperSky) -> Observation:
 
 def prepared_templates(paper: PaperSky, observation: Observation) -> dict[str, HarmonicSource]:
     """Prepare both foregrounds, from the shared small scales if the laws of both are constant."""
-    given = {name: Source(*paper.template(name)) for name in PAPER_FWHM}
+    given = {name: Source(*paper.template(name)) for name in ("dust", "synchrotron")}
     terms = plan_terms(given, observation)
     constant = {name: one for name, one in terms.items() if one is not None and not one.counts}
     if len(constant) < len(terms):

@@ -49,8 +49,8 @@ WORDS = TEXTS["sky"]
 PAPER_FWHM = {"dust": 10.0, "synchrotron": 60.0}
 #: The paper's ranges of the fits of power laws.
 RANGES = {"synchrotron": SYNCHROTRON, "dust": DUST}
-#: Reference frequency [GHz] and resolution [arcmin] of the AME; nside of its correlation with the
-#: dust, of random indices, and of the embedded model next to templates from files.
+#: Reference frequency [GHz] and resolution [arcmin] of the AME; nside of random indices, and of the
+#: embedded model next to templates from files.
 NU_AME, AME_FWHM, NSIDE = 23.0, 60.0, 64
 #: Fits of power laws end at this times nside; pixels resolve l = 2 nside.
 KNOWN = 15 / 8
@@ -58,15 +58,13 @@ KNOWN = 15 / 8
 PIXELS = 1.45
 #: Resolution of the paper's maps of indices [arcmin].
 FWHM = {"beta_dust": 180.0, "beta_syn": 600.0}
-#: Names in texts.
-SYMBOLS = {"beta_dust": "β_dust", "beta_syn": "β_syn"}
 #: Statistics of random index maps: the paper's mean; the scatter, which the paper gives only for
 #: synchrotron; and the exponent of the spectrum.
 MEAN = {"beta_dust": 1.53, "beta_syn": 2.9}
 SCATTER = {"beta_dust": 0.04, "beta_syn": 0.1}
 SLOPE = -2.0
 #: Map of an index, its resolution [arcmin], by how much it was made steeper (None if it is
-#: random), and its origin, as part of a sentence.
+#: random), and its origin, the end of a sentence that begins with its symbol.
 Index: TypeAlias = tuple[Float[Array, " pix"], float, float | None, str]
 
 
@@ -339,7 +337,7 @@ class PaperSky:
             return _read_index(self.folder, name, spec)
         if not isinstance(held, tuple) and held.ndim == 1:
             smooth = dust_index(held, 0.0, FWHM[name], nside)
-            return smooth, FWHM[name], 0.0, f"{SYMBOLS[name]} is that of the template"
+            return smooth, FWHM[name], 0.0, "is that of the template"
         return _drawn_index(stream(self.key, "index", name), name, min(NSIDE, nside))
 
 
@@ -350,9 +348,7 @@ def _drawn_index(key: Array, name: str, nside: int) -> Index:
     power = jnp.where(ell < 1, 0.0, jnp.maximum(ell, 1.0) ** SLOPE) * gaussian_beam(fwhm, lmax) ** 2
     field = synthesis(gaussian_fields(key, power[None, None]), nside)[0]
     values = MEAN[name] + SCATTER[name] * (field - field.mean()) / field.std()
-    origin = (
-        f"{SYMBOLS[name]} is a Gaussian field of mean {MEAN[name]:g} and scatter {SCATTER[name]:g}"
-    )
+    origin = f"is a Gaussian field of mean {MEAN[name]:g} and scatter {SCATTER[name]:g}"
     return values, fwhm, None, origin
 
 
@@ -361,7 +357,7 @@ def _read_index(folder: Path, name: str, spec: BeamedMap) -> Index:
     pure = spec if spec.unit is not None else spec.model_copy(update={"unit": ""})
     where, found = f"paper.{name}", inputs.read(folder, pure, stokes="", zeros_are_data=True)
     own, by = spec.fwhm or 0.0, 0.0
-    origin, fwhm = f"{SYMBOLS[name]} is that of {spec.label}", max(FWHM[name], own)
+    origin, fwhm = f"is that of {spec.label}", max(FWHM[name], own)
     if name == "beta_syn" and bool(np.all(found.maps[:, found.mask] < 0)):
         found = dataclasses.replace(found, maps=np.asarray(from_pysm_beta(found.maps)))
         origin = f"{origin} with the other sign"

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import commands
+from fits.commands import paper
 from fits.commands.forecast import forecast
-from fits.commands.paper import NUMBERS, STEPS, Make, labels_of, make_figures
+from fits.commands.paper import NUMBERS, STEPS, Make, labels_of
 from fits.commands.report import Section
-from fits.commands.run import DEFAULTS
+from fits.commands.run import DEFAULTS, Run
 from fits.common import common_maps
 from fits.comparison import compare
 from fits.inputs import inputs_of
@@ -30,7 +31,9 @@ from fits.results import with_error
 from jaxsky.checks import listed
 from jaxsky.harmonics import gaussian_beam, power_spectrum
 from jaxsky.io import read_maps
+from jaxsky.io.files import ALL, Folder
 from jaxsky.observation import Source
+from jaxsky.programs import Progress
 from jaxsky.settings import Experiment, load
 from jaxsky.simulation import harmonic_sources
 from jaxsky.small_scales import fit_power_law
@@ -38,6 +41,22 @@ from refusals import cases, raises
 
 LABELS = [*(f"Figure {n}" for n in (1, 2, 3, 4, 13)), "Table 1", "Figure 14"]
 EXAMPLE = Path(__file__).parents[1] / "examples" / "paper_real_sky.toml"
+
+
+class Quiet(Progress):
+    """Steps that leave no log."""
+
+    seconds = 0.0
+
+    def keep(self, path):
+        pass
+
+
+def make_figures(settings, out, only=(), *, overwrite=False, steps=STEPS) -> list[PaperFigure]:
+    """As the command does in its folder."""
+    out.mkdir(parents=True, exist_ok=True)
+    command = Run(settings, out, True, overwrite, (), Folder(out, ALL), Quiet(), ALL, None)
+    return paper.make_figures(settings, command, only, steps)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from fits.paper import figures_data, figures_model
 from fits.paper.sky import TEXTS, Impossible, PaperFigure, PaperSky, picture_of
 from fits.results import write_log
 from jaxsky.io import write_text
-from jaxsky.programs import QUIET, Progress, forget_programs
+from jaxsky.programs import forget_programs
 from jaxsky.settings import Experiment, changed_settings
 
 #: File of the settings and the figures made with them, from which a stopped run resumes.
@@ -66,31 +65,20 @@ def labels_of(words: Iterable[str], known: Iterable[str] = STEPS) -> list[str]:
 
 
 def make_figures(
-    settings: Experiment,
-    out: Path,
-    only: Iterable[str] = (),
-    *,
-    overwrite: bool = False,
-    begin: Callable[[], None] = lambda: None,
-    progress: Progress = QUIET,
-    steps: Mapping[str, Make] = STEPS,
-    executor: Executor | None = None,
+    settings: Experiment, command: Run, only: Iterable[str], steps: Mapping[str, Make] = STEPS
 ) -> list[PaperFigure]:
     """Make the missing figures and tables, and `index.html`, which shows all that exist.
 
     `only` lists numbers or labels of figures; `steps` has the function that makes each. With
-    `overwrite`, the wanted figures are made again; others in the folder are kept if they were made
-    with these settings, and otherwise removed once the first new figure is there. `begin` is called
-    after the checks, before anything is written; `executor` is that of `compare`. Returns all
+    --overwrite, the wanted figures are made again; others in the folder are kept if they were made
+    with these settings, and otherwise removed once the first new figure is there. Returns all
     figures of the page, new and old.
     """
-    started = time.perf_counter()
-    wanted = labels_of(only, steps)
+    out, overwrite, wanted = command.out, command.overwrite, labels_of(only, steps)
     mark = settings.model_dump(mode="json", exclude_none=True)
     figures, other = _kept(out, mark, overwrite)
-    begin()
-    out.mkdir(parents=True, exist_ok=True)
-    paper = PaperSky(settings, executor)
+    command.steps.keep(command.log)  # not `begin`: old figures are replaced one by one
+    paper = PaperSky(settings, command.executor)
     made = {
         label
         for label, (_, section, *_) in figures.items()
@@ -98,8 +86,8 @@ def make_figures(
     }
     todo = [label for label in wanted if overwrite or label not in made]
     for done, label in enumerate(todo):
-        progress.step(label)
-        progress.advance(done, len(todo))
+        command.steps.step(label)
+        command.steps.advance(done, len(todo))
         start = time.perf_counter()
         try:
             figure = steps[label](paper, out / picture_of(label))
@@ -116,7 +104,7 @@ def make_figures(
         # Figures have no compiled programs in common, and the memory of these adds up.
         forget_programs()
     shown = _write_page(paper, out, figures, steps)
-    write_log(out / CIRCUMSTANCES, settings, time.perf_counter() - started)
+    write_log(out / CIRCUMSTANCES, settings, command.steps.seconds)
     return shown
 
 
@@ -168,16 +156,7 @@ def _write_page(
 
 def report_figures(settings: Experiment, command: Run, *, only: Sequence[str]) -> Report:
     """Make some figures, or all, and report what was written."""
-    figures = make_figures(
-        settings,
-        command.out,
-        only,
-        overwrite=command.overwrite,
-        # Old figures are replaced one by one.
-        begin=lambda: command.steps.keep(command.log),
-        progress=command.steps,
-        executor=command.executor,
-    )
+    figures = make_figures(settings, command, only)
     sections = {figure.label: figure.section for figure in figures}
     missing = [f"{n}: {s.note}" for n, s in sections.items() if not (s.picture or s.table)]
     remark = f"{len(figures)} figures and tables ({command.steps.seconds:.1f} s)."

@@ -41,8 +41,6 @@ from jaxsky.workers import raised_in, workers_of
 
 #: Files in every results folder: the steps with their times, and the page of results.
 LOG, PAGE = "log.txt", "index.html"
-#: Words of Ctrl-C once everything is written.
-WRITTEN = "; all results are written"
 #: When, where and with what a command was run, next to its numbers.
 CIRCUMSTANCES = "log.json"
 #: Settings that may differ where results are resumed.
@@ -175,7 +173,7 @@ def run_command(
         report = command.work(settings, running)
         report = report._replace(warnings=[*report.warnings, *other_sky(settings)])
         written = job.of_first(lambda: _write(settings, report, running))
-        if_stopped(WRITTEN)
+        if_stopped("; all results are written")
     if job.index():
         return
     if report.description:

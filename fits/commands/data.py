@@ -102,9 +102,7 @@ def _fetch(
 @data_commands.command("verify")
 def _verify(folder: Folder, products: Words = None) -> None:
     """Check files that are there: size, hash, columns, units, and that they are complete."""
-    wanted = find(products or [])
-    if not products:
-        wanted = [product for product in wanted if (folder / product.name).exists()]
+    wanted = [p for p in find(products or []) if products or (folder / p.name).exists()]
     wrong = 0
     for product in wanted:
         try:

@@ -31,7 +31,7 @@ ANALYSES = {
     "fit": "Fit spectral indices to polarization maps: on a grid, by gradient and by MCMC.",
     "compare": "Compare observed maps with the model of foregrounds, CMB and noise.",
     "separate": "Separate CMB and foregrounds by their laws, and measure r from cleaned B modes.",
-    "forecast": "Forecast B modes: foregrounds against primordial ones, and errors on r and laws.",
+    "forecast": "Forecast B modes: foregrounds against primordial ones; errors on r and the laws.",
 }
 LACKING = {"fit": {"workers"}, "forecast": {"maps", "workers", "resume"}}
 

@@ -14,7 +14,6 @@ from fits.commands.report import ResultTable, Row
 from fits.commands.run import Command, Report, Run
 from fits.common import prepare_component
 from fits.mixing import Mixing, unit_sky
-from fits.pseudo_cl import FIELDS, LEAST_WINDOW, PIVOT
 from fits.regions import apodize, region_mask
 from fits.results import with_error
 from jaxsky import Sky
@@ -95,10 +94,10 @@ def forecast_inputs(settings: Experiment) -> ForecastInputs:
             f"forecast.lmax: {spec.lmax} is beyond what templates of nside {nside} resolve, "
             f"{2 * nside - 1}."
         )
-    if (window := float(gaussian_beam(fwhm, spec.lmax)[-1])) < LEAST_WINDOW:
+    if (window := float(gaussian_beam(fwhm, spec.lmax)[-1])) < pseudo_cl.LEAST_WINDOW:
         raise SettingsError(
             f"forecast.lmax: the templates' beam of {fwhm:g} arcmin leaves {window:.2g} of the "
-            f"amplitude at l = {spec.lmax}; a correction takes {LEAST_WINDOW:g}."
+            f"amplitude at l = {spec.lmax}; a correction takes {pseudo_cl.LEAST_WINDOW:g}."
         )
     used = region_mask(settings, spec.region, nside, coarser=True)
     components = {}
@@ -142,7 +141,7 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
             name: fisher.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
             for name, D in powers.items()
         }
-    highest = max(spectra.lmax, spec.fisher_lmax, PIVOT)
+    highest = max(spectra.lmax, spec.fisher_lmax, pseudo_cl.PIVOT)
     with at_key("cmb.cosmology"):
         tensors = tensor_spectra(highest, **settings.cmb.cosmology)
         lensed = camb_spectra(highest, **settings.cmb.cosmology)
@@ -150,8 +149,9 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
         name: fisher.equal_r(spectra, powers[name], law, tensors) for name, law in laws.items()
     }
     progress.step("Fisher matrix")
-    fields = tuple(field for field in FIELDS if field in spec.spectra)
-    ell, rows = np.arange(spec.lmin, spec.fisher_lmax + 1), [1 + FIELDS.index(f) for f in fields]
+    fields = tuple(field for field in pseudo_cl.FIELDS if field in spec.spectra)
+    ell = np.arange(spec.lmin, spec.fisher_lmax + 1)
+    rows = [1 + pseudo_cl.FIELDS.index(field) for field in fields]
     weights = [fisher.noise_weights(b, spec.fisher_lmax)[ell] for b in inputs.bands.values()]
     bandpasses = {name: band.band for name, band in inputs.bands.items()}
     model = fisher.ForecastModel(
@@ -204,7 +204,7 @@ def _numbers(found: Forecast, settings: Experiment) -> dict[str, Any]:
         "bins": {"first": spectra.edges[:-1], "last": [e - 1 for e in spectra.edges[1:]]},
         "foregrounds": {
             name: {
-                **dict(zip(FIELDS, powers, strict=True)),
+                **dict(zip(pseudo_cl.FIELDS, powers, strict=True)),
                 "BB_law": found.laws[name]._asdict(),
                 "equal_r": found.equal_r[name],
             }
@@ -246,7 +246,7 @@ def _tables(found: Forecast) -> list[ResultTable]:
         numbers += [(), ("r, without foregrounds", "", f"{found.without_foregrounds:.2g}", "", "")]
     ranges = [f"r, {where}" for where in next(iter(found.equal_r.values()))]
     header = ("band", "D_l / uK_CMB^2", "slope of C_l", *ranges)
-    caption = f"BB of foregrounds at l = {PIVOT}, and the r that has as much"
+    caption = f"BB of foregrounds at l = {pseudo_cl.PIVOT}, and the r that has as much"
     other = ("parameter", "value", "error", "others known", "prior")
     marginal = "errors of 68 %, all free parameters marginalised"
     return [ResultTable(header, bands, caption), ResultTable(other, numbers, marginal)]

@@ -34,7 +34,6 @@ from fits.commands.report import (
 from fits.results import write_json, write_log
 from jaxsky import job
 from jaxsky.io import files
-from jaxsky.io.files import ALL, Folder, occupied
 from jaxsky.io.stacks import scratch
 from jaxsky.settings import Experiment, check_log, load, of_file
 from jaxsky.workers import raised_in, workers_of
@@ -88,7 +87,7 @@ class Run(NamedTuple):
     resume: bool
     overwrite: bool
     results: Sequence[str]
-    folder: Folder
+    folder: files.Folder
     steps: Steps
     part: range
     executor: Executor | None
@@ -135,7 +134,7 @@ def run_command(
     resume: bool | None = None,
     overwrite: bool = False,
     maps: Path | None = None,
-    part: range = ALL,
+    part: range = files.ALL,
     workers: str | None = None,
 ) -> None:
     """Run a command with the options of the command line, see `results_folder`."""
@@ -221,8 +220,8 @@ def results_folder(
     *,
     resume: bool | None,
     overwrite: bool,
-    part: range = ALL,
-) -> Iterator[Folder]:
+    part: range = files.ALL,
+) -> Iterator[files.Folder]:
     """Guard the results folder, so that no other command writes the same results meanwhile.
 
     It is made if missing, and removed again if nothing was written. Existing files that match
@@ -235,7 +234,7 @@ def results_folder(
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is not a folder; choose another --out.")
     if_stopped("" if resume is None else "; resume with --resume")
-    with occupied(out, ALL if overwrite else part) as folder:
+    with files.occupied(out, files.ALL if overwrite else part) as folder:
         if not folder.locked:
             warn(
                 f"{out}: this file system has no locks, so see to it that no other command writes "

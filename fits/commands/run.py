@@ -160,10 +160,8 @@ def run_command(
         from jaxsky.montecarlo import other_sky
 
         mpl.use("Agg")  # pictures go to files
-        guarded = results_folder(
-            out, command.results, resume=resume, overwrite=overwrite, part=part
-        )
-        folder, owner = job.of_first(lambda: (stack.enter_context(guarded), os.getpid()))
+        guard = results_folder(out, command.results, resume=resume, overwrite=overwrite, part=part)
+        folder, owner = job.of_first(lambda: (stack.enter_context(guard), os.getpid()))
         if count > 1:
             files.writer = f"{owner}-{job.index()}"
         running = Run(

@@ -3,10 +3,10 @@
 Solvers of optimistix take the residuals, and so need only their first derivatives: the default of
 template fits. Newton's method takes the exact second derivatives of each cell, in a program that
 the checks and the covariance need in any case: the default of spectral likelihoods, where a first
-fit, nearly all of it compilation, takes half the time of one with optimistix, and later ones the
-same few milliseconds. With hundreds of regions LBFGS and BFGS take a little longer,
-LevenbergMarquardt on normal equations twice as long, and Dogleg, which factorises the residuals of
-all cells together, fifty times. Levenberg and Marquardt's steps converge from farthest away.
+fit takes half the time of one with optimistix. With hundreds of regions LBFGS and BFGS take a
+little longer, LevenbergMarquardt on normal equations twice as long, and Dogleg, which factorises
+the residuals of all cells together, fifty times. Levenberg and Marquardt's steps converge from
+farthest away.
 """
 
 from collections.abc import Callable, Mapping
@@ -51,7 +51,7 @@ class Newton(NamedTuple):
     last: float = 1e-5
 
     def minimise(
-        self, posterior: Posterior, max_steps: int = NEWTON_STEPS
+        self, posterior: Posterior, max_steps: int
     ) -> tuple[Float[np.ndarray, " par"], int]:
         """Return the optimum within bounds, and the number of steps to it."""
         theta = posterior.start
@@ -66,8 +66,7 @@ class Newton(NamedTuple):
                 return theta, step
             matrix = posterior.curvature(theta, posterior.derivatives(theta).hessian, moving)
             factor = Factor(matrix)
-            exact = factor.positive
-            if not exact:
+            if not (exact := factor.positive):
                 matrix = posterior.curvature(theta, posterior.convex(theta), moving)
                 factor = Factor(matrix)
             slope = gradient[moving]
@@ -189,9 +188,8 @@ def best_fit(
     solver : of optimistix: a least-squares solver, which works on the residuals, or a minimiser,
         which works on their sum of squares. Parameters, and so tolerances, are in units of their
         values at the start for the first, and of their standard deviations there for the second;
-        with uniform priors, those of numbers without bounds. Or `fits.Newton()`: damped
-        steps of Newton's method with exact second derivatives, clipped at the bounds. By default
-        that for spectral likelihoods and distributed pixels, which take no other; else
+        with uniform priors, those of numbers without bounds. Or `fits.Newton()`, the default for
+        spectral likelihoods and distributed pixels, which take no other; else the default is
         `LevenbergMarquardt`
     max_steps : largest number of steps; by default 100 for Newton's method, 500 for optimistix
     throw : raise if it fails, or the optimum lies at the edge of a uniform prior
@@ -208,14 +206,13 @@ def best_fit(
     Raises
     ------
     KeyError, TypeError, ValueError
-        For unknown parameters, start values outside their prior, an object that is no solver,
-        negative max_steps, and priors that are neither uniform nor Gaussian with a least-squares
-        solver.
+        For unknown parameters, start values outside their prior, no solver, negative max_steps, and
+        priors that are neither uniform nor Gaussian with a least-squares solver.
     FitError
-        If it did not converge, unless throw=False; the result is in its `.result`. That is so if
-        the search stopped away from an optimum (even at its start), if data and priors do not
-        determine a parameter, and if chi^2 is far too large for a fit (`fits.results`). The
-        message says in how many regions and pixels, and which prior would help.
+        If it did not converge, unless throw=False; the result is in its `.result`: if the search
+        stopped away from an optimum, even at its start, if data and priors do not determine a
+        parameter, and if chi^2 is far too large for a fit (`fits.results`). The message says in how
+        many regions and pixels, and which prior would help.
     """
     if not (solver is None or isinstance(solver, Solver)):
         raise TypeError(
@@ -227,39 +224,34 @@ def best_fit(
     like = like.at(start)
     posterior = Posterior(like, priors)
     distributed = mesh_of(like) is not None
-    if distributed and not isinstance(solver, Newton | None):
+    if solver is None:
+        exact = like.profiled or distributed
+        solver = Newton() if exact else optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)
+    if isinstance(solver, Newton):
+        max_steps = NEWTON_STEPS if max_steps is None else max_steps
+        theta, steps = solver.minimise(posterior, max_steps)
+    elif distributed:
         raise ValueError(
             f"Argument `solver` is {type(solver).__name__}, and optimistix does not take "
             "distributed pixels; take fits.Newton()."
         )
-    if solver is None and (like.profiled or distributed):
-        solver = Newton()
-    elif solver is None:
-        solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)
-    if max_steps is None:
-        max_steps = NEWTON_STEPS if isinstance(solver, Newton) else MAX_STEPS
-    if isinstance(solver, Newton):
-        theta, steps = solver.minimise(posterior, max_steps)
     else:
+        max_steps = MAX_STEPS if max_steps is None else max_steps
         theta, steps = _searched(posterior, solver, max_steps)
 
     # From here on, nothing depends on how the optimum was found.
-    edges = posterior.edges(theta)
-    keep = np.flatnonzero(posterior.present & ~edges)
+    keep = np.flatnonzero(posterior.present & ~posterior.edges(theta))
     found = posterior.derivatives(theta)
-    matrix = posterior.curvature(theta, found.hessian, keep)
-    scatter = posterior.curvature(theta, found.fisher, keep)
-    unknown = degenerate(matrix, [posterior.labels[i] for i in keep]) if keep.size else []
-    factor = Factor(matrix)
-    spread = scatter if like.profiled else matrix
-    covariance, sigma = _errors(posterior, matrix, factor, spread, keep, not unknown)
+    hessian, fisher = (posterior.curvature(theta, x, keep) for x in (found.hessian, found.fisher))
+    unknown = degenerate(hessian, [posterior.labels[i] for i in keep]) if keep.size else []
+    factor = Factor(hessian)
+    covariance, sigma = _errors(posterior, keep, hessian, fisher, None if unknown else factor)
     slope = posterior.value(theta)[1][keep]
     distance = float(np.sqrt(slope @ factor.solve(slope))) if factor.positive else np.inf
     close = REACHED * float(np.sqrt(max(len(keep), 1)))
     far = np.zeros(len(theta), bool)
-    far[keep] = ~(np.abs(slope) <= close * np.sqrt(np.abs(matrix.diagonal())))
+    far[keep] = ~(np.abs(slope) <= close * np.sqrt(np.abs(hessian.diagonal())))
     converged, message = _ended(posterior, theta, steps, max_steps, distance, close, unknown, far)
-    dense = isinstance(matrix, np.ndarray)
     values, errors = posterior.named(theta), posterior.named(sigma)
     result = FitResult(
         method="gradient",
@@ -276,56 +268,45 @@ def best_fit(
             "solver": type(solver).__name__,
             "steps": steps,
             "distance": distance,
-            "hessian": _widened(matrix, keep, len(theta)) if dense else None,
-            "fisher": _widened(scatter, keep, len(theta)) if dense else None,
+            "hessian": _widened(hessian, keep, len(theta)),
+            "fisher": _widened(fisher, keep, len(theta)),
         },
     )
     return result.judged(result.chi2, result.dof, like.start).checked(throw)
 
 
-def _widened(matrix: np.ndarray, keep: np.ndarray, size: int) -> np.ndarray:
-    """Return a matrix of all parameters, NaN for those that were left out."""
+def _widened(matrix: Matrix, keep: np.ndarray, size: int) -> np.ndarray | None:
+    """Return a matrix of all parameters, NaN for those left out; None instead of a sparse one."""
+    if not isinstance(matrix, np.ndarray):
+        return None
     wide = np.full((size, size), np.nan)
     wide[np.ix_(keep, keep)] = matrix
     return wide
 
 
-def _errors(
-    posterior: Posterior,
-    matrix: Matrix,
-    factor: Factor,
-    scatter: Matrix,
-    keep: np.ndarray,
-    determined: bool,
-) -> tuple[np.ndarray | None, np.ndarray]:
-    """Return the covariance, None for too many parameters, and standard deviations."""
-    size = len(posterior.present)
-    sigma = np.full(size, np.nan)
-    dense = isinstance(matrix, np.ndarray)
-    if not (determined and factor.positive):
-        return (np.full((size, size), np.nan) if dense else None), sigma
-    if not dense:
-        owner = posterior.owner[keep]
-        number = np.bincount(owner, minlength=len(posterior.like.free))
-        few = number * 10 < len(posterior.index)
-        sigma[keep] = np.sqrt(variances(factor, scatter, few[owner]))
-        return None, sigma
-    inverse = factor.solve(np.eye(len(keep)))
-    covariance = inverse if scatter is matrix else inverse @ scatter @ inverse
-    covariance = _widened((covariance + covariance.T) / 2, keep, size)
-    return covariance, np.sqrt(np.diagonal(covariance))
+def _errors(posterior, keep, hessian, fisher, factor):
+    """Return the covariance, None for too many parameters, and standard deviations.
+
+    `factor` is that of the Hessian, None if it does not determine all parameters.
+    """
+    sigma, covariance = np.full(len(posterior.present), np.nan), hessian * np.nan
+    scatter = fisher if posterior.like.profiled else hessian
+    if factor is not None and factor.positive:
+        if isinstance(hessian, np.ndarray):
+            inverse = factor.solve(np.eye(len(keep)))
+            covariance = inverse if scatter is hessian else inverse @ scatter @ inverse
+            covariance = (covariance + covariance.T) / 2
+            variance = np.diagonal(covariance)
+        else:
+            owner = posterior.owner[keep]
+            number = np.bincount(owner, minlength=len(posterior.like.free))
+            few = number * 10 < len(posterior.index)
+            variance = variances(factor, scatter, few[owner])
+        sigma[keep] = np.sqrt(variance)
+    return _widened(covariance, keep, len(sigma)), sigma
 
 
-def _ended(
-    posterior: Posterior,
-    theta: np.ndarray,
-    steps: int,
-    max_steps: int,
-    distance: float,
-    close: float,
-    unknown: list[str],
-    far: np.ndarray,
-) -> tuple[Convergence, str]:
+def _ended(posterior, theta, steps, max_steps, distance, close, unknown, far):
     """Return how a search ended, also in words; the most serious reason comes first.
 
     A search within `close` of an optimum has reached it. `unknown` are labels of degenerate

@@ -1,6 +1,7 @@
 """The posterior of one or two parameters on a grid: the paper's test."""
 
 from collections.abc import Mapping
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,9 @@ from fits.results import Convergence, FitResult
 from fits.template_likelihood import PixelLikelihood
 from jaxsky.checks import Numeric
 
+#: The points of each axis, and their range, by name.
+Axes: TypeAlias = dict[str, np.ndarray]
+Ranges: TypeAlias = dict[str, tuple[float, float]]
 #: The grid is narrowed to where the posterior exceeds exp(-NARROW/2) of its maximum (6 sigma).
 NARROW = 36.0
 #: A posterior whose logarithm changes by less than this over the whole prior is flat.
@@ -26,24 +30,20 @@ COARSE = 4.0
 
 @jax.jit
 def chi2_on_grid(like, axes):
-    """Return chi^2 on the product of the axes, which are arrays by parameter name.
+    """Return chi^2 on the product of the axes, which are arrays by parameter name."""
 
-    One vmap per axis, so that what depends on one parameter is computed only along its axis.
-    """
-    names = list(axes)
-
-    def point(*values):
-        return chi2(like, dict(zip(names, values, strict=True)))
+    def point(params):
+        return chi2(like, params)
 
     if isinstance(like, PixelLikelihood):
         # One point after the other: all at once would need the memory of as many sets of maps.
         mesh = jnp.meshgrid(*axes.values(), indexing="ij")
-        flat = jax.lax.map(lambda values: point(*values), tuple(axis.ravel() for axis in mesh))
+        flat = jax.lax.map(point, {n: x.ravel() for n, x in zip(axes, mesh, strict=True)})
         return flat.reshape(mesh[0].shape)
-    mapped = point
-    for i in reversed(range(len(names))):
-        mapped = jax.vmap(mapped, in_axes=tuple(0 if j == i else None for j in range(len(names))))
-    return mapped(*axes.values())
+    # One vmap per axis, so that what depends on one parameter is computed only along its axis.
+    for name in reversed(axes):
+        point = jax.vmap(point, in_axes=({n: 0 if n == name else None for n in axes},))
+    return point(axes)
 
 
 def _weights(axis: np.ndarray) -> np.ndarray:
@@ -58,9 +58,13 @@ def _along(values: np.ndarray, i: int) -> Float[np.ndarray, "point _"]:
     return np.moveaxis(values, i, 0).reshape(values.shape[i], -1)
 
 
-def _narrowed(
-    like: Likelihood, ranges: Mapping[str, tuple[float, float]], points: int
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def _highest(axes: Axes, chi2s: np.ndarray) -> dict[str, float]:
+    """Return the point of the grid with the largest posterior."""
+    lowest = np.unravel_index(np.argmin(chi2s), chi2s.shape)
+    return {name: float(axis[i]) for (name, axis), i in zip(axes.items(), lowest, strict=True)}
+
+
+def _narrowed(like: Likelihood, ranges: Ranges, points: int) -> tuple[Axes, np.ndarray]:
     """Return axes narrowed to where the posterior is not negligible, and chi^2 on their grid."""
     for _ in range(6):
         axes = {name: np.linspace(low, high, points) for name, (low, high) in ranges.items()}
@@ -78,9 +82,7 @@ def _narrowed(
     return axes, chi2s
 
 
-def _around(
-    found: FitResult, limits: Mapping[str, tuple[float, float]]
-) -> dict[str, tuple[float, float]]:
+def _around(found: FitResult, limits: Ranges) -> Ranges:
     """Return ranges of 7 standard deviations about a best fit, within the limits."""
     ranges = {}
     for name, (low, high) in limits.items():
@@ -89,9 +91,7 @@ def _around(
     return ranges
 
 
-def _is_settled(
-    axes: Mapping[str, np.ndarray], chi2s: np.ndarray, limits: Mapping[str, tuple[float, float]]
-) -> bool:
+def _is_settled(axes: Axes, chi2s: np.ndarray, limits: Ranges) -> bool:
     """Whether the grid contains all of the posterior, and is fine enough for its peak."""
     lowest = np.unravel_index(np.argmin(chi2s), chi2s.shape)
     for i, (name, axis) in enumerate(axes.items()):
@@ -127,9 +127,9 @@ def grid_fit(
 
     Returns
     -------
-    Result with the values at the highest point, intervals and covariance by integration over
-    the grid. `details` contains "axes" by name, "log_posterior" relative to its maximum, with
-    axes in the order of `free`, and "marginals" by name.
+    Result with the values at the highest point, intervals and covariance by integration over the
+    grid. `details` has "axes" by name, "log_posterior" relative to its maximum, with axes in the
+    order of `free`, and "marginals" by name.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def grid_fit(
             f"A grid takes one or two free parameters, not {len(free)} ({', '.join(free)}); "
             "use the gradient fit or MCMC."
         )
-    ranges = {}
+    limits: Ranges = {}
     for name in free:
         if (size := like.start[name].size) > 1:
             raise ValueError(
@@ -156,15 +156,12 @@ def grid_fit(
             )
         if not isinstance(prior := priors.get(name), Uniform):
             raise ValueError(f"A grid needs a uniform prior for {name!r}, to know its range.")
-        ranges[name] = (prior.low, prior.high)
-    limits = ranges
+        limits[name] = (prior.low, prior.high)
     axes, chi2s = _narrowed(like, limits, points)
     settled = _is_settled(axes, chi2s, limits)
     if not settled:
         # A ridge much narrower than the first grid is lost between its points.
-        lowest = np.unravel_index(np.argmin(chi2s), chi2s.shape)
-        at = {name: axis[i] for (name, axis), i in zip(axes.items(), lowest, strict=True)}
-        found = best_fit(like, at, priors=priors, throw=False)
+        found = best_fit(like, _highest(axes, chi2s), priors=priors, throw=False)
         if np.isfinite(list(found.sigma.values())).all():
             axes, chi2s = _narrowed(like, _around(found, limits), points)
             settled = _is_settled(axes, chi2s, limits)
@@ -181,20 +178,19 @@ def grid_fit(
         low, high = np.interp(levels, cumulative / cumulative[-1], axis).tolist()
         intervals[name] = (low, high)
     mesh = np.stack([m.ravel() for m in np.meshgrid(*axes.values(), indexing="ij")])
-    best = int(np.argmin(chi2s))
-    values = dict(zip(free, mesh[:, best].tolist(), strict=True))
     covariance = np.atleast_2d(np.cov(mesh, aweights=weights.ravel(), ddof=0))
+    values = _highest(axes, chi2s)
     edges = [name for name, value in values.items() if value in limits[name]]
     converged, message = Convergence.converged, "integrated"
-    if not settled:
-        converged = Convergence.unresolved
-        message = f"{points} points per axis are too few for the posterior, or miss part of it."
-    if edges:
-        converged = Convergence.at_edge
-        message = f"The highest point lies at the edge of the uniform prior of {', '.join(edges)}."
     if log_posterior.min() > -FLAT:
         converged = Convergence.undetermined
         message = f"The posterior is flat: the data do not constrain {', '.join(free)}."
+    elif edges:
+        converged = Convergence.at_edge
+        message = f"The highest point lies at the edge of the uniform prior of {', '.join(edges)}."
+    elif not settled:
+        converged = Convergence.unresolved
+        message = f"{points} points per axis are too few for the posterior, or miss part of it."
     result = FitResult(
         method="grid",
         best_fit=values,
@@ -202,7 +198,7 @@ def grid_fit(
         interval_68=intervals,
         labels=free,
         covariance=covariance,
-        chi2=float(chi2s.ravel()[best]),
+        chi2=float(chi2s.min()),
         dof=like.dof(len(free)),
         converged=converged,
         message=message,

@@ -7,7 +7,7 @@ parameters is assembled from these. A likelihood without regions is a single cel
 
 import dataclasses
 import operator
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -32,10 +32,10 @@ class Likelihood(eqx.Module):
     """Base class: -2 log L is the sum of squares of `residuals(params)`, up to a constant.
 
     A subclass defines `residuals` and `check`, and `total` and `derivatives` if it has them in
-    closed form.
+    closed form. `start` has start values of the free parameters, and `values` is the number of data
+    with weight minus that of amplitudes.
     """
 
-    #: Start values of the free parameters by name; number of data minus number of amplitudes.
     start: dict[str, Array]
     values: Int[Array, ""] | int
     #: Whether amplitudes are fitted in each pixel: then the inverse curvature alone
@@ -74,10 +74,10 @@ class Likelihood(eqx.Module):
 
     def named(self, theta: Float[Array, " par"]) -> dict[str, Array]:
         """Return parameters by name from the vector, the inverse of `flat`."""
-        ends = np.cumsum([self.start[name].size for name in self.free])
-        parts = jnp.split(jnp.asarray(theta), ends[:-1]) if len(ends) else []
-        shapes = [self.start[name].shape for name in self.free]
-        return {n: p.reshape(s) for n, p, s in zip(self.free, parts, shapes, strict=True)}
+        start = [self.start[name] for name in self.free]
+        ends = np.cumsum([own.size for own in start])
+        parts = jnp.split(jnp.asarray(theta), ends[:-1]) if start else []
+        return {n: p.reshape(s.shape) for n, p, s in zip(self.free, parts, start, strict=True)}
 
     def cells(self) -> Int[Array | np.ndarray, "cell free"]:
         """Return the position of each free parameter of each cell in the vector of all."""
@@ -140,10 +140,6 @@ def value_and_gradient(
     return _summed(_value_and_gradient, like, theta)
 
 
-def _derivatives_of(like: Likelihood, theta: Float[Array, " par"]) -> Derivatives:
-    return _summed(_cell_derivatives, like, theta)
-
-
 def hessian(like: Likelihood, params: Mapping[str, Numeric]) -> Float[np.ndarray, "par par"]:
     """Return second derivatives of -ln L in all parameters, regions one after the other."""
     return _dense("hessian", like, params)
@@ -160,7 +156,7 @@ def fisher_matrix(like: Likelihood, params: Mapping[str, Numeric]) -> Float[np.n
 
 def _dense(which, like, params):
     theta = like.flat(like.check(params))
-    local = np.asarray(getattr(_derivatives_of(like, theta), which))
+    local = np.asarray(getattr(_summed(_cell_derivatives, like, theta), which))
     matrix = assembled(local, np.asarray(like.cells()), len(theta), np.zeros(len(theta)))
     return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
 
@@ -176,6 +172,11 @@ def prior_terms(theta, priors):
         value += jnp.sum(jnp.where(where, -jax.vmap(prior.log_density)(theta), 0.0))
         first, second = jnp.where(where, one, first), jnp.where(where, two, second)
     return value, first, second
+
+
+def first_few(names: Sequence[str]) -> str:
+    """Return the first six names, and the number of others, for messages."""
+    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if names[6:] else "")
 
 
 class Density(NamedTuple):
@@ -207,9 +208,9 @@ class Density(NamedTuple):
 class Posterior:
     """The -log posterior as a function of the vector of parameters, within bounds.
 
-    `names` has the name of each parameter, `labels` name and region ("dust.beta_dust[3]");
-    `present` is true for regions with pixels; `low` and `high` are bounds from uniform priors, and
-    `priors` are the other priors, with the parameters that they apply to.
+    `names` has the name of each parameter, `labels` name and region if there are several
+    ("dust.beta_dust[3]"); `present` is true for regions with pixels; `low` and `high` are bounds
+    from uniform priors, and `priors` are the other priors, with the parameters that they apply to.
     """
 
     def __init__(self, like: Likelihood, priors: Mapping[str, Prior] | None) -> None:
@@ -219,6 +220,11 @@ class Posterior:
         self._last: tuple[bytes, Derivatives] | None = None
         self.owner = np.repeat(np.arange(len(like.free)), [like.start[n].size for n in like.free])
         self.names = tuple(like.free[i] for i in self.owner)
+        self.labels = tuple(
+            f"{name}[{k}]" if like.start[name].ndim else name
+            for name in like.free
+            for k in range(like.start[name].size)
+        )
         self.index = np.asarray(like.cells())
         self.present = np.zeros(len(self.owner), bool)
         self.present[self.index] = True
@@ -242,16 +248,6 @@ class Posterior:
         shaped = self.like.named(jnp.asarray(np.where(self.present, theta, np.nan)))
         return {name: np.asarray(v) if v.ndim else float(v) for name, v in shaped.items()}
 
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Name of each parameter, with its region if it has several."""
-        start = self.like.start
-        return tuple(
-            f"{name}[{k}]" if start[name].ndim else name
-            for name in self.like.free
-            for k in range(start[name].size)
-        )
-
     def where(self, bad: Bool[np.ndarray, " par"]) -> str:
         """Return names of parameters, with numbers of regions and pixels, for messages."""
         of_cell = np.zeros(len(self.index), int)
@@ -268,7 +264,7 @@ class Posterior:
                 counts = f"{(bad & own).sum()} of {own.sum()} regions"
                 name += f" in {counts} ({pixels[bad & own].sum()} of {pixels[own].sum()} pixels)"
             named.append(name)
-        return ", ".join(named[:6]) + (f" and {len(named) - 6} more" if named[6:] else "")
+        return first_few(named)
 
     def density(self, theta: np.ndarray) -> Density:
         """Return the posterior for compiled programs, with a vector of all parameters."""
@@ -282,7 +278,7 @@ class Posterior:
         """Return -ln L of each cell and its derivatives as numpy arrays, without priors."""
         key = theta.tobytes()
         if self._last is None or self._last[0] != key:
-            found = _derivatives_of(self.like, jnp.asarray(theta))
+            found = _summed(_cell_derivatives, self.like, jnp.asarray(theta))
             self._last = (key, jax.tree.map(np.asarray, found))
         return self._last[1]
 
@@ -323,7 +319,7 @@ class Posterior:
 
     def reach(self) -> Float[np.ndarray, " par"]:
         """Return the longest step of each parameter: far beyond its prior lie other optima."""
-        width = np.where(np.isfinite(self.high), self.high - self.low, np.inf) / 4
+        width = (self.high - self.low) / 4
         for prior, where in self.priors:
             if isinstance(prior, Gaussian):
                 width = np.where(where, 2 * prior.sigma, width)
@@ -332,5 +328,4 @@ class Posterior:
     def edges(self, theta: np.ndarray) -> Bool[np.ndarray, " par"]:
         """Return True for parameters that lie at an edge of their uniform prior."""
         near = np.minimum(np.abs(theta - self.low), np.abs(theta - self.high))
-        width = np.where(np.isfinite(self.high), self.high - self.low, 0.0)
-        return self.present & (near < EDGE * width)
+        return self.present & (near < EDGE * (self.high - self.low))

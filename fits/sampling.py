@@ -22,7 +22,7 @@ from rich.progress import Progress as Bar
 
 from fits.kept import KeptChain
 from fits.optimize import best_fit
-from fits.posterior import Likelihood, Posterior, Prior
+from fits.posterior import Likelihood, Posterior, Prior, first_few
 from fits.results import Convergence, FitResult
 from fits.unbounded import Unbounded, unbounded_posterior
 from jaxsky.checks import Numeric, check_seed
@@ -87,14 +87,13 @@ def _ensemble(
         parts = np.split(theta, 2) if len(theta) == nwalkers and nwalkers % 2 == 0 else [theta]
         return np.concatenate([_log_probs(part, leaves, structure) for part in parts])
 
-    rng = np.random.default_rng(seed)
     sampler = emcee.EnsembleSampler(nwalkers, size, log_probs, vectorize=True, backend=backend)
     # emcee's own wrapper prints a traceback when it is interrupted.
     sampler.log_prob_fn = sampler.log_prob_fn.f
-    done = sampler.iteration
-    if done:
+    if done := sampler.iteration:
         state = sampler.get_last_sample()
     else:
+        rng = np.random.default_rng(seed)
         positions = np.asarray(_values(unbounded, rng.normal(size=(nwalkers, size))))
         random_state = np.random.RandomState(rng.integers(2**32)).get_state()
         state = emcee.State(positions, random_state=random_state)
@@ -107,11 +106,11 @@ def _ensemble(
     chain = sampler.get_chain()
     tau = emcee.autocorr.integrated_time(chain, tol=0)
     worst = float(np.nanmax(tau)) if np.isfinite(tau).any() else float(len(chain))
-    enough = len(chain) >= ENOUGH * worst
     message = f"{len(chain)} steps are {len(chain) / worst:.0f} autocorrelation times ({worst:.0f})"
+    enough = len(chain) >= ENOUGH * worst
     return {
         "converged": Convergence.converged if enough else Convergence.unmixed,
-        "message": message + ("" if enough else f", of which at least {ENOUGH} are needed") + ".",
+        "message": message + ("." if enough else f", of which at least {ENOUGH} are needed."),
         "chain": chain,
         "log_prob": sampler.get_log_prob(),
         "tau": tau,
@@ -227,13 +226,13 @@ def _no_u_turn(
         f"{nchains} chains of {nsteps} steps: R-hat {ratio[worst]:.3f} of {labels[worst]!r}, at "
         f"least {least:.0f} effective samples, {diverged} divergent steps"
     )
-    failed = []
-    if not ratio[worst] < AGREEMENT:
-        failed.append(f"an R-hat below {AGREEMENT}")
-    if not least >= EFFECTIVE * nchains:
-        failed.append(f"{EFFECTIVE * nchains} effective samples")
-    if diverged > RARE * nsteps * nchains:
-        failed.append(f"at most {RARE * nsteps * nchains:.0f} divergent ones")
+    most = RARE * nsteps * nchains
+    needed = {
+        f"an R-hat below {AGREEMENT}": ratio[worst] < AGREEMENT,
+        f"{EFFECTIVE * nchains} effective samples": least >= EFFECTIVE * nchains,
+        f"at most {most:.0f} divergent ones": diverged <= most,
+    }
+    failed = [words for words, reached in needed.items() if not reached]
     with np.errstate(divide="ignore"):
         tau = nsteps * nchains / effective
     return {
@@ -275,11 +274,10 @@ def sample(
     progress: bool | Callable[[int, int], None] = True,
     throw: bool = True,
 ) -> FitResult:
-    """Draw samples of the posterior.
+    """Draw samples of the posterior: the likelihood times the priors.
 
-    The posterior is the likelihood times the priors. Where signals are near the noise of a pixel,
-    a spectral likelihood is narrower than the scatter of its maximum, and so are its samples: see
-    the covariance of `best_fit`.
+    Where signals are near the noise of a pixel, a spectral likelihood is narrower than the scatter
+    of its maximum, and so are its samples: see the covariance of `best_fit`.
 
     Parameters
     ----------
@@ -287,10 +285,9 @@ def sample(
     start : start values of the free parameters by name, by default those of the likelihood; chains
         and walkers start around the best fit
     priors : priors by name, the same in each region
-    sampler : "emcee", the affine-invariant ensemble, or "nuts", the no-U-turn sampler of blackjax.
-        For a few parameters the second takes seconds, nearly all of them to compile, and gives ten
-        times as many independent samples per second afterwards; for hundreds of regions, where the
-        first fails, minutes. The first can be resumed, the second cannot.
+    sampler : "emcee", the affine-invariant ensemble, which can be resumed, or "nuts", the no-U-turn
+        sampler of blackjax, which gives ten times as many independent samples per second after some
+        seconds of compilation, and takes minutes for hundreds of regions, where the first fails
     nsteps : all steps of each walker (5000), or those of each chain that are kept (1000)
     nwarmup : "nuts": steps before that (300): half of them to measure the covariance of the
         parameters, if these are few, and all to tune the step size
@@ -307,9 +304,9 @@ def sample(
     Result of method "mcmc" or "nuts", with the most probable sample, central intervals and
     covariance of the samples, of emcee after two autocorrelation times. Regions without a pixel
     have no row in it. `details` has "chain" (step, walker or chain, row), "log_prob", "tau" by
-    label, "acceptance", "discard" and "thin"; of "nuts" also "divergences", their number, "rhat"
-    and "ess", the number of effective samples, by label, "gradients", their mean number for a
-    step, and "step_size".
+    label, "acceptance", "discard" and "thin"; of "nuts" also the number of "divergences", "rhat"
+    and "ess", effective samples, by label, the mean number of "gradients" per step, and
+    "step_size".
 
     Raises
     ------
@@ -317,11 +314,10 @@ def sample(
         For unknown parameters, start values outside their prior, an unknown sampler, arguments of
         the other one, and fewer than twice as many walkers as parameters.
     FitError
-        If data and priors do not determine the parameters, a chain of emcee is shorter than 50
-        autocorrelation times, or, with "nuts", R-hat is 1.01 or more, there are fewer than 100
-        effective samples per chain, or more than one in a thousand steps diverged. Also if chi^2
-        is far too large for a fit, or a parameter is not constrained (`fits.results`). Not if
-        throw=False; the result is in its `.result`.
+        Unless throw=False, with the result as `.result`: if data and priors do not determine the
+        parameters; a chain of emcee is shorter than 50 autocorrelation times; with "nuts", R-hat is
+        1.01 or more, there are fewer than 100 effective samples per chain, or more than one in a
+        thousand steps diverged; or chi^2 or parameters are those of no fit (`fits.results`).
     """
     check_seed("seed", seed)
     if sampler not in SAMPLERS:
@@ -339,38 +335,33 @@ def sample(
     center = np.array(like.flat(like.check(fit.best_fit)))
     unbounded, unknown = unbounded_posterior(posterior, center)
     labels = tuple(np.array(posterior.labels)[posterior.present].tolist())
+    fit = fit._replace(method=method, labels=labels)
     if unknown:
-        shown = ", ".join(unknown[:6]) + (f" and {len(unknown) - 6} more" if unknown[6:] else "")
         nothing = posterior.named(np.full(posterior.start.size, np.nan))
         return fit._replace(
-            method=method,
             best_fit=nothing,
             sigma=nothing,
             interval_68={name: (value, value) for name, value in nothing.items()},
-            labels=labels,
             covariance=np.full((len(labels), len(labels)), np.nan),
             converged=Convergence.undetermined,
-            message=f"Data and priors do not determine {shown}: there is nothing to draw from.",
+            message=f"Data and priors do not determine {first_few(unknown)}: "
+            "there is nothing to draw from.",
             details={},
         ).checked(throw)
     with Bar(transient=True, disable=progress is not True) as bar:
         task = bar.add_task("samples", total=None)
 
-        def report(done: int, total: int) -> None:
-            if callable(progress):
-                progress(done, total)
-            elif progress:
-                bar.update(task, completed=done, total=total)
+        def draw(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
 
+        report = progress if callable(progress) else draw
         details = run(unbounded, labels, seed, report, **options)
     details["tau"] = dict(zip(labels, details["tau"].tolist(), strict=True))
     best = np.unravel_index(np.argmax(details["log_prob"]), details["log_prob"].shape)
     theta = np.array(unbounded.density.theta)
     theta[posterior.present] = details["chain"][best]
     result = fit._replace(
-        method=method,
         best_fit=posterior.named(theta),
-        labels=labels,
         chi2=2 * float(posterior.derivatives(theta).value.sum()),
         converged=details.pop("converged"),
         message=details.pop("message"),

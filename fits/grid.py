@@ -119,9 +119,7 @@ def grid_fit(
 
     Parameters
     ----------
-    like : from `fits.likelihood` or `fits.spectral_likelihood`
-    start : the free parameters by name (the values do not matter), one or two; by default those
-        of the likelihood
+    like, start : as for `best_fit`, with one or two free parameters; start values do not matter
     priors : a uniform prior for each of them
     points : points per axis
 

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import healpy
 import matplotlib as mpl
@@ -21,6 +21,8 @@ from jaxsky.components import parameter_declaration
 from jaxsky.io import whole
 from jaxsky.io.stacks import Maps, ranges
 
+#: A map of the full sky.
+Map: TypeAlias = Float[np.ndarray, " pix"]
 STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 9,
@@ -145,14 +147,7 @@ def color_limit(values: np.ndarray, quantile: float = 0.99) -> float:
     return (float(np.quantile(known, quantile)) if known.size else 0.0) or 1.0
 
 
-def _image(
-    axes: Axes,
-    pixels: np.ndarray,
-    limit: float,
-    label: str,
-    middle: float | None = None,
-    **options: Any,
-) -> None:
+def _image(axes, pixels, limit, label, middle, **options):
     """Draw values and a colour bar: linear up to a tenth of the limit, then logarithmic.
 
     So both the Galactic plane and high latitudes show in one picture. With a middle, the scale is
@@ -172,11 +167,7 @@ def _image(
 
 
 def draw_map(
-    axes: Axes,
-    values: Float[np.ndarray, " pix"],
-    limit: float,
-    label: str,
-    middle: float | None = None,
+    axes: Axes, values: Map, limit: float, label: str, middle: float | None = None
 ) -> None:
     """Draw a map of the full sky in Galactic coordinates, centred on l = 0, l growing leftwards.
 
@@ -194,18 +185,14 @@ class MapPanel(NamedTuple):
     """A map with its title and the arguments of `draw_map`; by default the limit fits the map."""
 
     title: str
-    values: Float[np.ndarray, " pix"]
+    values: Map
     label: str
     middle: float | None = None
     limit: float | None = None
 
 
 def stokes_panels(
-    name: str,
-    maps: Float[np.ndarray, "2 pix"],
-    limit: float,
-    unit: str,
-    middle: float | None = None,
+    name: str, maps: Sequence[Map], limit: float, unit: str, middle: float | None = None
 ) -> list[MapPanel]:
     """Return panels of Q and U."""
     return [
@@ -218,13 +205,14 @@ def thinned(maps: Maps, rows: Sequence[int]) -> np.ndarray:
     """Return some maps, those that are finer than a picture resolves at nside 512."""
     nside = healpy.npix2nside(maps.shape[-1])
     least = min(nside, FINEST)
-    parts = []
-    for part in ranges(healpy.nside2npix(least)):
-        at: Any = part
-        if nside > least:
-            at = healpy.ang2pix(nside, *healpy.pix2ang(least, np.arange(part.start, part.stop)))
-        parts.append(maps[..., at][list(rows)])
-    return np.concatenate(parts, axis=-1)
+
+    def pixels(part: slice) -> Any:
+        if nside == least:
+            return part
+        return healpy.ang2pix(nside, *healpy.pix2ang(least, np.arange(part.start, part.stop)))
+
+    parts = ranges(healpy.nside2npix(least))
+    return np.concatenate([maps[..., pixels(part)][list(rows)] for part in parts], axis=-1)
 
 
 def plot_maps(path: Path, rows: Sequence[Sequence[MapPanel]], title: str = "") -> None:
@@ -239,12 +227,7 @@ def plot_maps(path: Path, rows: Sequence[Sequence[MapPanel]], title: str = "") -
 
 
 def draw_patch(
-    axes: Axes,
-    values: Float[np.ndarray, " pix"],
-    center: tuple[float, float],
-    size: float,
-    limit: float,
-    label: str,
+    axes: Axes, values: Map, center: tuple[float, float], size: float, limit: float, label: str
 ) -> None:
     """Draw a square patch of the sky about (l, b), in degrees; gnomonic, l growing leftwards.
 

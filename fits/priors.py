@@ -20,12 +20,7 @@ class Prior(eqx.Module):
 
 
 class Uniform(Prior):
-    """Constant density in low <= value <= high.
-
-    Raises
-    ------
-    ValueError
-        If low is not below high.
+    """Constant density in low <= value <= high; ValueError if low is not below high.
 
     Examples
     --------
@@ -46,12 +41,7 @@ class Uniform(Prior):
 
 
 class Gaussian(Prior):
-    """Gaussian density with a mean and a standard deviation.
-
-    Raises
-    ------
-    ValueError
-        If the mean is not finite, or sigma not positive.
+    """Gaussian density; ValueError if the mean is not finite, or sigma not positive.
 
     Examples
     --------
@@ -86,10 +76,10 @@ def priors_of(settings: Experiment, command: str) -> dict[str, Prior]:
 
 def check_priors(priors: Mapping[str, Prior] | None, free: Iterable[str]) -> dict[str, Prior]:
     """Return the priors, after checking that each belongs to a free parameter."""
-    free = list(free)
-    for name in priors or {}:
+    priors, free = dict(priors or {}), list(free)
+    for name in priors:
         if name not in free:
             raise KeyError(
                 f"There is a prior for {name!r}, which is not free; free are {', '.join(free)}."
             )
-    return dict(priors or {})
+    return priors

@@ -121,7 +121,7 @@ class FitResult(NamedTuple):
             both = (np.asarray(x)[known] for x in (value, self.sigma[name]))
             shown = with_error(*map(np.median, both)) if known.any() else "unknown"
             regions = f", median of {known.sum()} regions" if np.ndim(value) else ""
-            rows.append((name, f"{shown}{regions}"))
+            rows.append((name, shown + regions))
         rows.append(("chi2", f"{self.chi2:.1f} for {self.dof} degrees of freedom"))
         state = "converged" if self.converged else f"not converged: {self.message}"
         return f"Fit by {self.method}, {state}", rows
@@ -169,25 +169,17 @@ class FitResult(NamedTuple):
     def to_getdist(
         self, title: str | None = None, symbol: Callable[[str], str] | None = None
     ) -> "MCSamples":
-        """Return the samples of a chain for getdist.
+        """Return the samples of a chain for getdist; ValueError if there are none.
 
-        Parameters
-        ----------
-        title : name of the samples in legends
-        symbol : TeX without dollar signs of an entry of `labels`; by default the entry itself
-
-        Raises
-        ------
-        ValueError
-            If the result is not that of a chain.
+        `title` names the samples in legends, and `symbol` returns TeX without dollar signs for an
+        entry of `labels`; by default the entry itself.
         """
         from getdist import MCSamples, chains
 
         if "chain" not in self.details:
             raise ValueError(f"A fit by the method {self.method!r} has no samples.")
         chains.print_load_details = False  # getdist otherwise prints about burn-in
-        details = self.details
-        chain = details["chain"][details["discard"] :: details["thin"]]
+        chain = self.details["chain"][self.details["discard"] :: self.details["thin"]]
         return MCSamples(
             samples=chain.reshape(-1, len(self.labels)),
             names=list(self.labels),
@@ -207,8 +199,7 @@ class FitResult(NamedTuple):
         for name, value in self.best_fit.items():
             limit = LOST * np.maximum(np.abs(start[name]), 1.0)
             lost = np.asarray((np.abs(value) > limit) | (np.asarray(self.sigma[name]) > limit))
-            lost &= not name.startswith("offset.")
-            if not (self.converged and lost.any()):
+            if not self.converged or not lost.any() or name.startswith("offset."):
                 continue
             where = f" in {lost.sum()} of {np.isfinite(value).sum()} regions"
             if not lost.ndim:
@@ -271,9 +262,9 @@ def with_error(value: float, error: float) -> str:
 
 
 def with_errors(best: float, low: float, high: float) -> str:
-    """Return a value with its interval as differences, to two digits of the smaller one.
+    """Return a value with its interval as differences, as far as there are an interval and a value.
 
-    Without an interval the value alone, and an empty text if there is no value.
+    Both have two digits of the smaller difference.
     """
     if not np.isfinite([low, high]).all():
         return f"{best:.4f}" if np.isfinite(best) else ""

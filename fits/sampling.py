@@ -24,7 +24,7 @@ from fits.kept import KeptChain
 from fits.optimize import best_fit
 from fits.posterior import Likelihood, Posterior, Prior, first_few
 from fits.results import Convergence, FitResult
-from fits.unbounded import Unbounded, unbounded_posterior
+from fits.unbounded import unbounded_posterior
 from jaxsky.checks import Numeric, check_seed
 
 #: A chain of emcee shorter than this many autocorrelation times is reported as too short.
@@ -62,15 +62,7 @@ def _values(unbounded, z):
     return jax.vmap(unbounded.values)(z)[0]
 
 
-def _ensemble(
-    unbounded: Unbounded,
-    labels: tuple[str, ...],
-    seed: int,
-    report: Callable[[int, int], None],
-    nsteps: int = 5000,
-    nwalkers: int | None = None,
-    backend: KeptChain | None = None,
-) -> dict[str, Any]:
+def _ensemble(unbounded, labels, seed, report, nsteps=5000, nwalkers=None, backend=None):
     """Run emcee's ensemble; steps that a file already contains are not made again."""
     size = len(labels)
     nwalkers = max(WALKERS, 2 * size + 2) if nwalkers is None else nwalkers
@@ -191,15 +183,7 @@ def _course(unbounded, z, key, first, last, nwarmup, report) -> dict[str, np.nda
     return {k: np.concatenate([c[k] for c in courses])[: last - first] for k in courses[0]}
 
 
-def _no_u_turn(
-    unbounded: Unbounded,
-    labels: tuple[str, ...],
-    seed: int,
-    report: Callable[[int, int], None],
-    nsteps: int = 1000,
-    nwarmup: int = 300,
-    nchains: int = 4,
-) -> dict[str, Any]:
+def _no_u_turn(unbounded, labels, seed, report, nsteps=1000, nwarmup=300, nchains=4):
     """Run chains of the no-U-turn sampler."""
     if nsteps < 4 or nwarmup < 0 or nchains < 1:
         raise ValueError(
@@ -207,8 +191,7 @@ def _no_u_turn(
             f"nsteps={nsteps}, nwarmup={nwarmup}, nchains={nchains}."
         )
     z = SPREAD * np.random.default_rng(seed).normal(size=(nchains, len(labels)))
-    key, total = jax.random.key(seed), nwarmup + nsteps
-    pilot = nwarmup // 2 // BLOCK * BLOCK
+    key, total, pilot = jax.random.key(seed), nwarmup + nsteps, nwarmup // 2 // BLOCK * BLOCK
     parts = partial(_course, key=key, nwarmup=nwarmup, report=lambda done: report(done, total))
     if pilot and unbounded.root.ndim == 2:
         # Half of the warm-up measures the covariance of the parameters.
@@ -281,10 +264,7 @@ def sample(
 
     Parameters
     ----------
-    like : from `fits.likelihood` or `fits.spectral_likelihood`
-    start : start values of the free parameters by name, by default those of the likelihood; chains
-        and walkers start around the best fit
-    priors : priors by name, the same in each region
+    like, start, priors : as for `best_fit`; chains and walkers start around the best fit
     sampler : "emcee", the affine-invariant ensemble, which can be resumed, or "nuts", the no-U-turn
         sampler of blackjax, which gives ten times as many independent samples per second after some
         seconds of compilation, and takes minutes for hundreds of regions, where the first fails

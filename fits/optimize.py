@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import scipy.sparse
-from jaxtyping import Float
 
 from fits.posterior import Gaussian, Likelihood, Matrix, Posterior, Prior
 from fits.results import Convergence, FitResult, help_by_prior
@@ -50,17 +49,14 @@ class Newton(NamedTuple):
 
     last: float = 1e-5
 
-    def minimise(
-        self, posterior: Posterior, max_steps: int
-    ) -> tuple[Float[np.ndarray, " par"], int]:
+    def minimise(self, posterior: Posterior, max_steps: int) -> tuple[np.ndarray, int]:
         """Return the optimum within bounds, and the number of steps to it."""
         theta = posterior.start
         value, gradient = posterior.value(theta)
         damping, reach = 1e-4, posterior.reach()
         for step in range(max_steps):
-            blocked = (theta <= posterior.low) & (gradient > 0) | (theta >= posterior.high) & (
-                gradient < 0
-            )
+            low, high = theta <= posterior.low, theta >= posterior.high
+            blocked = low & (gradient > 0) | high & (gradient < 0)
             moving = np.flatnonzero(posterior.present & ~blocked)
             if not moving.size:
                 return theta, step
@@ -312,35 +308,32 @@ def _ended(posterior, theta, steps, max_steps, distance, close, unknown, far):
     A search within `close` of an optimum has reached it. `unknown` are labels of degenerate
     parameters, and `far` is True for those neither at an optimum nor at an edge of their prior.
     """
+    where = posterior.where
 
-    def which(bad: np.ndarray) -> str:
-        names = tuple(dict.fromkeys(np.array(posterior.names)[bad]))
-        return f"{posterior.where(bad)}; {help_by_prior(names)}."
+    def advice(bad: np.ndarray) -> str:
+        return help_by_prior(tuple(dict.fromkeys(np.array(posterior.names)[bad])))
 
     if (wrong := posterior.present & ~np.isfinite(theta)).any():
-        message = f"The search left the finite numbers within {steps} steps: {which(wrong)}"
-        return Convergence.not_finite, message
-    edges = posterior.edges(theta)
-    if edges.any():
+        message = f"The search left the finite numbers within {steps} steps: {where(wrong)}; "
+        return Convergence.not_finite, f"{message}{advice(wrong)}."
+    if (edges := posterior.edges(theta)).any():
         first = int(np.argmax(edges))
         name, low, high = posterior.names[first], posterior.low[first], posterior.high[first]
         near = low if theta[first] - low < high - theta[first] else high
         own = edges & (posterior.owner == posterior.owner[first])
         return Convergence.at_edge, (
             f"The best fit of {name!r} lies at the edge {near:g} of its uniform prior "
-            f"{low:g} ... {high:g}{which(own).removeprefix(name)}"
+            f"{low:g} ... {high:g}{where(own).removeprefix(name)}; {advice(own)}."
         )
     if unknown and not far.any():
         open_ = np.isin(posterior.labels, unknown)
-        where = posterior.where(open_)
-        return Convergence.undetermined, (
-            f"The data do not determine {where}: parameters are degenerate"
-            f"{which(open_).removeprefix(where)}"
-        )
+        message = f"The data do not determine {where(open_)}: parameters are degenerate; "
+        return Convergence.undetermined, f"{message}{advice(open_)}."
     if not unknown and distance < close:
         return Convergence.converged, "converged"
     off = "and not at an optimum" if unknown else f"{distance:.2g} sigma from the optimum"
     still = steps and np.allclose(theta, posterior.start, rtol=1e-12, atol=0.0)
     ended = "did not leave its start" if still else f"stopped after {steps} steps"
-    message = f"The search {ended}, {off}{f': {which(far)}' if far.any() else '.'}"
+    message = f"The search {ended}, {off}"
+    message += f": {where(far)}; {advice(far)}." if far.any() else "."
     return Convergence.stalled if steps < max_steps else Convergence.max_steps, message

@@ -8,7 +8,6 @@ of `fits.unbounded`, in which the walkers of emcee also start.
 import inspect
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
 
 import blackjax
 import emcee
@@ -25,7 +24,7 @@ from fits.optimize import best_fit
 from fits.posterior import Likelihood, Posterior, Prior, first_few
 from fits.results import Convergence, FitResult
 from fits.unbounded import unbounded_posterior
-from jaxsky.checks import Numeric, check_seed
+from jaxsky.checks import Numeric, check_choice, check_seed
 
 #: A chain of emcee shorter than this many autocorrelation times is reported as too short.
 ENOUGH = 50
@@ -236,7 +235,7 @@ def _no_u_turn(unbounded, labels, seed, report, nsteps=1000, nwarmup=300, nchain
 
 
 #: The samplers, and the `method` of their results.
-SAMPLERS: dict[str, tuple[Callable[..., dict[str, Any]], str]] = {
+SAMPLERS: dict[str, tuple[Callable, str]] = {
     "emcee": (_ensemble, "mcmc"),
     "nuts": (_no_u_turn, "nuts"),
 }
@@ -300,9 +299,7 @@ def sample(
         thousand steps diverged; or chi^2 or parameters are those of no fit (`fits.results`).
     """
     check_seed("seed", seed)
-    if sampler not in SAMPLERS:
-        names = " or ".join(map(repr, SAMPLERS))
-        raise ValueError(f"Argument `sampler` must be {names}, not {sampler!r}.")
+    check_choice("sampler", sampler, SAMPLERS)
     run, method = SAMPLERS[sampler]
     options = {"nsteps": nsteps, "nwarmup": nwarmup, "nchains": nchains, "nwalkers": nwalkers}
     options = {n: v for n, v in (options | {"backend": backend}).items() if v is not None}

@@ -155,13 +155,11 @@ def _straightened(matrix, bounded, scale, jacobian):
     spread = scale * np.sqrt(np.diagonal(np.linalg.inv(matrix)))
     cut = bounded & (spread > NEAR)
     first, rest = np.flatnonzero(cut), np.flatnonzero(~cut)
-    coupling = matrix[np.ix_(rest, first)]
-    follow = -np.linalg.solve(matrix[np.ix_(rest, rest)], coupling)
+    coupling, alone = matrix[np.ix_(rest, first)], matrix[np.ix_(rest, rest)]
+    follow = -np.linalg.solve(alone, coupling)
+    led = matrix[np.ix_(first, first)] + coupling.T @ follow
     root, lean = np.zeros_like(matrix), np.zeros_like(matrix)
-    for own, block in (
-        (rest, matrix[np.ix_(rest, rest)]),
-        (first, matrix[np.ix_(first, first)] + coupling.T @ follow),
-    ):
+    for own, block in ((rest, alone), (first, led)):
         root[np.ix_(own, own)] = np.linalg.inv(np.linalg.cholesky(block)).T
     lean[np.ix_(rest, first)] = follow / (scale * jacobian)[first]
     return root * scale[:, None], cut, lean * scale[:, None]

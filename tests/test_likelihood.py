@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 from jax.test_util import check_grads
 
 import systems
@@ -51,6 +52,13 @@ def problem(seed: int = 0, sky: Sky | None = None):
     return sky, data + sigma * rng.normal(size=data.shape), sigma
 
 
+def fitted(**changes):
+    """The likelihood of the problem, with other arguments of `likelihood`."""
+    sky, data, sigma = problem()
+    given = {"sky": sky, "bands": BANDS, "data": data, "sigma": sigma, "start": START}
+    return likelihood(**(given | changes))
+
+
 def papers_chi2(sky, params, data, sigma, gain=(1.0, 1.0), offset=0.0):
     """The formula of the paper, summed with numpy."""
     model = np.asarray(observe(set_parameters(sky, params), list(BANDS.values())))
@@ -66,11 +74,9 @@ def fluctuations(cmb: bool = True) -> Fluctuations:
         Preparation.smoothing(nside_in, own, NSIDE, 1500.0, lmax) for own in (900.0, 300.0)
     )
     tilt = 1 + 0.5 * healpy.pix2vec(nside_in, np.arange(healpy.nside2npix(nside_in)))[2]
-    noise = tuple(uniform_covariance(s, nside_in) * tilt for s in (2000.0, 3000.0))
-    noise = (
-        noise[0].at[0, 1].set(0.3 * noise[0][0, 0]).at[1, 0].set(0.3 * noise[0][0, 0]),
-        noise[1],
-    )
+    first, second = (uniform_covariance(s, nside_in) * tilt for s in (2000.0, 3000.0))
+    rows, columns = np.array([0, 1]), np.array([1, 0])
+    noise = first.at[rows, columns].set(0.3 * first[0, 0]), second
     spectra = jnp.asarray(camb_spectra(lmax))[1:3] * 1e4
     windows = jnp.stack([gaussian_beam(fwhm, lmax) for fwhm in (1500.0, 1200.0)])
     correlated = (None, jnp.zeros(lmax + 1).at[2:].set(3.0 / jnp.arange(2, lmax + 1) ** 2))
@@ -89,31 +95,24 @@ def fluctuations(cmb: bool = True) -> Fluctuations:
 def dense_covariance(cmb: bool = True) -> np.ndarray:
     """Covariance of all values (band, stokes, pix) of the prepared maps, mode by mode."""
     model, blocks = fluctuations(cmb), []
-    for b, (preparation, noise) in enumerate(zip(model.preparations, model.noise, strict=True)):
+    Y, ell = synthesis_matrix(8), alm_ell(8)
+    each = zip(model.preparations, model.noise, model.correlated, strict=True)
+    for preparation, noise, correlated in each:
         npix_in = noise.shape[-1]
         basis = jnp.eye(2 * npix_in).reshape(-1, 2, npix_in)
         A = np.asarray(jax.lax.map(preparation, basis, batch_size=256))
         A = A.reshape(2 * npix_in, -1).T
-        N = np.zeros((2, npix_in, 2, npix_in))
-        for s in range(2):
-            for t in range(2):
-                N[s, :, t, :] = np.diag(noise[s, t])
-        block = A @ N.reshape(2 * npix_in, -1) @ A.T
-        if model.correlated[b] is not None:
-            Y = synthesis_matrix(model.correlated[b].size - 1)
-            block = block + Y @ np.diag(np.tile(model.correlated[b][alm_ell(8)], 2)) @ Y.T
-        blocks.append(block)
-    total = np.zeros((2, blocks[0].shape[0], 2, blocks[0].shape[0]))
-    for b in range(2):
-        total[b, :, b, :] = blocks[b]
+        N = np.block([[np.diag(noise[s, t]) for t in range(2)] for s in range(2)])
+        blocks.append(A @ N @ A.T)
+        if correlated is not None:
+            blocks[-1] += Y @ np.diag(np.tile(correlated[ell], 2)) @ Y.T
+    total = scipy.linalg.block_diag(*blocks)
     if model.cmb_spectra is not None:
-        Y = synthesis_matrix(8)
         f, windows = np.asarray(model.cmb_factors), np.asarray(model.cmb_windows)
-        for a in range(2):
-            for b in range(2):
-                spectra = np.asarray(model.cmb_spectra) * windows[a] * windows[b]
-                total[a, :, b, :] += f[a] * f[b] * Y @ np.diag(spectra[:, alm_ell(8)].ravel()) @ Y.T
-    return total.reshape(2 * blocks[0].shape[0], -1)
+        seen = [np.sqrt(model.cmb_spectra) * f[b] * windows[b] for b in range(2)]
+        rows = np.concatenate([Y * x[:, ell].ravel() for x in seen])
+        total = total + rows @ rows.T
+    return total
 
 
 def synthesis_matrix(lmax: int) -> np.ndarray:
@@ -127,14 +126,8 @@ def test_inner_products_do_not_depend_on_chunks_and_add_up():
     templates = jnp.stack([c.amplitude for c in sky.components.values()])
     weights = 1 / sigma**2
     whole = gram(data, templates, weights)
-    rows = np.concatenate(
-        [
-            data[:, :, None],
-            np.broadcast_to(templates, (2, *templates.shape)).swapaxes(1, 2),
-            np.ones((2, 2, 1, NPIX)),
-        ],
-        axis=2,
-    )
+    both = np.broadcast_to(templates, (2, *templates.shape)).swapaxes(1, 2)
+    rows = np.concatenate([data[:, :, None], both, np.ones((2, 2, 1, NPIX))], axis=2)
     dense = np.einsum("bsip,bsp,bsjp->bsij", rows, weights, rows)
     np.testing.assert_allclose(whole, dense, rtol=1e-12, atol=1e-9)
     np.testing.assert_allclose(gram(data, templates, weights, chunk=50), dense, atol=1e-9)
@@ -149,16 +142,15 @@ def test_square_root_of_singular_and_badly_scaled_matrices():
     G = jnp.asarray(rows @ rows.T)
     R = square_root(G)
     scale = np.sqrt(np.maximum(np.diag(G), 1e-300))
-    np.testing.assert_allclose(
-        R.T @ R / np.outer(scale, scale), G / np.outer(scale, scale), atol=1e-12
-    )
+    squares = np.outer(scale, scale)
+    np.testing.assert_allclose(R.T @ R / squares, G / squares, atol=1e-12)
 
 
 @pytest.mark.parametrize("pixelwise", [False, True])
 @pytest.mark.parametrize("stokes", ["Q", "U", "QU"])
 def test_diagonal_likelihood_is_the_papers_chi2(stokes, pixelwise):
     sky, data, sigma = problem()
-    like = likelihood(sky, BANDS, data, sigma, START, stokes=stokes, pixelwise=pixelwise)
+    like = fitted(stokes=stokes, pixelwise=pixelwise)
     kept = jnp.where(jnp.array([s in stokes for s in "QU"])[:, None], sigma, jnp.inf)
     for params in (START, {"dust.beta_dust": 1.2, "synchrotron.beta_syn": 3.7}):
         expected = papers_chi2(sky, params, data, kept)
@@ -188,9 +180,9 @@ def moved_bands(params):
 @pytest.mark.parametrize("pixelwise", [False, True])
 @pytest.mark.parametrize("stokes", ["Q", "QU"])
 def test_bands_with_parameters_against_a_sum_over_pixels(stokes, pixelwise):
-    sky, data, sigma = problem()
+    _, data, sigma = problem()
     kept = np.where(np.array([s in stokes for s in "QU"])[:, None], sigma, np.inf)
-    like = likelihood(sky, BANDS, data, sigma, MOVED | START, stokes=stokes, pixelwise=pixelwise)
+    like = fitted(start=MOVED | START, stokes=stokes, pixelwise=pixelwise)
     for params in (MOVED, MOVED | {"angle.44": -40.0, "angle.70": 1.0}):
         expected = np.sum(((np.asarray(data) - moved_bands(params)) / kept) ** 2)
         assert float(chi2(like, params | START)) == pytest.approx(expected, rel=1e-10)
@@ -250,10 +242,8 @@ def test_pulls_of_bands_with_parameters(exact, stokes):
 
 
 def test_an_angle_that_was_not_free_is_refused():
-    sky, data, sigma = problem()
-    like = likelihood(sky, BANDS, data, sigma, START)
-    with pytest.raises(ValueError, match=r"'angle.44' must be free in the likelihood already"):
-        best_fit(like, START | {"angle.44": 0.0})
+    words, start = "'angle.44' must be free in the likelihood already", START | {"angle.44": 0.0}
+    raises(ValueError, words, best_fit, fitted(), start)
 
 
 @pytest.mark.parametrize("pixelwise", [False, True])
@@ -263,7 +253,7 @@ def test_gain_offset_and_mask(pixelwise):
     masked = jnp.where(mask, sigma, jnp.inf)
     holes = data.at[:, :, ~mask].set(jnp.nan)
     params = {"gain.70": 1.02, "offset.44.Q": 0.3, "dust.beta_dust": 1.55}
-    like = likelihood(sky, BANDS, holes, masked, params, pixelwise=pixelwise)
+    like = fitted(data=holes, sigma=masked, start=params, pixelwise=pixelwise)
     offset = np.zeros((2, 2, 1))
     offset[0, 0] = 0.3
     expected = papers_chi2(sky, {"dust.beta_dust": 1.55}, data, masked, (1.0, 1.02), offset)
@@ -276,10 +266,7 @@ def test_exact_covariance_is_the_dense_one(cmb):
     model = fluctuations(cmb)
     rows = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3, 2, NPIX)))
     dense = dense_covariance(cmb)
-    flat = np.zeros((2, 3, 2, 2 * NPIX))
-    for b in range(2):
-        flat[b, :, b] = np.asarray(rows[b]).reshape(3, -1)
-    flat = flat.reshape(6, -1)
+    flat = scipy.linalg.block_diag(*np.reshape(rows, (2, 3, -1)))
     np.testing.assert_allclose(model.covariance(rows), flat @ dense @ flat.T, rtol=1e-9, atol=1e-9)
     sigma = np.sqrt(np.diag(dense_covariance(False))).reshape(2, 2, NPIX)
     # The map of variances neglects the rotation of Q and U within the kernel and their
@@ -290,17 +277,10 @@ def test_exact_covariance_is_the_dense_one(cmb):
 def test_exact_likelihood_is_that_of_the_amplitudes():
     """Against an independent, dense implementation: y = T^T W d, covariance T^T W C W T."""
     sky, data, sigma = problem()
-    model = fluctuations()
-    like = likelihood(sky, BANDS, data, sigma, START, covariance_of=model.covariance)
+    like = fitted(covariance_of=fluctuations().covariance)
     dense = dense_covariance()
-    rows = []
-    for b in range(2):
-        for s in range(2):
-            for c in sky.components.values():
-                row = np.zeros((2, 2, NPIX))
-                row[b, s] = c.amplitude[s] / sigma[b, s] ** 2
-                rows.append(row.ravel())
-    P = np.stack(rows)
+    templates = np.stack([c.amplitude for c in sky.components.values()], axis=1)
+    P = scipy.linalg.block_diag(*(templates / sigma[:, :, None] ** 2).reshape(4, 2, NPIX))
     for params in (START, {"dust.beta_dust": 1.2, "synchrotron.beta_syn": 3.7}):
         seen = np.asarray(observe(set_parameters(sky, params), list(BANDS.values())))
         y = P @ (np.asarray(data) - seen).ravel()
@@ -313,12 +293,8 @@ def white_covariance(sigma):
 
     def covariance_of(rows):
         spread = np.asarray(rows) * np.asarray(sigma)[:, None]
-        bands, count = spread.shape[:2]
-        total = np.zeros((bands, count, bands, count))
-        for b in range(bands):
-            flat = spread[b].reshape(count, -1)
-            total[b, :, b, :] = flat @ flat.T
-        return jnp.asarray(total.reshape(bands * count, -1))
+        flat = spread.reshape(*spread.shape[:2], -1)
+        return jnp.asarray(scipy.linalg.block_diag(*(own @ own.T for own in flat)))
 
     return covariance_of
 
@@ -332,12 +308,9 @@ def white_covariance(sigma):
     ],
 )
 def test_with_white_noise_the_two_likelihoods_agree(free, pixelwise):
-    sky, data, sigma = problem()
     exact, diagonal = (
-        best_fit(
-            likelihood(sky, BANDS, data, sigma, free, covariance_of=c, pixelwise=pixelwise), free
-        )
-        for c in (white_covariance(sigma), None)
+        best_fit(fitted(start=free, covariance_of=c, pixelwise=pixelwise))
+        for c in (white_covariance(problem()[2]), None)
     )
     np.testing.assert_allclose(exact.covariance, diagonal.covariance, rtol=1e-6, atol=1e-12)
     for name in free:
@@ -346,27 +319,25 @@ def test_with_white_noise_the_two_likelihoods_agree(free, pixelwise):
 
 @pytest.mark.parametrize("exact", [False, True])
 def test_pixel_and_template_paths_agree(exact):
-    sky, data, sigma = problem()
     free = {**START, **MOVED, "dust.T_dust": 21.0, "offset.70.U": 0.0}
-    options = {"covariance_of": fluctuations().covariance} if exact else {}
-    templates = likelihood(sky, BANDS, data, sigma, free, **options)
-    pixels = likelihood(sky, BANDS, data, sigma, free, pixelwise=True, **options)
+    covariance_of = fluctuations().covariance if exact else None
+    templates, pixels = (
+        fitted(start=free, pixelwise=p, covariance_of=covariance_of) for p in (False, True)
+    )
     rng = np.random.default_rng(5)
     for _ in range(3):
         params = {n: v + 0.05 * rng.normal() for n, v in free.items()}
-        assert float(chi2(pixels, params)) == pytest.approx(
-            float(chi2(templates, params)), rel=1e-9
-        )
+        expected = float(chi2(templates, params))
+        assert float(chi2(pixels, params)) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("exact", [False, True])
 def test_a_constant_map_with_an_offset_is_a_constant(exact):
-    sky, data, sigma = problem()
-    mapped = set_parameters(sky, {"dust.beta_dust": jnp.full(NPIX, 1.5)})
-    options = {"covariance_of": fluctuations().covariance} if exact else {}
+    mapped = set_parameters(problem()[0], {"dust.beta_dust": jnp.full(NPIX, 1.5)})
+    covariance_of = fluctuations().covariance if exact else None
     shift = {"dust.beta_dust.offset": 0.0, "synchrotron.beta_syn": 3.0}
-    by_map = likelihood(mapped, BANDS, data, sigma, shift, **options)
-    by_number = likelihood(sky, BANDS, data, sigma, START, **options)
+    by_map = fitted(sky=mapped, start=shift, covariance_of=covariance_of)
+    by_number = fitted(covariance_of=covariance_of)
     for beta in (1.4, 1.55):
         a = chi2(by_map, {"dust.beta_dust.offset": beta - 1.5, "synchrotron.beta_syn": 3.1})
         b = chi2(by_number, {"dust.beta_dust": beta, "synchrotron.beta_syn": 3.1})
@@ -375,7 +346,7 @@ def test_a_constant_map_with_an_offset_is_a_constant(exact):
 
 def test_an_offset_on_a_number_stays_on_inner_products():
     sky, data, sigma = problem()
-    like = likelihood(sky, BANDS, data, sigma, {"dust.beta_dust.offset": 0.1})
+    like = fitted(start={"dust.beta_dust.offset": 0.1})
     expected = papers_chi2(sky, {"dust.beta_dust": 1.53 + 0.02}, data, sigma)
     assert float(chi2(like, {"dust.beta_dust.offset": 0.02})) == pytest.approx(expected, rel=1e-11)
 
@@ -423,25 +394,19 @@ def test_gradients_against_finite_differences(pixelwise):
     assert all(float(jnp.abs(g)) > 0 for g in jax.grad(value)(zero).values())
 
 
-def call(**changes):
-    sky, data, sigma = problem()
-    arguments = {"sky": sky, "bands": BANDS, "data": data, "sigma": sigma, "start": START}
-    return likelihood(**(arguments | changes))
-
-
 @pytest.mark.parametrize(("changes", "error", "words"), cases("likelihood/bad_input"))
 def test_bad_input_is_refused(changes, error, words):
-    raises(getattr(builtins, error), words, call, **changes)
+    raises(getattr(builtins, error), words, fitted, **changes)
 
 
 def test_missing_pixels_and_templates_that_are_alike_are_refused():
     hole = np.where(np.arange(NPIX) == 3, -1.6375e30, np.ones((2, 2, NPIX)))
     words = r"`data` has 4 values that are not finite \(or UNSEEN\) in pixels that are used"
-    raises(ValueError, words, call, data=hole)
+    raises(ValueError, words, fitted, data=hole)
     maps = systems.random_maps(1, npix=NPIX)
     alike = Sky({"dust": Dust(maps), "synchrotron": Synchrotron(2 * maps)})
     covariance = fluctuations().covariance
-    raises(ValueError, "cannot be told apart", call, sky=alike, covariance_of=covariance)
+    raises(ValueError, "cannot be told apart", fitted, sky=alike, covariance_of=covariance)
 
 
 def test_single_precision_is_refused():

@@ -55,8 +55,8 @@ class Newton(NamedTuple):
         value, gradient = posterior.value(theta)
         damping, reach = 1e-4, posterior.reach()
         for step in range(max_steps):
-            low, high = theta <= posterior.low, theta >= posterior.high
-            blocked = low & (gradient > 0) | high & (gradient < 0)
+            at_low, at_high = theta <= posterior.low, theta >= posterior.high
+            blocked = at_low & (gradient > 0) | at_high & (gradient < 0)
             moving = np.flatnonzero(posterior.present & ~blocked)
             if not moving.size:
                 return theta, step
@@ -202,8 +202,8 @@ def best_fit(
     Raises
     ------
     KeyError, TypeError, ValueError
-        For unknown parameters, start values outside their prior, no solver, negative max_steps, and
-        priors that are neither uniform nor Gaussian with a least-squares solver.
+        For unknown parameters, start values outside their prior, other objects as solver, negative
+        max_steps, and priors that are neither uniform nor Gaussian with a least-squares solver.
     FitError
         If it did not converge, unless throw=False; the result is in its `.result`: if the search
         stopped away from an optimum, even at its start, if data and priors do not determine a
@@ -271,8 +271,8 @@ def best_fit(
     return result.judged(result.chi2, result.dof, like.start).checked(throw)
 
 
-def _widened(matrix: Matrix, keep: np.ndarray, size: int) -> np.ndarray | None:
-    """Return a matrix of all parameters, NaN for those left out; None instead of a sparse one."""
+def _widened(matrix: Matrix | None, keep: np.ndarray, size: int) -> np.ndarray | None:
+    """Return a matrix of all parameters, NaN for those left out; None if it is not dense."""
     if not isinstance(matrix, np.ndarray):
         return None
     wide = np.full((size, size), np.nan)
@@ -285,10 +285,11 @@ def _errors(posterior, keep, hessian, fisher, factor):
 
     `factor` is that of the Hessian, None if it does not determine all parameters.
     """
-    sigma, covariance = np.full(len(posterior.present), np.nan), hessian * np.nan
+    dense, sigma = isinstance(hessian, np.ndarray), np.full(len(posterior.present), np.nan)
+    covariance = np.full_like(hessian, np.nan) if dense else None
     scatter = fisher if posterior.like.profiled else hessian
     if factor is not None and factor.positive:
-        if isinstance(hessian, np.ndarray):
+        if dense:
             inverse = factor.solve(np.eye(len(keep)))
             covariance = inverse if scatter is hessian else inverse @ scatter @ inverse
             covariance = (covariance + covariance.T) / 2

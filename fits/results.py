@@ -262,9 +262,9 @@ def with_error(value: float, error: float) -> str:
 
 
 def with_errors(best: float, low: float, high: float) -> str:
-    """Return a value with its interval as differences, as far as there are an interval and a value.
+    """Return a value with its interval as differences, to two digits of the smaller one.
 
-    Both have two digits of the smaller difference.
+    Without an interval the value alone, and an empty text if there is no value.
     """
     if not np.isfinite([low, high]).all():
         return f"{best:.4f}" if np.isfinite(best) else ""

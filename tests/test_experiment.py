@@ -14,7 +14,7 @@ from astropy.io import fits as pyfits
 
 import systems
 from commands import experiment as experiment_text
-from commands import jaxsky, one_sentence
+from commands import jaxsky
 from fits.commands.run import DEFAULTS
 from jaxsky import experiment, inputs, montecarlo
 from jaxsky.experiment import simulation_inputs
@@ -30,6 +30,7 @@ from refusals import cases
 TEMPLATE = DEFAULTS / "experiment.toml"
 NSIDE = 8
 NPIX = 12 * NSIDE**2
+COVARIANCE = ["QQ_COV", "QU_COV", "UU_COV"]
 SMALL = "\n[sky.dust.small_scales]\nEE = [4, 10]\nBB = [3, 8]\nmodulation_fwhm = 1500.0\n"
 #: Changes with a name: small scales of dust, of both components, and templates with intensity.
 NAMED = {
@@ -47,25 +48,23 @@ def folder(tmp_path_factory):
     rng = np.random.default_rng(6)
     ell = alm_ell(2 * NSIDE)
     beam = np.asarray(expand(gaussian_beam(900.0, 2 * NSIDE)))
+    mask = np.arange(NPIX) > 4
+
+    def save(name, maps, names, unit="uK_RJ", **options):
+        write_maps(folder / f"{name}.fits", maps, names=names, unit=unit, **options)
+
     for name in ("dust", "synchrotron"):
         alm = np.where(ell > 1, 100 * rng.normal(size=(3, ell.size)) / (1 + ell), 0) * beam
         maps = np.asarray(synthesis(jnp.asarray(alm), NSIDE))
-        write_maps(folder / f"{name}.fits", maps[1:], names=["Q", "U"], unit="uK_RJ")
-        write_maps(folder / f"{name}_iqu.fits", maps, names=list("IQU"), unit="uK_RJ")
-        mask = np.arange(NPIX) > 4
-        write_maps(folder / f"{name}_cut.fits", maps[1:], names=["Q", "U"], unit="uK_RJ", mask=mask)
-    beta = 1.5 + 0.1 * np.cos(healpy.pix2ang(NSIDE, np.arange(NPIX))[0])
-    write_maps(folder / "beta.fits", beta, names="BETA_D", unit="")
+        save(name, maps[1:], ["Q", "U"])
+        save(f"{name}_iqu", maps, list("IQU"))
+        save(f"{name}_cut", maps[1:], ["Q", "U"], mask=mask)
+    save("beta", 1.5 + 0.1 * np.cos(healpy.pix2ang(NSIDE, np.arange(NPIX))[0]), "BETA_D", "")
     covariance = np.stack([1 + rng.random(NPIX), rng.random(NPIX) - 0.5, 1 + rng.random(NPIX)])
-    names = ["QQ_COV", "QU_COV", "UU_COV"]
-    write_maps(folder / "covariance.fits", covariance, names=names, unit="uK_RJ^2")
-    hits = np.where(np.arange(NPIX) > 4, 9.0, 0.0)
-    write_maps(folder / "hits.fits", hits, names="HITS", unit="")
-    coarse = np.ones(NPIX // 4)
-    write_maps(folder / "coarse.fits", coarse, names="RMS", unit="uK_RJ")
-    multipoles = np.arange(2, 40)
-    powers = np.array([1e3, 20.0, 5.0, 50.0])[:, None] * np.ones(multipoles.size)
-    table = np.column_stack([multipoles, *powers])
+    save("covariance", covariance, COVARIANCE, "uK_RJ^2")
+    save("hits", np.where(mask, 9.0, 0.0), "HITS", "")
+    save("coarse", np.ones(NPIX // 4), "RMS")
+    table = np.array([[multipole, 1e3, 20.0, 5.0, 50.0] for multipole in range(2, 40)])
     np.savetxt(folder / "cmb.dat", table)
     np.savetxt(folder / "short.dat", table[:8])
     window = np.asarray(gaussian_beam(800.0, 20))
@@ -81,8 +80,16 @@ def write(folder, *changes, of="simulate", name="experiment"):
     return path
 
 
-def command(monkeypatch, *arguments) -> int:
-    return jaxsky(monkeypatch, "simulate", *arguments)
+@pytest.fixture
+def run(monkeypatch):
+    """Makes a simulation; its exit code."""
+    return lambda path, out, *options: jaxsky(monkeypatch, "simulate", path, "--out", out, *options)
+
+
+@pytest.fixture
+def refused(mistake):
+    """Asks for a simulation that is refused; its one sentence."""
+    return lambda path, out, *options: mistake("simulate", path, "--out", out, *options)
 
 
 def content(out) -> dict[str, bytes]:
@@ -94,34 +101,40 @@ def columns(path) -> dict[str, np.ndarray]:
     return dict(zip(names, read_maps(path, fields=names).maps, strict=True))
 
 
+def simulated(path, number=0):
+    """The maps of a realisation in the bands."""
+    settings = load(path)
+    setup, key = simulation_inputs(settings), realisation_key(settings.seed, number)
+    cmb = None if setup.cmb is None else jnp.asarray(setup.cmb)
+    return np.asarray(simulate(key, setup.sources, setup.observation, cmb))
+
+
 COMPONENTS = ("sheet = false", "sheet = false\ncomponents = true")
 
 
 # What is written.
 
 
-def test_files_are_the_simulation(folder, tmp_path, monkeypatch, capsys):
+def test_files_are_the_simulation(folder, tmp_path, capsys, run):
     path, out = write(folder), tmp_path / "out"
-    assert command(monkeypatch, path, "--out", out) == 0
+    assert run(path, out) == 0
     assert " 2 maps in " in " ".join(capsys.readouterr().err.split())
     assert sorted(content(out)) == ["sim_00000/143.fits", "sim_00000/30.fits"]
-    setup = simulation_inputs(load(path))
-    key = realisation_key(3, 0)
-    expected = simulate(key, setup.sources, setup.observation, jnp.asarray(setup.cmb))
-    for name, maps in zip(setup.observation.names, expected, strict=True):
+    observation = simulation_inputs(load(path)).observation
+    for name, maps in zip(observation.names, simulated(path), strict=True):
         file = out / "sim_00000" / f"{name}.fits"
         found = read_maps(file)
         assert (found.names, found.unit, found.nside) == (("Q", "U"), "uK_RJ", NSIDE)
         assert found.mask.all()
         # Single precision.
-        np.testing.assert_allclose(found.maps, maps, atol=1e-6 * float(jnp.abs(maps).max()))
+        np.testing.assert_allclose(found.maps, maps, atol=1e-6 * np.abs(maps).max())
         again, header = healpy.read_map(file, field=None, h=True, dtype=np.float64)
         np.testing.assert_array_equal(again, found.maps)
         header = dict(header)
         wanted = cases("experiment/header") | {"BAND": name}
         assert {k: header[k] for k in wanted} == wanted
         assert header["CREATOR"].startswith("jaxsky ")
-        band = setup.observation.channels[name].band
+        band = observation.channels[name].band
         assert header["FREQ"] == pytest.approx(float(band.center))
         assert (header["FREQMIN"], header["FREQMAX"]) == (band.nu.min(), band.nu.max())
         assert header["RJ2CMB"] == pytest.approx(float(band.conversion("uK_RJ", "uK_CMB")))
@@ -135,15 +148,15 @@ def test_files_are_the_simulation(folder, tmp_path, monkeypatch, capsys):
     assert log["settings"]["bands"][0]["noise"]["level"] == 300.0
 
 
-def test_units_and_components(folder, tmp_path, monkeypatch):
+def test_units_and_components(folder, tmp_path, run):
     plain, thermodynamic = tmp_path / "RJ", tmp_path / "CMB"
-    assert command(monkeypatch, write(folder, COMPONENTS), "--out", plain) == 0
+    assert run(write(folder, COMPONENTS), plain) == 0
     change = (COMPONENTS[0], COMPONENTS[1] + '\nunit = "uK_CMB"')
-    assert command(monkeypatch, write(folder, change), "--out", thermodynamic) == 0
+    assert run(write(folder, change), thermodynamic) == 0
+    parts = ("dust", "synchrotron", "cmb", "noise")
     for name in ("30", "143"):
         one, other = (p / "sim_00000" / f"{name}.fits" for p in (plain, thermodynamic))
         maps = columns(one)
-        parts = ("dust", "synchrotron", "cmb", "noise")
         assert sorted(maps) == sorted([*"QU", *(f"{s}_{p}" for s in "QU" for p in parts)])
         assert list(maps)[:2] == ["Q", "U"]
         assert read_maps(other).unit == "uK_CMB"
@@ -155,9 +168,9 @@ def test_units_and_components(folder, tmp_path, monkeypatch):
             np.testing.assert_allclose(values, factor * maps[column], rtol=1e-6)
 
 
-def test_one_thing_only(folder, tmp_path, monkeypatch):
+def test_one_thing_only(folder, tmp_path, run):
     path = write(folder, COMPONENTS)
-    assert command(monkeypatch, path, "--out", tmp_path / "all") == 0
+    assert run(path, tmp_path / "all") == 0
     whole = columns(tmp_path / "all" / "sim_00000" / "143.fits")
     expected = {
         "noise": ["noise"],
@@ -167,7 +180,7 @@ def test_one_thing_only(folder, tmp_path, monkeypatch):
     }
     for only, parts in expected.items():
         out = tmp_path / only
-        assert command(monkeypatch, path, "--out", out, "--only", only) == 0
+        assert run(path, out, "--only", only) == 0
         file = out / "sim_00000" / "143.fits"
         maps = columns(file)
         assert pyfits.getheader(file, 1)["CONTENT"] == ", ".join(parts)
@@ -177,34 +190,30 @@ def test_one_thing_only(folder, tmp_path, monkeypatch):
             np.testing.assert_allclose(maps[s], total, atol=1e-5 * np.abs(total).max())
 
 
-def test_only_needs_no_files_that_it_does_not_show(folder, tmp_path, monkeypatch):
+def test_only_needs_no_files_that_it_does_not_show(folder, tmp_path, run):
     path = write(folder, ("dust.fits", "absent.fits"), ("cmb.dat", "absent.dat"))
-    assert command(monkeypatch, path, "--out", tmp_path / "out", "--only", "noise") == 0
+    assert run(path, tmp_path / "out", "--only", "noise") == 0
     header = pyfits.getheader(tmp_path / "out" / "sim_00000" / "30.fits", 1)
     assert str(header["COMMENT"]) == "No foregrounds."
 
 
 def test_beams_and_noise_of_all_kinds(folder):
-    rms, level = '{ rms = 1.0, unit = "uK_RJ" }', "{ level = 300.0 }"
     path = write(
         folder,
         ("fwhm = 1200.0", "fwhm = 0"),
-        ("fwhm = 900.0", "fwhm = 700.0"),
-        ("fwhm = 900.0", "fwhm = 700.0"),
-        (level, '{ covariance = { file = "covariance.fits", '
-         'fields = ["QQ_COV", "QU_COV", "UU_COV"] } }'),
+        *2 * [("fwhm = 900.0", "fwhm = 700.0")],
+        ("level = 300.0", f'covariance = {{ file = "covariance.fits", fields = {COVARIANCE} }}'),
         ("sheet = false", "diagonal_noise = true"),
-    )  # fmt: skip
+    )
     channels = simulation_inputs(load(path)).observation.channels
-    fields = ["QQ_COV", "QU_COV", "UU_COV"]
-    columns = read_maps(folder / "covariance.fits", fields=fields).maps
+    columns = read_maps(folder / "covariance.fits", fields=COVARIANCE).maps
     np.testing.assert_allclose(channels["30"].noise[[0, 0, 1], [0, 1, 1]], columns)
     assert channels["30"].diagonal
     assert channels["143"].noise == pytest.approx(healpy.nside2resol(NSIDE, arcmin=True))
     assert channels["30"].target is None
     np.testing.assert_allclose(channels["143"].beam, gaussian_beam(800.0, 16), rtol=1e-6)
     assert channels["30"].beam == 800.0
-    none = write(folder, (f"noise = {rms}", ""))
+    none = write(folder, ('noise = { rms = 1.0, unit = "uK_RJ" }', ""))
     assert simulation_inputs(load(none)).observation.channels["143"].noise is None
 
 
@@ -228,58 +237,51 @@ def test_multipoles_that_no_map_shows_are_left_out(folder):
 @pytest.fixture(scope="module")
 def three(folder, tmp_path_factory):
     """Three realisations with small scales, in one run."""
-    patch, out = pytest.MonkeyPatch(), tmp_path_factory.mktemp("three") / "out"
-    path = write(folder, "small", name="three")
-    assert command(patch, path, "--out", out, "--nsims", 3) == 0
-    patch.undo()
+    path, out = write(folder, "small", name="three"), tmp_path_factory.mktemp("three") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        assert jaxsky(patch, "simulate", path, "--out", out, "--nsims", 3) == 0
     return path, content(out)
 
 
-def test_a_realisation_does_not_depend_on_the_order(three, tmp_path, monkeypatch, capsys):
-    path, expected = three
-    out = tmp_path / "out"
+def test_a_realisation_does_not_depend_on_the_order(three, tmp_path, capsys, run):
+    (path, expected), out = three, tmp_path / "out"
     assert len(expected) == 6
     assert len(set(expected.values())) == 6
-    assert command(monkeypatch, path, "--out", out, "--first", 2) == 0
+    assert run(path, out, "--first", 2) == 0
     assert sorted(content(out)) == ["sim_00002/143.fits", "sim_00002/30.fits"]
-    assert command(monkeypatch, path, "--out", out, "--nsims", 2, "--resume") == 0
+    assert run(path, out, "--nsims", 2, "--resume") == 0
     assert content(out) == expected
     # One is lost, one is made again; the others are left alone.
     lost = out / "sim_00001" / "30.fits"
     times = {p: p.stat().st_mtime_ns for p in out.rglob("*.fits")}
     lost.unlink()
     capsys.readouterr()
-    assert command(monkeypatch, path, "--out", out, "--nsims", 3, "--resume") == 0
+    assert run(path, out, "--nsims", 3, "--resume") == 0
     assert " 1 maps in " in (said := " ".join(capsys.readouterr().err.split()))
     assert "5 maps were there already" in said
     assert content(out) == expected
     assert [p for p, t in times.items() if p.stat().st_mtime_ns != t] == [lost]
 
 
-def test_a_monte_carlo_is_split_over_processes(three, tmp_path, monkeypatch, mistake):
+def test_a_monte_carlo_is_split_over_processes(three, tmp_path, run, refused):
     """In one folder, at once or one after the other; each makes its own part."""
-    path, expected = three
-    out = tmp_path / "out"
+    (path, expected), out = three, tmp_path / "out"
+    other = "--first", 1, "--set", "seed=4"
     with occupied(out, range(1)):  # another process makes the first realisation
         for options in (["--nsims", 3], ["--overwrite", "--first", 1]):
-            assert "is being written to by another command (process" in mistake(
-                "simulate", path, "--out", out, *options
-            )
-        assert command(monkeypatch, path, "--out", out, "--first", 2) == 0
-        assert "holds a simulation of other settings" in mistake(
-            "simulate", path, "--out", out, "--first", 1, "--set", "seed=4"
-        )
-        assert command(monkeypatch, path, "--out", out, "--first", 1) == 0
-    assert "holds a simulation already" in mistake("simulate", path, "--out", out, "--first", 2)
-    assert command(monkeypatch, path, "--out", out) == 0
+            assert "is being written to by another command (process" in refused(path, out, *options)
+        assert run(path, out, "--first", 2) == 0
+        assert "holds a simulation of other settings" in refused(path, out, *other)
+        assert run(path, out, "--first", 1) == 0
+    assert "holds a simulation already" in refused(path, out, "--first", 2)
+    assert run(path, out) == 0
     assert content(out) == expected
     assert not list(out.glob(".*"))
 
 
-def test_processes_with_other_settings_do_not_meet(three, tmp_path, monkeypatch, mistake):
+def test_processes_with_other_settings_do_not_meet(three, tmp_path, monkeypatch, refused):
     """Both began in an empty folder, and one left its log before the other had a map."""
-    path, _ = three
-    out, observe = tmp_path / "out", montecarlo.observe_bands
+    (path, _), out, observe = three, tmp_path / "out", montecarlo.observe_bands
 
     def meanwhile(*arguments, **options):
         monkeypatch.setattr(montecarlo, "observe_bands", observe)
@@ -287,13 +289,12 @@ def test_processes_with_other_settings_do_not_meet(three, tmp_path, monkeypatch,
         return observe(*arguments, **options)
 
     monkeypatch.setattr(montecarlo, "observe_bands", meanwhile)
-    assert "holds a simulation of other settings" in mistake("simulate", path, "--out", out)
+    assert "holds a simulation of other settings" in refused(path, out)
     assert list(content(out)) == []
 
 
-def test_a_removed_folder_or_log_stops_the_run(three, tmp_path, monkeypatch, mistake):
-    path, _ = three
-    out, write_file = tmp_path / "out", montecarlo.write_maps
+def test_a_removed_folder_or_log_stops_the_run(three, tmp_path, monkeypatch, refused):
+    (path, _), out, write_file = three, tmp_path / "out", montecarlo.write_maps
 
     def remove(what):
         def removing(*arguments, **options):
@@ -304,19 +305,15 @@ def test_a_removed_folder_or_log_stops_the_run(three, tmp_path, monkeypatch, mis
         monkeypatch.setattr(montecarlo, "write_maps", removing)
 
     remove(out)
-    assert f"{out}: was removed while the command worked in it" in mistake(
-        "simulate", path, "--out", out, "--nsims", 3
-    )
+    assert f"{out}: was removed while the command worked in it" in refused(path, out, "--nsims", 3)
     assert not out.exists()
     remove(out / montecarlo.LOG)
-    assert "simulation.json: was removed while the simulation ran" in mistake(
-        "simulate", path, "--out", out, "--nsims", 3
-    )
+    words = "simulation.json: was removed while the simulation ran"
+    assert words in refused(path, out, "--nsims", 3)
 
 
-def test_a_stopped_run_goes_on(three, tmp_path, monkeypatch, capsys):
-    path, expected = three
-    out = tmp_path / "out"
+def test_a_stopped_run_goes_on(three, tmp_path, monkeypatch, capsys, run):
+    (path, expected), out = three, tmp_path / "out"
     write_file, count = montecarlo.write_maps, iter(range(100))
 
     def stopped(*arguments, **options):
@@ -325,12 +322,12 @@ def test_a_stopped_run_goes_on(three, tmp_path, monkeypatch, capsys):
         write_file(*arguments, **options)
 
     monkeypatch.setattr(montecarlo, "write_maps", stopped)
-    assert command(monkeypatch, path, "--out", out, "--nsims", 3) == 130
+    assert run(path, out, "--nsims", 3) == 130
     assert "Stopped; resume with --resume." in capsys.readouterr().err
     assert len(content(out)) == 3
     assert not list(out.rglob(".partial*"))
     monkeypatch.setattr(montecarlo, "write_maps", write_file)
-    assert command(monkeypatch, path, "--out", out, "--nsims", 3, "--resume") == 0
+    assert run(path, out, "--nsims", 3, "--resume") == 0
     assert content(out) == expected
 
 
@@ -360,7 +357,7 @@ def test_workers_write_the_same_files(changes, folder, tmp_path, two):
     assert {name: whole[name] for name in found["own"][0]} == found["own"][0]
 
 
-def test_what_cannot_be_written_stops_the_run(three, tmp_path, monkeypatch, mistake):
+def test_what_cannot_be_written_stops_the_run(three, tmp_path, monkeypatch, refused):
     """Bands are written while the next one is made; an error there is one, and leaves no file."""
     path, _ = three
     written, write_maps = [], montecarlo.write_maps
@@ -372,23 +369,21 @@ def test_what_cannot_be_written_stops_the_run(three, tmp_path, monkeypatch, mist
         written.append(where)
 
     monkeypatch.setattr(montecarlo, "write_maps", full)
-    assert "No space left on device" in mistake(
-        "simulate", path, "--out", tmp_path / "out", "--nsims", 3
-    )
+    assert "No space left on device" in refused(path, tmp_path / "out", "--nsims", 3)
     assert sorted((tmp_path / "out").glob("sim_*/*.fits")) == sorted(written)
 
 
-def test_small_scales_can_be_the_same_for_all(folder, tmp_path, monkeypatch):
+def test_small_scales_can_be_the_same_for_all(folder, tmp_path, run):
     found = {}
     for seed in ("", "small_scales_seed = 0", "small_scales_seed = 1"):
         change = (COMPONENTS[0], f"{COMPONENTS[1]}\n{seed}")
         path, out = write(folder, change, "small"), tmp_path / f"_{seed[-1:]}"
-        assert command(monkeypatch, path, "--out", out, "--nsims", 2) == 0
+        assert run(path, out, "--nsims", 2) == 0
         found[seed[-1:]] = [columns(out / f"sim_0000{i}" / "30.fits") for i in (0, 1)]
     for name in ("Q_cmb", "Q_noise"):
         assert not np.array_equal(found["0"][0][name], found["0"][1][name])
-        for i in (0, 1):
-            np.testing.assert_array_equal(found[""][i][name], found["0"][i][name])
+        for one, other in zip(found[""], found["0"], strict=True):
+            np.testing.assert_array_equal(one[name], other[name])
     for fixed in "01":
         np.testing.assert_array_equal(found[fixed][0]["Q_dust"], found[fixed][1]["Q_dust"])
     different = [found[""][0], found[""][1], found["0"][0], found["1"][0]]
@@ -397,14 +392,6 @@ def test_small_scales_can_be_the_same_for_all(folder, tmp_path, monkeypatch):
 
 
 # Every key does something.
-
-
-def simulated(path):
-    settings = load(path)
-    setup = simulation_inputs(settings)
-    key = realisation_key(settings.seed, 0)
-    cmb = None if setup.cmb is None else jnp.asarray(setup.cmb)
-    return np.asarray(simulate(key, setup.sources, setup.observation, cmb))
 
 
 @pytest.fixture(scope="module")
@@ -470,67 +457,62 @@ def test_keys_of_the_cmb_reach_camb(folder, monkeypatch):
     cases("experiment/refusals"),
     ids=lambda value: value[:40] if isinstance(value, str) else "",
 )
-def test_refusals(folder, tmp_path, changes, words, mistake):
+def test_refusals(folder, tmp_path, changes, words, refused):
     path, out = write(folder, *changes, name="mistake"), tmp_path / "a" / "out"
-    assert words in mistake("simulate", path, "--out", out)
+    assert words in refused(path, out)
     assert not (tmp_path / "a").exists()
 
 
 @pytest.mark.parametrize(("change", "words"), cases("experiment/refusals_of_instruments"))
-def test_refusals_of_instruments(folder, tmp_path, change, words, mistake):
+def test_refusals_of_instruments(folder, tmp_path, change, words, refused):
     path = write(folder, change, of="instrument", name="core")
-    assert words in mistake("simulate", path, "--out", tmp_path / "out")
+    assert words in refused(path, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_refusals_of_options(folder, tmp_path, monkeypatch, capsys, mistake):
+def test_refusals_of_options(folder, tmp_path, capsys, run, refused):
     path, out = write(folder), tmp_path / "out"
     for options, words in cases("experiment/options"):
-        assert words in mistake("simulate", path, "--out", out, *options)
+        assert words in refused(path, out, *options)
     for options in (("--nsims", "0"), ("--first", "-1")):
-        assert command(monkeypatch, path, "--out", out, *options) == 2
+        assert run(path, out, *options) == 2
         assert "Traceback" not in capsys.readouterr().err
-    assert "none.toml: cannot be read (No such file or directory)" in mistake(
-        "simulate", tmp_path / "none.toml", "--out", out
-    )
+    words = "none.toml: cannot be read (No such file or directory)"
+    assert words in refused(tmp_path / "none.toml", out)
     assert not out.exists()
 
 
-def test_a_folder_with_results_is_left_alone(folder, tmp_path, monkeypatch, capsys):
+def test_a_folder_with_results_is_left_alone(folder, tmp_path, run, refused):
     path, out = write(folder, name="mine"), tmp_path / "out"
-    assert command(monkeypatch, path, "--out", out) == 0
+    assert run(path, out) == 0
     before, log = content(out), out / montecarlo.LOG
+    whole = log.read_bytes()
 
-    def refused(path, *options):
-        capsys.readouterr()
-        assert command(monkeypatch, path, "--out", out, *options) == 2
+    def kept(words, path, *options):
+        assert words in refused(path, out, *options)
         assert content(out) == before
-        return one_sentence(capsys)
 
-    assert "holds a simulation already; go on with --resume, replace it" in refused(path)
+    kept("holds a simulation already; go on with --resume, replace it", path)
     for options, key in ((("--set", "seed=4"), "seed"), (("--only", "noise"), "simulate.include")):
-        said = refused(path, "--resume", *options)
-        assert f"holds a simulation of other settings ({key}); choose another --out" in said
+        words = f"holds a simulation of other settings ({key}); choose another --out"
+        kept(words, path, "--resume", *options)
     # A mistake that only the small scales notice does not cost the old results.
     wrong = write(folder, "small", ("[4, 10]", "[4, 30]"), name="wrong")
-    assert "from l = 4 to 30" in refused(wrong, "--overwrite")
-    whole = log.read_bytes()
+    kept("from l = 4 to 30", wrong, "--overwrite")
     for damage in (b"{}", b"[1]", b"\xff\xfe", whole[:50]):
         log.write_bytes(damage)
-        assert "simulation.json: is damaged; start again with --overwrite" in refused(
-            path, "--resume"
-        )
+        kept("simulation.json: is damaged; start again with --overwrite", path, "--resume")
     log.unlink()
     for options in ((), ("--resume",)):
-        assert "holds maps of unknown settings" in refused(path, *options)
+        kept("holds maps of unknown settings", path, *options)
     log.write_bytes(whole)
     # Neither a title, where the files are nor a picture make it another simulation.
     moved = write(folder, ('title = "A small sky"', 'data_dir = "."'), name="moved")
-    assert command(monkeypatch, moved, "--out", out, "--resume") == 0
+    assert run(moved, out, "--resume") == 0
     assert content(out) == before
     pictured = load(write(folder, ("sheet = false", "sheet = true"), name="sheet"))
     montecarlo.check_folder(out, pictured, resume=True, overwrite=False)
-    assert command(monkeypatch, path, "--out", out, "--overwrite", "--set", "seed=4") == 0
+    assert run(path, out, "--overwrite", "--set", "seed=4") == 0
     assert content(out).keys() == before.keys()
     assert all(content(out)[name] != before[name] for name in before)
 
@@ -571,25 +553,23 @@ def test_the_default_is_valid():
     experiment._check_pixels(256, "30", 60.0)
 
 
-def test_titles_of_all_kinds(folder, tmp_path, monkeypatch, capsys):
+def test_titles_of_all_kinds(folder, tmp_path, capsys, run):
     title = "Herv\u00edas-Caimap\u00f3 [red] \u00b5K " + 30 * "long "
     path, out = write(folder, ("A small sky", title)), tmp_path / "out"
     nothing_leaks = "--only", "noise", "--set", "bands.0.leakage=0.02"
-    assert command(monkeypatch, path, "--out", out, *nothing_leaks) == 0
+    assert run(path, out, *nothing_leaks) == 0
     header = pyfits.getheader(out / "sim_00000" / "30.fits", 1)
     assert header["INSTRUME"].startswith("Herv?as-Caimap? [red] ?K long")
-    assert command(monkeypatch, path, "--out", tmp_path / "fg", "--only", "foregrounds") == 0
+    assert run(path, tmp_path / "fg", "--only", "foregrounds") == 0
     assert "[red]" in capsys.readouterr().err
 
 
-def test_intensity_and_the_sheet(folder, tmp_path, monkeypatch):
+def test_intensity_and_the_sheet(folder, tmp_path, run):
     path, out = write(folder, ("sheet = false", "sheet = true"), "iqu"), tmp_path / "out"
-    assert command(monkeypatch, path, "--out", out, "--first", 7) == 0
+    assert run(path, out, "--first", 7) == 0
     (picture,) = out.glob("*.png")
     assert picture.name == "sim_00007.png"
     assert picture.read_bytes().startswith(b"\x89PNG")
-    setup = simulation_inputs(load(path))
-    key = realisation_key(3, 7)
-    expected = simulate(key, setup.sources, setup.observation, jnp.asarray(setup.cmb))
+    expected = simulated(path, 7)
     found = read_maps(out / "sim_00007" / "30.fits", fields=["I", "Q", "U"])
-    np.testing.assert_allclose(found.maps, expected[0], atol=1e-6 * float(jnp.abs(expected).max()))
+    np.testing.assert_allclose(found.maps, expected[0], atol=1e-6 * np.abs(expected).max())

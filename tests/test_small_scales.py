@@ -23,7 +23,14 @@ from refusals import cases, raises
 KEY = jax.random.key(0)
 #: Slopes and joins of the synthetic template, its beam [arcmin] and its resolution.
 SLOPES, RANGES, OWN, NSIDE = (-2.4, -2.0), ((5, 30), (5, 20)), 200.0, 32
-SMALL = SmallScales(*RANGES, modulation_fwhm=1200.0)
+
+
+def small_scales(**how):
+    """The small scales of the synthetic template."""
+    return SmallScales(*RANGES, **{"modulation_fwhm": 1200.0} | how)
+
+
+SMALL = small_scales()
 FILES = {
     "dust": "dust_d1_353GHz_n64.fits",
     "synchrotron": "synch_s1_30GHz_n64.fits",
@@ -36,9 +43,14 @@ REAL = {
 }
 
 
-def add_small_scales(key, maps, own, fwhm, nside, small):
+def continued(maps, how=SMALL, own=OWN, nside=64, key=KEY):
+    """Coefficients of a template with small scales."""
+    return continue_templates(key, [maps], [own], [how], nside).alms[0]
+
+
+def add_small_scales(maps, fwhm, how=SMALL, own=OWN, nside=NSIDE):
     """A template with small scales, at a beam that may be finer than its own."""
-    (alm,) = continue_templates(key, [maps], [own], [small], nside).alms
+    alm = continued(maps, how, own, nside)
     return h.synthesis(alm * h.expand(h.gaussian_beam(fwhm, h.lmax_of(alm))), nside)
 
 
@@ -81,14 +93,18 @@ def binned(spectrum, ends):
 
 
 def many(maps, own, small, nside, count):
-    """Results with several keys, shape (key, 2, alm), and the spectra that they follow."""
+    """Results with several keys, shape (key, field, alm), and the spectra that they follow.
+
+    Also the number of multipoles that are repaired.
+    """
 
     def one(key):
-        continued = continue_templates(key, [maps], [own], [small], nside)
-        return continued.alms[0], continued.parts[0]
+        done = continue_templates(key, maps, own, small, nside)
+        return jnp.concatenate(done.alms), (done.parts, done.repaired)
 
     # What does not depend on the key is computed once.
-    return jax.jit(jax.vmap(one, out_axes=(0, None)))(jax.random.split(KEY, count))
+    alms, others = jax.jit(jax.vmap(one, out_axes=(0, None)))(jax.random.split(KEY, count))
+    return alms, *others
 
 
 def assert_follows(alms, part, small, template, last, first=(0, 0)):
@@ -132,9 +148,8 @@ def test_power_law_against_numpy():
     curve = law(200)
     assert curve.shape == (201,)
     assert np.all(curve[:2] == 0)
-    np.testing.assert_allclose(
-        curve[2:], np.exp(constant) * (np.arange(2, 201) / 90) ** slope, rtol=1e-12
-    )
+    expected = np.exp(constant) * (np.arange(2, 201) / 90) ** slope
+    np.testing.assert_allclose(curve[2:], expected, rtol=1e-12)
 
 
 def test_power_law_is_that_of_the_template(template):
@@ -142,9 +157,8 @@ def test_power_law_is_that_of_the_template(template):
     for i in range(2):
         # The analysis is good to 1e-6.
         assert float(law[i].slope) == pytest.approx(SLOPES[i], abs=1e-5)
-        assert float(jnp.exp(law[i].log_amplitude)) == pytest.approx(
-            laws(64)[i, RANGES[i][1]], rel=1e-5
-        )
+        joined = laws(64)[i, RANGES[i][1]]
+        assert float(jnp.exp(law[i].log_amplitude)) == pytest.approx(joined, rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -191,7 +205,7 @@ def test_a_template_above_the_law_is_brought_down_to_it(coefficients):
 def test_final_spectra_of_a_power_law(coefficients, template):
     # All modes count here, so 20 realisations have the law within 2 %: the spectra of single
     # bins and their step at the join.
-    alms, part = many(template, OWN, SMALL, 64, 20)
+    alms, (part,), _ = many([template], [OWN], [SMALL], 64, 20)
     steps = assert_follows(alms, part, SMALL, coefficients, 128)
     np.testing.assert_allclose(steps, 1, atol=0.05)
 
@@ -200,7 +214,7 @@ def test_final_spectra_of_a_power_law(coefficients, template):
 @pytest.mark.parametrize("name", ["dust", "synchrotron"])
 def test_final_spectra_of_the_real_sky(data_dir, name):
     maps, small = jnp.asarray(real(data_dir, name)), REAL[name]
-    alms, part = many(maps, 0.0, small, 256, 8)
+    alms, (part,), _ = many([maps], [0.0], [small], 256, 8)
     steps = assert_follows(alms, part, small, h.analysis(maps, 128), 0.95 * 512)
     # The sky itself scatters about its law, in the bin below the join by about 10 %.
     np.testing.assert_allclose(steps, 1, atol=0.2)
@@ -210,21 +224,20 @@ def test_final_spectra_of_the_real_sky(data_dir, name):
 def test_final_spectra_of_the_embedded_sky():
     # With fewer steps along the line of sight than usual, for speed; slopes are the same in 0.06.
     maps = h.smooth(embedded_sky(512, steps=12).synchrotron[1:], 60.0)
-    known = 600
+    known, small = 600, SmallScales(*SYNCHROTRON)
     original = h.analysis(maps, known) / h.expand(h.gaussian_beam(60.0, known))
     # Many realisations of the multipoles near the joins, one of all.
-    near, part = many(maps, 60.0, SmallScales(*SYNCHROTRON), 128, 12)
-    steps = assert_follows(near, part, SmallScales(*SYNCHROTRON), original, 0.95 * 256)
+    near, (part,), _ = many([maps], [60.0], [small], 128, 12)
+    steps = assert_follows(near, part, small, original, 0.95 * 256)
     # Just below its join E of this template is 1.35 times its own law, which is not quite one.
     np.testing.assert_allclose(steps, [0.75, 1.1], atol=0.1)
-    alms, part = many(maps, 60.0, SmallScales(*SYNCHROTRON), 512, 1)
-    assert_follows(alms, part, SmallScales(*SYNCHROTRON), original, 0.95 * 1024, first=(200, 200))
+    alms, (part,), _ = many([maps], [60.0], [small], 512, 1)
+    assert_follows(alms, part, small, original, 0.95 * 1024, first=(200, 200))
 
 
 def test_amplitude_is_that_of_what_is_added(template):
     def alms(amplitude):
-        small = SmallScales(*RANGES, amplitude=amplitude, modulation_fwhm=1200.0)
-        return continue_templates(KEY, [template], [OWN], [small], 64).alms[0]
+        return continued(template, small_scales(amplitude=amplitude))
 
     none, once = alms(0.0), alms(1.0)
     np.testing.assert_allclose(alms(2.5), none + 2.5 * (once - none), atol=1e-12)
@@ -235,12 +248,10 @@ def test_amplitude_is_that_of_what_is_added(template):
 
 @pytest.mark.parametrize("tilt", [-0.6, 0.4])
 def test_tilt_turns_about_the_join(template, tilt):
-    def spectra(tilt):
-        small = SmallScales(*RANGES, tilt=tilt, modulation_fwhm=1200.0)
-        (alm,) = continue_templates(KEY, [template], [OWN], [small], 64).alms
-        return h.power_spectrum(alm)
-
-    ratio = spectra(tilt) / spectra(0.0)
+    tilted, plain = (
+        h.power_spectrum(continued(template, small_scales(tilt=t))) for t in (tilt, 0.0)
+    )
+    ratio = tilted / plain
     for i, (_, join) in enumerate(RANGES):
         np.testing.assert_allclose(ratio[i, 2 : join // 2], 1, rtol=1e-9)
         # With one key the scatter is common; the modulation mixes neighbouring multipoles.
@@ -250,8 +261,7 @@ def test_tilt_turns_about_the_join(template, tilt):
 
 def test_slopes_may_be_given(template):
     def alms(**how):
-        small = SmallScales(*RANGES, modulation_fwhm=1200.0, **how)
-        return continue_templates(KEY, [template], [OWN], [small], 64).alms[0]
+        return continued(template, small_scales(**how))
 
     # The template's own slopes, and those with a tilt; the analysis is good to 1e-6.
     np.testing.assert_allclose(alms(slope=SLOPES), alms(), atol=1e-5)
@@ -261,10 +271,7 @@ def test_slopes_may_be_given(template):
 
 
 def test_another_key_gives_other_small_scales(template):
-    first, second = (
-        continue_templates(jax.random.key(seed), [template], [OWN], [SMALL], 64).alms[0]
-        for seed in range(2)
-    )
+    first, second = (continued(template, key=jax.random.key(seed)) for seed in range(2))
     ell = h.alm_ell(128)
     np.testing.assert_allclose(first[:, ell < 10], second[:, ell < 10], atol=1e-12)
     for a, b in zip(first, second, strict=True):
@@ -275,7 +282,7 @@ def test_another_key_gives_other_small_scales(template):
 
 
 def test_the_spectrum_has_the_window_of_the_final_beam(template):
-    maps = [add_small_scales(KEY, template, OWN, fwhm, 64, SMALL) for fwhm in (60.0, 100.0)]
+    maps = [add_small_scales(template, fwhm, nside=64) for fwhm in (60.0, 100.0)]
     fine, coarse = (h.power_spectrum(h.analysis(m, 128)) for m in maps)
     window = h.gaussian_beam(80.0, 128)[2:] ** 2  # 100^2 = 60^2 + 80^2
     np.testing.assert_allclose(coarse[:, 2:] / fine[:, 2:], [window, window], rtol=1e-4)
@@ -283,12 +290,10 @@ def test_the_spectrum_has_the_window_of_the_final_beam(template):
 
 def test_the_beam_of_the_template_is_taken_out(coefficients, template):
     bare = h.synthesis(coefficients, NSIDE)
+    low = h.alm_ell(128) < 10
+    expected = coefficients[:, h.alm_ell(2 * NSIDE) < 10][:, : low.sum()]
     for maps, own in [(template, OWN), (bare, 0.0)]:
-        (alm,) = continue_templates(KEY, [maps], [own], [SMALL], 64).alms
-        low = h.alm_ell(128) < 10
-        np.testing.assert_allclose(
-            alm[:, low], coefficients[:, h.alm_ell(2 * NSIDE) < 10][:, : low.sum()], atol=1e-6
-        )
+        np.testing.assert_allclose(continued(maps, own=own)[:, low], expected, atol=1e-6)
 
 
 def test_modulation():
@@ -323,9 +328,9 @@ def result(template):
 
     @jax.jit
     def function(slope, tilt, amplitude, own, fwhm, smoothing, factor=1.0):
-        small = SmallScales(*RANGES, slope, tilt, amplitude, smoothing)
+        how = SmallScales(*RANGES, slope, tilt, amplitude, smoothing)
         maps = template * jnp.stack([factor**2 * jnp.ones(12 * NSIDE**2), jnp.ones(12 * NSIDE**2)])
-        return add_small_scales(KEY, maps, own, fwhm, NSIDE, small)
+        return add_small_scales(maps, fwhm, how, own)
 
     return function
 
@@ -336,8 +341,7 @@ NAMES = ["slope", "tilt", "amplitude", "own", "fwhm", "modulation_fwhm", "maps"]
 
 @pytest.mark.slow
 def test_inside_jit(result, template):
-    small = SmallScales(*RANGES, -2.3, 0.1, 1.2, 1200.0)
-    eager = add_small_scales(KEY, template, OWN, 150.0, NSIDE, small)
+    eager = add_small_scales(template, 150.0, SmallScales(*RANGES, -2.3, 0.1, 1.2, 1200.0))
     # Inside jit the last multipoles of the own beam and of the modulation are not cut.
     np.testing.assert_allclose(result(*AT[:-1]), eager, atol=1e-6)
 
@@ -393,15 +397,8 @@ def test_wide_beams_have_derivatives_when_traced():
 def pair(data_dir):
     """Dust and AME at nside 128 from the real maps at 64, six keys; and the templates."""
     maps = [jnp.asarray(real(data_dir, name)) for name in ("dust", "ame")]
-    small = [REAL["dust"], REAL["ame"]]
-
-    def one(key):
-        continued = continue_templates(key, maps, [0.0, 0.0], small, 128)
-        return jnp.concatenate(continued.alms), (continued.parts, continued.repaired)
-
-    several = jax.jit(jax.vmap(one, out_axes=(0, None)))
-    alms, (parts, repaired) = several(jax.random.split(KEY, 6))
-    return alms, parts, repaired, jnp.concatenate([h.analysis(m, 128) for m in maps])
+    found = many(maps, [0.0, 0.0], [REAL["dust"], REAL["ame"]], 128, 6)
+    return *found, jnp.concatenate([h.analysis(m, 128) for m in maps])
 
 
 def coefficients_of(alms, weight):
@@ -488,30 +485,26 @@ def test_refuses_nonsense(argument, error, message):
 
 def test_refuses_ranges_that_cannot_be_fitted(template):
     message = (
-        "A power law cannot be fitted from l = 5 to 65 to a spectrum that ends at "
-        "64; it needs four multipoles from l = 2 on."
+        "A power law cannot be fitted from l = 5 to 65 to a spectrum that ends at 64; "
+        "it needs four multipoles from l = 2 on."
     )
-    with pytest.raises(ValueError, match=message):
-        add_small_scales(KEY, template, 0.0, 60.0, NSIDE, SmallScales(EE=(5, 65), BB=(5, 20)))
+    how = SmallScales(EE=(5, 65), BB=(5, 20))
+    raises(ValueError, message, continued, template, how, 0.0, NSIDE)
 
 
 def test_refuses_templates_without_power_or_of_the_wrong_shape(template):
-    with pytest.raises(ValueError, match="`spectrum` must be positive, but its smallest value is"):
-        add_small_scales(KEY, 0 * template, 0.0, 60.0, NSIDE, SMALL)
+    words = "`spectrum` must be positive, but its smallest value is"
+    raises(ValueError, words, continued, 0 * template, own=0.0)
     for maps in (template[:1], template[0], jnp.ones((3, 12 * NSIDE**2))):
-        with pytest.raises(ValueError, match=r"shape \(2, pix\), Q and U, not of shape \("):
-            add_small_scales(KEY, maps, 0.0, 60.0, NSIDE, SMALL)
+        raises(ValueError, r"shape \(2, pix\), Q and U, not of shape \(", continued, maps, own=0.0)
 
 
 @pytest.mark.slow
 def test_a_coarse_template_is_correlated_with_what_is_known_of_a_finer_one(data_dir):
     # Dust is known up to l = 128, AME at 3 degrees up to l = 50: there it follows the dust's own
     # coefficients, beyond both it is drawn with them.
-    dust, ame = (
-        jnp.asarray(read_maps(data_dir / "templates" / f"{name}.fits").maps[1:])
-        for name in ("dust_d1_353GHz_n64", "ame_a2_30GHz_n64")
-    )
-    small = [SmallScales((20, 100), (20, 100)), SmallScales((20, 50), (20, 50))]
+    dust, ame = (jnp.asarray(real(data_dir, name)) for name in ("dust", "ame"))
+    small = [REAL["dust"], SmallScales((20, 50), (20, 50))]
     ranges = {"both known": slice(20, 51), "dust known": slice(60, 120), "none": slice(140, 250)}
     found = {name: [] for name in ranges}
     for seed in range(6):

@@ -108,30 +108,33 @@ class Handler(http.server.BaseHTTPRequestHandler):
         else:
             getattr(self, kind)(Handler.files.get(name, CONTENT), first)
 
-    def answer(self, status, headers, body, first=0):
+    def head(self, status, length, first, of, headers):
+        """The status of an answer, and headers that are right or replace these."""
         self.send_response(status)
-        right = {"ETag": OLD, "Last-Modified": "Sat, 28 Nov 2026 00:00:00 GMT"}
-        right["Content-Length"] = str(len(body))
+        right = {"ETag": OLD, "Content-Length": str(length)}
         if status == 206:
-            last = first + len(body) - 1
-            right["Content-Range"] = f"bytes {first}-{last}/{len(CONTENT)}"
+            right["Content-Range"] = f"bytes {first}-{first + length - 1}/{of}"
         for key, value in (right | headers).items():
             if value is not None:
                 self.send_header(key, value)
         self.end_headers()
+
+    def answer(self, status, headers, body, first=0):
+        dated = {"Last-Modified": "Sat, 28 Nov 2026 00:00:00 GMT"}
+        self.head(status, len(body), first, len(CONTENT), dated | headers)
         with contextlib.suppress(OSError):
             self.wfile.write(body)
 
     def begin(self, content, first, **headers):
         """The headers of a file, of which the caller sends the body."""
-        self.send_response(206 if first else 200)
-        right = {"ETag": OLD, "Content-Length": str(len(content) - first)}
-        if first:
-            right["Content-Range"] = f"bytes {first}-{len(content) - 1}/{len(content)}"
-        for key, value in (right | headers).items():
-            if value is not None:
-                self.send_header(key, value)
-        self.end_headers()
+        rest = len(content) - first
+        self.head(206 if first else 200, rest, first, len(content), headers)
+
+    def piece(self, content, seconds):
+        """A part of a file, and a pause."""
+        self.wfile.write(content)
+        self.wfile.flush()
+        time.sleep(seconds)
 
     def good(self, content, first):
         self.begin(content, first)
@@ -144,26 +147,17 @@ class Handler(http.server.BaseHTTPRequestHandler):
 
     def stalled(self, content, first):
         self.begin(content, first)
-        self.wfile.write(content[first : first + 100])
-        self.wfile.flush()
-        time.sleep(1.5)
+        self.piece(content[first : first + 100], 1.5)
 
-    def trickle(self, content, first):
+    def trickle(self, content, first, step=1000):
         self.begin(content, first)
-        for at in range(first, len(content), 1000):
-            self.wfile.write(content[at : at + 1000])
-            self.wfile.flush()
-            time.sleep(0.01)
+        for at in range(first, len(content), step):
+            self.piece(content[at : at + step], 0.01)
 
     def slow(self, content, first):
         """About a second for a file."""
-        self.begin(content, first)
-        step = max(1, len(content) // 100)
         with contextlib.suppress(OSError):
-            for at in range(first, len(content), step):
-                self.wfile.write(content[at : at + step])
-                self.wfile.flush()
-                time.sleep(0.01)
+            self.trickle(content, first, max(1, len(content) // 100))
 
     def chunked(self, content, first, end=b"0\r\n\r\n"):
         self.begin(content, 0, **{"Transfer-Encoding": "chunked", "Content-Length": "7"})
@@ -178,9 +172,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
     def reset(self, content, first):
         """The connection is reset amid the file."""
         self.begin(content, first)
-        self.wfile.write(content[first : first + CUT])
-        self.wfile.flush()
-        time.sleep(0.1)
+        self.piece(content[first : first + CUT], 0.1)
         self.hang_up()
 
     def hang_up(self, *_):

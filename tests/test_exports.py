@@ -1,8 +1,8 @@
 """Every compiled function is made for CUDA, on a machine without a GPU.
 
-A module with a function under `jit` has a table of calls here, and each of its functions has to
-appear in one of them. What has transforms has to have JAX's callback to the host, and nothing of
-jaxbind's own for GPUs, which its packages do not have; all else has to pass `jax.export`.
+A module with a function under `jit` has calls here, in which each of its functions has to appear.
+What has transforms has to have JAX's callback to the host, and nothing of jaxbind's own for GPUs,
+which its packages do not have; all else has to pass `jax.export`.
 """
 
 import importlib
@@ -23,42 +23,12 @@ from jax.interpreters import mlir
 
 import fits
 import jaxsky
-from fits import (
-    comparison,
-    compress,
-    distributed,
-    fisher,
-    grid,
-    mixing,
-    optimize,
-    patches,
-    posterior,
-    products,
-    profile_likelihood,
-    pseudo_cl,
-    sampling,
-    separated_maps,
-    systems,
-    tensor_ratio,
-    unbounded,
-)
-from fits import (
-    fluctuations as of_maps,
-)
-from jaxsky import (
-    bandpass,
-    cmb,
-    galaxy,
-    harmonics,
-    interpolation,
-    mesh,
-    noise,
-    sed,
-    simulation,
-    sky,
-    templates,
-)
-from jaxsky.components import laws
+from fits.compress import Layout, Noise
+from fits.mixing import Mixing
+from fits.posterior import Posterior
+from fits.unbounded import unbounded_posterior
+from jaxsky.bandpass import stack_bands
+from jaxsky.harmonics import Preparation
 from systems import bands, components, dust_and_synchrotron, random_maps, spread
 
 NSIDE, LMAX = 4, 8
@@ -70,16 +40,29 @@ MAPS, ALM = random_maps(1, npix=NPIX), random_maps(2, npix=(LMAX + 1) ** 2)
 MASK = np.linspace(0, 1, NPIX)
 NU = np.array([30.0, 100.0])
 BANDS = bands()
-SAMPLES = bandpass.stack_bands(BANDS)
+SAMPLES = stack_bands(BANDS)
 SKY = dust_and_synchrotron(NPIX)
 DUST = jaxsky.Dust(MAPS, spread(1.53, 0.1, NPIX), spread(20.0, 1.0, NPIX))
 COUNTS = (5, 5)
 START = {"dust.beta_dust": 1.55, "synchrotron.beta_syn": 3.05}
 FOUR = {f"{c:g}": jaxsky.Bandpass.top_hat(c, c / 4, samples=5) for c in (30.0, 95.0, 220.0, 353.0)}
 Calls = Iterator[tuple[Any, ...]]
+#: The calls of each module with compiled functions.
+CALLS: dict[str, Callable[[], Calls]] = {}
 
 
-def spectral_laws() -> Calls:
+def of(module: str) -> Callable:
+    """Add a function that takes a module, and yields calls of its functions."""
+
+    def added(function: Callable) -> Callable:
+        CALLS[module] = partial(function, importlib.import_module(module))
+        return function
+
+    return added
+
+
+@of("jaxsky.sed")
+def spectral_laws(sed) -> Calls:
     yield sed.power_law, NU, 3.1, 30.0
     yield sed.curved_power_law, NU, 3.1, -0.1, 23.0, 30.0
     yield sed.modified_blackbody, NU, 1.5, 20.0, 353.0
@@ -88,11 +71,13 @@ def spectral_laws() -> Calls:
     yield sed.cmb_derivative, NU
 
 
-def emission() -> Calls:
+@of("jaxsky.components.laws")
+def emission(laws) -> Calls:
     yield laws.amplitude_from_emission_measure, MAPS[0], 8000.0, 30.0
 
 
-def bandpasses() -> Calls:
+@of("jaxsky.bandpass")
+def bandpasses(bandpass) -> Calls:
     yield partial(bandpass._across, samples=9), 100.0, 20.0
     for convention in ("RJ", "power", "CMB"):
         yield partial(bandpass._integrand, convention=convention), NU, np.ones(2)
@@ -104,7 +89,8 @@ def bandpasses() -> Calls:
     yield jax.grad(lambda x: jaxsky.Bandpass.top_hat(x, 20.0).conversion("K_CMB", "uK_RJ")), 100.0
 
 
-def interpolated() -> Calls:
+@of("jaxsky.interpolation")
+def interpolated(interpolation) -> Calls:
     yield interpolation._tails, DUST, SAMPLES
     yield partial(interpolation._series, counts=COUNTS), DUST, BANDS[0]
     yield partial(interpolation._all_series, counts=COUNTS), DUST, SAMPLES
@@ -116,7 +102,8 @@ def interpolated() -> Calls:
     )
 
 
-def observed() -> Calls:
+@of("jaxsky.sky")
+def observed(sky) -> Calls:
     def total(one, bands):
         return jnp.sum(jaxsky.observe(one, bands) ** 2)
 
@@ -128,7 +115,8 @@ def observed() -> Calls:
     yield sky.observe_components, everything, BANDS
 
 
-def transforms() -> Calls:
+@of("jaxsky.harmonics.transforms")
+def transforms(harmonics) -> Calls:
     yield harmonics.expand, ELL
     yield partial(harmonics.resize, lmax=5), ALM
     yield harmonics.power_spectrum, ALM, ALM
@@ -139,15 +127,17 @@ def transforms() -> Calls:
     yield jax.vmap(partial(harmonics.analysis, lmax=LMAX)), MAPS[None]
 
 
-def resolution() -> Calls:
-    prepared = harmonics.Preparation.smoothing(NSIDE, 0.0, NSIDE // 2, 2000.0, LMAX)
+@of("jaxsky.harmonics.resolution")
+def resolution(harmonics) -> Calls:
+    prepared = Preparation.smoothing(NSIDE, 0.0, NSIDE // 2, 2000.0, LMAX)
     yield lambda fwhm, own: harmonics.beam_ratio(fwhm, own, LMAX), 2000.0, 1000.0
     yield partial(harmonics.resample, nside=2), MAPS, ELL
     yield partial(harmonics.average_pixels, nside=2), MAPS
     yield prepared.transpose, MAPS[:, : NPIX // 4]
 
 
-def random_fields() -> Calls:
+@of("jaxsky.cmb")
+def random_fields(cmb) -> Calls:
     spectra = np.eye(2)[..., None] * FALLING
     yield cmb.realisation, KEY, np.stack([FALLING] * 4)
     yield cmb.repair, spectra
@@ -155,7 +145,8 @@ def random_fields() -> Calls:
     yield cmb.gaussian_fields, KEY, spectra
 
 
-def noises() -> Calls:
+@of("jaxsky.noise")
+def noises(noise) -> Calls:
     covariance = np.eye(2)[..., None] * np.ones(NPIX)
     yield partial(noise.normal, shape=(2, 5), dtype=np.dtype(float)), KEY
     yield partial(noise.stokes_noise, stokes=2, size=5, dtype=np.dtype(float)), KEY
@@ -167,27 +158,31 @@ def noises() -> Calls:
     yield noise._number_indefinite, covariance
 
 
-def galaxies() -> Calls:
+@of("jaxsky.galaxy")
+def galaxies(galaxy) -> Calls:
     angles = healpy.pix2ang(NSIDE, np.arange(NPIX))
     model = galaxy.GalaxyModel()
     yield partial(galaxy._integrate, steps=4), model, KEY, angles
     yield galaxy._scaled, np.ones((2, 3, NPIX)), random_maps(1, npix=6 * 48).reshape(2, 3, -1)
 
 
-def simulations() -> Calls:
+@of("jaxsky.simulation")
+def simulations(simulation) -> Calls:
     part = simulation._Part((ALM, ALM), (1.0, 2.0), jnp.asarray(ELL))
     yield simulation._importance, dict(SKY.components), SAMPLES
     yield partial(simulation._term_alm, lmax=LMAX, steps=1), MAPS, DUST, np.ones(COUNTS)
     yield simulation._summed, (part, part)
 
 
-def correlations() -> Calls:
+@of("jaxsky.templates")
+def correlations(templates) -> Calls:
     yield partial(templates._jackknife, number=4), MAPS[0], MAPS[1], np.arange(NPIX) % 4
 
 
-def fluctuations() -> Calls:
-    prepared = harmonics.Preparation.smoothing(NSIDE, 0.0, NSIDE, 2000.0, LMAX)
-    found = of_maps.Fluctuations(
+@of("fits.fluctuations")
+def fluctuations(own) -> Calls:
+    prepared = Preparation.smoothing(NSIDE, 0.0, NSIDE, 2000.0, LMAX)
+    found = own.Fluctuations(
         (prepared,),
         (jnp.eye(2)[..., None] * jnp.ones(NPIX),),
         (jnp.asarray(FALLING),),
@@ -196,7 +191,7 @@ def fluctuations() -> Calls:
         jnp.ones(1),
         ("44",),
     )
-    yield of_maps._modes, MAPS, np.stack([FALLING] * 2)
+    yield own._modes, MAPS, np.stack([FALLING] * 2)
     yield found.cmb_realisation, KEY
     yield found.noise_realisation, KEY
 
@@ -224,7 +219,8 @@ def all_likelihoods():
     yield fits.spectral_likelihood(SKY, FOUR, data, per_pixel, {**START, "angle.95": 0.1})
 
 
-def posteriors() -> Calls:
+@of("fits.posterior")
+def posteriors(posterior) -> Calls:
     priors = [(fits.Gaussian(1.5, 0.1), np.array([True, False]))]
     yield posterior.prior_terms, np.ones(2), priors
     for like in all_likelihoods():
@@ -237,7 +233,8 @@ def posteriors() -> Calls:
         yield posterior._cell_derivatives, like, theta
 
 
-def template_passes() -> Calls:
+@of("fits.products")
+def template_passes(products) -> Calls:
     data = np.ones((4, 2, NPIX))
     yield products.gram, data, MAPS[None], data
     yield products._weights, data, 2 * data
@@ -247,17 +244,20 @@ def template_passes() -> Calls:
     yield products.weighted, data, MAPS[None]
 
 
-def comparisons() -> Calls:
+@of("fits.comparison")
+def comparisons(comparison) -> Calls:
     yield comparison._sums_of_squares, np.ones((4, 2, NPIX)), np.ones((3, NPIX), bool)
 
 
-def decompositions() -> Calls:
+@of("fits.systems")
+def decompositions(systems) -> Calls:
     yield systems.square_root, np.eye(4)[None]
 
 
-def shared_pixels() -> Calls:
-    data, layout = np.ones((4, 2, NPIX)), compress.Layout(False, (0, 1))
-    noise, used = compress.Noise(np.ones((4, 2, 1)), np.ones(NPIX)), np.ones(NPIX, bool)
+@of("fits.distributed")
+def shared_pixels(distributed) -> Calls:
+    data, layout = np.ones((4, 2, NPIX)), Layout(False, (0, 1))
+    noise, used = Noise(np.ones((4, 2, 1)), np.ones(NPIX)), np.ones(NPIX, bool)
     blocks = distributed.Blocks(np.arange(NPIX).reshape(2, -1), np.arange(2))
     yield partial(distributed._look, components=2), data, noise
     yield partial(distributed.counted, number=3), np.arange(NPIX)
@@ -267,23 +267,26 @@ def shared_pixels() -> Calls:
     yield partial(distributed.gathered, layout=layout), data, noise, blocks
 
 
-def separations() -> Calls:
+@of("fits.profile_likelihood")
+def separations(profile_likelihood) -> Calls:
     like = separation()
     yield profile_likelihood.matrices_at, like, dict(like.start)
 
 
-def separated() -> Calls:
-    data, layout = np.ones((4, 2, NPIX)), compress.Layout(False, (0, 1))
+@of("fits.separated_maps")
+def separated(separated_maps) -> Calls:
+    data, layout = np.ones((4, 2, NPIX)), Layout(False, (0, 1))
     matrix = np.random.default_rng(1).normal(size=(1, 4, 2))
     for errors in (False, True):
         options = {"layouts": (layout,), "errors": errors}
-        given = (matrix,), data, compress.Noise(data)
+        given = (matrix,), data, Noise(data)
         yield partial(separated_maps._over_devices, None, **options), *given
         own = partial(separated_maps._separated, used=np.ones(NPIX, bool), **options)
         yield own, np.zeros(NPIX, int), *given
 
 
-def grids() -> Calls:
+@of("fits.grid")
+def grids(grid) -> Calls:
     axes = {name: np.linspace(0.9, 1.1, 3) * value for name, value in START.items()}
     yield grid.chi2_on_grid, template_fit(), axes
     yield grid.chi2_on_grid, template_fit(pixelwise=True), axes
@@ -291,21 +294,23 @@ def grids() -> Calls:
 
 def densities(like):
     priors = {"dust.beta_dust": fits.Uniform(1.0, 2.0), "synchrotron.beta_syn": fits.Gaussian(3, 1)}
-    own = posterior.Posterior(like, priors)
+    own = Posterior(like, priors)
     return own, own.density(own.start)
 
 
-def optimisers() -> Calls:
+@of("fits.optimize")
+def optimisers(optimize) -> Calls:
     own, density = densities(template_fit())
     yield optimize._values, own.start, density, np.ones(2)
     yield jax.grad(optimize._objective), own.start, (density, np.ones(2))
     yield jax.jacfwd(optimize._residuals), own.start, (density, np.ones(2))
 
 
-def samplers() -> Calls:
+@of("fits.sampling")
+def samplers(sampling) -> Calls:
     own, _ = densities(separation())
     z = np.ones((4, own.start.size))
-    numbers, _ = unbounded.unbounded_posterior(own, own.start)
+    numbers, _ = unbounded_posterior(own, own.start)
     leaves, structure = jax.tree.flatten(numbers.density)
     yield partial(sampling._log_probs, structure=structure), z, leaves
     yield sampling._values, numbers, z
@@ -316,14 +321,15 @@ def samplers() -> Calls:
     yield sampling.agreement, np.random.default_rng(1).normal(size=(100, 4, 2))
 
 
-def forecasts() -> Calls:
+@of("fits.fisher")
+def forecasts(fisher) -> Calls:
     law = {name: jax.tree.map(lambda x: x[:, :1] if x.ndim == 2 else x, one)
            for name, one in SKY.components.items()}  # fmt: skip
     foregrounds = {"BB.dust.synchrotron.correlation": 0.4}
     for name in SKY:
         foregrounds |= {f"BB.{name}.amplitude": 1.0, f"BB.{name}.slope": -2.5}
     model = fisher.ForecastModel(
-        mixing.Mixing.of(sky.Sky(law), FOUR, "uK_CMB"),
+        Mixing.of(jaxsky.Sky(law), FOUR, "uK_CMB"),
         jnp.ones((LMAX, 4)),
         jnp.ones((1, LMAX)),
         jnp.ones((1, LMAX)),
@@ -335,59 +341,30 @@ def forecasts() -> Calls:
     yield partial(fisher._root, free=("r", "dust.beta_dust")), params, model
 
 
-def masked() -> Calls:
+@of("fits.pseudo_cl")
+def masked(pseudo_cl) -> Calls:
     maps = random_maps(3, npix=NPIX)
     yield partial(pseudo_cl._compiled_alm, lmax=LMAX), MASK, np.ones((4, NPIX)), maps
     yield partial(pseudo_cl._compiled_alm, lmax=LMAX), MASK, None, maps
 
 
-def patch_laws() -> Calls:
+@of("fits.patches")
+def patch_laws(patches) -> Calls:
     row = np.ones((3, 2))
     rows = patches.BandCombinations(row, row, row, row, np.ones((3, 2, 10)))
     yield partial(patches.minimise, ends=(2, 9)), rows, np.array([-2.4, 0.3])
 
 
-def tensors() -> Calls:
+@of("fits.tensor_ratio")
+def tensors(tensor_ratio) -> Calls:
     shape = (2, 2, 3, LMAX + 1, 5)
     ordered = np.moveaxis(np.ones(shape), 2, 0)
     yield tensor_ratio._squares, ordered, ordered, np.ones(3), np.ones((1, 2, LMAX + 1))
 
 
-def pieces() -> Calls:
+@of("jaxsky.mesh")
+def pieces(mesh) -> Calls:
     yield mesh._put, np.ones((2, NPIX)), np.ones((2, 5)), 3
-
-
-#: The calls of each module with compiled functions.
-CALLS: dict[str, Callable[[], Calls]] = {
-    "jaxsky.mesh": pieces,
-    "jaxsky.sed": spectral_laws,
-    "jaxsky.components.laws": emission,
-    "jaxsky.bandpass": bandpasses,
-    "jaxsky.interpolation": interpolated,
-    "jaxsky.sky": observed,
-    "jaxsky.harmonics.transforms": transforms,
-    "jaxsky.harmonics.resolution": resolution,
-    "jaxsky.cmb": random_fields,
-    "jaxsky.noise": noises,
-    "jaxsky.galaxy": galaxies,
-    "jaxsky.simulation": simulations,
-    "jaxsky.templates": correlations,
-    "fits.fluctuations": fluctuations,
-    "fits.posterior": posteriors,
-    "fits.products": template_passes,
-    "fits.comparison": comparisons,
-    "fits.systems": decompositions,
-    "fits.distributed": shared_pixels,
-    "fits.profile_likelihood": separations,
-    "fits.separated_maps": separated,
-    "fits.grid": grids,
-    "fits.optimize": optimisers,
-    "fits.sampling": samplers,
-    "fits.fisher": forecasts,
-    "fits.pseudo_cl": masked,
-    "fits.patches": patch_laws,
-    "fits.tensor_ratio": tensors,
-}
 
 
 #: Modules whose calls also take single precision.

@@ -15,21 +15,18 @@ from fits.sampling import sample
 from fits.template_likelihood import likelihood
 from jaxsky import Dust, Sky, observe, set_parameters
 from refusals import cases, raises
-from test_likelihood import BANDS, START, fluctuations, problem
+from test_likelihood import BANDS, START, fitted, fluctuations, problem
 
 PRIORS = {"dust.beta_dust": Uniform(0.5, 2.5), "synchrotron.beta_syn": Uniform(2.0, 4.5)}
 
 
 @pytest.fixture(scope="module", params=[pytest.param("diagonal", marks=pytest.mark.slow), "exact"])
 def like(request):
-    sky, data, sigma = problem()
     if request.param == "diagonal":
-        return likelihood(sky, BANDS, data, sigma, START)
+        return fitted()
     # A tenth of the noise, so that the posterior is close to a Gaussian.
     model = fluctuations()
-    return likelihood(
-        sky, BANDS, data, sigma, START, covariance_of=lambda rows: model.covariance(rows) / 100
-    )
+    return fitted(covariance_of=lambda rows: model.covariance(rows) / 100)
 
 
 def test_the_three_methods_agree(like):
@@ -87,10 +84,9 @@ def test_a_grid_finds_a_narrow_posterior_or_says_that_it_does_not(correlation, p
 
 
 def test_parameters_are_recovered_without_noise():
-    sky, _, sigma = problem()
     truth = {"dust.beta_dust": 1.7, "synchrotron.beta_syn": 2.8}
-    data = observe(set_parameters(sky, truth), list(BANDS.values()))
-    like = likelihood(sky, BANDS, data, sigma, START)
+    data = observe(set_parameters(problem()[0], truth), list(BANDS.values()))
+    like = fitted(data=data)
     for solver in (None, optx.GaussNewton(1e-12, 1e-12), optx.Dogleg(1e-12, 1e-12)):
         found = best_fit(like, START, priors=PRIORS, solver=solver)
         for name, value in truth.items():
@@ -111,18 +107,16 @@ def test_fits_do_not_depend_on_units():
     """Maps in K instead of uK, templates and noise with them, give the same indices."""
     sky, data, sigma = problem()
     small = {f"{n}.amplitude": 1e-6 * sky[n].amplitude for n in sky}
-    a = best_fit(likelihood(sky, BANDS, data, sigma, START), START)
-    rescaled = likelihood(set_parameters(sky, small), BANDS, 1e-6 * data, 1e-6 * sigma, START)
-    b = best_fit(rescaled, START)
+    a = best_fit(fitted())
+    b = best_fit(fitted(sky=set_parameters(sky, small), data=1e-6 * data, sigma=1e-6 * sigma))
     for name in START:
         assert b.best_fit[name] == pytest.approx(a.best_fit[name], abs=1e-6)
     np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-6)
 
 
 def test_a_gaussian_prior_pulls_by_its_weight():
-    sky, data, sigma = problem()
     name = "gain.44"
-    like = likelihood(sky, BANDS, data, sigma, {name: 1.0})
+    like = fitted(start={name: 1.0})
     free = best_fit(like, {name: 1.0})
     prior = Gaussian(free.best_fit[name] + 1.0, free.sigma[name])
     pulled = best_fit(like, {name: 1.0}, priors={name: prior})
@@ -132,10 +126,9 @@ def test_a_gaussian_prior_pulls_by_its_weight():
 
 @pytest.mark.slow
 def test_more_free_parameters_by_name():
-    sky, data, sigma = problem()
     start = {**START, "dust.T_dust": 20.0, "synchrotron.curvature": 0.0, "offset.44.Q": 0.0}
     priors = {"dust.T_dust": Gaussian(21.0, 1.0), "synchrotron.curvature": Gaussian(0.0, 0.1)}
-    found = best_fit(likelihood(sky, BANDS, data, sigma, start), start, priors=priors)
+    found = best_fit(fitted(start=start), priors=priors)
     for name, value in (("dust.beta_dust", 1.53), ("offset.44.Q", 0.0), ("dust.T_dust", 21.0)):
         assert abs(found.best_fit[name] - value) < 4 * found.sigma[name]
 
@@ -193,13 +186,6 @@ def test_samples_stay_inside_the_prior(like):
     assert bool(jnp.isfinite(chain.details["log_prob"]).all())
 
 
-def quick(data=None, sigma=None, start=START, sky=None):
-    known, clean, noise = problem()
-    sky = known if sky is None else sky
-    data = clean if data is None else data
-    return likelihood(sky, BANDS, data, noise if sigma is None else sigma, start)
-
-
 def by_each(like, start):
     """Gradient, grid and, as far as it goes, chain."""
     yield best_fit(like, start, priors=PRIORS, throw=False)
@@ -249,15 +235,15 @@ def test_a_chi2_that_is_astronomical_is_no_fit():
     _, data, sigma = problem()
     marred = np.array(data)
     marred[0, :, ::100] = -32768.0
-    for result in by_each(quick(data=marred), START):
+    for result in by_each(fitted(data=marred), START):
         assert not result.converged
         assert "missing values that are read as data, a wrong unit" in result.message
-    well = best_fit(quick(), START)
+    well = best_fit(fitted(), START)
     assert well.judged(1e9, 24, START).converged is Convergence.misfit
     with pytest.raises(FitError, match="degrees of freedom, so the model does not describe"):
-        best_fit(quick(data=marred), START, priors=PRIORS)
+        best_fit(fitted(data=marred), START, priors=PRIORS)
     # Errors three times too small, and bright pixels that no law describes, are those of real maps.
-    for other in (quick(sigma=np.asarray(sigma) / 3), quick(data=np.asarray(data) * 1.02)):
+    for other in (fitted(sigma=np.asarray(sigma) / 3), fitted(data=np.asarray(data) * 1.02)):
         assert best_fit(other, START, priors=PRIORS).converged
 
 
@@ -271,9 +257,9 @@ def test_degrees_of_freedom_are_data_with_weight():
     masked = np.array(np.broadcast_to(sigma, data.shape))
     masked[0, 0, :7] = np.inf
     for pixelwise in (False, True):
-        one = likelihood(problem()[0], BANDS, data, masked, START, pixelwise=pixelwise)
+        one = fitted(sigma=masked, pixelwise=pixelwise)
         assert one.dof(2) == data.size - 7 - 2
-        U = likelihood(problem()[0], BANDS, data, masked, START, stokes="U", pixelwise=pixelwise)
+        U = fitted(sigma=masked, stokes="U", pixelwise=pixelwise)
         assert U.dof(2) == data.size // 2 - 2
 
 
@@ -281,17 +267,17 @@ def test_a_start_at_the_optimum_is_told_from_a_search_that_does_not_move():
     sky, _, _ = problem()
     truth = {"dust.beta_dust": 1.7, "synchrotron.beta_syn": 2.8}
     data = observe(set_parameters(sky, truth), list(BANDS.values()))
-    assert best_fit(quick(data=data), truth, priors=PRIORS).converged
+    assert best_fit(fitted(data=data), truth, priors=PRIORS).converged
     # Steps of nothing, which optimistix takes for success.
     still = optx.GradientDescent(learning_rate=0.0, rtol=1e-3, atol=1e-3)
     with pytest.raises(FitError, match=r"did not leave its start, .* sigma from the opt") as caught:
-        best_fit(quick(data=data), START, solver=still)
+        best_fit(fitted(data=data), START, solver=still)
     assert caught.value.result.converged is Convergence.stalled
 
 
 @pytest.mark.parametrize("solver", [Newton(), optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)])
 def test_how_a_fit_ended_is_said_once_and_written_as_true_or_false(solver, tmp_path):
-    like = quick()
+    like = fitted()
     ended = {
         Convergence.converged: best_fit(like, START, solver=solver),
         Convergence.max_steps: best_fit(like, START, solver=solver, max_steps=1, throw=False),
@@ -310,7 +296,7 @@ def test_how_a_fit_ended_is_said_once_and_written_as_true_or_false(solver, tmp_p
 
 
 def test_weights_of_nothing_are_no_fit():
-    flat = quick(sigma=np.asarray(problem()[2]) * 1e12)
+    flat = fitted(sigma=np.asarray(problem()[2]) * 1e12)
     raises(FitError, r"do not constrain .*a Gaussian prior on .* would help", best_fit, flat, START)
     grid = grid_fit(flat, START, priors=PRIORS)
     assert grid.converged is Convergence.undetermined

@@ -369,6 +369,8 @@ def pieces(mesh) -> Calls:
 
 #: Modules whose calls also take single precision.
 SINGLE = ("jaxsky.bandpass", "jaxsky.interpolation", "jaxsky.sky", "fits.products")
+#: Modules whose programs take long to make: most others share functions with them.
+LARGE = {"jaxsky.sky", "fits.posterior", "fits.sampling"}
 
 
 def in_single_precision(x):
@@ -396,6 +398,13 @@ def compiled(module: str) -> set[str]:
     return names
 
 
+def each_module(names):
+    marks = {name: [pytest.mark.slow] if name in LARGE else [] for name in names}
+    return pytest.mark.parametrize(
+        "module", [pytest.param(name, marks=found) for name, found in marks.items()]
+    )
+
+
 def called(jaxpr) -> Iterator[str]:
     """Primitives of a traced program, and functions with their place."""
     for equation in jaxpr.eqns:
@@ -421,7 +430,7 @@ def lowered(function, arguments, monkeypatch) -> tuple[str, set[str]]:
     return text, inside
 
 
-@pytest.mark.parametrize("module", CALLS)
+@each_module(CALLS)
 def test_compiled_functions_are_made_for_a_gpu(module, monkeypatch):
     left = compiled(module)
     assert left
@@ -442,7 +451,7 @@ def test_no_module_is_forgotten():
     assert found == set(CALLS)
 
 
-@pytest.mark.parametrize("module", SINGLE)
+@each_module(SINGLE)
 def test_matrix_products_in_single_precision_are_not_rounded_further(module, monkeypatch):
     """As GPUs do with what has no precision of its own."""
     products = 0

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxsky.arrays import Scalar
 from jaxsky.checks import (
     EXACT,
     Numeric,
@@ -125,7 +126,7 @@ class Bandpass(Printed, eqx.Module):
         return _quadrature(self.nu, self.weights, self.convention)
 
     @property
-    def center(self) -> Float[Array, ""]:
+    def center(self) -> Scalar:
         """Mean frequency with the weights on antenna temperature [GHz]."""
         return jnp.dot(self.quadrature, self.nu, precision=EXACT)
 
@@ -138,9 +139,7 @@ class Bandpass(Printed, eqx.Module):
         nu = self.center + factor * (self.nu - self.center)
         return Bandpass(nu, self.weights, self.convention)
 
-    def conversion(
-        self, source: str, target: str, nu_ref: Numeric | None = None
-    ) -> Float[Array, ""]:
+    def conversion(self, source: str, target: str, nu_ref: Numeric | None = None) -> Scalar:
         """Return the factor between brightness units in this band; see `band_conversion`.
 
         MJy/sr requires `nu_ref`, the frequency at which it is quoted [GHz]: published factors

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxsky.arrays import Alm
 from jaxsky.checks import check_choice
 from jaxsky.harmonics import expand
 from jaxsky.noise import cholesky, normal
@@ -132,9 +133,7 @@ def _spectra(which: str, end: int, **arguments: Any) -> Float[np.ndarray, "4 ell
 
 
 @partial(jax.jit, static_argnames="stokes")
-def realisation(
-    key: Array, spectra: Float[Array | np.ndarray, "4 ell"], stokes: str = "QU"
-) -> Float[Array, "stokes alm"]:
+def realisation(key: Array, spectra: Float[Array | np.ndarray, "4 ell"], stokes: str = "QU") -> Alm:
     """Return packed coefficients (E, B or I, E, B) of a Gaussian realisation of spectra.
 
     `spectra` are the C_l of TT, EE, BB, TE, in the square of any unit; `stokes` is "QU" or "IQU".

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.polynomial.chebyshev import chebpts1, chebvander
 
+from jaxsky.arrays import Map, Scalar
 from jaxsky.bandpass import Bandpass, Samples, average, stack_bands
 from jaxsky.checks import EXACT, is_concrete
 from jaxsky.components import Component
@@ -56,7 +57,7 @@ def _coefficients(values: Float[Array, "..."]) -> Float[Array, "..."]:
     return values
 
 
-def _evaluate(coefs: Float[Array, "..."], *points: Float[Array, " pix"]) -> Float[Array, " pix"]:
+def _evaluate(coefs: Float[Array, "..."], *points: Map) -> Map:
     """Sum the series at points in [-1, 1]^d (one array per dimension), by Clenshaw's recurrence.
 
     The loops are unrolled: node counts are small, and everything fuses into one pass.
@@ -165,7 +166,7 @@ def _all_series(
     return jax.vmap(lambda band: _series(component, band, counts)[0].ravel())(samples)
 
 
-def _points(component: Component) -> list[Float[Array, " pix"]]:
+def _points(component: Component) -> list[Map]:
     """Return the parameters that are maps, scaled to [-1, 1]."""
     maps, _ = _split(component)
     return [(m - mid) / half for m, (mid, half) in zip(maps, map(_range, maps), strict=True)]
@@ -226,14 +227,12 @@ def _weights(component, samples, vectors, counts):
 
 
 @jax.jit
-def term(component: Component, coefs: Float[Array, "..."]) -> Float[Array, " pix"]:
+def term(component: Component, coefs: Float[Array, "..."]) -> Map:
     """Evaluate a term (`Terms.coefs`) in each pixel; a number if no parameter is a map."""
     return _evaluate(coefs, *_points(component))
 
 
-def band_sed(
-    component: Component, band: Bandpass, nodes: Nodes
-) -> Float[Array, ""] | Float[Array, " pix"]:
+def band_sed(component: Component, band: Bandpass, nodes: Nodes) -> Scalar | Map:
     """Return the band-averaged law of a component: a number, or a map if a parameter is one.
 
     The nodes come from `choose_nodes`; None sums directly over the band in every pixel.

@@ -39,11 +39,7 @@ def _content(settings: Experiment) -> dict[str, Any]:
 
 
 def check_folder(
-    out: Path,
-    settings: Experiment,
-    resume: bool,
-    overwrite: bool,
-    indices: range | None = None,
+    out: Path, settings: Experiment, resume: bool, overwrite: bool, indices: range | None = None
 ) -> None:
     """Raise ValueError unless realisations with these settings may be written to a folder.
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from jaxsky.arrays import Alm, Covariance, Map, Maps, Spectrum
 from jaxsky.checks import Numeric, as_array, check_finite, check_seed, check_shape, is_concrete
 from jaxsky.harmonics import analysis, children, expand, power_spectrum
 
@@ -56,7 +57,7 @@ def stokes_noise(key: Array, stokes: int, size: int, dtype: Any) -> Float[Array,
 @partial(jax.jit, static_argnames=("nside", "stokes", "pixels"))
 def uniform_covariance(
     noise: Numeric, nside: int, stokes: int = 2, pixels: int | None = None
-) -> Float[Array, "stokes stokes pix"]:
+) -> Covariance:
     """Return the covariance of each pixel for a level, the same for all Stokes parameters.
 
     By default of all pixels, else of as many.
@@ -65,25 +66,19 @@ def uniform_covariance(
     return jnp.eye(stokes)[..., None] * jnp.full(npix, (noise / pixel) ** 2)
 
 
-def pixel_covariance(
-    noise: Numeric, nside: int, stokes: int = 2
-) -> Float[Array, "stokes stokes pix"]:
+def pixel_covariance(noise: Numeric, nside: int, stokes: int = 2) -> Covariance:
     """Return the covariance of each pixel for noise given as a level or as a covariance."""
     return jnp.asarray(noise) if jnp.ndim(noise) else uniform_covariance(noise, nside, stokes)
 
 
-def uniform_map(
-    key: Array, noise: ArrayLike, nside: int, stokes: int = 2
-) -> Float[Array, "stokes pix"]:
+def uniform_map(key: Array, noise: ArrayLike, nside: int, stokes: int = 2) -> Maps:
     """Draw white noise of a level, as from `uniform_covariance` but without that in memory."""
     sigma = as_array("noise", noise) / float(healpy.nside2resol(nside, arcmin=True))
     return sigma * stokes_noise(key, stokes, healpy.nside2npix(nside), sigma.dtype)
 
 
 @partial(jax.jit, static_argnames=("lmax", "stokes"))
-def uniform_alm(
-    key: Array, noise: ArrayLike, lmax: int, stokes: int = 2
-) -> Float[Array, "stokes alm"]:
+def uniform_alm(key: Array, noise: ArrayLike, lmax: int, stokes: int = 2) -> Alm:
     """Draw packed coefficients of white noise, N_l = noise^2 (in (u rad)^2) at all multipoles.
 
     Rows are I (1), E, B (2) or I, E, B (3); E and B have no modes at l < 2.
@@ -111,7 +106,7 @@ def white_alm(key: Array, noise: Any, lmax: int) -> Float[Array, "2 alm"]:
 
 
 @jax.jit
-def cholesky(covariance: Float[Array, "stokes stokes pix"]) -> Float[Array, "stokes stokes pix"]:
+def cholesky(covariance: Covariance) -> Covariance:
     """Return the lower Cholesky factor of each pixel's covariance, unrolled over its elements."""
     n = len(covariance)
     lower = [[jnp.zeros_like(covariance[0, 0])] * n for _ in range(n)]
@@ -134,9 +129,7 @@ def _correlated(covariance, white, diagonal):
     return jnp.stack([sum(lower[i, j] * white[j] for j in js) for i, js in enumerate(terms)])
 
 
-def draw(
-    key: Array, covariance: Float[Array, "stokes stokes pix"], *, diagonal: bool = False
-) -> Float[Array, "stokes pix"]:
+def draw(key: Array, covariance: Covariance, *, diagonal: bool = False) -> Maps:
     """Draw noise L n with a given covariance in each pixel, independent between pixels.
 
     L is the lower Cholesky factor, n white noise. The paper (Hervias-Caimapo, Bonaldi & Brown 2016)
@@ -151,7 +144,7 @@ def draw(
     return _correlated(covariance, white, diagonal)
 
 
-def draw_in_pieces(key: Array, covariance: Any) -> Float[Array, "stokes pix"]:
+def draw_in_pieces(key: Array, covariance: Any) -> Maps:
     """Return the same as `draw` in double precision; a covariance on disk stays there."""
     _, stokes, npix = covariance.shape
     white = stokes_noise(key, stokes, npix, float)
@@ -164,9 +157,7 @@ def draw_in_pieces(key: Array, covariance: Any) -> Float[Array, "stokes pix"]:
     return jnp.asarray(found)
 
 
-def estimate_variance(
-    maps: Float[Array, "stokes pix"], used: Bool[Array, " pix"]
-) -> Float[Array, " stokes"]:
+def estimate_variance(maps: Maps, used: Bool[Array, " pix"]) -> Float[Array, " stokes"]:
     """Estimate the noise variance per pixel from the scatter in groups of four neighbouring pixels.
 
     A signal that is smooth over such a group cancels, which leaves the noise. Only groups of which
@@ -182,9 +173,7 @@ def estimate_variance(
     return jnp.sum(scatter * whole, axis=-1) / jnp.sum(whole)
 
 
-def knee_spectrum(
-    white: Numeric, ell_knee: Numeric, slope: Numeric, lmax: int
-) -> Float[Array, " ell"]:
+def knee_spectrum(white: Numeric, ell_knee: Numeric, slope: Numeric, lmax: int) -> Spectrum:
     """Return the spectrum of noise with excess at large scales, white [1 + (l/l_knee)^-slope].
 
     Zero at l < 2, where polarization has no modes.
@@ -201,9 +190,7 @@ def _deviance(theta, args):
     return jnp.sum(modes * (jnp.log(spectrum) + measured / spectrum))
 
 
-def fit_knee(
-    maps: Float[Array, "stokes pix"], used: Bool[Array, " pix"], lmax: int
-) -> tuple[float, float, float]:
+def fit_knee(maps: Maps, used: Bool[Array, " pix"], lmax: int) -> tuple[float, float, float]:
     """Fit white level, knee and slope (`knee_spectrum`) of the noise of Q, U maps, up to lmax.
 
     Returns the maximum-likelihood values for the spectrum (EE + BB)/2 of the masked maps, divided
@@ -231,7 +218,7 @@ def fit_knee(
     return float(level * white), float(knee), float(slope)
 
 
-def rms_covariance(rms: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:
+def rms_covariance(rms: Maps) -> Covariance:
     """Return the covariance of each pixel from maps of the rms, without correlations."""
     rms = as_array("rms", rms)
     check_shape("rms", rms, rms.ndim == 2, "have shape (stokes, pix)")
@@ -241,9 +228,7 @@ def rms_covariance(rms: Float[Array, "stokes pix"]) -> Float[Array, "stokes stok
     return _diagonal(rms**2)
 
 
-def hits_covariance(
-    sigma0: ArrayLike, hits: Float[Array, " pix"], stokes: int = 2
-) -> Float[Array, "stokes stokes pix"]:
+def hits_covariance(sigma0: ArrayLike, hits: Map, stokes: int = 2) -> Covariance:
     """Return the covariance of each pixel from the number of observations, sigma_0^2 / hits.
 
     The noise of one observation, sigma_0, is one number or one per Stokes parameter; for WMAP the
@@ -281,13 +266,11 @@ def _each(sigma0: ArrayLike, stokes: int) -> Float[Array, " stokes"]:
     return jnp.broadcast_to(sigma0, (stokes,))
 
 
-def _diagonal(variance: Float[Array, "stokes pix"]) -> Float[Array, "stokes stokes pix"]:
+def _diagonal(variance: Maps) -> Covariance:
     return jnp.eye(len(variance), dtype=variance.dtype)[..., None] * variance
 
 
-def covariance_from_columns(
-    columns: Float[Array, "column pix"],
-) -> Float[Array, "stokes stokes pix"]:
+def covariance_from_columns(columns: Float[Array, "column pix"]) -> Covariance:
     """Return the covariance of each pixel from its elements, in order of `COVARIANCE_COLUMNS`."""
     columns = as_array("columns", columns)
     good = columns.ndim == 2 and len(columns) in COVARIANCE_COLUMNS
@@ -298,14 +281,14 @@ def covariance_from_columns(
 
 
 @jax.jit
-def _number_indefinite(covariance: Float[Array, "stokes stokes pix"]) -> Int[Array, ""]:
+def _number_indefinite(covariance: Covariance) -> Int[Array, ""]:
     """Count the pixels whose covariance is not positive definite."""
     # A root of a negative number is NaN, and NaN is not positive; each pixel is read once.
     pivots = [row[s] for s, row in enumerate(cholesky(covariance.astype(float)))]
     return jnp.sum(~reduce(jnp.logical_and, [(p > 0) & jnp.isfinite(p) for p in pivots]))
 
 
-def check_covariance(name: str, covariance: Float[Array, "stokes stokes pix"]) -> None:
+def check_covariance(name: str, covariance: Covariance) -> None:
     """Raise ValueError if the covariance of any pixel is not positive definite, and count them.
 
     Only the lower triangle is read, as in `draw`. Traced arrays pass unchecked.

@@ -8,8 +8,9 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
+from jaxsky.arrays import Beam, Covariance, Scalar
 from jaxsky.bandpass import Bandpass
 from jaxsky.checks import (
     Printed,
@@ -39,7 +40,7 @@ class Source(eqx.Module):
     """
 
     component: Component
-    fwhm: Float[Array, ""] | float = 0.0
+    fwhm: Scalar | float = 0.0
     small_scales: SmallScales | None = None
     correlated_with: str | None = eqx.field(static=True, default=None)
 
@@ -63,9 +64,9 @@ class ObservedBand(Printed, eqx.Module):
     """
 
     band: Bandpass
-    beam: Float[Array, ""] | Float[Array, " ell"] | float
-    target: Float[Array, ""] | float | None = None
-    noise: Float[Array, ""] | Float[Array, "stokes stokes pix"] | float | None = None
+    beam: Beam
+    target: Scalar | float | None = None
+    noise: Scalar | Covariance | float | None = None
     diagonal: bool = eqx.field(static=True, default=False)
 
     def __post_init__(self) -> None:
@@ -86,7 +87,7 @@ class ObservedBand(Printed, eqx.Module):
         return "Observed band", rows
 
     @property
-    def map_beam(self) -> Float[Array, ""] | Float[Array, " ell"] | float:
+    def map_beam(self) -> Beam:
         """Beam of the observed map: the target if there is one, else the band's own."""
         return self.beam if self.target is None else self.target
 
@@ -113,7 +114,7 @@ class Observation(eqx.Module):
     channels: dict[str, ObservedBand]
     nside: int = eqx.field(static=True)
     stokes: str = eqx.field(static=True, default="QU")
-    finest: Float[Array, ""] | float = 0.0
+    finest: Scalar | float = 0.0
     lmax: int = eqx.field(static=True, default=None)
     precision: str = eqx.field(static=True, default="double")
     names: tuple[str, ...] = eqx.field(static=True, init=False)

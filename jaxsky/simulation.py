@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxsky.arrays import Alm, BandMaps, Maps, Scalar, Window
 from jaxsky.bandpass import Samples, average, stack_bands
 from jaxsky.checks import is_concrete
 from jaxsky.cmb import realisation
@@ -52,11 +53,11 @@ class HarmonicSource(NamedTuple):
     replace them. At `repaired` multipoles the matrix of correlated small scales was repaired.
     """
 
-    alms: tuple[Float[Array, "stokes alm"], ...]
+    alms: tuple[Alm, ...]
     weights: tuple[Float[Array, " term"], ...] | None
     component: Component | None
-    template: Float[Array, "stokes pix"] | None
-    fwhm: Float[Array, ""] | float
+    template: Maps | None
+    fwhm: Scalar | float
     repaired: Int[Array, ""] | int = 0
 
 
@@ -214,12 +215,8 @@ def harmonic_sources(
 
 @partial(jax.jit, static_argnames=("lmax", "steps"))
 def _term_alm(
-    template: Float[Array, "stokes pix"],
-    component: Component,
-    coefs: Float[Array, "..."],
-    lmax: int,
-    steps: int,
-) -> Float[Array, "stokes alm"]:
+    template: Maps, component: Component, coefs: Float[Array, "..."], lmax: int, steps: int
+) -> Alm:
     """Analyse a template times a term of the law, in one program to avoid storing the product."""
     return analysis(template * term(component, coefs).astype(template.dtype), lmax, steps)
 
@@ -227,13 +224,13 @@ def _term_alm(
 class _Part(NamedTuple):
     """The contribution of a component to a band: coefficients, their weights, and one window."""
 
-    alms: tuple[Float[Array, "stokes alm"], ...]
-    weights: Float[Array, " term"] | tuple[Float[Array, ""] | float, ...]
-    window: Float[Array, " ell"]
+    alms: tuple[Alm, ...]
+    weights: Float[Array, " term"] | tuple[Scalar | float, ...]
+    window: Window
 
 
 @jax.jit
-def _summed(parts: tuple[_Part, ...]) -> Float[Array, "stokes alm"]:
+def _summed(parts: tuple[_Part, ...]) -> Alm:
     """Sum the parts in one pass, in the precision of the coefficients."""
     dtype = parts[0].alms[0].dtype
     return sum(
@@ -243,9 +240,7 @@ def _summed(parts: tuple[_Part, ...]) -> Float[Array, "stokes alm"]:
     )
 
 
-def _noise(
-    key: Array, channel: ObservedBand, observation: Observation
-) -> _Part | Float[Array, "stokes pix"] | None:
+def _noise(key: Array, channel: ObservedBand, observation: Observation) -> _Part | Maps | None:
     """Draw the noise of a channel, in harmonic space or as a map, whichever is simpler."""
     if channel.noise is None:
         return None
@@ -269,7 +264,7 @@ def observe_bands(
     *,
     components: bool = False,
     names: Sequence[str] | None = None,
-) -> Iterator[tuple[str, dict[str, Float[Array, "stokes pix"]]]]:
+) -> Iterator[tuple[str, dict[str, Maps]]]:
     """Yield the name and maps [uK_RJ] of each channel in turn, so that only one is in memory.
 
     The key is for CMB and noise. `cmb` has the spectra TT, EE, BB, TE [uK_CMB^2] up to at least the
@@ -309,11 +304,8 @@ def observe_bands(
 
 
 def _maps(
-    parts: Mapping[str, _Part],
-    noise: _Part | Float[Array, "stokes pix"] | None,
-    nside: int,
-    components: bool,
-) -> dict[str, Float[Array, "stokes pix"]]:
+    parts: Mapping[str, _Part], noise: _Part | Maps | None, nside: int, components: bool
+) -> dict[str, Maps]:
     """Return the total of a band, and its components on request."""
     maps: dict[str, Array] = {}
     total: Array | float = 0.0
@@ -328,13 +320,7 @@ def _maps(
     return {**maps, "total": jnp.asarray(total)}
 
 
-def _seen(
-    source: HarmonicSource,
-    channel: ObservedBand,
-    index: int,
-    lmax: int,
-    name: str,
-) -> _Part:
+def _seen(source: HarmonicSource, channel: ObservedBand, index: int, lmax: int, name: str) -> _Part:
     """Return the contribution of a component to a band."""
     window = beam_ratio(channel.map_beam, source.fwhm, lmax, f"component {name!r}")
     if source.weights is not None:
@@ -354,7 +340,7 @@ def simulate(
     cmb: Float[Array | np.ndarray, "4 ell"] | None = None,
     *,
     terms: Mapping[str, Terms | None] | None = None,
-) -> Float[Array, "band stokes pix"]:
+) -> BandMaps:
     """Simulate the maps of all channels [uK_RJ]: `harmonic_sources`, then `observe_bands`.
 
     With a fixed key, differentiable in sources and observation.

@@ -6,8 +6,9 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike
 
+from jaxsky.arrays import BandMaps, Maps
 from jaxsky.bandpass import Bandpass
 from jaxsky.checks import Printed, as_array, check_names
 from jaxsky.components import Component, check_value, declared
@@ -107,9 +108,7 @@ def _check_bands(sky: object, bands: object) -> tuple[Bandpass, ...]:
     return tuple(bands)
 
 
-def _emission(
-    component: Component, bands: tuple[Bandpass, ...], nodes: Nodes
-) -> list[Float[Array, "stokes pix"]]:
+def _emission(component: Component, bands: tuple[Bandpass, ...], nodes: Nodes) -> list[Maps]:
     """Return the emission of a component in each band."""
     maps = []
     for band in bands:
@@ -146,7 +145,7 @@ def observe(
     *,
     tolerance: float = 1e-10,
     nodes: tuple[Nodes, ...] | None = None,
-) -> Float[Array, "band stokes pix"]:
+) -> BandMaps:
     """Observe the sky through a list of bands, the paper's eq. 8.
 
     Parameters
@@ -172,9 +171,7 @@ def observe(
     return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance), False)
 
 
-def observe_band(
-    sky: Sky, band: Bandpass, *, tolerance: float = 1e-10
-) -> Float[Array, "stokes pix"]:
+def observe_band(sky: Sky, band: Bandpass, *, tolerance: float = 1e-10) -> Maps:
     """Observe the sky through one band [uK_RJ]; see `observe`."""
     return observe(sky, [band], tolerance=tolerance)[0]
 
@@ -185,7 +182,7 @@ def observe_components(
     *,
     tolerance: float = 1e-10,
     nodes: tuple[Nodes, ...] | None = None,
-) -> dict[str, Float[Array, "band stokes pix"]]:
+) -> dict[str, BandMaps]:
     """Observe each component separately [uK_RJ]; see `observe`."""
     sky, bands = typed(sky), _check_bands(sky, bands)
     return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance), True)

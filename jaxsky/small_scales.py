@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from jaxsky.arrays import Map, Scalar, Spectrum
 from jaxsky.checks import (
     Parameter,
     as_array,
@@ -104,19 +105,19 @@ DUST = Ranges(EE=(60, 600), BB=(60, 600))
 class PowerLaw(NamedTuple):
     """C_l = exp(log_amplitude) (l / pivot)^slope, with the covariance of the two numbers."""
 
-    log_amplitude: Float[Array, ""]
-    slope: Float[Array, ""]
+    log_amplitude: Scalar
+    slope: Scalar
     covariance: Float[Array, "2 2"]
     pivot: int
 
-    def __call__(self, lmax: int) -> Float[Array, " ell"]:
+    def __call__(self, lmax: int) -> Spectrum:
         """Return C_l for l = 0 ... lmax, zero below l = 2."""
         ell = jnp.arange(lmax + 1)
         log = jnp.log(jnp.maximum(ell, 1) / self.pivot)
         return jnp.where(ell < 2, 0.0, jnp.exp(self.log_amplitude + self.slope * log))
 
 
-def fit_power_law(spectrum: Float[Array, " ell"], lmin: int, lmax: int) -> PowerLaw:
+def fit_power_law(spectrum: Spectrum, lmin: int, lmax: int) -> PowerLaw:
     """Fit a straight line to log C_l against log l by least squares, with equal weight for each l.
 
     This is the paper's fit, from lmin to lmax, both included; lmax is the pivot of the result. The
@@ -190,7 +191,7 @@ def _root(values: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(values > 0, jnp.sqrt(jnp.where(values > 0, values, 1.0)), 0.0)
 
 
-def modulation(maps: Float[Array, "2 pix"], fwhm: ArrayLike, nside: int) -> Float[Array, " pix"]:
+def modulation(maps: Float[Array, "2 pix"], fwhm: ArrayLike, nside: int) -> Map:
     """Return the polarized intensity of Q, U, smoothed by a beam [arcmin] and divided by its mean.
 
     Unlike Q over its mean, the paper's "normalised version of the template", it never changes sign.

@@ -10,8 +10,9 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike
 
+from jaxsky.arrays import Map, Maps, Scalar
 from jaxsky.checks import (
     Printed,
     as_array,
@@ -129,7 +130,7 @@ class Component(Printed, eqx.Module):
     polarized: ClassVar[bool] = True
     unit: ClassVar[str] = "uK_RJ"
 
-    amplitude: eqx.AbstractVar[Float[Array, "stokes pix"]]
+    amplitude: eqx.AbstractVar[Maps]
 
     def __init_subclass__(cls, law: str = "", **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -139,12 +140,12 @@ class Component(Printed, eqx.Module):
             raise ValueError(f"Law {law!r} is that of {known.__module__}:{known.__qualname__}.")
         _LAWS[cls.law] = cls
 
-    def sed(self, nu: ArrayLike) -> Float[Array, ""] | Float[Array, " pix"]:
+    def sed(self, nu: ArrayLike) -> Scalar | Map:
         """Return the spectral law at one frequency [GHz]; a map if any parameter is a map."""
         raise ValueError(f"{type(self).__name__} must define `sed`.")
 
     @property
-    def template(self) -> Float[Array, "stokes pix"]:
+    def template(self) -> Maps:
         """The maps that the law multiplies: the amplitude, unless a class scales it first."""
         return self.amplitude
 

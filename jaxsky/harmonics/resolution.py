@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxsky.arrays import Alm, Map, Maps, Window
 from jaxsky.checks import check_finite, check_shape, is_concrete
 from jaxsky.harmonics.transforms import analysis, expand, map_variance, resize, synthesis
 
@@ -21,7 +22,7 @@ NEGLIGIBLE = 1e-12
 FINER = 0.01
 
 
-def gaussian_beam(fwhm: ArrayLike, lmax: int) -> Float[Array, " ell"]:
+def gaussian_beam(fwhm: ArrayLike, lmax: int) -> Window:
     """Return the window b_l = exp(-l (l+1) sigma^2 / 2) of a Gaussian beam of `fwhm` [arcmin].
 
     The same window serves temperature and polarization, as in the paper; healpy's window for
@@ -31,16 +32,14 @@ def gaussian_beam(fwhm: ArrayLike, lmax: int) -> Float[Array, " ell"]:
 
 
 @partial(jax.jit, static_argnames="lmax")
-def _gaussian(fwhm: ArrayLike, own: ArrayLike, lmax: int) -> Float[Array, " ell"]:
+def _gaussian(fwhm: ArrayLike, own: ArrayLike, lmax: int) -> Window:
     """Return the window of a Gaussian divided by that of another."""
     variance = (jnp.square(fwhm) - jnp.square(own)) * math.radians(1 / 60) ** 2 / (8 * math.log(2))
     ell = jnp.arange(lmax + 1)
     return jnp.exp(-ell * (ell + 1) * variance / 2)
 
 
-def beam_ratio(
-    target: ArrayLike, own: ArrayLike, lmax: int, what: str = "the map"
-) -> Float[Array, " ell"]:
+def beam_ratio(target: ArrayLike, own: ArrayLike, lmax: int, what: str = "the map") -> Window:
     """Return the window that takes a map from its own beam to a target, differentiable in both.
 
     Each beam is the full width at half maximum of a Gaussian [arcmin], or a table b_l, l = 0 ...;
@@ -66,7 +65,7 @@ def beam_ratio(
     return ratio
 
 
-def _window(beam: Array, lmax: int, what: str) -> Float[Array, " ell"]:
+def _window(beam: Array, lmax: int, what: str) -> Window:
     if not beam.ndim:
         return gaussian_beam(beam, lmax)
     if len(beam) <= lmax:
@@ -79,7 +78,7 @@ def needed_lmax(window: Float[Array | np.ndarray, " ell"]) -> int:
     return int(np.flatnonzero(np.abs(np.asarray(window)) > NEGLIGIBLE).max(initial=0))
 
 
-def shortened(window: Float[Array, " ell"]) -> Float[Array, " ell"]:
+def shortened(window: Window) -> Window:
     """Cut a window where it becomes negligible for good, unless it is being traced."""
     # Q and U have no multipoles below 2.
     return window[: max(2, needed_lmax(window)) + 1] if is_concrete(window) else window
@@ -106,9 +105,7 @@ MARGIN = 3
 FINE, FINE_VARIANCE = 0.25, 0.375
 
 
-def low_multipoles(
-    maps: Float[Array, "stokes pix"], lmax: int, iterations: int | None = None
-) -> Float[Array, "stokes alm"]:
+def low_multipoles(maps: Maps, lmax: int, iterations: int | None = None) -> Alm:
     """Return packed coefficients up to lmax of maps that also have higher multipoles.
 
     Multipoles beyond those analysed leak into the result, so more are analysed than are kept.
@@ -120,12 +117,8 @@ def low_multipoles(
 
 @partial(jax.jit, static_argnames=("nside", "iterations", "fine"))
 def resample(
-    maps: Float[Array, "stokes pix"],
-    window: Float[Array, " ell"],
-    nside: int,
-    iterations: int | None = None,
-    fine: float = 0.0,
-) -> Float[Array, "stokes pix"]:
+    maps: Maps, window: Window, nside: int, iterations: int | None = None, fine: float = 0.0
+) -> Maps:
     """Multiply maps by a window in l and change their nside: smooth and degrade in one step.
 
     Linear in the maps, with an exact transpose. Multipoles above those of the window are cut,
@@ -141,12 +134,7 @@ def resample(
     return synthesis(alm * expand(window), nside)
 
 
-def smooth(
-    maps: Float[Array, "stokes pix"],
-    fwhm: ArrayLike,
-    own: ArrayLike = 0.0,
-    lmax: int | None = None,
-) -> Float[Array, "stokes pix"]:
+def smooth(maps: Maps, fwhm: ArrayLike, own: ArrayLike = 0.0, lmax: int | None = None) -> Maps:
     """Smooth maps from their own beam to another; differentiable in maps and widths.
 
     Parameters
@@ -194,7 +182,7 @@ class Preparation(eqx.Module):
     The window has a factor for each multipole; None averages pixels and leaves the beam unchanged.
     """
 
-    window: Float[Array, " ell"] | None
+    window: Window | None
     nside_in: int = eqx.field(static=True)
     nside: int = eqx.field(static=True)
 
@@ -222,19 +210,19 @@ class Preparation(eqx.Module):
         _check_nside(nside_in, nside, what)
         return cls(None, nside_in, nside)
 
-    def __call__(self, maps: Float[Array, "stokes pix"]) -> Float[Array, "stokes pix"]:
+    def __call__(self, maps: Maps) -> Maps:
         """Return the maps at the common resolution."""
         if self.window is None:
             return average_pixels(maps, self.nside)
         return resample(maps, self.window, self.nside, fine=FINE)
 
     @eqx.filter_jit
-    def transpose(self, maps: Float[Array, "stokes pix"]) -> Float[Array, "stokes pix"]:
+    def transpose(self, maps: Maps) -> Maps:
         """Apply the transposed operator, from the common resolution to that of the maps."""
         shape = (len(maps), healpy.nside2npix(self.nside_in))
         return jax.linear_transpose(self, jax.ShapeDtypeStruct(shape, maps.dtype))(maps)[0]
 
-    def variance(self, variance: Sequence[Float[Array, " pix"]]) -> Float[Array, "stokes pix"]:
+    def variance(self, variance: Sequence[Map]) -> Maps:
         """Return the variance of prepared white noise, given the variance of each input pixel.
 
         The variance of a smoothed map is the map of variances smoothed by the square of the

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxsky.arrays import Alm, Maps
 from jaxsky.checks import check_double
 from jaxsky.harmonics import primitives
 
@@ -105,9 +106,7 @@ def _blocks(stokes: int, spin: int) -> list[tuple[slice, int]]:
     return {1: [scalar], 2: [polarized], 3: [scalar, polarized]}[stokes]
 
 
-def _transform(
-    alm: Float[Array, "stokes alm"], nside: int, spin: int, weighted: bool = False
-) -> Float[Array, "stokes pix"]:
+def _transform(alm: Alm, nside: int, spin: int, weighted: bool = False) -> Maps:
     """Return the maps of coefficients, each ring times its weight if `weighted`."""
     check_double("A spherical harmonic transform")
     _finish_at_exit()
@@ -117,9 +116,7 @@ def _transform(
     )
 
 
-def _transposed(
-    maps: Float[Array, "stokes pix"], lmax: int, spin: int, weighted: bool = False
-) -> Float[Array, "stokes alm"]:
+def _transposed(maps: Maps, lmax: int, spin: int, weighted: bool = False) -> Alm:
     nside = healpy.npix2nside(maps.shape[-1])
     empty = jax.ShapeDtypeStruct((maps.shape[0], (lmax + 1) ** 2), maps.dtype)
     forward = partial(_transform, nside=nside, spin=spin, weighted=weighted)
@@ -127,9 +124,7 @@ def _transposed(
 
 
 @partial(jax.jit, static_argnames=("nside", "spin"))
-def synthesis(
-    alm: Float[Array, "stokes alm"], nside: int, spin: int = 2
-) -> Float[Array, "stokes pix"]:
+def synthesis(alm: Alm, nside: int, spin: int = 2) -> Maps:
     """Return maps of I, or Q, U, or I, Q, U from packed coefficients I, or E, B, or I, E, B.
 
     With lmax > 3 nside - 1 the maps are undersampled. `spin` is that of the last two rows.
@@ -138,20 +133,13 @@ def synthesis(
 
 
 @partial(jax.jit, static_argnames=("lmax", "spin"))
-def adjoint_synthesis(
-    maps: Float[Array, "stokes pix"], lmax: int, spin: int = 2
-) -> Float[Array, "stokes alm"]:
+def adjoint_synthesis(maps: Maps, lmax: int, spin: int = 2) -> Alm:
     """Apply the transpose of `synthesis`: inner products of maps with the spherical harmonics."""
     return _transposed(maps, lmax, spin)
 
 
 @partial(jax.jit, static_argnames=("lmax", "iterations", "spin"))
-def analysis(
-    maps: Float[Array, "stokes pix"],
-    lmax: int,
-    iterations: int | None = None,
-    spin: int = 2,
-) -> Float[Array, "stokes alm"]:
+def analysis(maps: Maps, lmax: int, iterations: int | None = None, spin: int = 2) -> Alm:
     """Return packed coefficients of maps of I, or Q, U, or I, Q, U: the inverse of `synthesis`.
 
     Uses ring-weighted quadrature, refined by Jacobi steps on the residual map. For a map without

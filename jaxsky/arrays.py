@@ -1,0 +1,25 @@
+"""Names of the arrays that the package passes on, by what they hold.
+
+Maps are in HEALPix RING order. Coefficients are packed, see `jaxsky.harmonics.transforms`.
+"""
+
+from typing import TypeAlias
+
+from jaxtyping import Array, Float
+
+#: A number that may be differentiated.
+Scalar: TypeAlias = Float[Array, ""]
+#: One map, and maps of I, or Q, U, or I, Q, U.
+Map: TypeAlias = Float[Array, " pix"]
+Maps: TypeAlias = Float[Array, "stokes pix"]
+#: Maps of several bands.
+BandMaps: TypeAlias = Float[Array, "band stokes pix"]
+#: Coefficients of I, or E, B, or I, E, B.
+Alm: TypeAlias = Float[Array, "stokes alm"]
+#: C_l and b_l for l = 0, 1, ...
+Spectrum: TypeAlias = Float[Array, " ell"]
+Window: TypeAlias = Float[Array, " ell"]
+#: Covariance of the Stokes parameters of each pixel.
+Covariance: TypeAlias = Float[Array, "stokes stokes pix"]
+#: The beam of a map: full width at half maximum of a Gaussian [arcmin], or its window.
+Beam: TypeAlias = Scalar | Window | float

@@ -34,8 +34,6 @@ CONVENTIONS: dict[str, Callable[[Array], Array]] = {
     "power": lambda nu: (nu / nu[0]) ** 2,
     "CMB": lambda nu: 1 / cmb_derivative(nu),
 }
-
-
 #: Higher frequencies [GHz] are taken to be given in the wrong unit.
 MAX_NU = 1e6
 
@@ -44,10 +42,10 @@ class Bandpass(Printed, eqx.Module):
     """The response of a detector as a function of frequency.
 
     A band observes the weighted mean of the antenna temperature, int W S dnu / int W dnu (the
-    paper's eq. 8, by the trapezoid rule). Tables of W come in three conventions: the response
-    to unit antenna temperature ("RJ": the paper, Planck LFI), to unit power, Jy/sr ("power":
-    WMAP, Planck HFI, PySM) or to unit thermodynamic temperature ("CMB"). They differ by a
-    frequency-dependent factor that is applied here; everything else is the same for all three.
+    paper's eq. 8, by the trapezoid rule). Tables of W come in three conventions, which differ by
+    a factor at each frequency: the response to unit antenna temperature ("RJ": the paper, Planck
+    LFI), to unit power, Jy/sr ("power": WMAP, Planck HFI, PySM) or to unit thermodynamic
+    temperature ("CMB").
 
     Parameters
     ----------
@@ -57,11 +55,10 @@ class Bandpass(Printed, eqx.Module):
 
     Raises
     ------
-    TypeError
-        If an argument carries a unit or is not numeric.
-    ValueError
-        For a wrong shape or convention, values that are not finite, frequencies that are not
-        positive and increasing or exceed 1e6 GHz, or an integral that is not positive.
+    TypeError, ValueError
+        For arguments that carry a unit or are not numeric, a wrong shape or convention, values that
+        are not finite, frequencies that do not increase from 0 or exceed 1e6 GHz, or an integral
+        that is not positive.
 
     Examples
     --------
@@ -121,9 +118,11 @@ class Bandpass(Printed, eqx.Module):
         return f"Bandpass, weights by the convention {self.convention!r}", rows
 
     @property
+    @jax.jit
     def quadrature(self) -> Float[Array, " sample"]:
         """Weights w_k with sum 1, such that the band reads sum_k w_k T(nu_k) in K_RJ."""
-        return _quadrature(self.nu, self.weights, self.convention)
+        integrand = _integrand(self.nu, self.weights, self.convention)
+        return integrand / integrand.sum()
 
     @property
     def center(self) -> Scalar:
@@ -135,7 +134,7 @@ class Bandpass(Printed, eqx.Module):
         return Bandpass(self.nu + delta, self.weights, self.convention)
 
     def stretched(self, factor: ArrayLike) -> "Bandpass":
-        """Return the band widened by a factor about its center; its averages are renormalised."""
+        """Return the band widened by a factor about its center; averages are renormalised."""
         nu = self.center + factor * (self.nu - self.center)
         return Bandpass(nu, self.weights, self.convention)
 
@@ -171,12 +170,6 @@ def _integrand(
     steps = jnp.diff(nu)
     ends = jnp.zeros(1, steps.dtype)
     return weights * (jnp.concatenate([ends, steps]) + jnp.concatenate([steps, ends])) / 2
-
-
-@partial(jax.jit, static_argnames="convention")
-def _quadrature(nu, weights, convention):
-    integrand = _integrand(nu, weights, convention)
-    return integrand / integrand.sum()
 
 
 class Samples(NamedTuple):

@@ -2,7 +2,7 @@
 
 from functools import cache, partial
 from importlib.metadata import version
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,6 @@ PLANCK_2018 = {
     "As": 2.1e-9,
     "ns": 0.9649,
 }
-
 #: Parameters that a cosmology may have instead of H0.
 EXPANSION = {"cosmomc_theta", "thetastar"}
 #: Arguments of `camb.set_params` that this module sets itself.
@@ -38,16 +37,11 @@ SCALARS_END, TENSORS_END = 1500, 3000
 def camb_spectra(lmax: int, r: float = 0.0, **cosmology: float) -> Float[np.ndarray, "4 ell"]:
     """Return C_l of TT, EE, BB, TE [uK_CMB^2], l = 0 ... lmax: lensed scalars plus tensors.
 
-    The primordial spectra are power laws with pivot k = 0.05 / Mpc: scalars with the amplitude
-    `As` and tilt `ns` of the cosmology, tensors with amplitude r `As` and no tilt unless the
-    cosmology sets `nt`. The spectra are therefore linear in r, with slope `tensor_spectra`. The
+    The cosmology consists of arguments of `camb.set_params` that replace or extend `PLANCK_2018`.
+    The primordial spectra are power laws with pivot k = 0.05 / Mpc: scalars with its amplitude `As`
+    and tilt `ns`, tensors with amplitude r `As`, r being the tensor-to-scalar ratio, and no tilt
+    unless it sets `nt`. The spectra are therefore linear in r, with slope `tensor_spectra`. The
     value at a multipole does not depend on lmax.
-
-    Parameters
-    ----------
-    lmax : largest multipole
-    r : tensor-to-scalar ratio at k = 0.05 / Mpc
-    **cosmology : arguments of `camb.set_params` that replace or extend `PLANCK_2018`
 
     Raises
     ------
@@ -61,11 +55,7 @@ def camb_spectra(lmax: int, r: float = 0.0, **cosmology: float) -> Float[np.ndar
 
 
 def tensor_spectra(lmax: int, **cosmology: float) -> Float[np.ndarray, "4 ell"]:
-    """Return C_l of TT, EE, BB, TE of tensors with r = 1 [uK_CMB^2], l = 0 ... lmax.
-
-    They scale linearly with r, and are not lensed. See `camb_spectra` for the primordial
-    spectrum and the parameters of the cosmology.
-    """
+    """Return C_l of TT, EE, BB, TE of tensors with r = 1, not lensed; see `camb_spectra`."""
     return _joined(_tensors, TENSORS_END, lmax, cosmology)
 
 
@@ -101,17 +91,9 @@ def _tensors(end, **cosmology):
     lmax = end + 500
     # With CAMB's default sampling in l, its interpolation is off by 2 % beyond l = 500.
     accuracy = {"nt": 0.0, "lSampleBoost": 2, "lAccuracyBoost": 2} | cosmology
-    return _spectra(
-        "get_tensor_cls",
-        end,
-        **accuracy,
-        r=1.0,
-        WantTensors=True,
-        WantScalars=False,
-        lmax=lmax,
-        max_l_tensor=lmax,
-        max_eta_k_tensor=3 * lmax,
-    )
+    tensors = {"r": 1.0, "WantTensors": True, "WantScalars": False}
+    ends = {"lmax": lmax, "max_l_tensor": lmax, "max_eta_k_tensor": 3 * lmax}
+    return _spectra("get_tensor_cls", end, **accuracy, **tensors, **ends)
 
 
 def _spectra(which: str, end: int, **arguments: Any) -> Float[np.ndarray, "4 ell"]:
@@ -141,21 +123,20 @@ def realisation(key: Array, spectra: Float[Array | np.ndarray, "4 ell"], stokes:
     check_choice("stokes", stokes, ("QU", "IQU"))
     TT, EE, BB, TE = spectra
     zero = jnp.zeros_like(TT)
-    rows = [TT, TE, zero], [TE, EE, zero], [zero, zero, BB]
-    fields = jnp.stack([jnp.stack(row) for row in rows])
+    fields = jnp.array([[TT, TE, zero], [TE, EE, zero], [zero, zero, BB]])
     return gaussian_fields(key, fields)[3 - len(stokes) :]
 
 
 # Mutually correlated fields, after Brown & Battye (2011).
 
+#: The auto- and cross-spectra C_l of fields.
+Spectra: TypeAlias = Float[Array, "field field ell"]
 #: Smallest eigenvalue of a repaired correlation matrix.
 LEAST = 1e-10
 
 
 @jax.custom_jvp
-def _positive(
-    matrix: Float[Array, "ell field field"],
-) -> tuple[Float[Array, "ell field field"], Float[Array, " ell"]]:
+def _positive(matrix: Float[Array, "ell field field"]) -> tuple[Array, Float[Array, " ell"]]:
     """Raise the eigenvalues of symmetric matrices to `LEAST`; also return the smallest before."""
     values, vectors = jnp.linalg.eigh(matrix)
     kept = jnp.maximum(values, LEAST)
@@ -164,7 +145,7 @@ def _positive(
 
 @_positive.defjvp
 def _positive_jvp(primals, tangents):
-    """Differentiate `_positive` by the formula of Daleckii & Krein, not through the eigenvectors.
+    """Differentiate `_positive` by the formula of Daleckii & Krein.
 
     Eigenvectors have no derivative where eigenvalues coincide, as all do without correlations.
     """
@@ -182,9 +163,7 @@ def _positive_jvp(primals, tangents):
 
 
 @jax.jit
-def repair(
-    spectra: Float[Array, "field field ell"],
-) -> tuple[Float[Array, "field field ell"], Int[Array, ""]]:
+def repair(spectra: Spectra) -> tuple[Spectra, Int[Array, ""]]:
     """Make the matrix of spectra positive semi-definite at each l; also count those that were not.
 
     Extrapolated cross-spectra may exceed what the auto-spectra allow. Such a matrix keeps its
@@ -207,9 +186,7 @@ def repair(
 
 
 @jax.jit
-def gaussian_fields(
-    key: Array, spectra: Float[Array, "field field ell"]
-) -> Float[Array, "field alm"]:
+def gaussian_fields(key: Array, spectra: Spectra) -> Float[Array, "field alm"]:
     """Draw packed coefficients of Gaussian fields with given auto- and cross-spectra C_l.
 
     The matrix of spectra must be positive semi-definite at each l (see `repair`).

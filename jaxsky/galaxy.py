@@ -93,11 +93,7 @@ class GalaxyModel(eqx.Module):
 
 
 class EmbeddedSky(eqx.Module):
-    """Maps of the model Galaxy, made by `embedded_sky`.
-
-    They are I, Q, U of dust and synchrotron at their reference frequencies [uK_RJ]; `seed` is that
-    of the turbulence.
-    """
+    """I, Q, U of dust and synchrotron at their reference frequencies [uK_RJ], by `embedded_sky`."""
 
     dust: Float[Array, "3 pix"]
     synchrotron: Float[Array, "3 pix"]
@@ -120,18 +116,12 @@ class EmbeddedSky(eqx.Module):
         return healpy.npix2nside(self.dust.shape[-1])
 
     def sky(self, stokes: str = "QU") -> Sky:
-        """Return a sky of dust and synchrotron with the paper's baseline spectral parameters.
-
-        `stokes` is "QU" or "IQU".
-        """
+        """Return a sky ("QU" or "IQU") with the paper's baseline spectral parameters."""
         check_choice("stokes", stokes, ("QU", "IQU"))
         rows = slice(3 - len(stokes), 3)
-        return Sky(
-            {
-                "dust": Dust(self.dust[rows], nu_ref=self.nu_dust),
-                "synchrotron": Synchrotron(self.synchrotron[rows], nu_ref=self.nu_synchrotron),
-            }
-        )
+        dust = Dust(self.dust[rows], nu_ref=self.nu_dust)
+        synchrotron = Synchrotron(self.synchrotron[rows], nu_ref=self.nu_synchrotron)
+        return Sky({"dust": dust, "synchrotron": synchrotron})
 
 
 def magnetic_field(
@@ -228,7 +218,7 @@ def _integrate(
     theta, phi = (jnp.asarray(angle, dtype) for angle in angles)
     st, ct, sp, cp = jnp.sin(theta), jnp.cos(theta), jnp.sin(phi), jnp.cos(phi)
     rows = [ct * cp, ct * sp, -st], [-sp, cp, jnp.zeros_like(sp)], [st * cp, st * sp, ct]
-    basis = jnp.stack(list(map(jnp.stack, rows)))
+    basis = jnp.array(rows)
     turbulence = _turbulence(key, model.slope, basis)
     path = {name: jnp.asarray(values) for name, values in _path(steps).items()}
 
@@ -327,17 +317,12 @@ def embedded_sky(
 
     Parameters
     ----------
-    nside : resolution. Below 64, where pixels are too wide to sample the Galactic plane, the maps
-        are those at 64 cut at l = 3 nside - 1; the dust intensity then rings around the plane
-        and is negative in places.
+    nside : resolution, a power of 2. Below 64, where pixels are too wide to sample the Galactic
+        plane, the maps are those at 64 cut at l = 3 nside - 1; the dust intensity then rings
+        around the plane and is negative in places.
     seed : seed of the turbulence; a different nside shows the same sky in more or less detail
     model : the parameters, by default `GalaxyModel()`
     steps : number of steps along the line of sight
-
-    Raises
-    ------
-    TypeError, ValueError
-        If nside is not a power of two, or the seed or the steps are not suitable integers.
 
     Examples
     --------
@@ -346,8 +331,7 @@ def embedded_sky(
     """
     _check(nside, seed, steps)
     model = GalaxyModel() if model is None else model
-    calibrator = line_of_sight(model, NSIDE_SCALE, seed, steps=steps)
-    maps = calibrator
+    maps = calibrator = line_of_sight(model, NSIDE_SCALE, seed, steps=steps)
     if nside > NSIDE_SCALE:
         maps = line_of_sight(model, nside, seed, steps=steps)
     elif nside < NSIDE_SCALE:

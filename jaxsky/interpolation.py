@@ -169,7 +169,8 @@ def _all_series(
 def _points(component: Component) -> list[Map]:
     """Return the parameters that are maps, scaled to [-1, 1]."""
     maps, _ = _split(component)
-    return [(m - mid) / half for m, (mid, half) in zip(maps, map(_range, maps), strict=True)]
+    ranges = map(_range, maps)
+    return [(values - middle) / half for values, (middle, half) in zip(maps, ranges, strict=True)]
 
 
 class Terms(NamedTuple):

@@ -23,7 +23,6 @@ PIX: Final = "pix"
 PIECE: Final = 1 << 18
 #: Results of passes: sums over all pixels, and maps whose last axis are pixels.
 SUMS: Final = PartitionSpec()
-
 #: How many times more pixels than a CPU an accelerator takes at once.
 WIDER = 64
 
@@ -61,22 +60,10 @@ def distribute(
     ----------
     maps : array (..., pix), or one on disk (`jaxsky.io.stacks`), or a function that returns the
         pixels of a slice, (..., pixels), to read or make no more than a process needs
-    mesh : by default `pixel_mesh()`
-    shape : shape (..., pix) of all maps, if `maps` is a function
-    dtype : type of the numbers, if `maps` is a function
+    mesh : by default `pixel_mesh()`; ValueError if it has more devices than there are pixels
+    shape, dtype : shape (..., pix) and type of all maps, if `maps` is a function
     fill : value of pixels that are added: NaN, which is refused wherever it would count; None for
         that of the last pixel, for maps of a sky and of labels
-
-    Returns
-    -------
-    Distributed maps, of shape (..., pix) with padding.
-
-    Raises
-    ------
-    TypeError
-        If `maps` is a function, and there is no `shape`.
-    ValueError
-        If the mesh has more devices than there are pixels.
 
     Examples
     --------
@@ -134,18 +121,22 @@ def _put(pixels, piece, start):
     return jax.lax.dynamic_update_slice_in_dim(pixels, piece, start, axis=-1)
 
 
+def _devices(value: Any) -> set[jax.Device]:
+    """Return the devices that hold an array of JAX; none if it is traced, or anything else."""
+    held = isinstance(value, jax.Array) and not isinstance(value, jax.core.Tracer)
+    return value.sharding.device_set if held else set()
+
+
 def spread(value: Any) -> bool:
     """Return whether an array lies on several devices, or is distributed over a mesh of one."""
-    if not isinstance(value, jax.Array) or isinstance(value, jax.core.Tracer):
-        return False
-    return len(value.sharding.device_set) > 1 or mesh_of(value) is not None
+    devices = _devices(value)
+    return len(devices) > 1 or (len(devices) == 1 and mesh_of(value) is not None)
 
 
 def on_accelerator(value: Any) -> bool:
     """Return whether an array lies on accelerators: looking at it on the host means a copy."""
-    if not isinstance(value, jax.Array) or isinstance(value, jax.core.Tracer):
-        return False
-    return all(device.platform != "cpu" for device in value.devices())
+    devices = _devices(value)
+    return bool(devices) and all(device.platform != "cpu" for device in devices)
 
 
 def at_once(few: int) -> int:
@@ -216,18 +207,14 @@ def typed(tree: Tree) -> Tree:
 
 
 def along(data: Any, tree: Tree) -> Tree:
-    """Return arrays with as many pixels as distributed data, distributed like them.
-
-    Unchanged if the data are not distributed.
-    """
+    """Return arrays with as many pixels as data, distributed like these if they are."""
     mesh = mesh_of(data)
     if mesh is None:
         return tree
 
     def one(leaf: Any) -> Any:
-        if np.shape(leaf)[-1:] != data.shape[-1:] or spread(leaf):
-            return leaf
-        return distribute(leaf, mesh)
+        alike = np.shape(leaf)[-1:] == data.shape[-1:] and not spread(leaf)
+        return distribute(leaf, mesh) if alike else leaf
 
     return jax.tree.map(one, typed(tree))
 
@@ -238,10 +225,7 @@ def parts_of(maps: Array) -> list[np.ndarray]:
 
 
 def from_parts(parts: Any, like: Array) -> Array:
-    """Return a distributed array from those of this process's devices, joined along the first axis.
-
-    They are in the order of `parts_of(like)`.
-    """
+    """Join arrays of the devices of this process, in the order of `parts_of(like)`, on axis 0."""
     mesh = mesh_of(like)
     sharding = NamedSharding(mesh, PartitionSpec(PIX))
     devices = [shard.device for shard in like.addressable_shards]
@@ -275,10 +259,7 @@ def over_pixels(out: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
     Each device then runs it on its own pixels, and nothing is exchanged but what the function asks
     for by `total` and `extremes`. For other arrays, and inside of another pass, it is unchanged.
-
-    Parameters
-    ----------
-    out : `SUMS` or `maps_of(axes)`, for all results or for each of them
+    `out` is `SUMS` or `maps_of(axes)`, for all results or for each of them.
     """
 
     def marked(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -58,10 +58,7 @@ def stokes_noise(key: Array, stokes: int, size: int, dtype: Any) -> Float[Array,
 def uniform_covariance(
     noise: Numeric, nside: int, stokes: int = 2, pixels: int | None = None
 ) -> Covariance:
-    """Return the covariance of each pixel for a level, the same for all Stokes parameters.
-
-    By default of all pixels, else of as many.
-    """
+    """Return the covariance of all (or so many) pixels for a level, alike for Stokes parameters."""
     npix, pixel = pixels or healpy.nside2npix(nside), healpy.nside2resol(nside, arcmin=True)
     return jnp.eye(stokes)[..., None] * jnp.full(npix, (noise / pixel) ** 2)
 
@@ -118,7 +115,7 @@ def cholesky(covariance: Covariance) -> Covariance:
                 lower[i][j] = jnp.where(rest > 0, jnp.sqrt(jnp.where(rest > 0, rest, 1.0)), 0.0)
             else:
                 lower[i][j] = rest / jnp.where(lower[j][j] > 0, lower[j][j], 1.0)
-    return jnp.stack([jnp.stack(row) for row in lower])
+    return jnp.array(lower)
 
 
 @partial(jax.jit, static_argnames="diagonal")
@@ -133,10 +130,9 @@ def draw(key: Array, covariance: Covariance, *, diagonal: bool = False) -> Maps:
     """Draw noise L n with a given covariance in each pixel, independent between pixels.
 
     L is the lower Cholesky factor, n white noise. The paper (Hervias-Caimapo, Bonaldi & Brown 2016)
-    uses only the diagonal of L, as standard deviations; `diagonal` does the same. These are the
-    scatter of each Stokes parameter given those before it, so the draws have no correlations. Where
-    the covariance has some, the variance of U is too small by the factor 1 - R^2, R being its
-    multiple correlation with I and Q; likewise for Q with I, while I is right.
+    uses only the diagonal of L, as standard deviations; `diagonal` does the same. The draws then
+    have no correlations, and where the covariance has some, the variance of U is too small by the
+    factor 1 - R^2, R being its multiple correlation with I and Q; likewise for Q with I.
     """
     # A program of its own: together with the products, XLA would redo the normals for each row.
     _, stokes, npix = covariance.shape
@@ -151,17 +147,15 @@ def draw_in_pieces(key: Array, covariance: Any) -> Maps:
     found = np.empty(white.shape)
     for start in range(0, npix, PIECE):
         part = slice(start, start + PIECE)
-        found[:, part] = _correlated(
-            jnp.asarray(covariance[..., part], float), white[:, part], False
-        )
+        piece = jnp.asarray(covariance[..., part], float)
+        found[:, part] = _correlated(piece, white[:, part], False)
     return jnp.asarray(found)
 
 
 def estimate_variance(maps: Maps, used: Bool[Array, " pix"]) -> Float[Array, " stokes"]:
     """Estimate the noise variance per pixel from the scatter in groups of four neighbouring pixels.
 
-    A signal that is smooth over such a group cancels, which leaves the noise. Only groups of which
-    all four pixels (RING) are used count.
+    A signal that is smooth over such a group cancels. Only groups count of which all are used.
     """
     nside = healpy.npix2nside(maps.shape[-1])
     whole = children(used, nside // 2).all(axis=-1)
@@ -193,9 +187,8 @@ def _deviance(theta, args):
 def fit_knee(maps: Maps, used: Bool[Array, " pix"], lmax: int) -> tuple[float, float, float]:
     """Fit white level, knee and slope (`knee_spectrum`) of the noise of Q, U maps, up to lmax.
 
-    Returns the maximum-likelihood values for the spectrum (EE + BB)/2 of the masked maps, divided
-    by the sky fraction and taken as independent between multipoles. Any sky signal in these pixels
-    (RING) counts as noise.
+    These have the highest likelihood for the spectrum (EE + BB)/2 of the masked maps, divided by
+    the sky fraction and independent between multipoles. Sky signal in these pixels counts as noise.
     """
     fraction = float(np.mean(used))
     if not fraction:
@@ -208,13 +201,13 @@ def fit_knee(maps: Maps, used: Bool[Array, " pix"], lmax: int) -> tuple[float, f
     level = jnp.median(measured[-lmax // 4 :])
     start = jnp.log(jnp.array([1.0, 10.0, 1.5]))
     solver: optx.AbstractMinimiser = optx.BFGS(1e-6, 1e-6)
-    args = (measured / level, modes)
-    solution: optx.Solution = optx.minimise(
-        _deviance, solver, start, args=args, max_steps=500, throw=False
+    given = measured / level, modes
+    found: optx.Solution = optx.minimise(
+        _deviance, solver, start, given, max_steps=500, throw=False
     )
-    if solution.result != optx.RESULTS.successful:
+    if found.result != optx.RESULTS.successful:
         raise ValueError("The spectrum of the noise could not be fitted.")
-    white, knee, slope = np.exp(np.asarray(solution.value))
+    white, knee, slope = np.exp(np.asarray(found.value))
     return float(level * white), float(knee), float(slope)
 
 
@@ -231,8 +224,7 @@ def rms_covariance(rms: Maps) -> Covariance:
 def hits_covariance(sigma0: ArrayLike, hits: Map, stokes: int = 2) -> Covariance:
     """Return the covariance of each pixel from the number of observations, sigma_0^2 / hits.
 
-    The noise of one observation, sigma_0, is one number or one per Stokes parameter; for WMAP the
-    values for polarization and intensity differ slightly.
+    The noise of one observation, sigma_0, is one number or, as for WMAP, one per Stokes parameter.
     """
     sigma0, hits = _each(sigma0, stokes), as_array("hits", hits)
     check_shape("hits", hits, hits.ndim == 1, "have shape (pix,)")
@@ -253,7 +245,7 @@ def weights_covariance(
     sigma0, weights = _each(sigma0, 2), as_array("weights", weights)
     check_shape("weights", weights, weights.shape[:-1] == (3,), "have shape (3, pix)")
     QQ, QU, UU = weights
-    inverse = jnp.stack([jnp.stack([UU, -QU]), jnp.stack([-QU, QQ])]) / (QQ * UU - QU**2)
+    inverse = jnp.array([[UU, -QU], [-QU, QQ]]) / (QQ * UU - QU**2)
     return jnp.outer(sigma0, sigma0)[..., None] * inverse
 
 
@@ -277,7 +269,7 @@ def covariance_from_columns(columns: Float[Array, "column pix"]) -> Covariance:
     check_shape("columns", columns, good, "have shape (3, pix) or (6, pix)")
     rows = dict(zip(COVARIANCE_COLUMNS[len(columns)], columns, strict=True))
     stokes = "QU" if len(columns) == 3 else "IQU"
-    return jnp.stack([jnp.stack([rows[min(a + b, b + a)] for b in stokes]) for a in stokes])
+    return jnp.array([[rows[min(a + b, b + a)] for b in stokes] for a in stokes])
 
 
 @jax.jit

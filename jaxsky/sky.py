@@ -26,11 +26,8 @@ class Sky(Printed, eqx.Module):
 
     Raises
     ------
-    TypeError
-        If `components` is no dictionary, or a value is not a component.
-    ValueError
-        If the mapping is empty, a name has a dot, or the shapes (stokes, pix) of the amplitudes
-        differ.
+    TypeError, ValueError
+        If these are no components by name, a name has a dot, or shapes of amplitudes differ.
 
     Examples
     --------
@@ -53,7 +50,6 @@ class Sky(Printed, eqx.Module):
         self.components = {name: components[name] for name in sorted(components)}
         if not self.components:
             raise ValueError("Argument `components` must have at least one component.")
-        shapes = {}
         for name, component in self.components.items():
             if not isinstance(name, str) or not name or "." in name:
                 raise ValueError(
@@ -65,7 +61,7 @@ class Sky(Printed, eqx.Module):
                     f"Component {name!r} must be a jaxsky Component, "
                     f"but is {type(component).__name__}."
                 )
-            shapes[name] = component.amplitude.shape
+        shapes = {name: component.amplitude.shape for name, component in self.components.items()}
         if len(set(shapes.values())) > 1:
             raise ValueError(f"Amplitudes must share one shape (stokes, pix), but have {shapes}.")
 
@@ -110,16 +106,12 @@ def _check_bands(sky: object, bands: object) -> tuple[Bandpass, ...]:
 
 def _emission(component: Component, bands: tuple[Bandpass, ...], nodes: Nodes) -> list[Maps]:
     """Return the emission of a component in each band."""
-    maps = []
-    for band in bands:
-        sed = band_sed(component, band, nodes)
-        if nodes and len(nodes.counts) > 1:
-            # Costly laws are evaluated once for all Stokes parameters, ...
-            maps.append(component.template * sed)
-        else:
-            # ... cheap ones once per row: XLA fuses each row into one pass over memory.
-            maps.append(jnp.stack([row * sed for row in component.template]))
-    return maps
+    laws = (band_sed(component, band, nodes) for band in bands)
+    # Costly laws are evaluated once for all Stokes parameters, ...
+    if nodes and len(nodes.counts) > 1:
+        return [component.template * law for law in laws]
+    # ... cheap ones once per row: XLA fuses each row into one pass over memory.
+    return [jnp.stack([row * law for row in component.template]) for law in laws]
 
 
 @partial(jax.jit, static_argnames=("plan", "apart"))
@@ -146,21 +138,16 @@ def observe(
     tolerance: float = 1e-10,
     nodes: tuple[Nodes, ...] | None = None,
 ) -> BandMaps:
-    """Observe the sky through a list of bands, the paper's eq. 8.
+    """Observe the sky through a list of bands, the paper's eq. 8: (band, stokes, pix) [uK_RJ].
 
     Parameters
     ----------
-    sky : the sky
-    bands : list of bands
+    sky, bands : the sky, and a list of bands
     tolerance : relative error of the band-averaged laws where parameters are maps; 0 sums
         directly over the bands in every pixel. Inside jit, where the range of the maps is not
-        known beforehand, a fixed number of nodes is used and checked as the program runs; if
-        they do not reach the tolerance, the direct sum is used.
+        known beforehand, a fixed number of nodes is used; if they do not reach the tolerance as
+        the program runs, the direct sum is.
     nodes : from `interpolation_nodes`, instead of a tolerance; not checked again
-
-    Returns
-    -------
-    Maps [uK_RJ], shape (band, stokes, pix).
 
     Raises
     ------
@@ -212,21 +199,13 @@ def unknown_parameter(name: str, known: Iterable[str]) -> KeyError:
 
 
 def get_parameters(sky: Sky, names: Iterable[str]) -> dict[str, Array]:
-    """Return parameter values by name.
-
-    Raises
-    ------
-    KeyError
-        If a name is unknown; the message lists the known ones.
-    TypeError
-        If `names` is a string.
-    """
+    """Return parameter values by name; KeyError lists the known names if one is unknown."""
     check_names("names", names)
-    names, (leaves, _) = tuple(names), _flatten(sky)
-    for name in names:
-        if name not in leaves:
-            raise unknown_parameter(name, leaves)
-    return {name: leaves[name] for name in names}
+    leaves, _ = _flatten(sky)
+    try:
+        return {name: leaves[name] for name in names}
+    except KeyError as error:
+        raise unknown_parameter(error.args[0], leaves) from None
 
 
 def check_parameter(sky: Sky, target: str, name: str, value: Array) -> None:
@@ -238,18 +217,13 @@ def check_parameter(sky: Sky, target: str, name: str, value: Array) -> None:
 def set_parameters(sky: Sky, params: Mapping[str, ArrayLike]) -> Sky:
     """Return a sky with some parameters replaced, or shifted for names that end in ".offset".
 
-    Parameters
-    ----------
-    sky : the sky to start from, which is not changed
-    params : values by name: numbers, or maps with the sky's pixels
+    Values are numbers, or maps with the sky's pixels; for amplitudes maps of the sky's shape.
 
     Raises
     ------
-    KeyError
-        If a name is unknown; the message lists the known ones.
-    ValueError
-        If a value has the wrong shape (for amplitudes that of the sky, else a number or a map
-        with the sky's pixels), is not finite, or is refused by the component.
+    KeyError, ValueError
+        If a name is unknown (the message lists the known ones), or a value has the wrong shape, is
+        not finite, or is refused by the component.
 
     Examples
     --------

@@ -58,8 +58,7 @@ class SmallScales(eqx.Module):
     Raises
     ------
     TypeError, ValueError
-        For ranges that are not two integers or too short for a fit, wrong shapes, numbers that are
-        not finite, a negative amplitude or a modulation_fwhm that is not positive.
+        For ranges that are not two integers or too short for a fit, or numbers out of range.
     """
 
     EE: tuple[int, int] = eqx.field(static=True)
@@ -118,10 +117,9 @@ class PowerLaw(NamedTuple):
 
 
 def fit_power_law(spectrum: Spectrum, lmin: int, lmax: int) -> PowerLaw:
-    """Fit a straight line to log C_l against log l by least squares, with equal weight for each l.
+    """Fit a straight line to log C_l against log l by least squares, each l alike, as in the paper.
 
-    This is the paper's fit, from lmin to lmax, both included; lmax is the pivot of the result. The
-    errors follow from the scatter about the line.
+    From lmin to lmax, both included; lmax is the pivot. Errors are from the scatter about the line.
     """
     if not 2 <= lmin <= lmax - 3 or lmax >= len(spectrum):
         raise ValueError(
@@ -145,7 +143,7 @@ class Extrapolation(NamedTuple):
     """
 
     measured: Float[Array, "2 ell_in"]
-    laws: tuple[PowerLaw, PowerLaw]
+    laws: tuple[PowerLaw, ...]
     target: Float[Array, "2 ell"]
     transfer: Float[Array, "2 ell_in"]
     injected: Float[Array, "2 ell"]
@@ -154,10 +152,7 @@ class Extrapolation(NamedTuple):
 def extrapolate(
     alm: Float[Array, "2 alm"], own: ArrayLike, small: SmallScales, lmax: int
 ) -> Extrapolation:
-    """Compute the spectra of a template and of the small scales that continue it up to `lmax`.
-
-    `alm` are its packed coefficients E, B as far as they are known, `own` its beam [arcmin].
-    """
+    """Continue the spectra of a template, E and B as far as they are known, of beam `own`."""
     known = lmax_of(alm)
     beam = gaussian_beam(own, known)
     # Beyond the joins the beam is not divided out: it may leave no signal there.
@@ -181,9 +176,7 @@ def extrapolate(
     missing = jnp.stack(target).at[:, :both].add(-jnp.stack(there)[:, :both])
     joins = jnp.array([[small.EE[1]], [small.BB[1]]])
     injected = jnp.where(jnp.arange(lmax + 1) > joins, jnp.maximum(missing, 0.0), 0.0)
-    return Extrapolation(
-        measured, (laws[0], laws[1]), jnp.stack(target), jnp.stack(transfer), injected
-    )
+    return Extrapolation(measured, tuple(laws), jnp.stack(target), jnp.stack(transfer), injected)
 
 
 def _root(values: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -209,15 +202,12 @@ def _correlated_parts(
     """Continue several templates so that they stay as correlated as they are.
 
     Each cross-spectrum is extrapolated with its correlation coefficient over the range of the fits.
-    Where template i is still known and j is not, j gets a part proportional to i: T_ij / T_ii times
+    Where field i is still known and j is not, j gets a part proportional to i: T_ij / T_ii times
     the coefficients of i, where T are the target spectra, multiplied by the fraction known of i (in
-    power) and missing of j (in amplitude).
-
-    `alms` are the coefficients that are kept, without beams, `parts` their spectra, and `ranges`
-    the range of the fit of each field. Returns the proportional parts, and the spectra of what is
-    still missing, to be drawn.
+    power) and missing of j (in amplitude). Returns these parts, and the spectra of what is still
+    missing, to be drawn, given the coefficients that are kept, without beams.
     """
-    lmin, lmax = max(r[0] for r in ranges), min(r[1] for r in ranges)
+    lmin, lmax = max(first for first, _ in ranges), min(join for _, join in ranges)
     if lmin > lmax:
         raise ValueError(
             f"Correlated small scales need ranges that overlap, but they are {list(ranges)}."
@@ -247,10 +237,9 @@ def _correlated_parts(
 
 
 class Continued(NamedTuple):
-    """Templates with their small scales.
+    """Templates with small scales (E, B without any beam), and the spectra that they follow.
 
-    `alms` are packed coefficients E, B without any beam, `parts` the spectra that they follow, and
-    `repaired` the number of multipoles at which the matrix of spectra had to be repaired.
+    The matrix of spectra had to be repaired at `repaired` multipoles.
     """
 
     alms: list[Float[Array, "2 alm"]]

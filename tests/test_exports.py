@@ -81,7 +81,6 @@ def bandpasses(bandpass) -> Calls:
     yield partial(bandpass._across, samples=9), 100.0, 20.0
     for convention in ("RJ", "power", "CMB"):
         yield partial(bandpass._integrand, convention=convention), NU, np.ones(2)
-        yield partial(bandpass._quadrature, convention=convention), NU, np.ones(2)
     yield bandpass.stack_bands, tuple(BANDS)
     yield lambda band: band.center, BANDS[0]
     yield partial(bandpass.average, lambda nu: nu**-3.1), BANDS[0]

@@ -28,12 +28,11 @@ def gaussian_beam(fwhm: ArrayLike, lmax: int) -> Window:
     The same window serves temperature and polarization, as in the paper; healpy's window for
     polarization differs by exp(2 sigma^2), 1.0001 for 1 degree. Differentiable in the width.
     """
-    return _gaussian(fwhm, 0.0, lmax)
+    return _gaussian_ratio(fwhm, 0.0, lmax)
 
 
 @partial(jax.jit, static_argnames="lmax")
-def _gaussian(fwhm: ArrayLike, own: ArrayLike, lmax: int) -> Window:
-    """Return the window of a Gaussian divided by that of another."""
+def _gaussian_ratio(fwhm: ArrayLike, own: ArrayLike, lmax: int) -> Window:
     variance = (jnp.square(fwhm) - jnp.square(own)) * math.radians(1 / 60) ** 2 / (8 * math.log(2))
     ell = jnp.arange(lmax + 1)
     return jnp.exp(-ell * (ell + 1) * variance / 2)
@@ -52,7 +51,7 @@ def beam_ratio(target: ArrayLike, own: ArrayLike, lmax: int, what: str = "the ma
                 f"The target beam of {float(target):g} arcmin is finer than that of {what}, "
                 f"{float(own):g} arcmin."
             )
-        return _gaussian(target, own, lmax)
+        return _gaussian_ratio(target, own, lmax)
     over, under = _window(target, lmax, "the target"), _window(own, lmax, what)
     empty = jnp.abs(under) < NEGLIGIBLE
     ratio = jnp.where(empty, 0.0, over / jnp.where(empty, 1.0, under))
@@ -91,9 +90,8 @@ def pixel_window(nside: int, lmax: int) -> Float[np.ndarray, " ell"]:
     """
     from scipy.special import j1  # slower to import than most windows are to compute
 
-    x = np.sqrt(np.arange(lmax + 1) * np.arange(1, lmax + 2)) * math.sqrt(
-        healpy.nside2pixarea(nside) / np.pi
-    )
+    ell, radius = np.arange(lmax + 1), math.sqrt(healpy.nside2pixarea(nside) / np.pi)
+    x = np.sqrt(ell * (ell + 1)) * radius
     return np.where(x > 0, 2 * j1(x) / np.where(x > 0, x, 1), 1.0)
 
 
@@ -137,17 +135,13 @@ def resample(
 def smooth(maps: Maps, fwhm: ArrayLike, own: ArrayLike = 0.0, lmax: int | None = None) -> Maps:
     """Smooth maps from their own beam to another; differentiable in maps and widths.
 
-    Parameters
-    ----------
-    maps : shape (stokes, pix), RING; one row is I, two are Q, U, three are I, Q, U
-    fwhm, own : the target beam and that of the maps, see `beam_ratio`
-    lmax : largest multipole kept; by default 2 nside, or less where the beam leaves nothing
+    The maps are I, or Q, U, or I, Q, U, shape (stokes, pix), RING; for the beams see `beam_ratio`.
+    Multipoles are kept up to lmax, by default 2 nside, or less where the beam leaves nothing.
 
     Raises
     ------
     ValueError
-        For a wrong shape, a target finer than the maps' own beam, or values that are not finite
-        or UNSEEN.
+        For a wrong shape, a target finer than the maps' own beam, or values that are not finite.
     """
     good = maps.ndim == 2 and healpy.isnpixok(maps.shape[-1])
     check_shape("maps", maps, good, "have shape (stokes, pix) with 12 nside^2 pixels")

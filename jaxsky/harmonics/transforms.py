@@ -12,8 +12,10 @@ import math
 import os
 import threading
 import time
+from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import healpy
 import jax
@@ -100,27 +102,26 @@ def alm_to_healpy(alm: ArrayLike, lmax: int) -> np.ndarray:
     return np.concatenate([alm[..., : lmax + 1], pairs[..., ::2] + 1j * pairs[..., 1::2]], axis=-1)
 
 
-def _blocks(stokes: int, spin: int) -> list[tuple[slice, int]]:
-    """Return the rows of I, Q, U or I, Q, U maps that are transformed together, and their spin."""
-    scalar, polarized = (slice(0, 1), 0), (slice(stokes - 2, stokes), spin)
-    return {1: [scalar], 2: [polarized], 3: [scalar, polarized]}[stokes]
+def _by_spin(transform: Callable[..., Any], rows: Array, spin: int, **how: Any) -> Array:
+    """Transform the rows I, or Q, U (or E, B), or both: the first is scalar, two have a spin."""
+    scalar, polarized = (slice(0, 1), 0), (slice(-2, None), spin)
+    blocks = {1: [scalar], 2: [polarized], 3: [scalar, polarized]}[len(rows)]
+    return jnp.concatenate([transform(rows[block], spin=s, **how)[0] for block, s in blocks])
 
 
-def _transform(alm: Alm, nside: int, spin: int, weighted: bool = False) -> Maps:
+def _transform(alm: Alm, nside: int, spin: int, weighted: bool) -> Maps:
     """Return the maps of coefficients, each ring times its weight if `weighted`."""
     check_double("A spherical harmonic transform")
     _finish_at_exit()
     how = {"nside": nside, "lmax": lmax_of(alm), "weighted": weighted}
-    return jnp.concatenate(
-        [primitives.synthesis(alm[rows], spin=s, **how)[0] for rows, s in _blocks(len(alm), spin)]
-    )
+    return _by_spin(primitives.synthesis, alm, spin, **how)
 
 
-def _transposed(maps: Maps, lmax: int, spin: int, weighted: bool = False) -> Alm:
+def _transposed(maps: Maps, lmax: int, spin: int = 2, weighted: bool = False) -> Alm:
     nside = healpy.npix2nside(maps.shape[-1])
-    empty = jax.ShapeDtypeStruct((maps.shape[0], (lmax + 1) ** 2), maps.dtype)
+    alm = jax.ShapeDtypeStruct((maps.shape[0], (lmax + 1) ** 2), maps.dtype)
     forward = partial(_transform, nside=nside, spin=spin, weighted=weighted)
-    return jax.linear_transpose(forward, empty)(maps)[0]
+    return jax.linear_transpose(forward, alm)(maps)[0]
 
 
 @partial(jax.jit, static_argnames=("nside", "spin"))
@@ -129,13 +130,13 @@ def synthesis(alm: Alm, nside: int, spin: int = 2) -> Maps:
 
     With lmax > 3 nside - 1 the maps are undersampled. `spin` is that of the last two rows.
     """
-    return _transform(alm, nside, spin)
+    return _transform(alm, nside, spin, weighted=False)
 
 
-@partial(jax.jit, static_argnames=("lmax", "spin"))
-def adjoint_synthesis(maps: Maps, lmax: int, spin: int = 2) -> Alm:
+@partial(jax.jit, static_argnames="lmax")
+def adjoint_synthesis(maps: Maps, lmax: int) -> Alm:
     """Apply the transpose of `synthesis`: inner products of maps with the spherical harmonics."""
-    return _transposed(maps, lmax, spin)
+    return _transposed(maps, lmax)
 
 
 @partial(jax.jit, static_argnames=("lmax", "iterations", "spin"))
@@ -155,9 +156,7 @@ def analysis(maps: Maps, lmax: int, iterations: int | None = None, spin: int = 2
     if not iterations:
         return alm
     how = {"nside": nside, "lmax": lmax, "iterations": iterations}
-    return jnp.concatenate(
-        [primitives.refined(alm[rows], spin=s, **how)[0] for rows, s in _blocks(len(alm), spin)]
-    )
+    return _by_spin(primitives.refined, alm, spin, **how)
 
 
 # Ending a Python process in which transforms may still run.
@@ -190,8 +189,9 @@ def _finish() -> None:
                     last().block_until_ready()
     daemons = [thread for thread in threading.enumerate() if thread.daemon]
     if _THREADS.is_dir() and not _calm(seconds=1.0 if daemons else 60.0):
-        for thread in daemons:
-            _end(thread)
+        for thread in daemons:  # they end where they next run Python code
+            ident, error = ctypes.c_ulong(thread.ident or 0), ctypes.py_object(SystemExit)
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ident, error)
         _calm(seconds=10.0)
 
 
@@ -213,9 +213,3 @@ def _computing() -> bool:
             if state in "RD":
                 return True
     return False
-
-
-def _end(thread: threading.Thread) -> None:
-    """Make a thread end where it next runs Python code."""
-    ident, error = ctypes.c_ulong(thread.ident or 0), ctypes.py_object(SystemExit)
-    ctypes.pythonapi.PyThreadState_SetAsyncExc(ident, error)

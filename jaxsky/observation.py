@@ -56,11 +56,6 @@ class ObservedBand(Printed, eqx.Module):
     noise : uniform level [uK_RJ arcmin], covariance of each pixel [uK_RJ^2], shape
         (stokes, stokes, pix), or None
     diagonal : draw noise with the diagonal of the Cholesky factor only (`noise.draw`)
-
-    Raises
-    ------
-    ValueError
-        If a beam, the target or the level of the noise is negative or not finite.
     """
 
     band: Bandpass
@@ -98,17 +93,12 @@ class Observation(eqx.Module):
     Parameters
     ----------
     channels : by name, in order
-    nside : resolution of the maps
+    nside : resolution of the maps, a power of 2
     stokes : "QU" or "IQU"
     finest : beam to which small scales are made [arcmin], at most the finest one observed
     lmax : largest multipole of the sky in the maps, by default 2 nside
     precision : "double" or "single", in which the maps are computed; single takes half the memory
         and rounds to 1e-7 of a map's rms
-
-    Raises
-    ------
-    ValueError
-        If there is no channel, `nside` is no power of 2, or `stokes` or `precision` is unknown.
     """
 
     channels: dict[str, ObservedBand]
@@ -215,10 +205,6 @@ def load_instrument(
     ------
     KeyError
         If a name is unknown; the message lists the known ones.
-    TypeError
-        If `channels` is a string.
-    ValueError
-        If the target is negative or not finite.
 
     Examples
     --------
@@ -242,10 +228,7 @@ def load_instrument(
 def band_tables(
     name: str, channels: Sequence[str] | None = None, folder: Path = Path()
 ) -> list[dict[str, Any]]:
-    """Return all or some bands of an instrument as tables of an experiment file.
-
-    `name` is that of a preset, or of a file with a list `bands`, relative to `folder`.
-    """
+    """Return bands of a preset, or of a file in a folder, as tables of an experiment file."""
     presets, path = packaged("instruments.toml"), folder / name
     if name in presets:
         bands = presets[name]["bands"]

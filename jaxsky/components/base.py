@@ -50,33 +50,19 @@ def parameter(
     ----------
     default : default value; without one, the parameter is required
     positive : refuse values that are not positive
-    within : refuse a number, or the median of a map, outside this range
-    hint : what to do if a value is outside the range
-    symbol : in TeX, for figures; by default the name
-    unit : "" for a pure number
+    within, hint : refuse a number, or the median of a map, outside this range, with a hint
+    symbol, unit : for figures and tables; by default the name (in TeX), and "" for a pure number
     zero : whether exact zeros in a map are data; if not, they are taken to mark missing values
     """
-    metadata = {
-        "positive": positive,
-        "within": within,
-        "hint": hint,
-        "symbol": symbol,
-        "unit": unit,
-        "zero": zero,
-    }
+    refused = {"positive": positive, "within": within, "hint": hint}
+    metadata = refused | {"symbol": symbol, "unit": unit, "zero": zero}
     return eqx.field(converter=_converted, metadata=metadata, default=default)
 
 
 def reference(default: float, within: tuple[float, float]) -> Any:
     """Declare the field for the reference frequency of a law [GHz], within a range."""
-    return parameter(
-        default,
-        positive=True,
-        within=within,
-        hint="it has to be in GHz",
-        symbol=r"\nu_{\rm ref}",
-        unit="GHz",
-    )
+    hint, symbol = "it has to be in GHz", r"\nu_{\rm ref}"
+    return parameter(default, positive=True, within=within, hint=hint, symbol=symbol, unit="GHz")
 
 
 def _converted(value: Any) -> Any:
@@ -107,9 +93,8 @@ class Component(Printed, eqx.Module):
     Raises
     ------
     TypeError, ValueError
-        On construction, for quantities with units, wrong shapes, values that are not finite or
-        not positive where they must be, and values outside a declared range, such as a beta_syn
-        of the opposite sign or a nu_ref that is not in GHz.
+        For quantities with units, wrong shapes, values that are not finite, and those outside a
+        declared range, such as a beta_syn of the opposite sign or a nu_ref that is not in GHz.
 
     Examples
     --------

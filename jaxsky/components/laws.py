@@ -25,12 +25,6 @@ class Dust(Component, law="dust"):
     nu_ref : reference frequency [GHz]
     nu_pivot : pivot of the emissivities [GHz], only for several bodies; default 3000
 
-    Raises
-    ------
-    ValueError
-        For tuples of different lengths, for E_dust or nu_pivot with a single body, and as for
-        any `Component`.
-
     Examples
     --------
     >>> import jax.numpy as jnp
@@ -146,13 +140,9 @@ class AME(Component, law="ame"):
     ) -> "AME":
         """Return AME polarized along the dust: Q, U = f T (cos, sin)(2 chi), the paper's eq. 5.
 
-        Parameters
-        ----------
-        intensity : AME intensity [uK_RJ], shape (pix,)
-        dust : dust polarization Q, U or I, Q, U in any unit, shape (stokes, pix); the result
-            has the same Stokes parameters. Where the dust is unpolarized, so is the AME.
-        polarization_fraction : f, 1 % in the paper
-        **parameters : further parameters of `AME`
+        From its intensity T [uK_RJ], shape (pix,), maps of dust, Q, U or I, Q, U in any unit, shape
+        (stokes, pix), and f, 1 % in the paper. The Stokes parameters are those of the dust; where
+        that is unpolarized, so is the AME. Further parameters are those of the class.
         """
         intensity, dust = as_array("intensity", intensity), as_array("dust", dust)
         form = f"have shape {dust.shape[1:]} like a map of `dust`"
@@ -179,9 +169,7 @@ def _emissivity(nu: Numeric, T_e: Numeric) -> Float[Array, "..."]:
 
 
 @jax.jit
-def amplitude_from_emission_measure(
-    EM: Numeric, T_e: Numeric, nu_ref: Numeric
-) -> Float[Array, "..."]:
+def amplitude_from_emission_measure(EM: Numeric, T_e: Numeric, nu_ref: Numeric) -> Array:
     """Return the antenna temperature of optically thin free-free emission [uK_RJ].
 
     The optical depth of Draine (2011) is 0.05468 T_e^-3/2 nu^-2 EM g_ff, with T_e in K, nu in GHz

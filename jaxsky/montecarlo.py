@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 import jaxsky
 from jaxsky.experiment import SimulationInputs
@@ -110,7 +110,7 @@ def _claim(out: Path, settings: Experiment, overwrite: bool) -> None:
 
 def _header(settings: Experiment, setup: SimulationInputs, name: str, index: int) -> dict[str, Any]:
     channel = setup.observation.channels[name]
-    nu = np.asarray(channel.band.nu)
+    nu, noise = np.asarray(channel.band.nu), channel.noise
     header: dict[str, Any] = {
         "CREATOR": (f"jaxsky {jaxsky.__version__}", "software"),
         "INSTRUME": _ascii(settings.title) or "own bands",  # long words leave no room for a comment
@@ -127,7 +127,6 @@ def _header(settings: Experiment, setup: SimulationInputs, name: str, index: int
         header["FWHM"] = (float(channel.map_beam), "[arcmin] beam of the maps")
     else:
         header["BEAM"] = ("table", "beam, in the table BEAM")
-    noise = channel.noise
     if noise is not None and not np.ndim(noise):
         header["NOISE"] = (float(noise), "[uK_RJ arcmin] noise before smoothing")
     to_CMB = float(channel.band.conversion("uK_RJ", "uK_CMB"))
@@ -143,8 +142,8 @@ def _ascii(text: str) -> str:
 
 def _columns(
     settings: Experiment, setup: SimulationInputs, name: str, maps: Mapping[str, Array]
-) -> tuple[list[str], Float[np.ndarray, "column pix"]]:
-    """Return names and values of the columns of a band's file, the total first."""
+) -> tuple[list[str], np.ndarray]:
+    """Return names and values (column, pix) of a band's file, the total first."""
     spec, total = settings.simulate, maps["total"]
     if (leaked := setup.leakage.get(name)) is not None:
         total = total.at[-2:].add(leaked.astype(total.dtype))
@@ -158,7 +157,7 @@ def _columns(
     return names, columns
 
 
-def _write(path: Path, columns: Float[np.ndarray, "column pix"], **options: Any) -> None:
+def _write(path: Path, columns: np.ndarray, **options: Any) -> None:
     check_guards()
     log = path.parents[1] / LOG
     if not log.exists():
@@ -181,12 +180,11 @@ def run(
 ) -> Iterator[bool]:
     """Simulate realisations into files, one per band; existing files are kept.
 
-    Yields for each file whether it was written. A realisation depends only on the seed and its
-    number. The folder is first changed when the first map is ready, so an earlier failure leaves it
-    untouched. Sources are removed from `setup` once used, if no other realisation needs them.
-    `note` is called with sentences for the user, `begun` once the folder has its log and the old
-    files have been removed (`overwrite`). Realisations are made in this process, or by an executor
-    (see `jaxsky.workers.realised`), for which the folder is changed once the templates are ready.
+    Yields for each file whether it was written. The folder is first changed when the first map is
+    ready (with an executor, see `jaxsky.workers.realised`, when the templates are), so an earlier
+    failure leaves it untouched. Sources are removed from `setup` once used, if no other realisation
+    needs them. `note` is called with sentences for the user, `begun` once the folder has its log
+    and the old files have been removed (`overwrite`).
     """
     names = setup.observation.names
     make = _Maker(settings, setup, out if executor is None else out.absolute())

@@ -33,7 +33,7 @@ from jaxsky.harmonics import (
     resample,
     synthesis,
 )
-from jaxsky.interpolation import Terms, band_sed, choose_terms, term, term_weights
+from jaxsky.interpolation import Terms, choose_terms, term, term_weights
 from jaxsky.noise import draw, stream, uniform_alm, uniform_map
 from jaxsky.observation import Observation, ObservedBand, Source, check_sources
 from jaxsky.small_scales import continue_templates
@@ -54,11 +54,11 @@ class HarmonicSource(NamedTuple):
     """
 
     alms: tuple[Alm, ...]
-    weights: tuple[Float[Array, " term"], ...] | None
-    component: Component | None
-    template: Maps | None
+    weights: tuple[Float[Array, " term"], ...]
     fwhm: Scalar | float
     repaired: Int[Array, ""] | int = 0
+    component: Component | None = None
+    template: Maps | None = None
 
 
 def _continued(
@@ -180,12 +180,12 @@ def harmonic_sources(
     result = {}
     for name in list(sources):
         chosen, component = terms[name], _law(_at(sources[name].component, nside))
-        fwhm = sources[name].fwhm
+        fwhm: Array | float = 0.0
         repaired: Array | int = 0
         if name in continued:
-            (alm, repaired), fwhm = continued[name], 0.0
+            alm, repaired = continued[name]
         else:
-            template = sources[name].component.template.astype(dtype)
+            template, fwhm = sources[name].component.template.astype(dtype), sources[name].fwhm
             # As many steps as its pixels need at the observed beam.
             steps = _iterations(1.0, healpy.npix2nside(template.shape[-1]), finest)
             alm = low_multipoles(template, lmax, steps)
@@ -200,7 +200,7 @@ def harmonic_sources(
                 alm = alm * expand(gaussian_beam(fwhm, lmax).astype(dtype))
             alms, template = [], synthesis(alm, nside)
         if chosen is None:
-            result[name] = HarmonicSource((), None, component, template, fwhm, repaired)
+            result[name] = HarmonicSource((), (), fwhm, repaired, component, template)
             continue
         for i, size in enumerate(chosen.sizes if chosen.counts else ()):
             steps = _iterations(size, nside, finest)
@@ -209,7 +209,7 @@ def harmonic_sources(
                 # Otherwise JAX would make the maps of all terms before analysing any.
                 alms[-1].block_until_ready()
         weights = term_weights(component, observation.bands, chosen)
-        result[name] = HarmonicSource(tuple(alms), weights, None, None, fwhm, repaired)
+        result[name] = HarmonicSource(tuple(alms), weights, fwhm, repaired)
     return result
 
 
@@ -323,12 +323,9 @@ def _maps(
 def _seen(source: HarmonicSource, channel: ObservedBand, index: int, lmax: int, name: str) -> _Part:
     """Return the contribution of a component to a band."""
     window = beam_ratio(channel.map_beam, source.fwhm, lmax, f"component {name!r}")
-    if source.weights is not None:
+    if source.component is None or source.template is None:
         return _Part(source.alms, source.weights[index], window)
-    # Both are set where there are no weights.
-    assert source.component is not None
-    assert source.template is not None
-    law = band_sed(source.component, channel.band, None)
+    law = average(source.component.sed, channel.band)
     seen = source.template * law.astype(source.template.dtype)
     return _Part((analysis(seen, lmax),), (1.0,), window)
 
@@ -354,10 +351,8 @@ def simulate(
 
     Raises
     ------
-    TypeError
-        If `sources` is no dictionary of Source.
-    ValueError
-        If a beam is finer than that of a component without small scales, or inputs do not match.
+    TypeError, ValueError
+        If inputs do not match, or a beam is finer than a component's without small scales.
     """
     prepared = harmonic_sources(key, sources, observation, terms)
     seen = observe_bands(key, prepared, observation, cmb)

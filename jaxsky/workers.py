@@ -61,10 +61,8 @@ def realised(
 
     Raises
     ------
-    TypeError
-        If `work` cannot be pickled.
-    ValueError
-        If a worker has another version of jaxsky or JAX.
+    TypeError, ValueError
+        If `work` cannot be pickled, or a worker has another version of jaxsky or JAX.
     OSError
         If workers do not see the folder, or are lost; what was yielded before is complete.
     """
@@ -160,19 +158,14 @@ def _check_versions(worker: str, there: Mapping[str, Any], here: Mapping[str, st
 
 @dataclass(frozen=True)
 class _Task:
-    """Makes realisations in a worker as in the process that asks for them.
+    """Makes realisations in a worker as in the process that asks for them."""
 
-    `state` is the file of the function that makes one, `owner` the number and the word of the
-    process that asks. Modules are found in the same folders, and numbers have the same precision;
-    `programs` is the cache.
-    """
-
-    state: Path
-    owner: tuple[int, str]
+    state: Path  # the file of the function that makes one
+    owner: tuple[int, str]  # the number and the word of the process that asks
     versions: Mapping[str, str]
-    modules: tuple[str, ...]
+    modules: tuple[str, ...]  # folders where these are found
     double: bool
-    programs: Path | None
+    programs: Path | None  # the cache
 
     def __call__(self, numbers: Sequence[int]) -> list[Any]:
         try:
@@ -286,14 +279,8 @@ def workers_of(
 ) -> Iterator[Executor | None]:
     """Yield the executor that `--workers` names: a number of processes, or the address of Dask.
 
-    None for None. `note` is called with sentences for the user.
-
-    Raises
-    ------
-    ValueError
-        If it is neither, Dask is not installed, or its workers have another version of jaxsky.
-    ConnectionError
-        If no scheduler answers.
+    None for None. `note` is called with sentences for the user. ValueError if it is neither, Dask
+    is not installed or its workers have another version; ConnectionError if no scheduler answers.
     """
     if text is None:
         yield None

@@ -253,8 +253,6 @@ def prepared_templates(paper: PaperSky, observation: Observation) -> dict[str, H
         name: HarmonicSource(
             tuple(alm.astype(observation.dtype) for alm in paper.continued(name).alms),
             term_weights(given[name].component, observation.bands, one),
-            None,
-            None,
             0.0,
         )
         for name, one in constant.items()

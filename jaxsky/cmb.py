@@ -116,10 +116,7 @@ def _spectra(which: str, end: int, **arguments: Any) -> Float[np.ndarray, "4 ell
 
 @partial(jax.jit, static_argnames="stokes")
 def realisation(key: Array, spectra: Float[Array | np.ndarray, "4 ell"], stokes: str = "QU") -> Alm:
-    """Return packed coefficients (E, B or I, E, B) of a Gaussian realisation of spectra.
-
-    `spectra` are the C_l of TT, EE, BB, TE, in the square of any unit; `stokes` is "QU" or "IQU".
-    """
+    """Draw coefficients E, B ("QU") or I, E, B ("IQU") from C_l of TT, EE, BB, TE in any unit."""
     check_choice("stokes", stokes, ("QU", "IQU"))
     TT, EE, BB, TE = spectra
     zero = jnp.zeros_like(TT)
@@ -145,10 +142,8 @@ def _positive(matrix: Float[Array, "ell field field"]) -> tuple[Array, Float[Arr
 
 @_positive.defjvp
 def _positive_jvp(primals, tangents):
-    """Differentiate `_positive` by the formula of Daleckii & Krein.
-
-    Eigenvectors have no derivative where eigenvalues coincide, as all do without correlations.
-    """
+    """Differentiate `_positive` by the formula of Daleckii & Krein."""
+    # Eigenvectors have no derivative where eigenvalues coincide, as all do without correlations.
     values, vectors = jnp.linalg.eigh(primals[0])
     kept = jnp.maximum(values, LEAST)
     above = values > LEAST
@@ -187,10 +182,7 @@ def repair(spectra: Spectra) -> tuple[Spectra, Int[Array, ""]]:
 
 @jax.jit
 def gaussian_fields(key: Array, spectra: Spectra) -> Float[Array, "field alm"]:
-    """Draw packed coefficients of Gaussian fields with given auto- and cross-spectra C_l.
-
-    The matrix of spectra must be positive semi-definite at each l (see `repair`).
-    """
+    """Draw packed coefficients of Gaussian fields; for spectra that are not definite see `repair`."""
     n, lmax = len(spectra), spectra.shape[-1] - 1
     lower = cholesky(spectra)
     white = normal(key, (n, (lmax + 1) ** 2), spectra.dtype)

@@ -148,10 +148,8 @@ def magnetic_field(
 
 
 def _sine_and_cosine(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Return sine and cosine to a few roundings, several times faster than XLA's scalar code.
-
-    Sums the series at an eighth of the angle and doubles it three times, with 1 - cos for cos.
-    """
+    """Return sine and cosine to a few roundings, several times faster than XLA's scalar code."""
+    # The series at an eighth of the angle, doubled three times, with 1 - cos for cos.
     z = (x - 2 * np.pi * jnp.round(x / (2 * np.pi))) / 8
     square = z**2
     sine = versine = jnp.ones_like(x)

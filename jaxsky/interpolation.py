@@ -58,10 +58,8 @@ def _coefficients(values: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def _evaluate(coefs: Float[Array, "..."], *points: Map) -> Map:
-    """Sum the series at points in [-1, 1]^d (one array per dimension), by Clenshaw's recurrence.
-
-    The loops are unrolled: node counts are small, and everything fuses into one pass.
-    """
+    """Sum the series at points in [-1, 1]^d (one array per dimension), by Clenshaw's recurrence."""
+    # The loops are unrolled: node counts are small, and everything fuses into one pass.
     if not points:
         return coefs
     t, *rest = points
@@ -93,10 +91,7 @@ def _range(values: Array) -> tuple[Array, Array]:
 @jax.jit
 @over_pixels(SUMS)
 def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
-    """Bound the relative error of a series cut at each length, for each map, over all bands.
-
-    The series along one parameter is taken at the ends and the middle of the others' ranges.
-    """
+    """Bound the relative error of a series cut at each length, for each map, over all bands."""
     maps, rebuild = _split(component)
 
     def tail(values, band):
@@ -108,7 +103,7 @@ def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
     grid = jnp.asarray(chebpts1(MAX_NODES))
     worst = []
     for axis in range(len(maps)):
-        lines = []
+        lines = []  # at the ends and the middle of the ranges of the others
         for corner in itertools.product((-1.0, 0.0, 1.0), repeat=len(maps) - 1):
             unit: list[Any] = [*corner[:axis], grid, *corner[axis:]]
             values = [mid + half * u for (mid, half), u in zip(ranges, unit, strict=True)]
@@ -119,10 +114,7 @@ def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
 
 
 def choose_nodes(component: Component, bands: tuple[Bandpass, ...], tolerance: float) -> Nodes:
-    """Choose node counts that give band averages of a component to a relative tolerance.
-
-    None where the direct sum is better, or no parameter is a map.
-    """
+    """Choose node counts for a relative tolerance; None if the direct sum is better, or no map."""
     maps, _ = _split(component)
     if not maps or len(maps) > MAX_DIMENSIONS or tolerance <= 0:
         return None
@@ -174,15 +166,11 @@ def _points(component: Component) -> list[Map]:
 
 
 class Terms(NamedTuple):
-    """Combinations of Chebyshev polynomials that span the band averages of a component.
+    """Combinations of Chebyshev polynomials that span the band averages of a component."""
 
-    `vectors` are orthonormal vectors of Chebyshev coefficients, `counts` the number of nodes along
-    each parameter map; `sizes` bound what each term adds to the maps, relative to the maps.
-    """
-
-    vectors: Float[np.ndarray, "term node"]
-    counts: tuple[int, ...]
-    sizes: tuple[float, ...]
+    vectors: Float[np.ndarray, "term node"]  # orthonormal Chebyshev coefficients
+    counts: tuple[int, ...]  # of nodes along each parameter map
+    sizes: tuple[float, ...]  # bounds of what each term adds to the maps, relative to these
 
     def coefs(self, index: int) -> Float[np.ndarray, "..."]:
         """Return Chebyshev coefficients of a term in the scaled parameters that are maps."""
@@ -200,8 +188,8 @@ def choose_terms(
     The singular values of the law's matrix (band, node) fall fast, so a few combinations of
     polynomials serve all bands, and linear operations (a transform) are applied to these only.
     `importance` times the law is the component's size relative to the maps of a band, and so is
-    the tolerance; it is not needed where no parameter is a map, which gives one constant term.
-    Returns None where bands are better averaged one by one.
+    the tolerance. Returns one constant term where no parameter is a map, and None where bands are
+    better averaged one by one.
     """
     if not _split(component)[0]:
         return Terms(np.ones((1, 1)), (), (1.0,))
@@ -234,10 +222,7 @@ def term(component: Component, coefs: Float[Array, "..."]) -> Map:
 
 
 def band_sed(component: Component, band: Bandpass, nodes: Nodes) -> Scalar | Map:
-    """Return the band-averaged law of a component: a number, or a map if a parameter is one.
-
-    The nodes come from `choose_nodes`; None sums directly over the band in every pixel.
-    """
+    """Return the band-averaged law of a component: a number, or a map if a parameter is one."""
     if nodes is None:
         return average(component.sed, band)
     coefs, values = _series(component, band, nodes.counts)

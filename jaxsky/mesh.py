@@ -140,18 +140,14 @@ def on_accelerator(value: Any) -> bool:
 
 
 def at_once(few: int) -> int:
-    """Return how many pixels a step of a pass takes: few, for the cache of a CPU, or many.
-
-    An accelerator has no such cache, and needs longer to begin a step than to compute a small one.
-    """
+    """Return how many pixels a step of a pass takes: few, for the cache of a CPU, or many."""
+    # An accelerator needs longer to begin a step than to compute a small one.
     return few if jax.default_backend() == "cpu" else WIDER * few
 
 
 def in_place(data: Any, *others: Any) -> tuple[Any, ...]:
-    """Return maps (..., band, stokes, pix) as distributed over the accelerator that holds the data.
-
-    Nothing is copied, and nothing changed if the data lie elsewhere or are distributed already.
-    """
+    """Return maps (..., band, stokes, pix) as distributed over the accelerator of the data."""
+    # Nothing is copied, and nothing changed if the data lie elsewhere or are distributed already.
     if spread(data) or not on_accelerator(data):
         return data, *others
     mesh = _mesh_over(np.array(list(data.devices())))

@@ -64,10 +64,7 @@ def check_folder(
 
 
 def other_sky(settings: Experiment) -> list[str]:
-    """Return a warning if maps were simulated with different settings, else an empty list.
-
-    Without the log next to the folder of the maps no difference is known.
-    """
+    """Return a warning if maps were simulated with other settings by the log next to them."""
     if (maps := settings.common.maps) is None:
         return []
     now = _content(settings)
@@ -209,10 +206,7 @@ def run(
 
 
 class _Maker:
-    """Makes the files of realisations, in this process or a worker.
-
-    Templates without small scales, or with the same for all realisations, are prepared once.
-    """
+    """Makes the files of realisations, in this process or a worker, of templates prepared once."""
 
     def __init__(self, settings: Experiment, setup: SimulationInputs, out: Path) -> None:
         self.settings, self.setup, self.out = settings, setup, out

@@ -112,10 +112,7 @@ def _law(component: Component) -> Component:
 def plan_terms(
     sources: Mapping[str, Source], observation: Observation, tolerance: float = TOLERANCE
 ) -> dict[str, Terms | None]:
-    """Choose the terms of each source for `harmonic_sources`, from values that are not traced.
-
-    The tolerance is the error of varying laws relative to the maps of a band.
-    """
+    """Choose the terms of each source for `harmonic_sources`, from values that are not traced."""
     # Terms depend on the ranges of the parameter maps at the resolution at which they are used.
     components = {n: _at(source.component, observation.nside) for n, source in sources.items()}
     if any(leaf.ndim == 1 for leaf in jax.tree.leaves(components)):
@@ -132,12 +129,10 @@ def plan_terms(
 def _importance(
     components: dict[str, Component], samples: Samples
 ) -> dict[str, Float[Array, " band"]]:
-    """Return the rms of each template relative to the total rms in each band.
-
-    The total uses each law at the mean of its parameters.
-    """
+    """Return the rms of each template relative to the total rms in each band."""
     rms, levels = {}, {}
     for name, component in components.items():
+        # For the total, each law is taken at the mean of its parameters.
         middle = jax.tree.map(lambda x: x.mean() if x.ndim == 1 else x, component)
         rms[name] = jnp.sqrt(jnp.mean(component.template**2))
         levels[name] = rms[name] * jax.vmap(partial(average, middle.sed))(samples)

@@ -185,10 +185,8 @@ def _root(values: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def modulation(maps: Float[Array, "2 pix"], fwhm: ArrayLike, nside: int) -> Map:
-    """Return the polarized intensity of Q, U, smoothed by a beam [arcmin] and divided by its mean.
-
-    Unlike Q over its mean, the paper's "normalised version of the template", it never changes sign.
-    """
+    """Return the polarized intensity of Q, U over its mean, smoothed by a beam [arcmin]."""
+    # Unlike the paper's "normalised version of the template", Q over its mean, it has one sign.
     intensity = _root(jnp.sum(maps**2, axis=0))
     window = shortened(gaussian_beam(fwhm, 2 * healpy.npix2nside(maps.shape[-1])))
     return resample(intensity[None], window, nside)[0] / intensity.mean()
@@ -237,14 +235,11 @@ def _correlated_parts(
 
 
 class Continued(NamedTuple):
-    """Templates with small scales (E, B without any beam), and the spectra that they follow.
-
-    The matrix of spectra had to be repaired at `repaired` multipoles.
-    """
+    """Templates with small scales (E, B without any beam), and the spectra that they follow."""
 
     alms: list[Float[Array, "2 alm"]]
     parts: list[Extrapolation]
-    repaired: Int[Array, ""]
+    repaired: Int[Array, ""]  # multipoles at which the matrix of spectra had to be repaired
 
 
 def continue_templates(

@@ -108,10 +108,8 @@ def realised(
 
 
 def _lost(executor: Executor) -> bool:
-    """Return whether the client of a Dask cluster has lost its scheduler, and what it had asked.
-
-    Tasks whose results were on their way are then neither finished nor cancelled by Dask.
-    """
+    """Return whether the client of a Dask cluster has lost its scheduler, and what it had asked."""
+    # Dask neither finishes nor cancels tasks whose results were on their way then.
     client = getattr(executor, "_client", None)
     return client is not None and (client.status != "running" or not client.futures)
 

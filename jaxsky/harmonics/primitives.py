@@ -26,21 +26,14 @@ GROUP = 1 << 27
 
 
 def _lower(ctx: Any, *operands: Any, **parameters: Any) -> Any:
-    """Lower a transform, and tell JAX that it calls Python, so that it is not cached on disk.
-
-    jaxbind writes the address of a Python object into the program; in another process something
-    else may be at that address.
-    """
+    """Lower a transform, and tell JAX that it calls Python, so that it is not cached on disk."""
+    # jaxbind writes the address of a Python object into the program: another one elsewhere.
     ctx.module_context.add_host_callback(lambda *_: ())
     return jaxbind._lowering(ctx, *operands, **parameters)
 
 
 def _through_callback(*operands: Any, _func: Any, **parameters: Any) -> Any:
-    """Call a function of jaxbind on the host, where the arrays are on an accelerator.
-
-    The primitive stays jaxbind's, and with it gradients, transposes and batches. JAX does not
-    cache programs with callbacks on disk.
-    """
+    """Call a function of jaxbind, whose gradients and batches stay, on the host of a GPU."""
     found = jaxbind._exec_abstract(*operands, _func=_func, **parameters)
     shapes = [jax.ShapeDtypeStruct(one.shape, one.dtype) for one in found]
     if _func.can_batch:
@@ -74,14 +67,11 @@ def _ring_weights(nside: int) -> np.ndarray:
 
 @cache
 def _groups(nside: int, lmax: int, spin: int, size: int, weighted: bool) -> list[dict[str, Any]]:
-    """Return groups of rings, each symmetric about the equator, as arguments of ducc.
-
-    `size` is that of the coefficients of a ring at each m [bytes]. With `weighted` rings are
-    multiplied by their weights.
-    """
+    """Return groups of rings, each symmetric about the equator, as arguments of ducc."""
     geometry = ducc0.healpix.Healpix_Base(nside, "RING").sht_info()
     if weighted:
         geometry["ringfactor"] = _ring_weights(nside)
+    # Each ring has coefficients of this size [bytes] at each m.
     number = math.ceil((4 * nside - 1) * (lmax + 1) * size / GROUP)
     shared = {"lmax": lmax, "mmax": lmax, "spin": spin, "nthreads": 0}
     groups = []

@@ -84,10 +84,8 @@ def shortened(window: Window) -> Window:
 
 
 def pixel_window(nside: int, lmax: int) -> Float[np.ndarray, " ell"]:
-    """Return the pixel window, approximated by a disc of the pixel's area, 2 J_1(x)/x.
-
-    healpy has tables, but fetches them over the network.
-    """
+    """Return the pixel window, approximated by a disc of the pixel's area, 2 J_1(x)/x."""
+    # healpy has tables, but fetches them over the network.
     from scipy.special import j1  # slower to import than most windows are to compute
 
     ell, radius = np.arange(lmax + 1), math.sqrt(healpy.nside2pixarea(nside) / np.pi)
@@ -104,11 +102,8 @@ FINE, FINE_VARIANCE = 0.25, 0.375
 
 
 def low_multipoles(maps: Maps, lmax: int, iterations: int | None = None) -> Alm:
-    """Return packed coefficients up to lmax of maps that also have higher multipoles.
-
-    Multipoles beyond those analysed leak into the result, so more are analysed than are kept.
-    Coefficients above 2 nside of the maps are zero.
-    """
+    """Return coefficients up to lmax of maps that have higher multipoles; zero above 2 nside."""
+    # Multipoles beyond those analysed leak into the result, so more are analysed than are kept.
     resolved = 2 * healpy.npix2nside(maps.shape[-1])
     return resize(analysis(maps, min(resolved, MARGIN * lmax), iterations), lmax)
 
@@ -171,12 +166,9 @@ def average_pixels(maps: Float[Array, "... pix"], nside: int) -> Float[Array, ".
 
 
 class Preparation(eqx.Module):
-    """Operator that takes maps to a common beam and nside, or averages over pixels only.
+    """Operator that takes maps to a common beam and nside, or averages over pixels only."""
 
-    The window has a factor for each multipole; None averages pixels and leaves the beam unchanged.
-    """
-
-    window: Window | None
+    window: Window | None  # None averages pixels and leaves the beam unchanged
     nside_in: int = eqx.field(static=True)
     nside: int = eqx.field(static=True)
 
@@ -190,11 +182,7 @@ class Preparation(eqx.Module):
         lmax: int,
         what: str = "map",
     ) -> "Preparation":
-        """Smooth from the maps' own beam to a Gaussian of fwhm [arcmin]; see `beam_ratio`.
-
-        `own` is the FWHM of a Gaussian [arcmin], or a table b_l. Multipoles up to lmax are kept, or
-        fewer where the beam leaves nothing.
-        """
+        """Smooth from the maps' own beam to a Gaussian up to lmax or less; see `beam_ratio`."""
         _check_nside(nside_in, nside, what)
         return cls(shortened(beam_ratio(fwhm, own, lmax, what)), nside_in, nside)
 
@@ -217,14 +205,11 @@ class Preparation(eqx.Module):
         return jax.linear_transpose(self, jax.ShapeDtypeStruct(shape, maps.dtype))(maps)[0]
 
     def variance(self, variance: Sequence[Map]) -> Maps:
-        """Return the variance of prepared white noise, given the variance of each input pixel.
-
-        The variance of a smoothed map is the map of variances smoothed by the square of the
-        kernel. The square is computed exactly, on Gauss-Legendre nodes.
-        """
+        """Return the variance of prepared white noise, given the variance of each input pixel."""
         if self.window is None:
             mean = average_pixels(jnp.asarray(variance, float), self.nside)
             return mean * (self.nside / self.nside_in) ** 2
+        # That of a smoothed map is the map of variances smoothed by the square of the kernel.
         squared = jnp.asarray(_squared_window(np.asarray(self.window), 2 * self.nside_in))
         area = healpy.nside2pixarea(self.nside_in)
         rows = []
@@ -247,7 +232,7 @@ def _check_nside(nside_in: int, nside: int, what: str) -> None:
 
 
 def _squared_window(window: np.ndarray, highest: int) -> np.ndarray:
-    """Return the window of the squared kernel, given the window of the kernel."""
+    """Return the window of the squared kernel, exact on Gauss-Legendre nodes, given its window."""
     lmax = min(2 * (len(window) - 1), highest)
     order = 2 * len(window) + lmax
     x = np.cos(ducc0.misc.GL_thetas(order))

@@ -35,10 +35,8 @@ def alm_ell(lmax: int) -> np.ndarray:
 
 
 def degrees(lmax: int) -> tuple[Array, Array, Array]:
-    """Return l, m and part (0 real, 1 imaginary) of each packed coefficient.
-
-    They are computed inside the program: as constants they would be as large as the coefficients.
-    """
+    """Return l, m and part (0 real, 1 imaginary) of each packed coefficient."""
+    # Computed inside the program: as constants they would be as large as the coefficients.
     i = jnp.arange((lmax + 1) ** 2)
     pair, part = jnp.divmod(jnp.maximum(i - (lmax + 1), 0), 2)
     # Counted from the end, m = lmax has one pair, m = lmax - 1 two, ...: triangular numbers.

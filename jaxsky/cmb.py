@@ -182,7 +182,7 @@ def repair(spectra: Spectra) -> tuple[Spectra, Int[Array, ""]]:
 
 @jax.jit
 def gaussian_fields(key: Array, spectra: Spectra) -> Float[Array, "field alm"]:
-    """Draw packed coefficients of Gaussian fields; for spectra that are not definite see `repair`."""
+    """Draw coefficients of Gaussian fields with these spectra, positive semi-definite (`repair`)."""
     n, lmax = len(spectra), spectra.shape[-1] - 1
     lower = cholesky(spectra)
     white = normal(key, (n, (lmax + 1) ** 2), spectra.dtype)

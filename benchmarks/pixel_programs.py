@@ -63,9 +63,10 @@ def programs(nside: int) -> dict[str, jax.stages.Lowered]:
     laws = Sky({"dust": Dust(one, 1.55, 21.0), "synchrotron": Synchrotron(one)})
     options = {"labels": {name: labels}, "compress": False}
     like = spectral_likelihood(laws, BANDS, data, noise, START, **options)
+    plan = interpolation_nodes(sky, bands, 1e-10)
     (layout,), theta, matrix = like.layout, like.flat({}), np.ones((1, len(BANDS), 2))
     return {
-        "observe": _observe.lower(sky, bands, interpolation_nodes(sky, bands, 1e-10), False),
+        "observe": _observe.lower(sky, bands, plan=plan, apart=False),
         "inner products": jax.jit(gram).lower(data, templates, jnp.abs(data)),
         "used pixels": distributed._look.lower(data, noise, 2),
         "band covariances": jax.jit(

@@ -49,16 +49,10 @@ class Bandpass(Printed, eqx.Module):
 
     Parameters
     ----------
-    nu : frequencies [GHz], shape (sample,), strictly increasing; one sample is a delta function
-    weights : response, shape (sample,), any normalisation
+    nu : frequencies [GHz], shape (sample,), positive and strictly increasing, at most 1e6 GHz;
+        one sample is a delta function
+    weights : response, shape (sample,), any normalisation, with a positive integral
     convention : "RJ", "power" or "CMB"
-
-    Raises
-    ------
-    TypeError, ValueError
-        For arguments that carry a unit or are not numeric, a wrong shape or convention, values that
-        are not finite, frequencies that do not increase from 0 or exceed 1e6 GHz, or an integral
-        that is not positive.
 
     Examples
     --------

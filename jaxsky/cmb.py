@@ -43,10 +43,7 @@ def camb_spectra(lmax: int, r: float = 0.0, **cosmology: float) -> Float[np.ndar
     unless it sets `nt`. The spectra are therefore linear in r, with slope `tensor_spectra`. The
     value at a multipole does not depend on lmax.
 
-    Raises
-    ------
-    ValueError
-        If lmax or r is negative, or CAMB rejects the cosmology.
+    ValueError if lmax or r is negative, or CAMB rejects the cosmology.
     """
     if not (np.isfinite(r) and r >= 0):
         raise ValueError(f"Argument `r` must be a number from 0 on, but is {r}.")
@@ -182,7 +179,7 @@ def repair(spectra: Spectra) -> tuple[Spectra, Int[Array, ""]]:
 
 @jax.jit
 def gaussian_fields(key: Array, spectra: Spectra) -> Float[Array, "field alm"]:
-    """Draw coefficients of Gaussian fields with these spectra, positive semi-definite (`repair`)."""
+    """Draw coefficients of Gaussian fields of given spectra, positive semi-definite (`repair`)."""
     n, lmax = len(spectra), spectra.shape[-1] - 1
     lower = cholesky(spectra)
     white = normal(key, (n, (lmax + 1) ** 2), spectra.dtype)

@@ -196,15 +196,10 @@ def load_instrument(
 
     Parameters
     ----------
-    name : "planck", "wmap", "core" or "litebird"
+    name : "planck", "wmap", "core" or "litebird"; for unknown names KeyError lists the known ones
     channels : names of the channels wanted, in this order; by default all
     target : common beam of the maps [arcmin]; None keeps the beam of each
     samples : number of samples per band; see `Bandpass.top_hat`
-
-    Raises
-    ------
-    KeyError
-        If a name is unknown; the message lists the known ones.
 
     Examples
     --------

@@ -19,15 +19,8 @@ from jaxsky.mesh import maps_of, over_pixels, typed
 class Sky(Printed, eqx.Module):
     """A sum of named components on the same pixels.
 
-    Parameters
-    ----------
-    components : mapping from names to components; a name is the first part of the names of
-        its parameters ("dust.beta_dust")
-
-    Raises
-    ------
-    TypeError, ValueError
-        If these are no components by name, a name has a dot, or shapes of amplitudes differ.
+    `components` are a mapping from names, each the first part of the names of its parameters
+    ("dust.beta_dust"), to components whose amplitudes share one shape (stokes, pix).
 
     Examples
     --------
@@ -57,10 +50,8 @@ class Sky(Printed, eqx.Module):
                     f"must be text without dots, not {name!r}."
                 )
             if not isinstance(component, Component):
-                raise TypeError(
-                    f"Component {name!r} must be a jaxsky Component, "
-                    f"but is {type(component).__name__}."
-                )
+                what = type(component).__name__
+                raise TypeError(f"Component {name!r} must be a jaxsky Component, but is {what}.")
         shapes = {name: component.amplitude.shape for name, component in self.components.items()}
         if len(set(shapes.values())) > 1:
             raise ValueError(f"Amplitudes must share one shape (stokes, pix), but have {shapes}.")
@@ -115,20 +106,16 @@ def _emission(component: Component, bands: tuple[Bandpass, ...], nodes: Nodes) -
 
 
 @partial(jax.jit, static_argnames=("plan", "apart"))
-def _observe(sky, bands, plan, apart):
+@over_pixels(maps_of(3))
+def _observe(sky, bands, *, plan, apart):
     """Return the maps of all components together, or of each separately."""
-
-    @over_pixels(maps_of(3))
-    def observed(sky, bands):
-        emissions = {
-            name: _emission(component, bands, nodes)
-            for (name, component), nodes in zip(sky.components.items(), plan, strict=True)
-        }
-        if apart:
-            return {name: jnp.stack(maps) for name, maps in emissions.items()}
-        return jnp.stack([sum(maps) for maps in zip(*emissions.values(), strict=True)])
-
-    return observed(sky, bands)
+    emissions = {
+        name: _emission(component, bands, nodes)
+        for (name, component), nodes in zip(sky.components.items(), plan, strict=True)
+    }
+    if apart:
+        return {name: jnp.stack(maps) for name, maps in emissions.items()}
+    return jnp.stack([sum(maps) for maps in zip(*emissions.values(), strict=True)])
 
 
 def observe(
@@ -148,14 +135,10 @@ def observe(
         known beforehand, a fixed number of nodes is used; if they do not reach the tolerance as
         the program runs, the direct sum is.
     nodes : from `interpolation_nodes`, instead of a tolerance; not checked again
-
-    Raises
-    ------
-    TypeError, ValueError
-        If `sky` is no Sky, or `bands` is not a list of at least one Bandpass.
     """
     sky, bands = typed(sky), _check_bands(sky, bands)
-    return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance), False)
+    plan = nodes or interpolation_nodes(sky, bands, tolerance)
+    return _observe(sky, bands, plan=plan, apart=False)
 
 
 def observe_band(sky: Sky, band: Bandpass, *, tolerance: float = 1e-10) -> Maps:
@@ -172,7 +155,8 @@ def observe_components(
 ) -> dict[str, BandMaps]:
     """Observe each component separately [uK_RJ]; see `observe`."""
     sky, bands = typed(sky), _check_bands(sky, bands)
-    return _observe(sky, bands, nodes or interpolation_nodes(sky, bands, tolerance), True)
+    plan = nodes or interpolation_nodes(sky, bands, tolerance)
+    return _observe(sky, bands, plan=plan, apart=True)
 
 
 # Parameters by name. A sky is a tree of arrays, and names follow from the tree: the component,
@@ -184,8 +168,8 @@ OFFSET = ".offset"
 
 def _flatten(sky: Sky) -> tuple[dict[str, Array], "jax.tree_util.PyTreeDef"]:
     paths, structure = jax.tree_util.tree_flatten_with_path(sky)
-    names = [jax.tree_util.keystr(path[1:], simple=True, separator=".") for path, _ in paths]
-    return dict(zip(names, (leaf for _, leaf in paths), strict=True)), structure
+    name = partial(jax.tree_util.keystr, simple=True, separator=".")
+    return {name(path[1:]): leaf for path, leaf in paths}, structure
 
 
 def parameter_names(sky: Sky) -> tuple[str, ...]:
@@ -218,12 +202,8 @@ def set_parameters(sky: Sky, params: Mapping[str, ArrayLike]) -> Sky:
     """Return a sky with some parameters replaced, or shifted for names that end in ".offset".
 
     Values are numbers, or maps with the sky's pixels; for amplitudes maps of the sky's shape.
-
-    Raises
-    ------
-    KeyError, ValueError
-        If a name is unknown (the message lists the known ones), or a value has the wrong shape, is
-        not finite, or is refused by the component.
+    KeyError lists the known names if one is unknown; ValueError refuses values of another shape,
+    that are not finite, or outside the range of the parameter.
 
     Examples
     --------
@@ -235,7 +215,6 @@ def set_parameters(sky: Sky, params: Mapping[str, ArrayLike]) -> Sky:
     1.75
     """
     leaves, structure = _flatten(sky)
-    stokes, npix = sky.shape
     # Values first, then shifts, whatever the order of the dictionary.
     for name, value in sorted(params.items(), key=lambda item: item[0].endswith(OFFSET)):
         target = name.removesuffix(OFFSET)
@@ -243,8 +222,8 @@ def set_parameters(sky: Sky, params: Mapping[str, ArrayLike]) -> Sky:
             raise unknown_parameter(name, leaves)
         value = as_array(name, value)
         amplitude = target.endswith(".amplitude")
-        if value.shape not in (((stokes, npix),) if amplitude else ((), (npix,))):
-            wanted = f"shape {(stokes, npix)}" if amplitude else f"a number or of shape ({npix},)"
+        if value.shape not in ((sky.shape,) if amplitude else ((), sky.shape[1:])):
+            wanted = f"shape {sky.shape}" if amplitude else f"a number or of shape {sky.shape[1:]}"
             raise ValueError(f"Parameter {name!r} must be {wanted}, but has shape {value.shape}.")
         leaves[target] = leaves[target] + value if name.endswith(OFFSET) else value
         check_parameter(sky, target, name, leaves[target])

@@ -49,16 +49,12 @@ class SmallScales(eqx.Module):
 
     Parameters
     ----------
-    EE, BB : ranges of l over which the power laws are fitted; their upper ends are the joins
+    EE, BB : ranges of l over which the power laws are fitted, four multipoles from l = 2 on at
+        least; their upper ends are the joins
     slope : slopes of the laws of E and B, instead of the fitted ones; one number serves both
     tilt : added to the slopes; negative is steeper. The pivot is the join.
     amplitude : of the injected map; 1 makes the mean spectrum continuous
     modulation_fwhm : beam with which the modulating polarized intensity is smoothed [arcmin]
-
-    Raises
-    ------
-    TypeError, ValueError
-        For ranges that are not two integers or too short for a fit, or numbers out of range.
     """
 
     EE: tuple[int, int] = eqx.field(static=True)

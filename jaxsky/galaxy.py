@@ -133,9 +133,8 @@ def magnetic_field(
     sin psi(r) cos chi(z) r_hat + cos psi(r) cos chi(z) phi_hat + sin chi(z) z_hat, eq. 9 of Page
     et al. (2007) with the first two terms as in the hammurabi code (Waelkens et al. 2009,
     A&A 495, 697). It points to l = 63 degrees near the Sun, close to the 70 that Planck XLIV
-    measured; with sine and cosine exchanged it would point to 27, and the maps would agree less
-    well with the observed ones at high latitude. Within `CORE` of its axis, where a spiral has no
-    direction, the field turns vertical.
+    measured; with sine and cosine exchanged it would point to 27. Within `CORE` of its axis, where
+    a spiral has no direction, the field turns vertical.
     """
     r2 = x**2 + y**2 + 1e-12
     psi = jnp.deg2rad(model.psi0 + model.psi1 * jnp.log(jnp.sqrt(r2) / model.r_sun))

@@ -182,11 +182,8 @@ def mesh_of(tree: Any) -> Any:
 
 
 def typed(tree: Tree) -> Tree:
-    """Return arrays with what is distributed in their types, without a copy.
-
-    So are those on meshes with automatic axes, or with axes of other names, made alike. Unchanged
-    while something is traced: then XLA distributes the work.
-    """
+    """Return arrays with what is distributed in their types, on any mesh, without a copy."""
+    # While something is traced, XLA distributes the work.
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)):
         return tree
 

@@ -41,11 +41,8 @@ def _content(settings: Experiment) -> dict[str, Any]:
 def check_folder(
     out: Path, settings: Experiment, resume: bool, overwrite: bool, indices: range | None = None
 ) -> None:
-    """Raise ValueError unless realisations with these settings may be written to a folder.
-
-    Other realisations with the same settings may exist: this is how a Monte Carlo is split over
-    processes. `indices` are the numbers of the realisations, by default all.
-    """
+    """Raise ValueError unless realisations (by default all) may be written to a folder."""
+    # Others with the same settings may exist: this is how a Monte Carlo is split over processes.
     log = out / LOG
     if overwrite:
         return

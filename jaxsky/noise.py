@@ -90,13 +90,11 @@ def uniform_alm(key: Array, noise: ArrayLike, lmax: int, stokes: int = 2) -> Alm
 
 
 def white_alm(key: Array, noise: Any, lmax: int) -> Float[Array, "2 alm"]:
-    """Draw coefficients E and B of noise given as a level or as a covariance of each pixel.
-
-    A level needs no pixels. A covariance is drawn in pixels and analysed without iterations or
-    multipoles beyond lmax, ten times faster than usual; the mean spectrum is right to 1e-4.
-    """
+    """Draw coefficients E and B of noise given as a level or as a covariance of each pixel."""
     if not jnp.ndim(noise):
         return uniform_alm(key, noise, lmax)
+    # Without iterations or multipoles beyond lmax, ten times faster than usual, the mean spectrum
+    # is right to 1e-4.
     in_memory = isinstance(noise, jax.Array)
     pixels = draw(key, noise.astype(float)) if in_memory else draw_in_pieces(key, noise)
     return analysis(pixels, lmax, 0)
@@ -153,10 +151,8 @@ def draw_in_pieces(key: Array, covariance: Any) -> Maps:
 
 
 def estimate_variance(maps: Maps, used: Bool[Array, " pix"]) -> Float[Array, " stokes"]:
-    """Estimate the noise variance per pixel from the scatter in groups of four neighbouring pixels.
-
-    A signal that is smooth over such a group cancels. Only groups count of which all are used.
-    """
+    """Estimate the noise variance per pixel from the scatter in groups of four pixels, all used."""
+    # A signal that is smooth over such a group cancels.
     nside = healpy.npix2nside(maps.shape[-1])
     whole = children(used, nside // 2).all(axis=-1)
     if not bool(whole.any()):
@@ -168,10 +164,8 @@ def estimate_variance(maps: Maps, used: Bool[Array, " pix"]) -> Float[Array, " s
 
 
 def knee_spectrum(white: Numeric, ell_knee: Numeric, slope: Numeric, lmax: int) -> Spectrum:
-    """Return the spectrum of noise with excess at large scales, white [1 + (l/l_knee)^-slope].
-
-    Zero at l < 2, where polarization has no modes.
-    """
+    """Return the spectrum of noise with excess at large scales, white [1 + (l/l_knee)^-slope]."""
+    # Zero at l < 2, where polarization has no modes.
     ell = jnp.arange(2, lmax + 1)
     return jnp.concatenate([jnp.zeros(2), white * (1 + (ell / ell_knee) ** -slope)])
 
@@ -222,7 +216,7 @@ def rms_covariance(rms: Maps) -> Covariance:
 
 
 def hits_covariance(sigma0: ArrayLike, hits: Map, stokes: int = 2) -> Covariance:
-    """Return the covariance of each pixel from the number of observations, sigma_0^2 / hits.
+    """Return the covariance of each pixel, sigma_0^2 / hits, from the numbers of observations.
 
     The noise of one observation, sigma_0, is one number or, as for WMAP, one per Stokes parameter.
     """
@@ -281,10 +275,7 @@ def _number_indefinite(covariance: Covariance) -> Int[Array, ""]:
 
 
 def check_covariance(name: str, covariance: Covariance) -> None:
-    """Raise ValueError if the covariance of any pixel is not positive definite, and count them.
-
-    Only the lower triangle is read, as in `draw`. Traced arrays pass unchecked.
-    """
+    """Raise ValueError if covariances of pixels are not positive definite by the lower triangle."""
     good = covariance.ndim == 3 and covariance.shape[0] == covariance.shape[1]
     check_shape(name, covariance, good, "have shape (stokes, stokes, pix)")
     if not is_concrete(covariance):

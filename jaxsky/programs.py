@@ -31,7 +31,6 @@ class Progress:
 
 QUIET = Progress()
 
-
 #: Parameters of glibc's mallopt: M_ARENA_MAX, M_MMAP_THRESHOLD.
 MALLOC = {-8: 1, -3: 8 * 2**20}
 #: Largest size of the cache [bytes], and number of (JAX version, processor) pairs in it.
@@ -96,12 +95,9 @@ def forget_programs() -> None:
 
 
 def return_memory() -> None:
-    """Make glibc return freed memory to the system.
-
-    JAX computes in threads, and glibc gives each a heap that keeps freed memory, including maps of
-    up to 32 MiB: a third of all memory in use. So all threads share one heap, and large arrays are
-    allocated outside it.
-    """
+    """Make glibc return freed memory to the system."""
+    # It gives each thread of JAX a heap that keeps freed memory, including maps of up to 32 MiB: a
+    # third of all memory in use. So all threads share one, with large arrays outside it.
     with contextlib.suppress(OSError, AttributeError):  # other systems have other ways
         mallopt = ctypes.CDLL(None).mallopt
         for parameter, value in MALLOC.items():

@@ -29,8 +29,9 @@ class Dust(Component, law="dust"):
     --------
     >>> import jax.numpy as jnp
     >>> maps = jnp.ones((2, 12))
-    >>> Dust(maps, beta_dust=(1.67, 2.70), T_dust=(9.4, 16.2), E_dust=(0.49, 1.0)).bodies
-    2
+    >>> two = Dust(maps, beta_dust=(1.67, 2.70), T_dust=(9.4, 16.2), E_dust=(0.49, 1.0))
+    >>> round(float(two.sed(353.0)), 6)
+    1.0
     """
 
     amplitude: Maps = template()
@@ -65,11 +66,6 @@ class Dust(Component, law="dust"):
                 "Arguments `beta_dust`, `T_dust` and `E_dust` must be tuples with one entry a "
                 f"body, but have lengths {lengths}."
             )
-
-    @property
-    def bodies(self) -> int:
-        """Number of modified black bodies."""
-        return len(self.E_dust) if self.E_dust is not None else 1
 
     def sed(self, nu):
         if self.E_dust is None:

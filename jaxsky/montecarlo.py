@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -183,6 +184,7 @@ def run(
     names = setup.observation.names
     make = _Maker(settings, setup, out if executor is None else out.absolute())
 
+    @cache
     def claim() -> None:
         _claim(out, settings, overwrite)
         begun()
@@ -249,17 +251,16 @@ class _Maker:
         self,
         indices: Iterable[int],
         note: Callable[[str], None],
-        claim: Callable[[], None] | None = None,
+        claim: Callable[[], None] = lambda: None,
         overwrite: bool = False,
     ) -> Iterator[bool]:
-        """Write the missing files; `claim`, if given, is called before the first is written."""
+        """Write the missing files, or all; `claim` is called when a map is ready."""
         settings, setup, observation = self.settings, self.setup, self.setup.observation
         writing = list[Future[None]]()
         with ThreadPoolExecutor(1) as thread:
             for index in indices:
                 files = paths(self.out, observation.names, index)
-                stale = overwrite and claim is not None
-                missing = [name for name, path in files.items() if stale or not path.exists()]
+                missing = [name for name, path in files.items() if overwrite or not path.exists()]
                 yield from [False] * (len(files) - len(missing))
                 if not missing:
                     continue
@@ -274,9 +275,7 @@ class _Maker:
                 )
                 for name, maps in seen:
                     names, columns = _columns(settings, setup, name, maps)
-                    if claim is not None:
-                        claim()
-                        claim = None
+                    claim()
                     # Write this file while the next band is being made.
                     while writing:
                         writing.pop().result()

@@ -12,14 +12,7 @@ from jaxtyping import Array
 
 from jaxsky.arrays import Beam, Covariance, Scalar
 from jaxsky.bandpass import Bandpass
-from jaxsky.checks import (
-    Printed,
-    check_choice,
-    check_names,
-    check_not_negative,
-    check_nside,
-    shown,
-)
+from jaxsky.checks import Printed, check_choice, check_names, check_not_negative, check_nside, shown
 from jaxsky.components import Component
 from jaxsky.public import packaged
 from jaxsky.small_scales import SmallScales

@@ -32,8 +32,9 @@ class NodeCounts(NamedTuple):
     tolerance: float | None = None
 
 
-#: How a component is averaged; None for the direct sum.
+#: How a component is averaged (None for the direct sum), and each component of a sky.
 Nodes: TypeAlias = NodeCounts | None
+Plan: TypeAlias = tuple[Nodes, ...]
 
 #: Most nodes tried; a law that they do not resolve is summed directly.
 MAX_NODES = 33

@@ -12,7 +12,7 @@ from jaxsky.arrays import BandMaps, Maps
 from jaxsky.bandpass import Bandpass
 from jaxsky.checks import Printed, as_array, check_names
 from jaxsky.components import Component, check_value, declared
-from jaxsky.interpolation import Nodes, band_sed, choose_nodes
+from jaxsky.interpolation import Nodes, Plan, band_sed, choose_nodes
 from jaxsky.mesh import maps_of, over_pixels, typed
 
 
@@ -73,7 +73,7 @@ class Sky(Printed, eqx.Module):
         return stokes, npix
 
 
-def interpolation_nodes(sky: Sky, bands: Sequence[Bandpass], tolerance: float) -> tuple[Nodes, ...]:
+def interpolation_nodes(sky: Sky, bands: Sequence[Bandpass], tolerance: float) -> Plan:
     """Choose node counts for each component as `observe` does, for its argument `nodes`."""
     return tuple(choose_nodes(c, tuple(bands), tolerance) for c in sky.components.values())
 
@@ -119,11 +119,7 @@ def _observe(sky, bands, *, plan, apart):
 
 
 def observe(
-    sky: Sky,
-    bands: Sequence[Bandpass],
-    *,
-    tolerance: float = 1e-10,
-    nodes: tuple[Nodes, ...] | None = None,
+    sky: Sky, bands: Sequence[Bandpass], *, tolerance: float = 1e-10, nodes: Plan | None = None
 ) -> BandMaps:
     """Observe the sky through a list of bands, the paper's eq. 8: (band, stokes, pix) [uK_RJ].
 
@@ -147,11 +143,7 @@ def observe_band(sky: Sky, band: Bandpass, *, tolerance: float = 1e-10) -> Maps:
 
 
 def observe_components(
-    sky: Sky,
-    bands: Sequence[Bandpass],
-    *,
-    tolerance: float = 1e-10,
-    nodes: tuple[Nodes, ...] | None = None,
+    sky: Sky, bands: Sequence[Bandpass], *, tolerance: float = 1e-10, nodes: Plan | None = None
 ) -> dict[str, BandMaps]:
     """Observe each component separately [uK_RJ]; see `observe`."""
     sky, bands = typed(sky), _check_bands(sky, bands)

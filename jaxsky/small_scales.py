@@ -29,7 +29,7 @@ from jaxsky.checks import (
     check_positive,
     check_shape,
 )
-from jaxsky.cmb import gaussian_fields, repair
+from jaxsky.cmb import Spectra, gaussian_fields, repair
 from jaxsky.harmonics import (
     analysis,
     expand,
@@ -189,10 +189,8 @@ def modulation(maps: Float[Array, "2 pix"], fwhm: ArrayLike, nside: int) -> Map:
 
 
 def _correlated_parts(
-    alms: Float[Array, "field alm"],
-    parts: Sequence[Extrapolation],
-    ranges: Sequence[tuple[int, int]],
-) -> tuple[Float[Array, "field alm"], Float[Array, "field field ell"]]:
+    alms: Float[Array, "field alm"], parts: Sequence[Extrapolation], small: Sequence[SmallScales]
+) -> tuple[Float[Array, "field alm"], Spectra]:
     """Continue several templates so that they stay as correlated as they are.
 
     Each cross-spectrum is extrapolated with its correlation coefficient over the range of the fits.
@@ -201,10 +199,11 @@ def _correlated_parts(
     power) and missing of j (in amplitude). Returns these parts, and the spectra of what is still
     missing, to be drawn, given the coefficients that are kept, without beams.
     """
+    ranges = [ends for how in small for ends in (how.EE, how.BB)]
     lmin, lmax = max(first for first, _ in ranges), min(join for _, join in ranges)
     if lmin > lmax:
         raise ValueError(
-            f"Correlated small scales need ranges that overlap, but they are {list(ranges)}."
+            f"Correlated small scales need ranges that overlap, but they are {ranges}."
         )
     law = jnp.concatenate([part.target for part in parts])
     n, ell = len(alms), jnp.arange(law.shape[-1])
@@ -276,8 +275,7 @@ def continue_templates(
     if len(maps) == 1:
         borrowed, matrix = jnp.zeros_like(stay[0]), jnp.eye(2)[..., None] * parts[0].injected
     else:
-        ranges = [r for how in small for r in (how.EE, how.BB)]
-        borrowed, matrix = _correlated_parts(jnp.concatenate(stay), parts, ranges)
+        borrowed, matrix = _correlated_parts(jnp.concatenate(stay), parts, small)
     # The same for all: different modulations would make the maps less correlated than the fields.
     gain = sum(gains) / len(gains)
     matrix, repaired = repair(matrix / jnp.mean(gain**2))

@@ -141,7 +141,7 @@ def _importance(
 
 
 def _iterations(size: float, nside: int, beam: Array | float) -> int:
-    """Return the Jacobi steps for an error below `TOLERANCE` from a term of a given relative size."""
+    """Return the Jacobi steps for an error below `TOLERANCE` from a term of this relative size."""
     # Without steps a spectrum like the Galaxy's is wrong by some 3e-5 of the map at nside 256 with
     # a beam of 2 pixels. The error scales with the pixel size and with what the beam leaves of the
     # multipoles where the quadrature is poor. Each step gains at least a factor of 20.

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 Scalar: TypeAlias = Float[Array, ""]
 #: One map, and maps of I, or Q, U, or I, Q, U.
 Map: TypeAlias = Float[Array, " pix"]
-Maps: TypeAlias = Float[Array, "stokes pix"]
+StokesMaps: TypeAlias = Float[Array, "stokes pix"]
 #: Maps of several bands.
 BandMaps: TypeAlias = Float[Array, "band stokes pix"]
 #: Coefficients of I, or E, B, or I, E, B.

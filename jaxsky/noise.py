@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxsky.arrays import Alm, Covariance, Map, Maps, Spectrum
+from jaxsky.arrays import Alm, Covariance, Map, Spectrum, StokesMaps
 from jaxsky.checks import Numeric, as_array, check_finite, check_seed, check_shape, is_concrete
 from jaxsky.harmonics import analysis, children, expand, power_spectrum
 
@@ -68,7 +68,7 @@ def pixel_covariance(noise: Numeric, nside: int, stokes: int = 2) -> Covariance:
     return jnp.asarray(noise) if jnp.ndim(noise) else uniform_covariance(noise, nside, stokes)
 
 
-def uniform_map(key: Array, noise: ArrayLike, nside: int, stokes: int = 2) -> Maps:
+def uniform_map(key: Array, noise: ArrayLike, nside: int, stokes: int = 2) -> StokesMaps:
     """Draw white noise of a level, as from `uniform_covariance` but without that in memory."""
     sigma = as_array("noise", noise) / float(healpy.nside2resol(nside, arcmin=True))
     return sigma * stokes_noise(key, stokes, healpy.nside2npix(nside), sigma.dtype)
@@ -124,7 +124,7 @@ def _correlated(covariance, white, diagonal):
     return jnp.stack([sum(lower[i, j] * white[j] for j in js) for i, js in enumerate(terms)])
 
 
-def draw(key: Array, covariance: Covariance, *, diagonal: bool = False) -> Maps:
+def draw(key: Array, covariance: Covariance, *, diagonal: bool = False) -> StokesMaps:
     """Draw noise L n with a given covariance in each pixel, independent between pixels.
 
     L is the lower Cholesky factor, n white noise. The paper (Hervias-Caimapo, Bonaldi & Brown 2016)
@@ -138,7 +138,7 @@ def draw(key: Array, covariance: Covariance, *, diagonal: bool = False) -> Maps:
     return _correlated(covariance, white, diagonal)
 
 
-def draw_in_pieces(key: Array, covariance: Any) -> Maps:
+def draw_in_pieces(key: Array, covariance: Any) -> StokesMaps:
     """Return the same as `draw` in double precision; a covariance on disk stays there."""
     _, stokes, npix = covariance.shape
     white = stokes_noise(key, stokes, npix, float)
@@ -150,7 +150,7 @@ def draw_in_pieces(key: Array, covariance: Any) -> Maps:
     return jnp.asarray(found)
 
 
-def estimate_variance(maps: Maps, used: Bool[Array, " pix"]) -> Float[Array, " stokes"]:
+def estimate_variance(maps: StokesMaps, used: Bool[Array, " pix"]) -> Float[Array, " stokes"]:
     """Estimate the noise variance per pixel from the scatter in groups of four pixels, all used."""
     # A signal that is smooth over such a group cancels.
     nside = healpy.npix2nside(maps.shape[-1])
@@ -178,7 +178,7 @@ def _deviance(theta, args):
     return jnp.sum(modes * (jnp.log(spectrum) + measured / spectrum))
 
 
-def fit_knee(maps: Maps, used: Bool[Array, " pix"], lmax: int) -> tuple[float, float, float]:
+def fit_knee(maps: StokesMaps, used: Bool[Array, " pix"], lmax: int) -> tuple[float, float, float]:
     """Fit white level, knee and slope (`knee_spectrum`) of the noise of Q, U maps, up to lmax.
 
     These have the highest likelihood for the spectrum (EE + BB)/2 of the masked maps, divided by
@@ -205,7 +205,7 @@ def fit_knee(maps: Maps, used: Bool[Array, " pix"], lmax: int) -> tuple[float, f
     return float(level * white), float(knee), float(slope)
 
 
-def rms_covariance(rms: Maps) -> Covariance:
+def rms_covariance(rms: StokesMaps) -> Covariance:
     """Return the covariance of each pixel from maps of the rms, without correlations."""
     rms = as_array("rms", rms)
     check_shape("rms", rms, rms.ndim == 2, "have shape (stokes, pix)")
@@ -252,7 +252,7 @@ def _each(sigma0: ArrayLike, stokes: int) -> Float[Array, " stokes"]:
     return jnp.broadcast_to(sigma0, (stokes,))
 
 
-def _diagonal(variance: Maps) -> Covariance:
+def _diagonal(variance: StokesMaps) -> Covariance:
     return jnp.eye(len(variance), dtype=variance.dtype)[..., None] * variance
 
 

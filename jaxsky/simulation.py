@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsky.arrays import Alm, BandMaps, Maps, Scalar, Window
+from jaxsky.arrays import Alm, BandMaps, Scalar, StokesMaps, Window
 from jaxsky.bandpass import Samples, average, stack_bands
 from jaxsky.checks import is_concrete
 from jaxsky.cmb import realisation
@@ -58,7 +58,7 @@ class HarmonicSource(NamedTuple):
     fwhm: Scalar | float
     repaired: Int[Array, ""] | int = 0
     component: Component | None = None
-    template: Maps | None = None
+    template: StokesMaps | None = None
 
 
 def _continued(
@@ -208,7 +208,7 @@ def harmonic_sources(
 
 @partial(jax.jit, static_argnames=("lmax", "steps"))
 def _term_alm(
-    template: Maps, component: Component, coefs: Float[Array, "..."], lmax: int, steps: int
+    template: StokesMaps, component: Component, coefs: Float[Array, "..."], lmax: int, steps: int
 ) -> Alm:
     """Analyse a template times a term of the law, in one program to avoid storing the product."""
     return analysis(template * term(component, coefs).astype(template.dtype), lmax, steps)
@@ -233,7 +233,9 @@ def _summed(parts: tuple[_Part, ...]) -> Alm:
     )
 
 
-def _noise(key: Array, channel: ObservedBand, observation: Observation) -> _Part | Maps | None:
+def _noise(
+    key: Array, channel: ObservedBand, observation: Observation
+) -> _Part | StokesMaps | None:
     """Draw the noise of a channel, in harmonic space or as a map, whichever is simpler."""
     if channel.noise is None:
         return None
@@ -257,7 +259,7 @@ def observe_bands(
     *,
     components: bool = False,
     names: Sequence[str] | None = None,
-) -> Iterator[tuple[str, dict[str, Maps]]]:
+) -> Iterator[tuple[str, dict[str, StokesMaps]]]:
     """Yield the name and maps [uK_RJ] of each channel in turn, so that only one is in memory.
 
     The key is for CMB and noise. `cmb` has the spectra TT, EE, BB, TE [uK_CMB^2] up to at least the
@@ -297,8 +299,8 @@ def observe_bands(
 
 
 def _maps(
-    parts: Mapping[str, _Part], noise: _Part | Maps | None, nside: int, components: bool
-) -> dict[str, Maps]:
+    parts: Mapping[str, _Part], noise: _Part | StokesMaps | None, nside: int, components: bool
+) -> dict[str, StokesMaps]:
     """Return the total of a band, and its components on request."""
     maps: dict[str, Array] = {}
     total: Array | float = 0.0

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from jaxsky.arrays import BandMaps, Maps
+from jaxsky.arrays import BandMaps, StokesMaps
 from jaxsky.bandpass import Bandpass
 from jaxsky.checks import Printed, as_array, check_names
 from jaxsky.components import Component, check_value, declared
@@ -95,7 +95,7 @@ def _check_bands(sky: object, bands: object) -> tuple[Bandpass, ...]:
     return tuple(bands)
 
 
-def _emission(component: Component, bands: tuple[Bandpass, ...], nodes: Nodes) -> list[Maps]:
+def _emission(component: Component, bands: tuple[Bandpass, ...], nodes: Nodes) -> list[StokesMaps]:
     """Return the emission of a component in each band."""
     laws = (band_sed(component, band, nodes) for band in bands)
     # Costly laws are evaluated once for all Stokes parameters, ...
@@ -137,7 +137,7 @@ def observe(
     return _observe(sky, bands, plan=plan, apart=False)
 
 
-def observe_band(sky: Sky, band: Bandpass, *, tolerance: float = 1e-10) -> Maps:
+def observe_band(sky: Sky, band: Bandpass, *, tolerance: float = 1e-10) -> StokesMaps:
     """Observe the sky through one band [uK_RJ]; see `observe`."""
     return observe(sky, [band], tolerance=tolerance)[0]
 

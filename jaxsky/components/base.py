@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from jaxsky.arrays import Map, Maps, Scalar
+from jaxsky.arrays import Map, Scalar, StokesMaps
 from jaxsky.checks import (
     Printed,
     as_array,
@@ -115,7 +115,7 @@ class Component(Printed, eqx.Module):
     polarized: ClassVar[bool] = True
     unit: ClassVar[str] = "uK_RJ"
 
-    amplitude: eqx.AbstractVar[Maps]
+    amplitude: eqx.AbstractVar[StokesMaps]
 
     def __init_subclass__(cls, law: str = "", **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -130,7 +130,7 @@ class Component(Printed, eqx.Module):
         raise ValueError(f"{type(self).__name__} must define `sed`.")
 
     @property
-    def template(self) -> Maps:
+    def template(self) -> StokesMaps:
         """The maps that the law multiplies: the amplitude, unless a class scales it first."""
         return self.amplitude
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky import sed
-from jaxsky.arrays import Maps
+from jaxsky.arrays import StokesMaps
 from jaxsky.checks import Numeric, Parameter, as_array, check_shape, is_concrete
 from jaxsky.components.base import Component, parameter, reference, template
 from jaxsky.sed import T_CMB
@@ -34,7 +34,7 @@ class Dust(Component, law="dust"):
     1.0
     """
 
-    amplitude: Maps = template()
+    amplitude: StokesMaps = template()
     beta_dust: Parameter | tuple[Parameter, ...] = parameter(
         1.53, symbol=r"\beta_{\rm dust}", zero=False
     )
@@ -87,7 +87,7 @@ class Synchrotron(Component, law="synchrotron"):
     nu_ref : reference frequency [GHz]
     """
 
-    amplitude: Maps = template()
+    amplitude: StokesMaps = template()
     beta_syn: Parameter = parameter(
         3.10,
         within=(0.0, 10.0),
@@ -115,7 +115,7 @@ class AME(Component, law="ame"):
     nu_ref : reference frequency [GHz]
     """
 
-    amplitude: Maps = template()
+    amplitude: StokesMaps = template()
     polarization_fraction: Parameter = parameter(1.0, symbol=r"f_{\rm p}")
     m60: Parameter = parameter(4.0, symbol="m_{60}")
     nu_max: Parameter = parameter(19.0, positive=True, symbol=r"\nu_{\rm max}", unit="GHz")
@@ -191,7 +191,7 @@ class FreeFree(Component, law="free_free"):
 
     polarized: ClassVar[bool] = False
 
-    amplitude: Maps = template()
+    amplitude: StokesMaps = template()
     T_e: Parameter = parameter(7000.0, positive=True, symbol=r"T_{\rm e}", unit="K", zero=False)
     nu_ref: Parameter = reference(30.0, within=(0.01, 1e3))
 
@@ -210,7 +210,7 @@ class CMB(Component, law="cmb"):
 
     unit: ClassVar[str] = "uK_CMB"
 
-    amplitude: Maps = template()
+    amplitude: StokesMaps = template()
     T_cmb: Parameter = parameter(T_CMB, positive=True, symbol=r"T_{\rm CMB}", unit="K", zero=False)
 
     def sed(self, nu):

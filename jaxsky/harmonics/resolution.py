@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxsky.arrays import Alm, Map, Maps, Window
+from jaxsky.arrays import Alm, Map, StokesMaps, Window
 from jaxsky.checks import check_finite, check_shape, is_concrete
 from jaxsky.harmonics.transforms import analysis, expand, map_variance, resize, synthesis
 
@@ -101,7 +101,7 @@ MARGIN = 3
 FINE, FINE_VARIANCE = 0.25, 0.375
 
 
-def low_multipoles(maps: Maps, lmax: int, iterations: int | None = None) -> Alm:
+def low_multipoles(maps: StokesMaps, lmax: int, iterations: int | None = None) -> Alm:
     """Return coefficients up to lmax of maps that have higher multipoles; zero above 2 nside."""
     # Multipoles beyond those analysed leak into the result, so more are analysed than are kept.
     resolved = 2 * healpy.npix2nside(maps.shape[-1])
@@ -110,8 +110,8 @@ def low_multipoles(maps: Maps, lmax: int, iterations: int | None = None) -> Alm:
 
 @partial(jax.jit, static_argnames=("nside", "iterations", "fine"))
 def resample(
-    maps: Maps, window: Window, nside: int, iterations: int | None = None, fine: float = 0.0
-) -> Maps:
+    maps: StokesMaps, window: Window, nside: int, iterations: int | None = None, fine: float = 0.0
+) -> StokesMaps:
     """Multiply maps by a window in l and change their nside: smooth and degrade in one step.
 
     Linear in the maps, with an exact transpose. Multipoles above those of the window are cut,
@@ -127,7 +127,9 @@ def resample(
     return synthesis(alm * expand(window), nside)
 
 
-def smooth(maps: Maps, fwhm: ArrayLike, own: ArrayLike = 0.0, lmax: int | None = None) -> Maps:
+def smooth(
+    maps: StokesMaps, fwhm: ArrayLike, own: ArrayLike = 0.0, lmax: int | None = None
+) -> StokesMaps:
     """Smooth maps from their own beam to another; differentiable in maps and widths.
 
     The maps are I, or Q, U, or I, Q, U, shape (stokes, pix), RING; for the beams see `beam_ratio`.
@@ -192,19 +194,19 @@ class Preparation(eqx.Module):
         _check_nside(nside_in, nside, what)
         return cls(None, nside_in, nside)
 
-    def __call__(self, maps: Maps) -> Maps:
+    def __call__(self, maps: StokesMaps) -> StokesMaps:
         """Return the maps at the common resolution."""
         if self.window is None:
             return average_pixels(maps, self.nside)
         return resample(maps, self.window, self.nside, fine=FINE)
 
     @eqx.filter_jit
-    def transpose(self, maps: Maps) -> Maps:
+    def transpose(self, maps: StokesMaps) -> StokesMaps:
         """Apply the transposed operator, from the common resolution to that of the maps."""
         shape = (len(maps), healpy.nside2npix(self.nside_in))
         return jax.linear_transpose(self, jax.ShapeDtypeStruct(shape, maps.dtype))(maps)[0]
 
-    def variance(self, variance: Sequence[Map]) -> Maps:
+    def variance(self, variance: Sequence[Map]) -> StokesMaps:
         """Return the variance of prepared white noise, given the variance of each input pixel."""
         if self.window is None:
             mean = average_pixels(jnp.asarray(variance, float), self.nside)

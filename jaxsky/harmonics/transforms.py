@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxsky.arrays import Alm, Maps
+from jaxsky.arrays import Alm, StokesMaps
 from jaxsky.checks import check_double
 from jaxsky.harmonics import primitives
 
@@ -107,7 +107,7 @@ def _by_spin(transform: Callable[..., Any], rows: Array, spin: int, **how: Any) 
     return jnp.concatenate([transform(rows[block], spin=s, **how)[0] for block, s in blocks])
 
 
-def _transform(alm: Alm, nside: int, spin: int, weighted: bool) -> Maps:
+def _transform(alm: Alm, nside: int, spin: int, weighted: bool) -> StokesMaps:
     """Return the maps of coefficients, each ring times its weight if `weighted`."""
     check_double("A spherical harmonic transform")
     _finish_at_exit()
@@ -115,7 +115,7 @@ def _transform(alm: Alm, nside: int, spin: int, weighted: bool) -> Maps:
     return _by_spin(primitives.synthesis, alm, spin, **how)
 
 
-def _transposed(maps: Maps, lmax: int, spin: int = 2, weighted: bool = False) -> Alm:
+def _transposed(maps: StokesMaps, lmax: int, spin: int = 2, weighted: bool = False) -> Alm:
     nside = healpy.npix2nside(maps.shape[-1])
     alm = jax.ShapeDtypeStruct((maps.shape[0], (lmax + 1) ** 2), maps.dtype)
     forward = partial(_transform, nside=nside, spin=spin, weighted=weighted)
@@ -123,7 +123,7 @@ def _transposed(maps: Maps, lmax: int, spin: int = 2, weighted: bool = False) ->
 
 
 @partial(jax.jit, static_argnames=("nside", "spin"))
-def synthesis(alm: Alm, nside: int, spin: int = 2) -> Maps:
+def synthesis(alm: Alm, nside: int, spin: int = 2) -> StokesMaps:
     """Return maps of I, or Q, U, or I, Q, U from packed coefficients I, or E, B, or I, E, B.
 
     With lmax > 3 nside - 1 the maps are undersampled. `spin` is that of the last two rows.
@@ -132,13 +132,13 @@ def synthesis(alm: Alm, nside: int, spin: int = 2) -> Maps:
 
 
 @partial(jax.jit, static_argnames="lmax")
-def adjoint_synthesis(maps: Maps, lmax: int) -> Alm:
+def adjoint_synthesis(maps: StokesMaps, lmax: int) -> Alm:
     """Apply the transpose of `synthesis`: inner products of maps with the spherical harmonics."""
     return _transposed(maps, lmax)
 
 
 @partial(jax.jit, static_argnames=("lmax", "iterations", "spin"))
-def analysis(maps: Maps, lmax: int, iterations: int | None = None, spin: int = 2) -> Alm:
+def analysis(maps: StokesMaps, lmax: int, iterations: int | None = None, spin: int = 2) -> Alm:
     """Return packed coefficients of maps of I, or Q, U, or I, Q, U: the inverse of `synthesis`.
 
     Uses ring-weighted quadrature, refined by Jacobi steps on the residual map. For a map without

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fits.compress import Noise, as_noise
-from fits.fluctuations import Fluctuations, MapNoise, of_pixels
+from fits.fluctuations import Fluctuations, MapNoise
 from fits.inputs import Inputs
 from fits.kept import remembered
 from fits.mixing import TemplateErrors, template_errors
@@ -28,6 +28,7 @@ from jaxsky.harmonics import (
 from jaxsky.io.stacks import Computed, Maps, Stack, computed, is_large, ranges, stored
 from jaxsky.job import filled
 from jaxsky.mesh import distribute, spread
+from jaxsky.noise import pixel_covariance
 from jaxsky.programs import return_memory
 from jaxsky.settings import Experiment, at_key
 
@@ -210,7 +211,7 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         """Return noise of the pixels that are kept, and C_l of its correlated part."""
         operator, own = operators[what], kept[what]
         if own is not None:
-            whole = of_pixels(noise, operator.nside_in)
+            whole = pixel_covariance(noise, operator.nside_in)
             shape, dtype = whole.shape, whole.dtype
             noise = computed(shape, lambda at: whole[..., at] * own[at], dtype, many)
         if spectrum is not None:

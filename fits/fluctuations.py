@@ -32,18 +32,10 @@ from jaxsky.harmonics import (
 )
 from jaxsky.io.stacks import Maps, empty, is_large, loaded, ranges
 from jaxsky.job import filled
-from jaxsky.noise import draw, pixel_covariance, stream, uniform_covariance, white_alm
+from jaxsky.noise import draw, pixel_covariance, stream, white_alm
 
 #: Pixels whose products are summed at once; few enough to stay in cache.
 CHUNK = 1 << 16
-
-
-def of_pixels(noise: Numeric | Maps, nside: int) -> Any:
-    """Return the covariance of each pixel; a level takes no memory."""
-    if np.ndim(noise):
-        return noise
-    one = np.asarray(uniform_covariance(noise, nside, pixels=1))
-    return np.broadcast_to(one, (2, 2, healpy.nside2npix(nside)))
 
 
 class MapNoise(NamedTuple):
@@ -70,7 +62,7 @@ class MapNoise(NamedTuple):
             spectra = np.stack([self.correlated] * 2)
             modes = _modes_of((count,), spectra.shape[-1] - 1)
         white = bool(np.ndim(self.noise) or self.noise)
-        covariance = of_pixels(self.noise, self.preparation.nside_in)
+        covariance = pixel_covariance(self.noise, self.preparation.nside_in)
         npix = covariance.shape[-1]
         before = empty((count, 2, npix), covariance.dtype) if white else None
         for own, row in enumerate(rows):

@@ -63,9 +63,12 @@ def uniform_covariance(
     return jnp.eye(stokes)[..., None] * jnp.full(npix, (noise / pixel) ** 2)
 
 
-def pixel_covariance(noise: Numeric, nside: int, stokes: int = 2) -> Covariance:
-    """Return the covariance of each pixel for noise given as a level or as a covariance."""
-    return jnp.asarray(noise) if jnp.ndim(noise) else uniform_covariance(noise, nside, stokes)
+def pixel_covariance(noise: Any, nside: int) -> Any:
+    """Return the covariance of Q and U in each pixel; that of a level takes no memory."""
+    if np.ndim(noise):
+        return noise
+    one = np.asarray(uniform_covariance(noise, nside, pixels=1))
+    return np.broadcast_to(one, (2, 2, healpy.nside2npix(nside)))
 
 
 def uniform_map(key: Array, noise: ArrayLike, nside: int, stokes: int = 2) -> StokesMaps:

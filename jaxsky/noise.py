@@ -103,6 +103,11 @@ def white_alm(key: Array, noise: Any, lmax: int) -> Float[Array, "2 alm"]:
     return analysis(pixels, lmax, 0)
 
 
+def positive_root(values: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the square root of positive values, else 0 (with derivative 0)."""
+    return jnp.where(values > 0, jnp.sqrt(jnp.where(values > 0, values, 1.0)), 0.0)
+
+
 @jax.jit
 def cholesky(covariance: Covariance) -> Covariance:
     """Return the lower Cholesky factor of each pixel's covariance, unrolled over its elements."""
@@ -112,8 +117,7 @@ def cholesky(covariance: Covariance) -> Covariance:
         for j in range(i + 1):
             rest = covariance[i, j] - sum(lower[i][k] * lower[j][k] for k in range(j))
             if i == j:
-                # Rounding may make a zero negative, and the root of zero has no derivative.
-                lower[i][j] = jnp.where(rest > 0, jnp.sqrt(jnp.where(rest > 0, rest, 1.0)), 0.0)
+                lower[i][j] = positive_root(rest)  # rounding may make a zero negative
             else:
                 lower[i][j] = rest / jnp.where(lower[j][j] > 0, lower[j][j], 1.0)
     return jnp.array(lower)

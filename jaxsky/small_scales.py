@@ -42,6 +42,7 @@ from jaxsky.harmonics import (
     synthesis,
 )
 from jaxsky.harmonics.resolution import NEGLIGIBLE
+from jaxsky.noise import positive_root
 
 
 class SmallScales(eqx.Module):
@@ -175,15 +176,10 @@ def extrapolate(
     return Extrapolation(measured, tuple(laws), jnp.stack(target), jnp.stack(transfer), injected)
 
 
-def _root(values: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the square root of positive values, else 0 (with derivative 0)."""
-    return jnp.where(values > 0, jnp.sqrt(jnp.where(values > 0, values, 1.0)), 0.0)
-
-
 def modulation(maps: Float[Array, "2 pix"], fwhm: ArrayLike, nside: int) -> Map:
     """Return the polarized intensity of Q, U over its mean, smoothed by a beam [arcmin]."""
     # Unlike the paper's "normalised version of the template", Q over its mean, it has one sign.
-    intensity = _root(jnp.sum(maps**2, axis=0))
+    intensity = positive_root(jnp.sum(maps**2, axis=0))
     window = shortened(gaussian_beam(fwhm, 2 * healpy.npix2nside(maps.shape[-1])))
     return resample(intensity[None], window, nside)[0] / intensity.mean()
 
@@ -214,12 +210,12 @@ def _correlated_parts(
     kept = jax.vmap(lambda one: jax.vmap(lambda other: power_spectrum(one, other))(alms))(alms)
     power = jnp.einsum("iil->il", kept)
     auto = jnp.where(beyond, law, power)
-    root, other = _root(auto), ~jnp.eye(n, dtype=bool)[..., None]
+    root, other = positive_root(auto), ~jnp.eye(n, dtype=bool)[..., None]
     continued = other & (beyond[:, None] | beyond)
     wanted = jnp.where(continued, rho * root[:, None] * root, kept)
     wanted = jnp.where(other, wanted, auto[:, None])
     known = power / jnp.where(auto > 0, auto, 1.0)
-    share = jnp.where(beyond, 1 - _root(jnp.minimum(known, 1.0)), 0.0)[:, None] * known
+    share = jnp.where(beyond, 1 - positive_root(jnp.minimum(known, 1.0)), 0.0)[:, None] * known
     borrowed = jnp.where(other, share * wanted / jnp.where(auto > 0, auto, 1.0), 0.0)
     added = jnp.stack([sum(expand(borrowed[j, i]) * alms[i] for i in range(n)) for j in range(n)])
     mixing = borrowed + jnp.eye(n)[..., None]

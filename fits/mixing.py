@@ -18,6 +18,7 @@ coefficients of the best fit.
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -140,10 +141,7 @@ class Mixing(eqx.Module):
         """Return the signal of 1 uK_RJ in bands, after any shift, in the unit of the data."""
         size, kind = parse_unit(self.unit)
         factor = 1e-6 / size * self.of_bands("gain", params)
-
-        def cmb(samples):
-            return jax.vmap(lambda band: average(cmb_derivative, band))(samples)
-
+        cmb = partial(average, cmb_derivative)
         if kind == "K_CMB":
             return factor / cmb(self._samples(bands))
         if self.on_cmb and bands is not self.bandpasses:
@@ -154,10 +152,7 @@ class Mixing(eqx.Module):
         """Return the matrix for parameters that are numbers."""
         bands = self.moved(params)
         samples = self._samples(bands)
-        laws = [
-            jax.vmap(lambda band, c=c: average(c.sed, band))(samples)
-            for c in self.laws(params).components.values()
-        ]
+        laws = [average(c.sed, samples) for c in self.laws(params).components.values()]
         return jnp.stack(laws, axis=-1) * self.factors(bands, params)[:, None]
 
     def _interpolated(self, params, cells) -> Float[Array, "cell band component"]:

@@ -187,9 +187,12 @@ def average(sed: Callable[[Array], Array], band: Bandpass | Samples) -> Float[Ar
     """Return the band average sum_k w_k S(nu_k) of a spectrum, by direct summation.
 
     `sed` is a function of one frequency [GHz] that returns a number or a map; the result has the
-    same shape. Maps are summed one sample at a time, so that memory does not grow with the number
-    of samples; gradients recompute the maps instead of storing them.
+    same shape, with an axis of bands in front if there are several (`stack_bands`). Maps are summed
+    one sample at a time, so that memory does not grow with the number of samples; gradients
+    recompute the maps instead of storing them.
     """
+    if band.nu.ndim > 1:
+        return jax.vmap(partial(average, sed))(band)
     shape = jax.eval_shape(sed, band.nu[0]).shape
     if shape == ():
         return jnp.dot(band.quadrature, jax.vmap(sed)(band.nu), precision=EXACT)

@@ -254,7 +254,7 @@ def band_seds(
     """Compute `band_sed` in many bands (`stack_bands`) by matrix products: one small program."""
     maps, _ = _split(component)
     if not maps:
-        return jax.vmap(lambda band: average(component.sed, band))(samples)
+        return average(component.sed, samples)
 
     def direct():
         return jax.lax.map(lambda band: average(component.sed, band), samples).T

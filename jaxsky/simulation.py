@@ -135,7 +135,7 @@ def _importance(
         # For the total, each law is taken at the mean of its parameters.
         middle = jax.tree.map(lambda x: x.mean() if x.ndim == 1 else x, component)
         rms[name] = jnp.sqrt(jnp.mean(component.template**2))
-        levels[name] = rms[name] * jax.vmap(partial(average, middle.sed))(samples)
+        levels[name] = rms[name] * average(middle.sed, samples)
     total = jnp.sqrt(sum(level**2 for level in levels.values()))
     return {name: value / total for name, value in rms.items()}
 

@@ -34,13 +34,10 @@ def maps_of(axes: int) -> PartitionSpec:
     return PartitionSpec(*[None] * (axes - 1), PIX)
 
 
-def pixel_mesh() -> Mesh:
-    """Return the mesh of all devices of all processes, with the axis "pix"."""
-    return _mesh_over(np.array(jax.devices()))
-
-
-def _mesh_over(devices: np.ndarray) -> Mesh:
-    return Mesh(devices.ravel(), (PIX,), axis_types=(AxisType.Explicit,))
+def pixel_mesh(devices: Any = None) -> Mesh:
+    """Return the mesh of devices, by default all of all processes, with the axis "pix"."""
+    every = np.array(jax.devices() if devices is None else devices)
+    return Mesh(every.ravel(), (PIX,), axis_types=(AxisType.Explicit,))
 
 
 def distribute(
@@ -150,7 +147,7 @@ def in_place(data: Any, *others: Any) -> tuple[Any, ...]:
     # Nothing is copied, and nothing changed if the data lie elsewhere or are distributed already.
     if spread(data) or not on_accelerator(data):
         return data, *others
-    mesh = _mesh_over(np.array(list(data.devices())))
+    mesh = pixel_mesh(list(data.devices()))
     return tuple(
         jax.device_put(one, NamedSharding(mesh, maps_of(one.ndim)))
         if on_accelerator(one) and one.ndim > 2
@@ -193,7 +190,7 @@ def typed(tree: Tree) -> Tree:
             return leaf
         axes = tuple(sharding.spec)
         shared = bool(axes) and len(axes) == leaf.ndim and axes[-1] is not None
-        mesh = _mesh_over(np.array(sharding.mesh.devices))
+        mesh = pixel_mesh(sharding.mesh.devices)
         return jax.device_put(leaf, NamedSharding(mesh, maps_of(leaf.ndim) if shared else SUMS))
 
     return jax.tree.map(one, tree)

@@ -160,9 +160,7 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
     nsides = {what: healpy.npix2nside(used.size) for what, (used, _) in given.items()}
     lmax = min(3 * nside - 1, 2 * min(nsides.values()))
     operators = {
-        what: Preparation.smoothing(nsides[what], own, nside, fwhm, lmax, what)
-        if fwhm
-        else Preparation.averaging(nsides[what], nside, what)
+        what: Preparation.smoothing(nsides[what], own, nside, fwhm or None, lmax, what)
         for what, (_, own) in given.items()
     }
     holes = common_holes([used for used, _ in given.values()]) if fwhm else {}

@@ -44,8 +44,8 @@ def random_alm(lmax: int, seed: int = 0) -> jnp.ndarray:
     "preparation",
     [
         Preparation.smoothing(16, 100.0, 8, 600.0, 23),
-        Preparation.averaging(16, 8),
-        Preparation.averaging(8, 8),
+        Preparation(None, 16, 8),
+        Preparation(None, 8, 8),
     ],
 )
 def test_preparation_is_linear_with_an_exact_transpose(preparation):
@@ -76,7 +76,7 @@ def test_variance_of_prepared_noise():
     covariance = uniform_covariance(1000.0, nside_in) * (1.5 + np.cos(np.radians(latitude)))
     for preparation in (
         Preparation.smoothing(nside_in, 60.0, nside, 400.0, 47),
-        Preparation.averaging(nside_in, nside),
+        Preparation(None, nside_in, nside),
     ):
         draws = jax.lax.map(lambda k, p=preparation: p(draw(k, covariance)), keys, batch_size=50)
         model = Fluctuations(

@@ -180,19 +180,18 @@ class Preparation(eqx.Module):
         nside_in: int,
         own: float | Array,
         nside: int,
-        fwhm: float,
+        fwhm: float | None,
         lmax: int,
         what: str = "map",
     ) -> "Preparation":
-        """Smooth from the maps' own beam to a Gaussian up to lmax or less; see `beam_ratio`."""
-        _check_nside(nside_in, nside, what)
-        return cls(shortened(beam_ratio(fwhm, own, lmax, what)), nside_in, nside)
+        """Smooth from the maps' own beam to a Gaussian up to lmax or less (see `beam_ratio`).
 
-    @classmethod
-    def averaging(cls, nside_in: int, nside: int, what: str = "map") -> "Preparation":
-        """Average over pixels."""
-        _check_nside(nside_in, nside, what)
-        return cls(None, nside_in, nside)
+        With None for `fwhm`, pixels are averaged instead.
+        """
+        if nside > nside_in:
+            raise ValueError(f"The common nside {nside} is larger than that of {what}, {nside_in}.")
+        window = None if fwhm is None else shortened(beam_ratio(fwhm, own, lmax, what))
+        return cls(window, nside_in, nside)
 
     def __call__(self, maps: StokesMaps) -> StokesMaps:
         """Return the maps at the common resolution."""
@@ -226,11 +225,6 @@ class Preparation(eqx.Module):
         if self.window is None:
             return (level / healpy.nside2resol(self.nside, arcmin=True)) ** 2
         return map_variance((level * np.radians(1 / 60) * np.asarray(self.window)) ** 2)
-
-
-def _check_nside(nside_in: int, nside: int, what: str) -> None:
-    if nside > nside_in:
-        raise ValueError(f"The common nside {nside} is larger than that of {what}, {nside_in}.")
 
 
 def _squared_window(window: np.ndarray, highest: int) -> np.ndarray:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxsky.arrays import Alm, Map, StokesMaps, Window
+from jaxsky.arrays import Alm, Beam, Map, StokesMaps, Window
 from jaxsky.checks import check_finite, check_shape, is_concrete
 from jaxsky.harmonics.transforms import analysis, expand, map_variance, resize, synthesis
 
@@ -176,13 +176,7 @@ class Preparation(eqx.Module):
 
     @classmethod
     def smoothing(
-        cls,
-        nside_in: int,
-        own: float | Array,
-        nside: int,
-        fwhm: float | None,
-        lmax: int,
-        what: str = "map",
+        cls, nside_in: int, own: Beam, nside: int, fwhm: float | None, lmax: int, what: str = "map"
     ) -> "Preparation":
         """Smooth from the maps' own beam to a Gaussian up to lmax or less (see `beam_ratio`).
 

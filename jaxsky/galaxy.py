@@ -262,7 +262,7 @@ def _emission(model, basis, turbulence, step):
 
 
 def _check(nside: int, seed: int, steps: int) -> None:
-    for name, value in {"nside": nside, "seed": seed, "steps": steps}.items():
+    for name, value in {"seed": seed, "nside": nside, "steps": steps}.items():
         check_seed(name, value)  # or another integer that is not negative
     check_nside("nside", nside)
     if steps < 1:

@@ -11,6 +11,7 @@ The large ones are symmetric, and dense or sparse, since few of their parameters
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -98,8 +99,9 @@ def _model(mixing: Array, amplitudes: Array) -> Array:
     return jnp.einsum("ru,kun->krn", mixing, amplitudes)
 
 
-def _solved(mixing: Array, pixels: Pixels, right: Array) -> tuple[Array, list[list[Array]]]:
-    """Return the solution of M^T W M x = right (group, unknown, pix), and the matrix's factors."""
+def _solved(mixing: Array, pixels: Pixels) -> tuple[Array, list[list[Array]]]:
+    """Return the solution of M^T W M s = M^T W d, and the factors of the matrix."""
+    right = _projected(mixing, _weighted(pixels, pixels.data))
     lower = _cholesky(_gram(mixing, pixels))
     return _back_substituted(lower, right), lower
 
@@ -120,22 +122,18 @@ def _along(function, primals, tangents):
 @jax.custom_jvp
 def solve(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, "group unknown pix"]:
     """Return amplitudes s = (M^T W M)^-1 M^T W d; NaN where a system is singular."""
-    return _solved(mixing, pixels, _projected(mixing, _weighted(pixels, pixels.data)))[0]
+    return _solved(mixing, pixels)[0]
 
 
+@partial(solve.defjvp, symbolic_zeros=True)
 def _solve_jvp(primals, tangents):
     """Differentiate M^T W (d - M s) = 0: one more solution, no derivative of the factors."""
-    mixing, pixels = primals
-    right = _projected(mixing, _weighted(pixels, pixels.data))
-    amplitudes, lower = _solved(mixing, pixels, right)
+    amplitudes, lower = _solved(*primals)
 
     def zero(mixing, pixels):
         return _projected(mixing, _weighted(pixels, pixels.data - _model(mixing, amplitudes)))
 
     return amplitudes, _back_substituted(lower, _along(zero, primals, tangents))
-
-
-solve.defjvp(_solve_jvp, symbolic_zeros=True)
 
 
 def inverse_gram(
@@ -190,8 +188,7 @@ def derivatives(
         fisher_ij = B_i^T W B_j - (A^T W B_i)^T G^-1 (A^T W B_j)
         hessian_ij = B_i^T W B_j - r^T W A_ij s - D_i^T G^-1 D_j.
     """
-    right = _projected(mixing, _weighted(pixels, pixels.data))
-    amplitudes, lower = _solved(mixing, pixels, right)
+    amplitudes, lower = _solved(mixing, pixels)
     rest = pixels.data - _model(mixing, amplitudes)
     weighted = _weighted(pixels, rest)
     moved = jax.vmap(lambda m: _model(m, amplitudes))(first)
@@ -230,6 +227,7 @@ def least_chi2(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Arr
     return jnp.sum(rest * weighted)
 
 
+@partial(least_chi2.defjvp, symbolic_zeros=True)
 def _chi2_jvp(primals, tangents):
     amplitudes, rest, weighted = fitted(*primals)
 
@@ -239,9 +237,6 @@ def _chi2_jvp(primals, tangents):
         return 2 * jnp.sum(weighted * moved) + jnp.sum(rest * _weighted(pixels, rest))
 
     return jnp.sum(rest * weighted), _along(linear, primals, tangents)
-
-
-least_chi2.defjvp(_chi2_jvp, symbolic_zeros=True)
 
 
 @jax.jit
@@ -289,21 +284,18 @@ class Factor:
     def __init__(self, matrix: np.ndarray | scipy.sparse.csc_matrix) -> None:
         self._matrix, diagonal = matrix, matrix.diagonal()
         self.positive = bool(np.all(diagonal > 0) and np.isfinite(diagonal).all())
-        self._scale = 1 / np.sqrt(diagonal) if self.positive else np.ones_like(diagonal)
         if not self.positive:
             return
-        if isinstance(matrix, np.ndarray):
-            scaled = matrix * self._scale * self._scale[:, None]
-            self._blocks = _independent(scaled)
-            try:
-                self._factors = [
-                    scipy.linalg.cho_factor(scaled[np.ix_(at, at)]) for at in self._blocks
-                ]
-            except (scipy.linalg.LinAlgError, ValueError):
-                self.positive = False
-            return
-        scale = scipy.sparse.diags(self._scale)
+        self._scale = 1 / np.sqrt(diagonal)
         try:
+            if isinstance(matrix, np.ndarray):
+                scaled = matrix * self._scale * self._scale[:, None]
+                self._blocks = [
+                    (at, scipy.linalg.cho_factor(scaled[np.ix_(at, at)]))
+                    for at in _independent(scaled)
+                ]
+                return
+            scale = scipy.sparse.diags(self._scale)
             # Without pivoting the factors are those of L D L^T, and the signs of D tell.
             self._sparse = scipy.sparse.linalg.splu(
                 scipy.sparse.csc_matrix(scale @ matrix @ scale),
@@ -311,10 +303,9 @@ class Factor:
                 diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True},
             )
-        except RuntimeError:
+            self.positive = bool(np.all(self._sparse.U.diagonal() > 0))
+        except (ValueError, RuntimeError):  # errors of linear algebra are ValueErrors
             self.positive = False
-            return
-        self.positive = bool(np.all(self._sparse.U.diagonal() > 0))
 
     def __reduce__(self) -> tuple[Any, ...]:  # sparse factors cannot be sent to a process
         return Factor, (self._matrix,)
@@ -326,7 +317,7 @@ class Factor:
             return scale * self._sparse.solve(scale * right)
         scaled = scale * right
         solution = np.empty_like(scaled)
-        for at, factor in zip(self._blocks, self._factors, strict=True):
+        for at, factor in self._blocks:
             solution[at] = scipy.linalg.cho_solve(factor, scaled[at])
         return scale * solution
 
@@ -348,10 +339,9 @@ def degenerate(
     found = []
     for at in _independent(scaled):
         values, vectors = np.linalg.eigh(scaled[np.ix_(at, at)])
-        if values[0] > threshold:
-            continue
-        share = np.abs(vectors[:, 0])
-        found += at[share > 0.05 * share.max()].tolist()
+        if not values[0] > threshold:
+            share = np.abs(vectors[:, 0])
+            found += at[share > 0.05 * share.max()].tolist()
     return [names[i] for i in sorted(found)]
 
 
@@ -361,30 +351,23 @@ def variances(
     """Return the diagonal of H^-1 S H^-1 for sparse H, given as factor; NaN if it takes too long.
 
     Without parameters that many cells share, H consists of small independent parts, so a few
-    solutions serve all of them at once.
+    solutions serve all of them at once: one for each position in a part.
     """
     size = len(shared)
-    if shared.any():
-        # All parameters are coupled: column by column, if there are not too many.
-        if size > MOST:
-            return np.full(size, np.nan)
-        position = np.arange(size)
-        component = np.zeros(size, int)
-    else:
-        count, component = scipy.sparse.csgraph.connected_components(scatter, directed=False)
-        order = np.argsort(component, kind="stable")
-        first = np.searchsorted(component[order], np.arange(count))
-        position = np.empty(size, int)
-        position[order] = np.arange(size) - first[component[order]]
-        if position.max() >= MOST:
-            return np.full(size, np.nan)
+    part = np.zeros(size, int)
+    if not shared.any():
+        part = scipy.sparse.csgraph.connected_components(scatter, directed=False)[1]
+    order = np.argsort(part, kind="stable")
+    position = np.empty(size, int)
+    position[order] = np.arange(size) - np.searchsorted(part[order], part[order])
+    if (largest := int(position.max()) + 1) > MOST:
+        return np.full(size, np.nan)
     result = np.empty(size)
-    for begin in range(0, int(position.max()) + 1, COLUMNS):
-        columns = np.arange(begin, min(begin + COLUMNS, int(position.max()) + 1))
+    for begin in range(0, largest, COLUMNS):
+        columns = np.arange(begin, min(begin + COLUMNS, largest))
         solved = factor.solve((position[:, None] == columns).astype(float))
         terms = solved * (scatter @ solved)
         for j, column in enumerate(columns):
             here = position == column
-            sums = np.bincount(component, terms[:, j], minlength=component.max() + 1)
-            result[here] = sums[component[here]]
+            result[here] = np.bincount(part, terms[:, j])[part[here]]
     return result

@@ -114,8 +114,8 @@ def fiducial(
         matrix = np.array(_correlations(foregrounds, field, components))
         if (least := np.linalg.eigvalsh(matrix).min()) < -ROUNDING:
             pairs = [
-                f"{components[i]} x {components[j]} {matrix[i, j]:.3g}"
-                for i, j in itertools.combinations(range(len(components)), 2)
+                f"{a} x {b} {foregrounds[f'{field}.{a}.{b}.correlation']:.3g}"
+                for a, b in itertools.combinations(components, 2)
             ]
             raise ValueError(
                 f"The correlations of {field}, {', '.join(pairs)}, are those of no sky (their "
@@ -139,14 +139,15 @@ def _spectra(
 ) -> Float[Array, "field ell component component"]:
     """Return the spectra C_l of the components [uK_RJ^2], the CMB last [uK_CMB^2]."""
     names, found = list(model.sky), []
+
+    def root(name: str) -> Float[Array, " ell"]:
+        C = 2 * jnp.pi / (PIVOT * (PIVOT + 1)) * params[f"{name}.amplitude"]
+        return jnp.sqrt(C) * (model.ell / PIVOT) ** (params[f"{name}.slope"] / 2)
+
     for field, tensors, scalars in zip(model.fields, model.tensors, model.scalars, strict=True):
-        roots = []
-        for name in names:
-            to_C = 2 * jnp.pi / (PIVOT * (PIVOT + 1)) * params[f"{field}.{name}.amplitude"]
-            slope = params[f"{field}.{name}.slope"]
-            roots.append(jnp.sqrt(to_C) * (model.ell / PIVOT) ** (slope / 2))
+        roots = jnp.stack([root(f"{field}.{name}") for name in names])
         rho = jnp.array(_correlations(params, field, names))
-        foregrounds = jnp.einsum("ij,il,jl->lij", rho, jnp.stack(roots), jnp.stack(roots))
+        foregrounds = jnp.einsum("ij,il,jl->lij", rho, roots, roots)
         lensing = params["A_lens"] if field == "BB" else 1.0
         cmb = params["r"] * tensors + lensing * scalars
         found.append(jnp.pad(foregrounds, ((0, 0), (0, 1), (0, 1))).at[:, -1, -1].set(cmb))
@@ -214,10 +215,8 @@ def fisher_errors(
 
     Raises
     ------
-    RuntimeError
-        Without double precision.
-    KeyError
-        For a name that does not exist; lists the known ones.
+    RuntimeError, KeyError
+        Without double precision; for names that do not exist.
     ValueError
         For a prior of a parameter that is not free, spectra that no sky can have, and degenerate
         parameters, which it names.
@@ -254,14 +253,12 @@ def fisher_errors(
         )
     scaled = vectors.T / singular
     covariance = scaled @ scaled.T / np.outer(size, size)
-    return Errors(
-        free,
-        {name: float(params[name]) for name in free},
-        dict(zip(free, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
-        covariance,
-        dict(zip(free, (1 / size).tolist(), strict=True)),
-        priors,
+    sigma, known = (
+        dict(zip(free, each.tolist(), strict=True))
+        for each in (np.sqrt(np.diag(covariance)), 1 / size)
     )
+    at = {name: float(params[name]) for name in free}
+    return Errors(free, at, sigma, covariance, known, priors)
 
 
 class BandLaw(NamedTuple):

@@ -29,10 +29,7 @@ ROUNDING = 1e-6
 
 @takes_quantities
 def bare(name: str, value: object) -> np.ndarray:
-    """Return a numeric array without a copy, in its own precision.
-
-    Distributed arrays, and those on disk, are returned as they are.
-    """
+    """Return a numeric array without a copy, in its own precision; those on disk stay there."""
     refuse_unit(name, value)
     if isinstance(value, Stack):
         return value  # type: ignore[return-value]
@@ -72,7 +69,7 @@ class Noise(NamedTuple):
     def weights(self, pixels: slice | np.ndarray) -> Float[np.ndarray, "band stokes #pix"]:
         """Return inverse variances, or the diagonal of inverse covariances; 0 where masked."""
         if self.covariance is not None:
-            (QQ, UU), determinant = self._elements(pixels)[:2]
+            QQ, UU, _, determinant = self._elements(pixels)
             return module_of(QQ).stack([UU / determinant, QQ / determinant], axis=1)
         assert self.sigma is not None
         sigma = self.sigma if self.separable else self.sigma[..., pixels]
@@ -82,18 +79,18 @@ class Noise(NamedTuple):
         """Return element QU of the inverse covariances; None if Q and U are independent."""
         if self.covariance is None:
             return None
-        _, determinant, QU = self._elements(pixels)
+        *_, QU, determinant = self._elements(pixels)
         return -QU / determinant
 
     def _elements(self, pixels):
+        """Return QQ, UU and QU of the covariances, and the determinants; infinite where masked."""
         assert self.covariance is not None
         block = as_double(self.covariance[..., pixels])
         xp = module_of(block)
         masked = ~xp.isfinite(block[:, 0, 0]) | ~xp.isfinite(block[:, 1, 1])
         QQ, UU = (xp.where(masked, 1.0, block[:, s, s]) for s in range(2))
         QU = xp.where(masked, 0.0, block[:, 0, 1])
-        determinant = xp.where(masked, np.inf, QQ * UU - QU**2)
-        return (QQ, UU), determinant, QU
+        return QQ, UU, QU, xp.where(masked, np.inf, QQ * UU - QU**2)
 
 
 def as_noise(
@@ -111,10 +108,8 @@ def as_noise(
     shape : (band, stokes, pix) of the data
     pixel_sigma : factor on the standard deviations in each pixel, (pix,)
 
-    Returns
-    -------
-    The noise. Standard deviations whose ratios between bands and Stokes parameters are the same
-    in all pixels are recognised: then the likelihood does not depend on the number of pixels.
+    Standard deviations whose ratios between bands and Stokes parameters are the same in all pixels
+    are recognised: then the likelihood does not depend on the number of pixels.
     """
     if isinstance(noise, Noise):
         return noise
@@ -171,7 +166,7 @@ def _separated(sigma: np.ndarray) -> Noise | None:
     ratio = sigma[..., at : at + 1] / first[at]
     if not np.isfinite(ratio).all():
         return None
-    for part in ranges(sigma.shape[-1], PIECE):
+    for part in ranges(first.size, PIECE):
         expected, own = ratio * first[part], sigma[..., part]
         with np.errstate(invalid="ignore"):
             off = np.abs(own - expected) > ROUNDING * expected
@@ -184,7 +179,7 @@ def _covariance(covariance: np.ndarray) -> Noise:
     noise = Noise(None, None, covariance)
     bad, xp = 0, module_of(covariance)
     for part in [slice(None)] if spread(covariance) else ranges(covariance.shape[-1], PIECE):
-        (QQ, UU), determinant, _ = noise._elements(part)
+        QQ, UU, _, determinant = noise._elements(part)
         block = covariance[..., part]
         asymmetric = xp.isfinite(determinant) & (block[:, 0, 1] != block[:, 1, 0])
         bad += int(xp.sum(~((QQ > 0) & (UU > 0) & (determinant > 0)) | asymmetric))

@@ -57,14 +57,14 @@ class MapNoise(NamedTuple):
 
         Rows at the resolution of the noise are stored in its precision.
         """
-        block, modes, spectra = np.zeros((count, count)), None, None
+        block, modes, before = np.zeros((count, count)), None, None
         if self.correlated is not None:
             spectra = np.stack([self.correlated] * 2)
             modes = _modes_of((count,), spectra.shape[-1] - 1)
-        white = bool(np.ndim(self.noise) or self.noise)
         covariance = pixel_covariance(self.noise, self.preparation.nside_in)
         npix = covariance.shape[-1]
-        before = empty((count, 2, npix), covariance.dtype) if white else None
+        if np.ndim(self.noise) or self.noise:
+            before = empty((count, 2, npix), covariance.dtype)
         for own, row in enumerate(rows):
             if before is not None:
                 before[own] = np.asarray(
@@ -118,13 +118,9 @@ class MapNoise(NamedTuple):
 class Fluctuations(eqx.Module):
     """Noise and CMB: what Q, U maps in several bands contain besides the model.
 
-    Parameters
-    ----------
-    preparations, noise, correlated : per band; see `MapNoise`
-    cmb_spectra : C_l of EE and BB [uK_CMB^2], shape (2, ell); None without CMB
-    cmb_windows : beam and pixel window of the prepared maps of each band, shape (band, ell)
-    cmb_factors : uK_RJ per uK_CMB in each band, shape (band,)
-    names : names of the bands, from which the random numbers of each are derived
+    Bands have the fields of `MapNoise`, `cmb_windows` with the beam and pixel window of their
+    prepared maps, `cmb_factors` in uK_RJ per uK_CMB, and `names`, from which the random numbers of
+    each are derived. `cmb_spectra` are C_l of EE and BB [uK_CMB^2], None without CMB.
     """
 
     preparations: tuple[Preparation, ...]
@@ -149,9 +145,11 @@ class Fluctuations(eqx.Module):
         npix = healpy.nside2npix(self.preparations[0].nside)  # without padding
         noises, blocks = list(self.noises.values()), list[np.ndarray]()
         modes: Any = None
-        spectra = self._cmb_spectra_of_bands()
-        if spectra is not None:
-            modes = _modes_of(rows.shape[:2], spectra.shape[-1] - 1)
+        if self.cmb_spectra is not None and self.cmb_windows is not None:
+            # As far as the beams leave some.
+            last = max(len(shortened(window)) for window in self.cmb_windows)
+            spectra = self.cmb_power()[..., :last]
+            modes = _modes_of(rows.shape[:2], last - 1)
         for start in range(0, len(noises), job.number()):
             # As many bands at a time as there are processes, which take turns.
             bands = range(len(noises))[start : start + job.number()]
@@ -160,7 +158,7 @@ class Fluctuations(eqx.Module):
             def of_band(i: int, maps: dict[int, Any] = maps) -> tuple[np.ndarray, list[np.ndarray]]:
                 own = (row[..., :npix] for row in maps[i])
                 block = noises[i].covariance(own, len(maps[i]))
-                if spectra is None:
+                if modes is None:
                     return block, []
                 return block, [np.asarray(_modes(row[..., :npix], spectra[i])) for row in maps[i]]
 
@@ -170,13 +168,6 @@ class Fluctuations(eqx.Module):
                     modes[i, row] = each
         total = scipy.linalg.block_diag(*blocks)
         return total if modes is None else total + _products(modes)
-
-    def _cmb_spectra_of_bands(self) -> Float[np.ndarray, "band 2 ell"] | None:
-        """Return C_l of EE and BB of the CMB in each band, as far as the beams leave some."""
-        if self.cmb_spectra is None or self.cmb_windows is None:
-            return None
-        last = max(len(shortened(window)) for window in self.cmb_windows)
-        return self.cmb_power()[..., :last]
 
     # Not one program: there XLA would draw the normals anew for each row.
     def noise_realisation(self, key: Array) -> Maps:

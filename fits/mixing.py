@@ -17,7 +17,7 @@ coefficients of the best fit.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -197,15 +197,9 @@ class TemplateErrors(NamedTuple):
     """Noise of templates at the common resolution, as a sum of independent sources.
 
     Sources are the noise of each template that no other map has, and the noise of bands that
-    templates share.
-
-    Attributes
-    ----------
-    covariances_of : covariance of the products of rows (band, row, stokes, pix) with each source,
-        (source, bandrow, bandrow)
-    parts : factor of each source in each template, shape (template, source)
-    of_band : 1 where a source is the noise of a band, shape (band, source)
-    variance : variance of each source in each pixel [uK_RJ^2], shape (source, stokes, pix)
+    templates share. `covariances_of` returns the covariance of the products of rows (band, row,
+    stokes, pix) with each of them; `parts` is the factor of each in each template, `of_band` is 1
+    where one is the noise of a band, and `variance` is that in each pixel [uK_RJ^2].
     """
 
     covariances_of: Callable[[Any], Float[np.ndarray, "source bandrow bandrow"]]
@@ -230,21 +224,17 @@ class TemplateErrors(NamedTuple):
         return total
 
     def covariance(
-        self,
-        rows: Any,
-        coefficients: Float[np.ndarray, "band row template"],
+        self, rows: Any, coefficients: Float[np.ndarray, "band row template"]
     ) -> Float[np.ndarray, "bandrow bandrow"]:
         """Return what noise of templates adds to the covariance of rows times residuals.
 
-        The rows are an array (band, row, stokes, pix), or made when they are read.
         `coefficients` are those of the templates in the residuals that each row multiplies.
         """
         each = self.covariances_of(rows)
         own = np.repeat(self.of_band, rows.shape[1], axis=0)
-        seen = own - np.asarray(coefficients).reshape(len(own), -1) @ self.parts
-        return np.einsum("umn,mu,nu->mn", each, seen, seen) - np.einsum(
-            "umn,mu,nu->mn", each, own, own
-        )
+        seen = own - coefficients.reshape(len(own), -1) @ self.parts
+        sums = "umn,mu,nu->mn"
+        return np.einsum(sums, each, seen, seen) - np.einsum(sums, each, own, own)
 
 
 def template_errors(
@@ -273,16 +263,15 @@ def template_errors(
     def variance(pixels: Any) -> np.ndarray:
         return np.maximum(np.stack([one[..., pixels] for one in each]), 0.0)
 
-    def every(source: "MapNoise", rows: Any) -> Float[np.ndarray, "row row"]:
-        flat = (row[..., : shape[-1]] for own in rows for row in own)
-        return source.covariance(flat, rows.shape[0] * rows.shape[1])
+    def covariances(rows: Any) -> Float[np.ndarray, "source bandrow bandrow"]:
+        def flat() -> Iterator[Any]:
+            return (row[..., : shape[-1]] for own in rows for row in own)
 
-    return TemplateErrors(
-        remembered(lambda rows: np.stack([every(source, rows) for source in sources])),
-        np.array(parts),
-        np.array(of_band),
-        computed(shape, variance),
-    )
+        count = rows.shape[0] * rows.shape[1]
+        return np.stack([source.covariance(flat(), count) for source in sources])
+
+    variances = computed(shape, variance)
+    return TemplateErrors(remembered(covariances), np.array(parts), np.array(of_band), variances)
 
 
 def check_signal(products: Float[np.ndarray, "band stokes template template"]) -> None:

@@ -9,13 +9,15 @@ import healpy
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.polynomial import legendre
 
 from fits.common import CommonMaps, common_maps, window_of
+from fits.fluctuations import of_pixels
 from fits.inputs import Band, Inputs
 from fits.patches import PatchFits, fit_patches
 from fits.pseudo_cl import PreparedPatches, prepare_patches
 from jaxsky.harmonics import average_pixels, beam_ratio, gaussian_beam, pixel_window, smooth
-from jaxsky.noise import pixel_covariance, realisation_key, stream
+from jaxsky.noise import realisation_key, stream
 from jaxsky.settings import Experiment
 
 #: Radius of the paper's discs: 400 square degrees.
@@ -42,13 +44,11 @@ def _smoothed_disc(radius: float, fwhm: float, angle: np.ndarray) -> np.ndarray:
     """Return a disc smoothed by a Gaussian, at angles from its centre [deg]; closed form."""
     lmax = int(np.ceil(6.0 / np.radians(fwhm) * np.sqrt(8 * np.log(2))))
     ell = np.arange(lmax + 2)
-    legendre = np.polynomial.legendre.legvander(np.array([np.cos(np.radians(radius))]), lmax + 2)[0]
-    # 2 pi int P_l over the disc, times (2l+1)/4 pi of the sum over harmonics
-    coefs = np.empty(lmax + 2)
-    coefs[0] = (1 - legendre[1]) / 2
-    coefs[1:] = (legendre[ell[1:] - 1] - legendre[ell[1:] + 1]) / 2
+    P = legendre.legvander(np.array([np.cos(np.radians(radius))]), lmax + 2)[0]
+    # 2 pi int P_l over the disc, times (2l+1)/4 pi of the sum over harmonics; P_-1 is 1
+    coefs = (P[np.maximum(ell - 1, 0)] - P[ell + 1]) / 2
     window = np.asarray(gaussian_beam(60 * fwhm, lmax + 1))
-    return np.polynomial.legendre.legval(np.cos(np.radians(angle)), coefs * window)
+    return legendre.legval(np.cos(np.radians(angle)), coefs * window)
 
 
 def disc_mask(
@@ -93,9 +93,8 @@ def bicep2_mask(nside: int, fwhm: float = APODIZATION) -> Float[np.ndarray, " pi
 
 def paper_patches(nside: int) -> dict[str, Float[np.ndarray, " pix"]]:
     """Return the paper's 48 discs at |b| > 45 deg, and the field of BICEP2, by name."""
-    discs = {
-        f"l {lon:.0f}, b {lat:.0f}": disc_mask(nside, lon, lat) for lon, lat in disc_centers().T
-    }
+    centers = disc_centers().T
+    discs = {f"l {lon:.0f}, b {lat:.0f}": disc_mask(nside, lon, lat) for lon, lat in centers}
     return discs | {"BICEP2": bicep2_mask(nside)}
 
 
@@ -120,40 +119,40 @@ class PatchComparison(NamedTuple):
         """True if EE or BB of any patch is detected in both."""
         return bool((self.observed.detected & self.model.detected).any())
 
+    def _pairs(self, name: str, index: int) -> Float[np.ndarray, "2 patch"]:
+        """Return A or alpha, observed and of the model, where EE (0) or BB (1) is detected."""
+        both = self.detected(index)
+        return np.array([getattr(fit, name)[both, index] for fit in (self.observed, self.model)])
+
+    def _mean(self, values: np.ndarray, index: int) -> tuple[float, float]:
+        """Return the mean over these patches, and its error; NaN for fewer than two."""
+        if (count := len(values)) < 2:
+            return float("nan"), float("nan")
+        both = self.detected(index)
+        shared = self.overlap[np.ix_(both, both)].sum() / count
+        return float(values.mean()), float(values.std(ddof=1) * np.sqrt(shared / count))
+
     def ratio(self, index: int) -> tuple[float, float]:
         """Return the geometric mean of A observed over A of the model, and its error.
 
         The error is from the scatter over patches where EE (0) or BB (1) is detected, with
         allowance for their overlap.
         """
-        both = self.detected(index)
-        logs = np.log(self.observed.A[both, index] / self.model.A[both, index])
-        mean, error = self._mean(logs, both)
+        observed, model = self._pairs("A", index)
+        mean, error = self._mean(np.log(observed / model), index)
         return float(np.exp(mean)), float(np.exp(mean)) * error
-
-    def _mean(self, values: np.ndarray, patches: np.ndarray) -> tuple[float, float]:
-        """Return the mean over patches, and its error; NaN for fewer than two."""
-        if (count := len(values)) < 2:
-            return float("nan"), float("nan")
-        shared = self.overlap[np.ix_(patches, patches)].sum() / count
-        return float(values.mean()), float(values.std(ddof=1) * np.sqrt(shared / count))
 
     def slope_difference(self, index: int) -> tuple[float, float]:
         """Return the mean of alpha observed - alpha of the model, and its error, likewise."""
-        both = self.detected(index)
-        difference = (self.observed.alpha - self.model.alpha)[both, index]
-        return self._mean(difference, both)
+        observed, model = self._pairs("alpha", index)
+        return self._mean(observed - model, index)
 
     def correlation(self, index: int) -> tuple[float, float]:
         """Return Pearson's coefficients of log A and of alpha between map and model."""
-        both = self.detected(index)
-        if both.sum() < 3:
+        if self.detected(index).sum() < 3:
             return float("nan"), float("nan")
-        pairs = (
-            np.log([self.observed.A[both, index], self.model.A[both, index]]),
-            [self.observed.alpha[both, index], self.model.alpha[both, index]],
-        )
-        A, alpha = (float(np.corrcoef(*pair)[0, 1]) for pair in pairs)
+        pairs = np.log(self._pairs("A", index)), self._pairs("alpha", index)
+        A, alpha = (float(np.corrcoef(pair)[0, 1]) for pair in pairs)
         return A, alpha
 
 
@@ -162,7 +161,7 @@ def _patch_noise(
 ) -> Float[np.ndarray, "patch 2 ell"]:
     """Return the noise spectrum in the prepared maps on each patch, from its own pixels."""
     (preparation,), lmax = prepared.fluctuations.preparations, patches.spectra[0].lmax
-    covariance = pixel_covariance(band.noise, preparation.nside_in)
+    covariance = of_pixels(band.noise, preparation.nside_in)
     variance = average_pixels(jnp.stack([covariance[0, 0], covariance[1, 1]]), preparation.nside)
     weights = np.stack([one.mask**2 for one in patches.spectra])
     # Q and U mix on a patch, so that E and B have the mean of both.
@@ -195,9 +194,8 @@ def compare_patches(settings: Experiment, inputs: Inputs) -> PatchComparison:
     noise = _patch_noise(band, prepared, patches)
     # Not the realisations of the observed maps.
     key = stream(realisation_key(settings.seed), "patches")
-    model = prepared.model()[0]
-    fluctuations = prepared.fluctuations
-    model = model + fluctuations.noise_realisation(key)[0] + fluctuations.cmb_realisation(key)[0]
+    model, added = prepared.model()[0], prepared.fluctuations
+    model = model + added.noise_realisation(key)[0] + added.cmb_realisation(key)[0]
     return PatchComparison(
         name,
         fit_patches(prepared.data[0], patches, noise=noise),

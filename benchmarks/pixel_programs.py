@@ -68,7 +68,7 @@ def programs(nside: int) -> dict[str, jax.stages.Lowered]:
     return {
         "observe": _observe.lower(sky, bands, plan=plan, apart=False),
         "inner products": jax.jit(gram).lower(data, templates, jnp.abs(data)),
-        "used pixels": distributed._look.lower(data, noise, 2),
+        "used pixels": distributed._look.lower(data, noise, components=2),
         "band covariances": jax.jit(
             partial(distributed.band_covariance, layout=layout, number=3)
         ).lower(data, noise, blocks),

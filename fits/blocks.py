@@ -16,7 +16,7 @@ from fits.compress import BLOCK, Layout, Noise, pixel_rows, refuse_data
 from fits.regions import Cells
 from fits.systems import Pixels
 from jaxsky.checks import UNSEEN
-from jaxsky.io.stacks import Maps
+from jaxsky.io.stacks import Maps, ranges
 
 #: Pixels in memory at once if the maps are on disk.
 STREAM = 1 << 17
@@ -63,8 +63,8 @@ class Blocks:
         self.where, self.cell = arranged(own, counts, block_size(counts))
         self.in_order = np.array_equal(self.cell, np.arange(cells.number))
 
-    def read(self, layout: Layout, blocks: slice) -> list[np.ndarray | None]:
-        """Return the fields of `Pixels` for some blocks, (block, group, row, pix)."""
+    def read(self, layout: Layout, blocks: slice) -> Pixels:
+        """Return the pixels of some blocks, (block, group, row, pix), as arrays of numpy."""
         index = self.where[blocks].ravel()
         used, size = index >= 0, self.where.shape[1]
         whole = used.all() and index[-1] - index[0] == len(index) - 1 and np.all(np.diff(index) > 0)
@@ -72,21 +72,19 @@ class Blocks:
         found = pixel_rows(self._data, self._noise, layout, where, used)
         if not np.isfinite(found[0]).all() or found[0].min() < UNSEEN:
             refuse_data(self._data, self._noise)
-        shaped = []
-        for rows in found:
-            if rows is not None:
-                rows = np.broadcast_to(rows, (*rows.shape[:2], index.size))
-                rows = np.moveaxis(rows.reshape(*rows.shape[:2], -1, size), 2, 0)
-            shaped.append(rows)
-        return shaped
+
+        def shaped(rows: np.ndarray) -> np.ndarray:
+            rows = np.broadcast_to(rows, (*rows.shape[:2], index.size))
+            return np.moveaxis(rows.reshape(*rows.shape[:2], -1, size), 2, 0)
+
+        return Pixels(*jax.tree.map(shaped, found))
 
     def pieces(self, like: Any) -> Iterator[Any]:
         """Yield a `SpectralLikelihood` with a few blocks at a time, as many but for the last."""
-        step = max(1, STREAM // self.where.shape[1])
-        for begin in range(0, len(self.where), step):
-            blocks = slice(begin, begin + step)
-            rows = [jax.tree.map(jnp.asarray, self.read(each, blocks)) for each in like.layout]
-            pixels, cells = tuple(Pixels(*own) for own in rows), jnp.asarray(self.cell[blocks])
+        number, size = self.where.shape
+        for blocks in ranges(number, max(1, STREAM // size)):
+            read = tuple(self.read(each, blocks) for each in like.layout)
+            pixels, cells = jax.tree.map(jnp.asarray, (read, self.cell[blocks]))
             yield dataclasses.replace(like, pixels=pixels, block_cell=cells, source=None)
 
 
@@ -96,15 +94,12 @@ def gathered(
     """Return the pixels in blocks, and the cell of each block, None if they are in order."""
     blocks = Blocks(data, noise, cells, used)
     number, size = blocks.where.shape
-    shape = (number, len(layout.groups), len(data) * len(layout.groups[0]), size)
-    correlated = layout.joint and noise.covariance is not None
-    cross = np.empty((number, 1, len(data), size)) if correlated else None
-    every = np.empty(shape), np.empty(shape), cross
-    step = max(1, BLOCK // size)
-    for begin in range(0, number, step):
-        block = slice(begin, begin + step)
-        for target, rows in zip(every, blocks.read(layout, block), strict=True):
-            if target is not None and rows is not None:
-                target[block] = rows
+    every: Any = None
+    for some in ranges(number, max(1, BLOCK // size)):
+        read = blocks.read(layout, some)
+        if every is None:
+            every = jax.tree.map(lambda own: np.empty((number, *own.shape[1:])), read)
+        for target, own in zip(*map(jax.tree.leaves, (every, read)), strict=True):
+            target[some] = own
     cell = None if blocks.in_order else jnp.asarray(blocks.cell)
-    return Pixels(*jax.tree.map(jnp.asarray, every)), cell
+    return jax.tree.map(jnp.asarray, every), cell

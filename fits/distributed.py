@@ -17,21 +17,9 @@ from fits.blocks import arranged, block_size
 from fits.compress import PIECE, Layout, Noise, pixel_rows, wrong_data
 from fits.regions import Cells
 from fits.systems import Pixels
+from jaxsky import mesh
 from jaxsky.checks import UNSEEN
 from jaxsky.io.stacks import ranges
-from jaxsky.mesh import (
-    SUMS,
-    along,
-    at_once,
-    from_parts,
-    maps_of,
-    module_of,
-    of_own,
-    over_pixels,
-    parts_of,
-    spread,
-    total,
-)
 
 #: All pixels of a device.
 ALL = slice(None)
@@ -39,32 +27,23 @@ ALL = slice(None)
 LEAST_SHARE = 1e-6
 
 
-def noise_like(data: Any, noise: Noise) -> Noise:
-    """Return noise whose maps are distributed as the data are."""
-    return Noise(*(None if each is None else along(data, each) for each in noise))
-
-
 def _seen(weights, components):
     """Return used pixels, their number, those in too few bands, and sums over bands."""
     seen = (weights > 0).sum(axis=0)
     used = seen.any(axis=0)
-    own = module_of(weights).where(used, weights, 0.0)
+    own = mesh.module_of(weights).where(used, weights, 0.0)
     few = (used & (seen < components).any(axis=0)).sum()
     return used, used.sum(), few, own.sum(axis=(1, 2)), (own > 0).sum(axis=(1, 2))
 
 
 @partial(jax.jit, static_argnames="components")
-def _look(data, noise, components):
+@mesh.over_pixels((mesh.maps_of(1), *[mesh.SUMS] * 5))
+def _look(data, noise, *, components):
     """Return the same, and the number of bad data."""
-
-    @over_pixels((maps_of(1), *[SUMS] * 5))
-    def look(data, noise):
-        weights = jnp.broadcast_to(noise.weights(ALL), data.shape)
-        used, *sums = _seen(weights, components)
-        bad = jnp.sum((~jnp.isfinite(data) | (data < UNSEEN)) & (weights > 0))
-        return used, *map(total, (*sums, bad))
-
-    return look(data, noise)
+    weights = jnp.broadcast_to(noise.weights(ALL), data.shape)
+    used, *sums = _seen(weights, components)
+    bad = jnp.sum((~jnp.isfinite(data) | (data < UNSEEN)) & (weights > 0))
+    return used, *map(mesh.total, (*sums, bad))
 
 
 class Looked(NamedTuple):
@@ -75,13 +54,8 @@ class Looked(NamedTuple):
     weights: Float[np.ndarray, " band"]
     counts: Int[np.ndarray, " band"]
 
-    def heavy(
-        self, squares: Float[np.ndarray, "band component"]
-    ) -> tuple[Bool[np.ndarray, " band"], int]:
-        """Return the bands that carry weight, and the number of data in them.
-
-        `squares` are those of the laws.
-        """
+    def heavy(self, squares: Float[np.ndarray, "band component"]) -> tuple[np.ndarray, int]:
+        """Return the bands that carry weight, given squares of the laws, and the data in them."""
         share = self.weights[:, None] * squares
         heavy = (share >= LEAST_SHARE * share.sum(axis=0)).any(axis=1)
         return heavy, int(self.counts[heavy].sum())
@@ -93,8 +67,8 @@ def look(data: Any, noise: Noise, components: int) -> Looked:
     Data that are not finite are refused here if they are distributed, and else where they are read.
     """
     bands, stokes, npix = data.shape
-    if spread(data):
-        used, *sums, bad = _look(data, noise, components)
+    if mesh.spread(data):
+        used, *sums, bad = _look(data, noise, components=components)
     else:
         used, sums, bad = np.empty(npix, bool), [0, 0, np.zeros(bands), np.zeros(bands, int)], 0
         for part in ranges(npix, PIECE):
@@ -115,11 +89,11 @@ def look(data: Any, noise: Noise, components: int) -> Looked:
 
 
 @partial(jax.jit, static_argnames="number")
-@over_pixels(SUMS)
+@mesh.over_pixels(mesh.SUMS)
 def counted(of_pixel, *, number: int):
     """Return the number of pixels with each of some numbers; negative ones are not counted."""
     own = jnp.where(of_pixel < 0, number, of_pixel)
-    return total(jnp.zeros(number, int).at[own].add(1, mode="drop"))
+    return mesh.total(jnp.zeros(number, int).at[own].add(1, mode="drop"))
 
 
 def intersections(labels: Mapping[str, Int[Array, " pix"]], used: Bool[Array, " pix"]) -> Cells:
@@ -132,13 +106,11 @@ def intersections(labels: Mapping[str, Int[Array, " pix"]], used: Bool[Array, " 
         key = key * size + array
     there = np.flatnonzero(counted(jnp.where(used, key, -1), number=int(np.prod(sizes))))
     found = dict(zip(labels, np.unravel_index(there, sizes), strict=True))
-    if len(there) == 1:
-        return Cells(None, found, 1)
-    return Cells(_numbered(there, key, used), found, len(there))
+    return Cells(_numbered(there, key, used) if len(there) > 1 else None, found, len(there))
 
 
 @jax.jit
-@over_pixels(maps_of(1))
+@mesh.over_pixels(mesh.maps_of(1))
 def _numbered(there, key, used):
     """Return the cell of each pixel from the sorted keys of all cells."""
     return jnp.where(used, jnp.searchsorted(there, key), -1).astype(jnp.int32)
@@ -154,62 +126,53 @@ class Blocks(NamedTuple):
 def blocks(cells: Cells, used: Bool[Array, " pix"]) -> Blocks:
     """Arrange the used pixels of each device by cells; all devices have as many blocks."""
     of_pixel: Any = jnp.where(used, 0, -1) if cells.of_pixel is None else cells.of_pixel
-    own = parts_of(of_pixel)
+    own = mesh.parts_of(of_pixel)
     sizes = [np.bincount(each[each >= 0], minlength=cells.number) for each in own]
 
     def most(numbers: list[int]) -> int:
-        return int(from_parts([np.array([n]) for n in numbers], of_pixel).max())
+        return int(mesh.from_parts([np.array([n]) for n in numbers], of_pixel).max())
 
     size = most(list(map(block_size, sizes)))
     number = most([int(np.sum(-(-n // size))) for n in sizes])
     each = [arranged(*one, size, number) for one in zip(own, sizes, strict=True)]
-    return Blocks(*(from_parts(parts, of_pixel) for parts in zip(*each, strict=True)))
+    return Blocks(*(mesh.from_parts(parts, of_pixel) for parts in zip(*each, strict=True)))
 
 
 @jax.jit
-@over_pixels(maps_of(1))
+@mesh.over_pixels(mesh.maps_of(1))
 def pieces(used: Bool[Array, " pix"]) -> Blocks:
     """Return the pixels of each device as they are, in blocks of one cell; -1 where not used."""
     npix = used.shape[-1]
-    size = min(at_once(PIECE), npix)
+    size = min(mesh.at_once(PIECE), npix)
     own = jnp.arange(-(-npix // size) * size, dtype=jnp.int32)
     own = jnp.where(used[jnp.minimum(own, npix - 1)] & (own < npix), own, -1).reshape(-1, size)
     return Blocks(own, jnp.zeros(len(own), int))
 
 
 @partial(jax.jit, static_argnames=("layout", "number"))
-def band_covariance(data, noise, blocks, layout, number):
+@mesh.over_pixels(mesh.SUMS)
+def band_covariance(data, noise, blocks, *, layout, number):
     """Return what `fits.compress.band_covariance` does, for a number of cells."""
 
-    @over_pixels(SUMS)
-    def summed(data, noise, blocks):
-        def add(found, block):
-            own, cell = block
-            root = jnp.sqrt(noise.pixel_weights(own))
-            values = jnp.where(own >= 0, data[..., own].astype(float) * root, 0.0)
-            rows = layout.rows(values)
-            return found.at[cell].add(jnp.einsum("grp,gqp->grq", rows, rows)), None
+    def add(found, block):
+        own, cell = block
+        root = jnp.sqrt(noise.pixel_weights(own))
+        values = jnp.where(own >= 0, data[..., own].astype(float) * root, 0.0)
+        rows = layout.rows(values)
+        return found.at[cell].add(jnp.einsum("grp,gqp->grq", rows, rows)), None
 
-        size = len(data) * len(layout.groups[0])
-        start = of_own(jnp.zeros((number, len(layout.groups), size, size)))
-        return total(jax.lax.scan(add, start, blocks)[0])
-
-    return summed(data, noise, blocks)
+    size = len(data) * len(layout.groups[0])
+    start = mesh.of_own(jnp.zeros((number, len(layout.groups), size, size)))
+    return mesh.total(jax.lax.scan(add, start, blocks)[0])
 
 
 @partial(jax.jit, static_argnames="layout")
-def gathered(data: Array, noise: Noise, blocks: Blocks, layout: Layout) -> Pixels:
+@mesh.over_pixels(mesh.maps_of(1))
+def gathered(data: Array, noise: Noise, blocks: Blocks, *, layout: Layout) -> Pixels:
     """Return the pixels in blocks, padded with zeros of unit weight."""
 
-    @over_pixels(maps_of(1))
-    def gather(data, noise, pixels):
-        def one(own):
-            rows = pixel_rows(data, noise, layout, own, own >= 0)
-            return tuple(
-                None if each is None else jnp.broadcast_to(each, (*each.shape[:-1], own.size))
-                for each in rows
-            )
+    def one(own):
+        rows = pixel_rows(data, noise, layout, own, own >= 0)
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], own.size)), rows)
 
-        return Pixels(*jax.lax.map(one, pixels))
-
-    return gather(data, noise, blocks.pixels)
+    return Pixels(*jax.lax.map(one, blocks.pixels))

@@ -40,7 +40,7 @@ from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.bandpass import parse_unit
 from jaxsky.checks import Numeric, as_array, check_double, check_finite, check_shape
 from jaxsky.io.stacks import Stack
-from jaxsky.mesh import SUMS, at_once, in_place, maps_of, over_pixels, spread
+from jaxsky.mesh import SUMS, along, at_once, in_place, maps_of, over_pixels, spread
 from jaxsky.mesh import total as over_devices
 from jaxsky.sky import check_parameter, unknown_parameter
 
@@ -288,8 +288,7 @@ def spectral_likelihood(
             "and their laws one more."
         )
     mixing = Mixing.of(unit_sky(sky), bands, unit)
-    noise = as_noise(noise, data.shape)
-    noise = distributed.noise_like(data, noise)
+    noise = along(data, as_noise(noise, data.shape))
     looked, apart = distributed.look(data, noise, components), spread(data)
     used: Any = looked.used
     varying = {n: check_labels(n, v, used) for n, v in (labels or {}).items()}
@@ -343,13 +342,13 @@ def spectral_likelihood(
         blocks = distributed.blocks(cells, used) if ordered else distributed.pieces(used)
     for layout in like.layout:
         if few and blocks is not None:
-            summed = distributed.band_covariance(data, noise, blocks, layout, cells.number)
-            parts.append(compressed(np.asarray(summed), noise, layout))
+            D = distributed.band_covariance(data, noise, blocks, layout=layout, number=cells.number)
+            parts.append(compressed(np.asarray(D), noise, layout))
         elif few:
             summed = band_covariance(data, noise, cells, used, layout)
             parts.append(compressed(summed, noise, layout))
         elif blocks is not None:
-            parts.append(distributed.gathered(data, noise, blocks, layout))
+            parts.append(distributed.gathered(data, noise, blocks, layout=layout))
             block_cell = blocks.cell
         elif isinstance(data, Stack):
             source = Blocks(data, noise, cells, used)

@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from fits import systems
 from fits.compress import PIECE, Noise, as_noise, bare, pixel_rows
-from fits.distributed import ALL, look, noise_like
+from fits.distributed import ALL, look
 from fits.mixing import spectral_names
 from fits.multipoles import check_alm, multipoles_of
 from fits.optimize import best_fit
@@ -189,7 +189,7 @@ def component_maps(
     good = data.ndim == 3 and data.shape[:2] == wanted
     check_shape("data", data, good, f"have shape (band, stokes, pix) = {(*wanted, 'pix')}")
     names, (bands, stokes, npix) = tuple(like.mixing.sky), data.shape
-    noise, known = noise_like(data, as_noise(noise, data.shape)), _matrices(like, params)
+    noise, known = along(data, as_noise(noise, data.shape)), _matrices(like, params)
     uniform = noise.separable and noise.pixel_sigma is None and like.of_pixel is None
     each, cells = covariance and not uniform, like.of_pixel
     if spread(data):

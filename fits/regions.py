@@ -3,9 +3,9 @@
 Regions are maps of labels 0, 1, ..., one map per parameter; cells are their intersections.
 """
 
-import itertools
 import operator
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +33,11 @@ from jaxsky.settings import (
 COMPARISONS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 
 
+def absolute_latitude(nside: int) -> Float[np.ndarray, " pix"]:
+    """Return |b| of all pixels (RING) [deg]."""
+    return np.abs(healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)[1])
+
+
 def region_masks(settings: Experiment, names: Sequence[str]) -> dict[str, Bool[np.ndarray, " pix"]]:
     """Return the pixels of some regions at the common nside; see `region_mask`."""
     return {name: region_mask(settings, name, settings.common.nside) for name in names}
@@ -47,8 +52,7 @@ def region_mask(
     if isinstance(region, MapFile):
         masks[f"regions.{name}"] = region
     elif (said := parse_region(region)) is not None:
-        latitude = healpy.pix2ang(nside, np.arange(inside.size), lonlat=True)[1]
-        inside = COMPARISONS[said[0]](np.abs(latitude), said[1])
+        inside = COMPARISONS[said[0]](absolute_latitude(nside), said[1])
     for where, mask in masks.items():
         if mask is None:
             continue
@@ -69,14 +73,13 @@ def common_holes(maps: Sequence[Bool[np.ndarray, " pix"]]) -> dict[int, np.ndarr
     Smoothing spreads the surroundings of a hole into it, and the hole into its surroundings, so
     all maps, templates and data, get the same holes.
     """
-    if all(used.all() for used in maps):
-        return {}
-    nsides = {healpy.npix2nside(used.size) for used in maps}
     holed = [used for used in maps if not used.all()]
-    found = {nside: np.ones(healpy.nside2npix(nside), bool) for nside in nsides}
-    for (nside, kept), used in itertools.product(found.items(), holed):
-        kept &= healpy.ud_grade(used.astype(float), nside) > 0.999
-    return found
+
+    def kept(nside: int) -> np.ndarray:
+        each = (healpy.ud_grade(used.astype(float), nside) > 0.999 for used in holed)
+        return reduce(np.logical_and, each)
+
+    return {n: kept(n) for n in {healpy.npix2nside(used.size) for used in maps} if holed}
 
 
 def region_words(settings: Experiment, name: str) -> str:
@@ -95,13 +98,8 @@ def apodize(used: Bool[np.ndarray, " pix"], width: float) -> Float[np.ndarray, "
 
     Parameters
     ----------
-    used : True in used pixels, RING
+    used : True in used pixels, RING; TypeError if it is not of bool
     width : distance over which the mask rises [deg]; 0 leaves it unchanged
-
-    Raises
-    ------
-    TypeError
-        If the mask is not of bool.
     """
     if used.dtype != bool:
         raise TypeError(f"Argument `used` must be a mask of bool, but is of {used.dtype}.")
@@ -115,22 +113,15 @@ def apodize(used: Bool[np.ndarray, " pix"], width: float) -> Float[np.ndarray, "
 def superpixels(nside_map: int, nside: int) -> Int[np.ndarray, " pix"]:
     """Return labels of a map's pixels (RING): the coarser RING pixels that they lie in.
 
-    Parameters
-    ----------
-    nside_map, nside : resolution of the map, and of the labels
-
-    Raises
-    ------
-    ValueError
-        If one is not a power of 2, or the labels are finer than the map.
+    ValueError if a resolution is not a power of 2, or the labels are finer than the map.
 
     Examples
     --------
     >>> np.bincount(superpixels(4, 1))
     array([16, 16, 16, 16, 16, 16, 16, 16, 16, 16, 16, 16])
     """
-    for name, value in (("nside_map", nside_map), ("nside", nside)):
-        check_nside(name, value)
+    check_nside("nside_map", nside_map)
+    check_nside("nside", nside)
     if nside > nside_map:
         raise ValueError(
             f"Argument `nside` must be at most that of the map, {nside_map}, but is {nside}."
@@ -150,9 +141,7 @@ def latitude_bands(nside_map: int, edges: Sequence[float]) -> Int[np.ndarray, " 
     limits = np.asarray(edges, float)
     if limits.ndim != 1 or not np.all(np.diff([0.0, *limits, 90.0]) > 0):
         raise ValueError(f"Argument `edges` must increase between 0 and 90, but is {edges}.")
-    npix = healpy.nside2npix(nside_map)
-    latitude = healpy.pix2ang(nside_map, np.arange(npix), lonlat=True)[1]
-    return np.digitize(np.abs(latitude), limits)
+    return np.digitize(absolute_latitude(nside_map), limits)
 
 
 def clusters(
@@ -164,13 +153,8 @@ def clusters(
     ----------
     maps : values to compare pixels by, shape (map, pix), each map scaled to its scatter; NaN or
         infinite where masked: such pixels get the label of the mean
-    count : number of clusters
+    count : number of clusters; ValueError if there are fewer pixels, or different values
     seed, iterations : those of k-means; empty clusters are left out
-
-    Raises
-    ------
-    ValueError
-        For a wrong shape, or fewer pixels, or different values, than clusters.
     """
     check_seed("seed", seed)
     values = np.atleast_2d(np.asarray(maps, float))
@@ -274,6 +258,4 @@ def intersections(labels: Mapping[str, Int[np.ndarray, " pix"]], used: np.ndarra
     of_pixel = np.full(used.shape, -1, np.int32)
     of_pixel[used] = cell
     found = {name: array[where] for name, array in labels.items()}
-    if len(first) == 1:
-        return Cells(None, found, 1)
-    return Cells(of_pixel, found, len(first))
+    return Cells(of_pixel if len(first) > 1 else None, found, len(first))

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import scipy.stats
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from fits.pseudo_cl import PIVOT, PreparedPatches, band_powers, mean_spectrum
 from fits.tensor_ratio import covariance_terms
@@ -123,11 +123,11 @@ def _noise_spectra(
     lmax = patches.spectra[0].lmax
     shape = (len(patches.names), 2, lmax + 1)
     if noise is None:
-        rows = np.zeros((shape[0], 1, lmax + 1))
-        if other is not None:
-            half = (maps - other) / math.sqrt(2)
-            rows[:, 0] = [mean_spectrum(one.mask, half, lmax) for one in patches.spectra]
-        return np.broadcast_to(rows, shape)
+        if other is None:
+            return np.zeros(shape)
+        half = (maps - other) / math.sqrt(2)
+        rows = np.array([mean_spectrum(one.mask, half, lmax) for one in patches.spectra])
+        return np.broadcast_to(rows[:, None], shape)
     values = np.asarray(noise, float)
     if not np.isfinite(values).all() or values.min() < 0:
         raise ValueError("Argument `noise` has values that are negative or not finite.")
@@ -139,24 +139,25 @@ def _noise_spectra(
     return np.broadcast_to(values[..., : lmax + 1], shape)
 
 
-def _fit_powers(
-    powers: Float[np.ndarray, "patch 2 bin"],
-    noises: Float[np.ndarray, "patch 2 ell"],
-    patches: PreparedPatches,
-    cross: bool,
-    slope: tuple[float, float],
-) -> PatchFits:
-    """Fit band powers from which the noise is subtracted."""
+def _fit_powers(powers, noises, patches, cross, slope):
+    """Fit band powers (patch, 2, bin) from which the noise is subtracted.
+
+    Noise has one spectrum for all patches in the covariance of EE and BB, with a level per patch.
+    """
     first, (mean, spread) = patches.spectra[0], slope
     ell, ends = np.arange(first.lmax + 1), (first.edges[0], first.edges[-1] - 1)
-    form, level = _covariance_terms(patches, noises, cross, mean)
+    law = np.asarray(_law(ell, ends, mean, mean))
+    to_C = np.where(ell > 1, 2 * math.pi / np.maximum(ell * (ell + 1), 1), 0.0)
+    level = noises[..., ends[0] : ends[1] + 1].mean(axis=(1, 2))
+    noise = (noises / np.where(level > 0, level, 1.0)[:, None, None]).mean(axis=0)
+    form = _covariance_terms(patches, to_C * law * patches.window**2, noise, cross)
 
     def covariance(A):
         amplitudes = np.concatenate([np.maximum(A, least), level[:, None]], axis=1)
         return np.einsum("pixybc,px,py->pibc", form, amplitudes, amplitudes), amplitudes
 
-    windows = np.stack([one.windows for one in patches.spectra]) * _to_C(ell)
-    means = windows @ np.asarray(_law(ell, ends, mean, mean))  # (p, i, b, of j)
+    windows = np.stack([one.windows for one in patches.spectra]) * to_C
+    means = windows @ law  # (p, i, b, of j)
     own = np.einsum("pibi->pib", means)
     # A first amplitude, for the mean slope, with errors of the signal without noise.
     signal = np.stack([form[:, i, i, i] for i in (0, 1)], axis=1)
@@ -191,53 +192,31 @@ def _fit_powers(
     errors, amplitudes = covariance(straight)
     d, slopes = seen * amplitudes[:, :2, None], slopes * amplitudes[:, :2, None]
     spreads = turn @ errors @ np.swapaxes(turn, -1, -2)
-    parameters = _sandwich(
-        derivatives=np.stack([seen, slopes], axis=-1),
-        variance=2 / nu * ((offset + d) ** 2 + width**2),
-        covariance=spreads,
-        spread=spread,
-    )
+    derivatives, variance = np.stack([seen, slopes], -1), 2 / nu * ((offset + d) ** 2 + width**2)
+    parameters = _sandwich(derivatives, variance, spreads, spread)
+    detected = DETECTION * np.sqrt(parameters[..., 0, 0]) < A
     rest = data - model
-    value = np.sum(rest * np.linalg.solve(spreads, rest[..., None])[..., 0], axis=-1)
-    return PatchFits(
-        names=patches.names,
-        A=A,
-        alpha=alpha,
-        covariance=parameters,
-        chi2=value,
-        pte=scipy.stats.chi2.sf(value, len(first.edges) - 3),
-        detected=DETECTION * np.sqrt(parameters[..., 0, 0]) < A,
-        converged=converged,
-        powers=powers,
-        errors=np.sqrt(np.einsum("pibb->pib", errors)),
-        centers=first.centers,
-    )
+    chi2 = np.sum(rest * np.linalg.solve(spreads, rest[..., None])[..., 0], axis=-1)
+    pte = scipy.stats.chi2.sf(chi2, len(first.edges) - 3)
+    errors = np.sqrt(np.einsum("pibb->pib", errors))
+    fits = A, alpha, parameters, chi2, pte, detected, converged
+    return PatchFits(patches.names, *fits, powers, errors, first.centers)
 
 
 def _covariance_terms(
-    patches: PreparedPatches, noises: np.ndarray, cross: bool, mean: float
-) -> tuple[Float[np.ndarray, "patch 2 3 3 bin bin"], Float[np.ndarray, " patch"]]:
+    patches: PreparedPatches, power: np.ndarray, noise: np.ndarray, cross: bool
+) -> Float[np.ndarray, "patch 2 3 3 bin bin"]:
     """Return the covariance of EE and BB as a quadratic form of amplitudes of EE, BB and noise.
 
-    The signal has the mean slope; the noise has one spectrum for all patches, with a level per
-    patch, which is also returned.
+    `power` is C_l of a signal of amplitude 1, and `noise` are those of noise, (2, ell), as seen.
     """
-    first = patches.spectra[0]
-    ell, ends = np.arange(first.lmax + 1), (first.edges[0], first.edges[-1] - 1)
-    level = noises[..., ends[0] : ends[1] + 1].mean(axis=(1, 2))
-    shape = (noises / np.where(level > 0, level, 1.0)[:, None, None]).mean(axis=0)
-    power = _to_C(ell) * np.asarray(_law(ell, ends, mean, mean)) * patches.window**2
-    fields = np.array([[power, 0 * power], [0 * power, power], shape])
+    fields = np.array([[power, 0 * power], [0 * power, power], noise])
     of_shape = {i: covariance_terms(patches.spectra[i], fields) for i in set(patches.shapes)}
     terms = 2 * np.stack([np.einsum("xyibic->ixybc", of_shape[i]) for i in patches.shapes])
     if cross:  # Signal times noise counts once instead of twice, and noises differ.
         terms[:, :, 2] /= 2
         terms[:, :, :2, 2] /= 2
-    return terms, level
-
-
-def _to_C(ell: Int[np.ndarray, " ell"]) -> Float[np.ndarray, " ell"]:
-    return np.where(ell > 1, 2 * math.pi / np.maximum(ell * (ell + 1), 1), 0.0)
+    return terms
 
 
 def _law(ell: ArrayLike, ends: tuple[int, int], mean: ArrayLike, alpha: ArrayLike) -> Array:
@@ -272,15 +251,11 @@ class BandCombinations(NamedTuple):
     laws: Float[Array, "... bin ell"]  # d of D_l
 
 
-def _variances(
-    form: Float[np.ndarray, "patch bin x x"],
-    amplitudes: Float[np.ndarray, "patch x"],
-    seen: Float[np.ndarray, "patch bin"],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _variances(form, amplitudes, seen):
     """Return nu, offset and width (`BandCombinations`) of one field, given other amplitudes.
 
-    `form` has the variances of d as a quadratic form of the amplitudes, those of the field first;
-    d is `seen` for an amplitude of 1.
+    `form` has the variances of d as a quadratic form of the amplitudes, those of the field first,
+    (patch, bin, x, x); d is `seen` (patch, bin) for an amplitude of 1.
     """
     rest = amplitudes[:, 1:]
     square = form[..., 0, 0]
@@ -290,16 +265,11 @@ def _variances(
     return 2 * seen**2 / square, offset, np.sqrt(np.maximum(constant - offset**2, least**2))
 
 
-def _sandwich(
-    derivatives: Float[np.ndarray, "... bin 2"],
-    variance: Float[np.ndarray, "... bin"],
-    covariance: Float[np.ndarray, "... bin bin"],
-    spread: float,
-) -> Float[np.ndarray, "... 2 2"]:
+def _sandwich(derivatives, variance, covariance, spread):
     """Return the covariance of solutions of G^T V^-1 (data - model) = 0, with a prior on alpha.
 
-    G are derivatives of the model by the two parameters, V the variance in the weights, whatever
-    the covariance of the data; `spread` is the width of the prior.
+    G are derivatives of the model by the two parameters, (..., bin, 2), V the variance in the
+    weights, whatever the covariance of the data; `spread` is the width of the prior.
     """
     prior = np.diag([0, spread**-2])
     weights = np.swapaxes(derivatives / variance[..., None], -1, -2)

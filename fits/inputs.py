@@ -4,31 +4,22 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import healpy
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from fits.regions import absolute_latitude
 from jaxsky import Bandpass, Component, Sky, job, set_parameters
+from jaxsky import inputs as reading
 from jaxsky.checks import Numeric, listed
 from jaxsky.components import component_class
 from jaxsky.experiment import SimulationInputs, cmb_spectra, simulation_inputs
 from jaxsky.galaxy import EmbeddedSky
 from jaxsky.harmonics import gaussian_beam
-from jaxsky.inputs import (
-    Template,
-    bandpass_of,
-    beam_of,
-    check_stokes,
-    embedded_galaxy,
-    narrow,
-    read,
-    read_parameters,
-    read_sky,
-    uK_RJ_per,
-)
 from jaxsky.io import MissingFileError
 from jaxsky.io.stacks import Maps, stored
 from jaxsky.job import by_turns
@@ -77,13 +68,12 @@ class Band(NamedTuple):
 
     def of_many(self, number: int) -> "Band":
         """Return the band, of which there are as many, with its maps on disk if all are large."""
-        noise = stored(self.noise, number) if np.ndim(self.noise) else self.noise
+
+        def moved(leaf: Any) -> Any:
+            return stored(leaf, number) if np.ndim(leaf) > 1 else leaf
+
         used = np.broadcast_to(True, self.used.shape) if self.used.all() else self.used
-        band = self._replace(maps=stored(self.maps, number), used=used, noise=noise)
-        if band.leakage is None:
-            return band
-        leaked = band.leakage._replace(maps=stored(band.leakage.maps, number))
-        return band._replace(leakage=leaked)
+        return jax.tree.map(moved, self._replace(used=used))
 
 
 class TemplateNoise(NamedTuple):
@@ -114,7 +104,7 @@ class Inputs(NamedTuple):
     all bands have of large maps lies on disk.
     """
 
-    templates: dict[str, Template]
+    templates: dict[str, reading.Template]
     bands: dict[str, Band]
     cmb: Callable[[int], np.ndarray] | None
     truth: dict[str, float] | None
@@ -140,26 +130,21 @@ def inputs_of(
         raise SettingsError("bands: there are none.")
     components, own = settings.sky.components, settings.sky.templates
     if galaxy is None and any(components[name].file is None for name in own):
-        galaxy = embedded_galaxy(settings)
-    sky: dict[str, Template] = {}
-    description = settings.title
+        galaxy = reading.embedded_galaxy(settings)
+    sky, description, many = dict[str, reading.Template](), settings.title, len(settings.bands)
     if templates:
-        names, many = settings.modelled(), len(settings.bands)
-        sky, description = read_sky(settings, names=names, galaxy=galaxy, number=many)
-    bands: dict[str, Band] = {}
-    truths: list[Mapping[str, float] | None] = []
+        names = settings.modelled()
+        sky, description = reading.read_sky(settings, names=names, galaxy=galaxy, number=many)
 
-    def read(spec: BandTable) -> tuple[Band, Mapping[str, float] | None]:
+    def read(spec: BandTable) -> tuple[str, Band, Mapping[str, float] | None]:
         band, truth = _from_file(settings, spec)
-        return band.of_many(len(settings.bands)), truth
+        return str(spec.name), band.of_many(many), truth
 
     filed = [s for s in settings.bands if s.file is not None or settings.common.maps is not None]
-    for spec, (band, truth) in zip(filed, by_turns(read, filed), strict=True):
-        bands[str(spec.name)] = band
-        truths.append(truth)
-    alone = None
-    missing = [str(spec.name) for spec in settings.bands if str(spec.name) not in bands]
-    if missing:
+    found = list(by_turns(read, filed))
+    bands = {name: band for name, band, _ in found}
+    truths, alone = [truth for *_, truth in found], None
+    if missing := [str(spec.name) for spec in settings.bands if str(spec.name) not in bands]:
         if "noise" not in settings.included():
             raise SettingsError("simulate.include: leaves out the noise, which errors are made of.")
         setup = simulation_inputs(settings, missing, written=False, galaxy=galaxy)
@@ -186,7 +171,7 @@ def level_spectrum(level: float, fwhm: float, lmax: int) -> Float[Array, " ell"]
 
 
 def read_template_noise(
-    folder: Path, name: str, spec: ComponentTable, template: Template
+    folder: Path, name: str, spec: ComponentTable, template: reading.Template
 ) -> TemplateNoise | None:
     """Read the noise of a template from the settings; None if they do not state it."""
     noise, where = spec.noise, f"sky.{name}.noise"
@@ -201,7 +186,7 @@ def read_template_noise(
         )
     nside = healpy.npix2nside(template.used.size)
     if noise.level is not None:
-        level = noise.level * uK_RJ_per(noise.unit or template.unit, spec.nu_ref, where)
+        level = noise.level * reading.uK_RJ_per(noise.unit or template.unit, spec.nu_ref, where)
         spectrum = level_spectrum(level, template.fwhm, 4 * nside)
         return TemplateNoise(correlated=spectrum, shared=noise.shared)
     found, _ = read_noise(
@@ -238,25 +223,25 @@ def _simulated(
     observation, key = setup.observation, realisation_key(settings.seed)
     sky = harmonic_sources(setup.small_scales_key(key), setup.sources, observation)
     used = np.ones(healpy.nside2npix(observation.nside), bool)
-    names = observation.names
-    made = observe_bands(key, sky, observation, setup.cmb, names=names[job.index() :: job.number()])
+    names, many = observation.names, len(settings.bands)
+    own = names[job.index() :: job.number()]
+    made = observe_bands(key, sky, observation, setup.cmb, names=own)
 
     def band_of(name: str) -> Band:
         observed, total = observed_band(setup, name), next(made)[1]["total"]
         noise, correlated = _noise_of(observed, observation.nside, f"bands.{name}.noise")
         if (leakage := _leakage_of(observed, used)) is not None:
             total = total + leakage.maps
-        band, beam = observed.bandpass, observed.beam
-        whole = Band(total, used, band, beam, noise, correlated, leakage)
-        return whole.of_many(len(settings.bands))
+        said = observed.bandpass, observed.beam, noise, correlated, leakage
+        return Band(total, used, *said).of_many(many)
 
     bands = dict(zip(names, by_turns(band_of, names), strict=True))
     if not foregrounds or not sky:
         return bands, None
     quiet = {n: ObservedBand(c.band, c.beam, c.target) for n, c in observation.channels.items()}
     alone = Observation(quiet, observation.nside, lmax=observation.lmax)
-    seen = observe_bands(key, sky, alone, names=names[job.index() :: job.number()])
-    each = by_turns(lambda _: stored(next(seen)[1]["total"], len(settings.bands)), names)
+    seen = observe_bands(key, sky, alone, names=own)
+    each = by_turns(lambda _: stored(next(seen)[1]["total"], many), names)
     return bands, dict(zip(names, each, strict=True))
 
 
@@ -303,20 +288,14 @@ def _from_file(settings: Experiment, spec: BandTable) -> tuple[Band, Mapping[str
 def _check_beam(folder: Path, spec: BandTable, observed: Observed, where: str) -> None:
     """Refuse a beam that differs from that of the simulated map."""
     own = np.asarray(observed.beam)
-    if spec.beam is not None:
-        said, same = f"beam: {spec.beam}", False
-        if own.ndim:
-            given = np.asarray(beam_of(folder, spec, own.size - 1))
-            same = np.allclose(given, own, rtol=0, atol=1e-6)
-    elif spec.fwhm is not None:
-        said, same = f"fwhm: {spec.fwhm:g} arcmin", not own.ndim and spec.fwhm == float(own)
-    else:
+    given = reading.beam_of(folder, spec, own.size - 1)
+    if given is None or (np.shape(given) == own.shape and np.allclose(given, own, 0, 1e-6)):
         return
-    if not same:
-        raise SettingsError(
-            f"{where}.{said}, but the map {spec.label} says that its beam is "
-            f"{'another table' if own.ndim else f'{own:g} arcmin'}."
-        )
+    said = f"fwhm: {spec.fwhm:g} arcmin" if spec.beam is None else f"beam: {spec.beam}"
+    raise SettingsError(
+        f"{where}.{said}, but the map {spec.label} says that its beam is "
+        f"{'another table' if own.ndim else f'{own:g} arcmin'}."
+    )
 
 
 def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -> Band:
@@ -328,10 +307,10 @@ def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -
     if spec.bandpass is None and observed is not None:
         bandpass = observed.bandpass
     else:
-        bandpass = bandpass_of(folder, spec)
+        bandpass = reading.bandpass_of(folder, spec)
     maps, used, unit = _polarization(folder, spec, bandpass, where)
     nside = healpy.npix2nside(used.size)
-    if (beam := beam_of(folder, spec, 2 * nside)) is None:
+    if (beam := reading.beam_of(folder, spec, 2 * nside)) is None:
         beam = 0.0 if observed is None else observed.beam
     leakage = _leakage_of(observed, used)
     if isinstance(given := spec.leakage, MapKeys):
@@ -360,20 +339,19 @@ def _polarization(
     folder: Path, spec: MapKeys, bandpass: Bandpass, where: str, zeros_are_data: bool = False
 ) -> tuple[Array, Bool[np.ndarray, " pix"], str]:
     """Read Q and U of a map [uK_RJ], where they are known, and the unit of its file."""
-    found = read(folder, spec, zeros_are_data=zeros_are_data)
-    check_stokes(where, found, "QU")
-    maps = narrow(found.maps[-2:] * uK_RJ_per(found.unit, bandpass, where))
+    found = reading.read(folder, spec, zeros_are_data=zeros_are_data)
+    reading.check_stokes(where, found, "QU")
+    maps = reading.narrow(found.maps[-2:] * reading.uK_RJ_per(found.unit, bandpass, where))
     return maps, np.asarray(found.mask), found.unit
 
 
 def _estimated_noise(noise, maps, used):
     """Estimate white noise, and the spectrum of the rest, from the maps themselves."""
-    nside, npix = healpy.npix2nside(maps.shape[-1]), maps.shape[-1]
-    latitude = healpy.pix2ang(nside, np.arange(npix), lonlat=True)[1]
-    quiet = used & (np.abs(latitude) >= noise.estimate_above)
+    nside = healpy.npix2nside(used.size)
+    quiet = used & (absolute_latitude(nside) >= noise.estimate_above)
     if not noise.correlated:
         variance = estimate_variance(maps, quiet)
-        return jnp.eye(2)[..., None] * variance[:, None, None] * jnp.ones(npix), None
+        return jnp.eye(2)[..., None] * variance[:, None, None] * jnp.ones(used.size), None
     white, knee, slope = fit_knee(maps, quiet, 2 * nside)
     excess = knee_spectrum(white, knee, slope, 4 * nside) - white
     return float(np.degrees(np.sqrt(white)) * 60), excess.at[:2].set(0.0)
@@ -389,7 +367,7 @@ def modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
     components: dict[str, Component] = {"cmb": component_class("cmb")(amplitude)}
     known = np.ones(12 * nside**2, bool)
     for name, spec in laws.items():
-        numbers, has = read_parameters(folder, name, spec, nside, "common.nside")
+        numbers, has = reading.read_parameters(folder, name, spec, nside, "common.nside")
         known &= has
         with at_key(f"sky.{name}"):
             assert spec.law is not None  # the settings ensure this

@@ -75,8 +75,7 @@ def known_truth(inputs: Inputs, fits: Sequence[RegionFit]) -> dict[str, float] |
     if inputs.truth is None:
         return None
     free = all_free(fits)
-    # Simulated bands have nominal parameters.
-    truth = inputs.truth | nominal(free)
+    truth = inputs.truth | nominal(free)  # simulated bands have nominal parameters
     return {name: truth[name] for name in free if name in truth}
 
 
@@ -105,20 +104,8 @@ def settled(
     return like
 
 
-def _fit_pixels(
-    settings: Experiment,
-    prepared: CommonMaps,
-    used: Bool[np.ndarray, " pix"],
-    region: str,
-    stokes: str,
-    out: Path | None,
-    mark: str,
-    progress: Progress,
-) -> RegionFit:
-    """Fit one region and choice of Stokes parameters; see `fit_regions`.
-
-    `mark` stands for the maps, of which chains in `out` are.
-    """
+def _fit_pixels(settings, prepared, used, region, stokes, out, mark, progress):
+    """Fit one region and choice of Stokes parameters; `mark` stands for the maps of chains."""
     # An offset of a Stokes parameter that is not fitted has no effect.
     start = {
         name: value
@@ -126,54 +113,43 @@ def _fit_pixels(
         if not name.startswith("offset.") or name[-1] in stokes
     }
     priors = {name: prior for name, prior in priors_of(settings, "fit").items() if name in start}
+    spec, errors = settings.fit, prepared.template_errors
     progress.step(f"{region}, {stokes}: inner products")
     with at_key("free"):
         plain = prepared._replace(template_errors=None)
-        diagonal = plain.likelihood(start, stokes=stokes, region=used, kind="diagonal")
-        like, dof_amplitudes = diagonal, None
-        exact = settings.fit.likelihood == "exact"
-        if exact or prepared.template_errors is not None:
-            kind = settings.fit.likelihood
-            make = partial(prepared.likelihood, stokes=stokes, region=used, kind=kind)
-            like = make(start) if prepared.template_errors is None else settled(make, start, priors)
+        like = diagonal = plain.likelihood(start, stokes=stokes, region=used, kind="diagonal")
+        if spec.likelihood == "exact" or errors is not None:
+            make = partial(prepared.likelihood, stokes=stokes, region=used, kind=spec.likelihood)
+            like = make(start) if errors is None else settled(make, start, priors)
     nothing, expected, shares = _look(prepared, start, used, stokes)
-    number = len(prepared.bands) - len(nothing)
-    if exact:
+    number, dof_amplitudes = len(prepared.bands) - len(nothing), None
+    if spec.likelihood == "exact":
         values = like.residuals(start).size * number / len(prepared.bands)
         dof_amplitudes = round(values) - len(start)
     results: dict[str, FitResult] = {}
-    for method in settings.fit.methods:
+    for method in spec.methods:
         progress.step(f"{region}, {stokes}: {method}")
         if method == "grid":
             if len(start) <= 2 and all(isinstance(priors.get(n), Uniform) for n in start):
-                results[method] = grid_fit(like, start, priors=priors, points=settings.fit.points)
+                results[method] = grid_fit(like, start, priors=priors, points=spec.points)
         elif method == "gradient":
             results[method] = best_fit(like, start, priors=priors, throw=False)
         else:
             chain = None
             if out is not None:
-                said = settings.fit.likelihood, settings.free, settings.seed
+                said = spec.likelihood, settings.free, settings.seed
                 own = f"{mark} {fingerprint(used)} {stokes} {said}"
                 chain = KeptChain(out / f"chain_{region}_{stokes}.npz", own)
-            results[method] = sample(
-                like,
-                start,
-                priors=priors,
-                nsteps=settings.fit.nsteps,
-                seed=settings.seed,
-                backend=chain,
-                progress=progress.advance,
-                throw=False,
-            )
+            run: dict[str, Any] = {"seed": settings.seed, "progress": progress.advance}
+            run |= {"priors": priors, "nsteps": spec.nsteps, "backend": chain}
+            results[method] = sample(like, start, throw=False, **run)
     if not results:
         raise SettingsError(
             "fit.methods: a grid alone takes one or two free parameters with uniform priors."
         )
     chi2s = {method: float(chi2(diagonal, r.best_fit)) for method, r in results.items()}
     dof = int(used.sum()) * number * len(stokes) - len(start)
-    results = {
-        method: r.judged(chi2s[method], dof, start, expected) for method, r in results.items()
-    }
+    results = {m: r.judged(chi2s[m], dof, start, expected) for m, r in results.items()}
     known = nothing, shares, isinstance(like, TemplateLikelihood)
     return RegionFit(region, stokes, results, chi2s, dof, dof_amplitudes, *known)
 
@@ -183,11 +159,9 @@ def _look(
 ) -> tuple[tuple[str, ...], float, dict[str, float]]:
     """Look at the signal and the noise of all bands in one pass over the pixels.
 
-    Returns
-    -------
-    weightless : bands that carry no weight for any template, compared with the other bands
-    expected : mean square of noise and CMB over that of noise, which alone chi^2 counts
-    shares : fraction of the weighted power of each template that is noise, if any is known
+    Return the bands that carry no weight for any template, compared with the others; the mean
+    square of noise and CMB over that of noise, which alone chi^2 counts; and the fraction of the
+    weighted power of each template that is noise, if any is known.
     """
     errors, sky = prepared.template_errors, prepared.sky
     assert sky is not None  # there are templates

@@ -30,18 +30,9 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
+from fits import products
 from fits.mixing import Mixing, TemplateErrors, check_signal, named_bands, unit_sky
 from fits.posterior import Likelihood
-from fits.products import (
-    Rows,
-    as_maps,
-    checked_weights,
-    gram,
-    one_stokes_each,
-    stacked,
-    summed,
-    swapped,
-)
 from fits.systems import square_root
 from jaxsky import Bandpass, Sky, observe_components, parameter_names
 from jaxsky.checks import Numeric, as_array, check_double, check_shape
@@ -71,10 +62,9 @@ class SkyLikelihood(Likelihood):
         self, seen: Float[Array, "band stokes x"], params: Mapping[str, Array]
     ) -> tuple[Float[Array, "band stokes x"], Float[Array, "band stokes x"]]:
         """Return what rotated bands see of the same Stokes parameter, and of the other one."""
-        sign = np.array([{"I": 0, "Q": -1, "U": 1}[s] for s in self.stokes])
-        angle = 2 * jnp.deg2rad(self.mixing.of_bands("angle", params))
-        angle = (angle[:, None] * sign)[..., None]
-        return jnp.cos(angle) * seen, jnp.sin(angle) * swapped(seen)
+        sign = np.array([{"I": 0, "Q": -1, "U": 1}[s] for s in self.stokes])[:, None]
+        angle = 2 * jnp.deg2rad(self.mixing.of_bands("angle", params))[:, None, None] * sign
+        return jnp.cos(angle) * seen, jnp.sin(angle) * products.swapped(seen)
 
     def offset(self, params: Mapping[str, Array]) -> Float[Array, "band stokes"]:
         """Return offsets [uK_RJ], 0 unless given."""
@@ -85,9 +75,8 @@ class SkyLikelihood(Likelihood):
     def check(self, params):
         if not params:
             raise ValueError("Argument `start` must name at least one free parameter.")
-        names = self.mixing.names
-        bands = [*self.mixing.band_parameters()]
-        bands += [f"offset.{b}.{s}" for b in names for s in self.stokes]
+        bands = [f"offset.{band}.{s}" for band in self.mixing.names for s in self.stokes]
+        bands = [*self.mixing.band_parameters(), *bands]
         of_sky = [n for n in parameter_names(self.mixing.sky) if not n.endswith(".amplitude")]
         for name, value in params.items():
             if name.removesuffix(OFFSET) not in of_sky and name not in bands:
@@ -155,8 +144,8 @@ class PixelLikelihood(SkyLikelihood):
         model = model + self.offset(params)[..., None]
         if self.rows is None:
             return ((self.data - model) * self.root_weights).ravel()
-        products = total(jnp.einsum("brsp,bsp->br", self.rows, self.data - model))
-        return jnp.asarray(self.whitening) @ products.ravel()
+        inner = total(jnp.einsum("brsp,bsp->br", self.rows, self.data - model))
+        return jnp.asarray(self.whitening) @ inner.ravel()
 
 
 def likelihood(
@@ -197,17 +186,15 @@ def likelihood(
 
     Raises
     ------
-    RuntimeError
-        If JAX is not in double precision.
-    KeyError
-        For unknown parameters.
+    RuntimeError, KeyError
+        If JAX is not in double precision; for unknown parameters.
     ValueError
         For shapes that do not match, sigma that is not positive, data that are not finite, no
         pixel left, unknown Stokes parameters, or templates that cannot be told apart.
     """
     check_double("fits")
     bands = named_bands(bands)
-    data, sigma = typed((as_maps("data", data), as_maps("sigma", sigma)))
+    data, sigma = typed((products.as_maps("data", data), products.as_maps("sigma", sigma)))
     sky, sigma = along(data, (sky, sigma))
     shape = (len(bands), *sky.shape)
     form = f"(band, stokes, pix) = {shape}"
@@ -217,7 +204,7 @@ def likelihood(
     check_shape("sigma", sigma, broadcasts, f"broadcast to {form}")
     if isinstance(data, Stack) and not isinstance(sigma, Stack):
         sigma = np.broadcast_to(sigma, shape)
-    weights, counts = checked_weights(data, sigma)
+    weights, counts = products.checked_weights(data, sigma)
     labels = "QU" if shape[1] == 2 else "IQU"
     stokes = labels if stokes is None else stokes
     if not stokes or set(stokes) - set(labels):
@@ -227,9 +214,9 @@ def likelihood(
     angles = [name for name in start if name.startswith("angle.")]
     params = SkyLikelihood({}, 0, mixing, labels, bool(angles)).check(start)
     offsets = [name for name in params if name.startswith("offset.")]
-    for name in (*offsets, *angles):
-        if name[-1] not in stokes if name in offsets else stokes == "I":
-            raise ValueError(f"Parameter {name!r} has no effect on Stokes {stokes}.")
+    silent = [n for n in offsets if n[-1] not in stokes] + (angles if stokes == "I" else [])
+    if silent:
+        raise ValueError(f"Parameter {silent[0]!r} has no effect on Stokes {stokes}.")
     sky = mixing.laws({n: value for n, value in params.items() if not n.endswith(OFFSET)})
     if pixelwise or any(leaf.ndim == 1 for leaf in jax.tree.leaves(sky)):
         sky, data, weights = jax.tree.map(jnp.asarray, (sky, data, weights))  # in memory
@@ -249,30 +236,28 @@ def likelihood(
         )
     mixing = dataclasses.replace(mixing, sky=unit_sky(sky, len(labels)))
     templates: list[Any] = [c.amplitude for c in sky.components.values()]
-    templates += [swapped(one) for one in templates] if angles else []
-    products, count = np.asarray(summed(gram, data, stacked(templates), weights)), len(templates)
-    values = int(counts[:, keep].sum())
-    like = TemplateLikelihood(
-        params, jnp.asarray(values), mixing, labels, bool(angles), jnp.zeros((0, 0))
-    )
+    templates += [products.swapped(one) for one in templates] if angles else []
+    inner = products.summed(products.gram, data, products.stacked(templates), weights)
+    inner, count = np.asarray(inner), len(templates)
+    values = jnp.asarray(int(counts[:, keep].sum()))
+    known = params, values, mixing, labels, bool(angles)
+    like = TemplateLikelihood(*known, matrix=jnp.zeros((0, 0)))  # until there is one
     if covariance_of is None and template_errors is None:
-        matrix = _matrix(np.asarray(square_root(products[:, keep])), keep, len(labels))
+        matrix = _matrix(np.asarray(square_root(inner[:, keep])), keep, len(labels))
         return dataclasses.replace(like, matrix=matrix)
     # A constant row tells offsets from templates.
     if offsets:
         first = templates[0]
         on_disk = isinstance(first, Stack)
         templates.append(np.broadcast_to(1.0, first.shape) if on_disk else jnp.ones_like(first))
-    maps = stacked(templates)
-    rows = Rows(maps, weights)
+    maps = products.stacked(templates)
+    rows = products.Rows(maps, weights)
     used = slice(1, len(maps) + 1)
     if covariance_of is not None:
         covariance = np.asarray(covariance_of(rows))
     else:  # that of T^T W n, with white noise n, is T^T W T
-        covariance = scipy.linalg.block_diag(
-            *products[..., used, used].reshape(-1, *2 * [len(maps)])
-        )
-    blocks = products[:, :, used]
+        covariance = scipy.linalg.block_diag(*inner[..., used, used].reshape(-1, *2 * [len(maps)]))
+    blocks = inner[:, :, used]
     if template_errors is not None:
         seen = np.repeat(np.asarray(like.coefficients(params)), len(maps), axis=1)
         covariance = covariance + template_errors.covariance(rows, seen)
@@ -283,8 +268,8 @@ def likelihood(
     if covariance_of is not None:
         return dataclasses.replace(like, values=jnp.asarray(len(whitening)), matrix=matrix)
     # The part that no combination of templates explains is the same for all parameters.
-    left = products[:, keep, : used.stop, : used.stop]
-    constant = jnp.zeros_like(matrix[:1]).at[0, keep[0] * products.shape[-1]]
+    left = inner[:, keep, : used.stop, : used.stop]
+    constant = jnp.zeros_like(matrix[:1]).at[0, keep[0] * inner.shape[-1]]
     unexplained = constant.set(np.sqrt(np.sum(1 / np.linalg.inv(left)[..., 0, 0])))
     return dataclasses.replace(like, matrix=jnp.concatenate([matrix, unexplained]))
 
@@ -300,15 +285,8 @@ def _matrix(blocks, keep, stokes, whitening=None):
     return jnp.asarray(full.reshape(len(matrix), -1))
 
 
-def _of_kept(
-    covariance: Float[np.ndarray, "row row"],
-    rows: Float[Array, "band row stokes pix"] | Rows,
-    keep: np.ndarray,
-) -> Float[np.ndarray, "row row"]:
-    """Return the covariance of rows of the kept Stokes parameters, a part of that of all rows.
-
-    The covariance of all rows can so be reused for any choice.
-    """
+def _of_kept(covariance, rows, keep):
+    """Return the covariance of rows of the kept Stokes parameters; that of all rows is reused."""
     bands, count, stokes, _ = rows.shape
     split = covariance.reshape(2 * (bands, stokes, count // stokes))
     size = bands * len(keep) * count // stokes
@@ -344,10 +322,10 @@ def _on_pixels(like, data, weights, keep, covariance_of):
     if covariance_of is not None:
         maps = list(observe_components(at_start, mixing.bandpasses, nodes=nodes).values())
         if like.angles:
-            maps += [swapped(one) for one in maps]
+            maps += [products.swapped(one) for one in maps]
         if any(name.startswith("offset.") for name in params):
             maps.append(jnp.ones_like(data))
-        rows = one_stokes_each(jnp.stack(maps, axis=1), weights)
+        rows = products.one_stokes_each(jnp.stack(maps, axis=1), weights)
         covariance = _of_kept(np.asarray(covariance_of(rows)), rows, keep)
         whitening = jnp.asarray(_whitening(covariance))
         kept = (keep[:, None] * len(maps) + np.arange(len(maps))).ravel()

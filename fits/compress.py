@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from fits.regions import Cells
 from fits.systems import Pixels, square_root
-from jaxsky.checks import UNSEEN, Numeric
+from jaxsky.checks import UNSEEN, Numeric, check_shape
 from jaxsky.io.stacks import Stack, ranges
 from jaxsky.mesh import as_double, module_of, spread, typed
 from jaxsky.public import refuse_unit, takes_quantities
@@ -121,12 +121,9 @@ def as_noise(
         )
     bands, stokes, npix = shape
     known = [(bands,), (bands, stokes), shape, (bands, 2, 2, npix)]
-    if array.shape not in known or (array.ndim == 4 and stokes != 2):
-        shapes = "(band,), (band, stokes), (band, stokes, pix) or, for Q and U, (band, 2, 2, pix)"
-        raise ValueError(
-            f"Argument `noise` must have shape {shapes} for data of shape {shape}, "
-            f"but has shape {array.shape}."
-        )
+    good = array.shape in known and (array.ndim < 4 or stokes == 2)
+    shapes = "(band,), (band, stokes), (band, stokes, pix) or, for Q and U, (band, 2, 2, pix)"
+    check_shape("noise", array, good, f"have shape {shapes} for data of shape {shape}")
     pixel = None if pixel_sigma is None else bare("pixel_sigma", pixel_sigma)
     if pixel is not None:
         if pixel.shape != (npix,) or array.ndim > 2:

@@ -70,14 +70,14 @@ class Blocks:
         whole = used.all() and index[-1] - index[0] == len(index) - 1 and np.all(np.diff(index) > 0)
         where = slice(int(index[0]), int(index[-1]) + 1) if whole else index
         found = pixel_rows(self._data, self._noise, layout, where, used)
-        if not np.isfinite(found[0]).all() or found[0].min() < UNSEEN:
+        if not np.isfinite(found.data).all() or found.data.min() < UNSEEN:
             refuse_data(self._data, self._noise)
 
         def shaped(rows: np.ndarray) -> np.ndarray:
             rows = np.broadcast_to(rows, (*rows.shape[:2], index.size))
             return np.moveaxis(rows.reshape(*rows.shape[:2], -1, size), 2, 0)
 
-        return Pixels(*jax.tree.map(shaped, found))
+        return jax.tree.map(shaped, found)
 
     def pieces(self, like: Any) -> Iterator[Any]:
         """Yield a `SpectralLikelihood` with a few blocks at a time, as many but for the last."""

@@ -68,19 +68,17 @@ class Noise(NamedTuple):
 
     def weights(self, pixels: slice | np.ndarray) -> Float[np.ndarray, "band stokes #pix"]:
         """Return inverse variances, or the diagonal of inverse covariances; 0 where masked."""
+        return self.inverse(pixels)[0]
+
+    def inverse(self, pixels: Any) -> tuple[np.ndarray, Float[np.ndarray, "band pix"] | None]:
+        """Return `weights`, and element QU of the inverse covariances, None without these."""
         if self.covariance is not None:
-            QQ, UU, _, determinant = self._elements(pixels)
-            return module_of(QQ).stack([UU / determinant, QQ / determinant], axis=1)
+            QQ, UU, QU, determinant = self._elements(pixels)
+            weights = module_of(QQ).stack([UU / determinant, QQ / determinant], axis=1)
+            return weights, -QU / determinant
         assert self.sigma is not None
         sigma = self.sigma if self.separable else self.sigma[..., pixels]
-        return 1 / as_double(sigma) ** 2 * self.pixel_weights(pixels)
-
-    def cross(self, pixels: slice | np.ndarray) -> Float[np.ndarray, "band pix"] | None:
-        """Return element QU of the inverse covariances; None if Q and U are independent."""
-        if self.covariance is None:
-            return None
-        *_, QU, determinant = self._elements(pixels)
-        return -QU / determinant
+        return 1 / as_double(sigma) ** 2 * self.pixel_weights(pixels), None
 
     def _elements(self, pixels):
         """Return QQ, UU and QU of the covariances, and the determinants; infinite where masked."""
@@ -291,18 +289,16 @@ def compressed(
     return Pixels(root, jnp.broadcast_to(weights, (len(covariance), *weights.shape)))
 
 
-def pixel_rows(
-    data: Any, noise: Noise, layout: Layout, pixels: Any, used: Any
-) -> tuple[Any, Any, Any | None]:
-    """Return the fields of `Pixels` for some pixels; unused ones are zero with unit weight.
+def pixel_rows(data: Any, noise: Noise, layout: Layout, pixels: Any, used: Any) -> Pixels:
+    """Return some pixels, as arrays of the module of the data; unused ones are zero, of weight 1.
 
     If noise is the same in all pixels and all are used, for which `used` is None, the weights are
     those of a single pixel.
     """
-    weights, xp = noise.weights(pixels), module_of(data)
-    cross = noise.cross(pixels) if layout.joint else None
+    (weights, cross), xp = noise.inverse(pixels), module_of(data)
     values = xp.where(weights > 0, as_double(data[..., pixels]), 0.0)
     if used is not None:
         values, weights = xp.where(used, values, 0.0), xp.where(used, weights, 1.0)
         cross = None if cross is None else xp.where(used, cross, 0.0)
-    return layout.rows(values), layout.rows(weights), None if cross is None else cross[None]
+    rows: Any = layout.rows(values), layout.rows(weights), None if cross is None else cross[None]
+    return Pixels(*rows)

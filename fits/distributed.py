@@ -175,4 +175,4 @@ def gathered(data: Array, noise: Noise, blocks: Blocks, *, layout: Layout) -> Pi
         rows = pixel_rows(data, noise, layout, own, own >= 0)
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], own.size)), rows)
 
-    return Pixels(*jax.lax.map(one, blocks.pixels))
+    return jax.lax.map(one, blocks.pixels)

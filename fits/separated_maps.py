@@ -19,7 +19,6 @@ from fits.multipoles import check_alm, multipoles_of
 from fits.optimize import best_fit
 from fits.profile_likelihood import SpectralLikelihood, matrices_at, spectral_likelihood
 from fits.results import FitResult
-from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.checks import Numeric, as_array, check_finite, check_names, check_shape
 from jaxsky.components import component_class
@@ -118,7 +117,7 @@ def _separated(of_pixel, known, data, noise, used, layouts, errors):
     amplitude, alone = jnp.zeros((2, size, stokes, npix))
     blocks, square = jnp.zeros((size, *alone.shape)), jnp.zeros(npix)
     for layout, matrix in zip(layouts, known, strict=True):
-        pixels = Pixels(*pixel_rows(data, noise, layout, ALL, used))
+        pixels = pixel_rows(data, noise, layout, ALL, used)
         solved, squares, *variances = _solved(_own(of_pixel, matrix), pixels, errors)
         amplitude = amplitude.at[:, np.array(layout.stokes)].set(layout.maps(solved))
         square = square + squares

@@ -162,6 +162,8 @@ def likelihood(
 ) -> SkyLikelihood:
     """Return the likelihood of maps as a function of the parameters named in `start`.
 
+    `chi2(like, params)` and `like.residuals(params)` are its values.
+
     Parameters
     ----------
     sky : templates and spectral laws at the resolution of the data, amplitudes in uK_RJ
@@ -179,10 +181,6 @@ def likelihood(
     pixelwise : evaluate pixel by pixel even where inner products would do
     template_errors : noise of the templates, which is subtracted from the inner products; its
         part of their covariance is that at `start`. Likelihoods pixel by pixel ignore it.
-
-    Returns
-    -------
-    A likelihood; `chi2(like, params)` and `like.residuals(params)` are its values.
 
     Raises
     ------

@@ -61,7 +61,6 @@ class Blocks:
         own = np.where(used, 0, -1).astype(np.int32) if cells.of_pixel is None else cells.of_pixel
         counts = np.bincount(own[own >= 0], minlength=cells.number)
         self.where, self.cell = arranged(own, counts, block_size(counts))
-        self.in_order = np.array_equal(self.cell, np.arange(cells.number))
 
     def read(self, layout: Layout, blocks: slice) -> Pixels:
         """Return the pixels of some blocks, (block, group, row, pix), as arrays of numpy."""
@@ -87,19 +86,15 @@ class Blocks:
             pixels, cells = jax.tree.map(jnp.asarray, (read, self.cell[blocks]))
             yield dataclasses.replace(like, pixels=pixels, block_cell=cells, source=None)
 
-
-def gathered(
-    data: np.ndarray, noise: Noise, cells: Cells, used: np.ndarray, layout: Layout
-) -> tuple[Pixels, Array | None]:
-    """Return the pixels in blocks, and the cell of each block, None if they are in order."""
-    blocks = Blocks(data, noise, cells, used)
-    number, size = blocks.where.shape
-    every: Any = None
-    for some in ranges(number, max(1, BLOCK // size)):
-        read = blocks.read(layout, some)
-        if every is None:
-            every = jax.tree.map(lambda own: np.empty((number, *own.shape[1:])), read)
-        for target, own in zip(*map(jax.tree.leaves, (every, read)), strict=True):
-            target[some] = own
-    cell = None if blocks.in_order else jnp.asarray(blocks.cell)
-    return jax.tree.map(jnp.asarray, every), cell
+    def gathered(self, layout: Layout) -> tuple[Pixels, Array | None]:
+        """Return all pixels, and the cell of each block, None if they are in order."""
+        number, size = self.where.shape
+        every: Any = None
+        for some in ranges(number, max(1, BLOCK // size)):
+            read = self.read(layout, some)
+            if every is None:
+                every = jax.tree.map(lambda own: np.empty((number, *own.shape[1:])), read)
+            for target, own in zip(*map(jax.tree.leaves, (every, read)), strict=True):
+                target[some] = own
+        in_order = np.array_equal(self.cell, np.arange(number))
+        return jax.tree.map(jnp.asarray, every), None if in_order else jnp.asarray(self.cell)

@@ -8,6 +8,7 @@ of D replace the pixels. Everything else is streamed over pixels, from disk if n
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -57,8 +58,7 @@ class Noise(NamedTuple):
 
     def at(self, pixels: Any) -> "Noise":
         """Return the noise of some of the pixels."""
-        each = (x if x is None or x.shape[-1] == 1 else x[..., pixels] for x in self)
-        return Noise(*each)
+        return jax.tree.map(lambda x: x if x.shape[-1] == 1 else x[..., pixels], self)
 
     def pixel_weights(self, pixels: slice | np.ndarray) -> Float[np.ndarray, " pix"] | float:
         """Return 1 / pixel_sigma^2 in some of the pixels."""

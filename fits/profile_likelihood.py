@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from fits import distributed, regions, systems
-from fits.blocks import ON_DISK, Blocks, gathered
+from fits.blocks import ON_DISK, Blocks
 from fits.compress import (
     Layout,
     Noise,
@@ -353,7 +353,7 @@ def spectral_likelihood(
         elif isinstance(data, Stack):
             source = Blocks(data, noise, cells, used)
         else:
-            pixels, block_cell = gathered(data, noise, cells, used, layout)
+            pixels, block_cell = Blocks(data, noise, cells, used).gathered(layout)
             parts.append(pixels)
     return dataclasses.replace(
         like,

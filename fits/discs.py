@@ -12,12 +12,11 @@ from jaxtyping import Array, Float
 from numpy.polynomial import legendre
 
 from fits.common import CommonMaps, common_maps, window_of
-from fits.fluctuations import of_pixels
 from fits.inputs import Band, Inputs
 from fits.patches import PatchFits, fit_patches
 from fits.pseudo_cl import PreparedPatches, prepare_patches
 from jaxsky.harmonics import average_pixels, beam_ratio, gaussian_beam, pixel_window, smooth
-from jaxsky.noise import realisation_key, stream
+from jaxsky.noise import pixel_covariance, realisation_key, stream
 from jaxsky.settings import Experiment
 
 #: Radius of the paper's discs: 400 square degrees.
@@ -161,7 +160,7 @@ def _patch_noise(
 ) -> Float[np.ndarray, "patch 2 ell"]:
     """Return the noise spectrum in the prepared maps on each patch, from its own pixels."""
     (preparation,), lmax = prepared.fluctuations.preparations, patches.spectra[0].lmax
-    covariance = of_pixels(band.noise, preparation.nside_in)
+    covariance = pixel_covariance(band.noise, preparation.nside_in)
     variance = average_pixels(jnp.stack([covariance[0, 0], covariance[1, 1]]), preparation.nside)
     weights = np.stack([one.mask**2 for one in patches.spectra])
     # Q and U mix on a patch, so that E and B have the mean of both.

@@ -54,6 +54,11 @@ class Bandpass(Printed, eqx.Module):
     weights : response, shape (sample,), any normalisation, with a positive integral
     convention : "RJ", "power" or "CMB"
 
+    Raises
+    ------
+    TypeError, ValueError
+        For arguments with a unit, and for those that are not as said above.
+
     Examples
     --------
     >>> band = Bandpass([28.0, 30.0, 32.0], [1.0, 2.0, 1.0])

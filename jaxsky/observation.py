@@ -49,6 +49,11 @@ class ObservedBand(Printed, eqx.Module):
     noise : uniform level [uK_RJ arcmin], covariance of each pixel [uK_RJ^2], shape
         (stokes, stokes, pix), or None
     diagonal : draw noise with the diagonal of the Cholesky factor only (`noise.draw`)
+
+    Raises
+    ------
+    ValueError
+        If a beam, the target or the level of the noise is negative or not finite.
     """
 
     band: Bandpass
@@ -92,6 +97,11 @@ class Observation(eqx.Module):
     lmax : largest multipole of the sky in the maps, by default 2 nside
     precision : "double" or "single", in which the maps are computed; single takes half the memory
         and rounds to 1e-7 of a map's rms
+
+    Raises
+    ------
+    ValueError
+        If there is no channel, `nside` is no power of 2, or `stokes` or `precision` is unknown.
     """
 
     channels: dict[str, ObservedBand]
@@ -189,10 +199,17 @@ def load_instrument(
 
     Parameters
     ----------
-    name : "planck", "wmap", "core" or "litebird"; for unknown names KeyError lists the known ones
+    name : "planck", "wmap", "core" or "litebird"
     channels : names of the channels wanted, in this order; by default all
     target : common beam of the maps [arcmin]; None keeps the beam of each
     samples : number of samples per band; see `Bandpass.top_hat`
+
+    Raises
+    ------
+    KeyError
+        If a name is unknown; the message lists the known ones.
+    TypeError, ValueError
+        If `channels` is a string, or the target negative or not finite.
 
     Examples
     --------

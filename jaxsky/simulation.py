@@ -335,9 +335,20 @@ def simulate(
 ) -> BandMaps:
     """Simulate the maps of all channels [uK_RJ]: `harmonic_sources`, then `observe_bands`.
 
-    `cmb` are the spectra TT, EE, BB, TE [uK_CMB^2], None for no CMB. With a fixed key (of
-    jax.random) differentiable in sources and observation. Refused are inputs that do not match, and
-    a beam finer than that of a component without small scales.
+    With a fixed key, differentiable in sources and observation.
+
+    Parameters
+    ----------
+    key : key of jax.random
+    sources, observation : what is observed, and how
+    cmb : spectra TT, EE, BB, TE [uK_CMB^2], or None for no CMB
+    terms : see `harmonic_sources`
+
+    Raises
+    ------
+    TypeError, ValueError
+        If `sources` is no dictionary of Source, inputs do not match, or a beam is finer than that
+        of a component without small scales.
     """
     prepared = harmonic_sources(key, sources, observation, terms)
     seen = observe_bands(key, prepared, observation, cmb)

@@ -20,7 +20,8 @@ class Sky(Printed, eqx.Module):
     """A sum of named components on the same pixels.
 
     `components` are a mapping from names, each the first part of the names of its parameters
-    ("dust.beta_dust"), to components whose amplitudes share one shape (stokes, pix).
+    ("dust.beta_dust"), to components whose amplitudes share one shape (stokes, pix); TypeError or
+    ValueError if they are not.
 
     Examples
     --------
@@ -131,6 +132,11 @@ def observe(
         known beforehand, a fixed number of nodes is used; if they do not reach the tolerance as
         the program runs, the direct sum is.
     nodes : from `interpolation_nodes`, instead of a tolerance; not checked again
+
+    Raises
+    ------
+    TypeError, ValueError
+        If `sky` is no Sky, or `bands` is not a list of at least one Bandpass.
     """
     sky, bands = typed(sky), _check_bands(sky, bands)
     plan = nodes or interpolation_nodes(sky, bands, tolerance)

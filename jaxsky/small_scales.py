@@ -56,6 +56,11 @@ class SmallScales(eqx.Module):
     tilt : added to the slopes; negative is steeper. The pivot is the join.
     amplitude : of the injected map; 1 makes the mean spectrum continuous
     modulation_fwhm : beam with which the modulating polarized intensity is smoothed [arcmin]
+
+    Raises
+    ------
+    TypeError, ValueError
+        For ranges that are no integers or too short, and numbers that are not finite or negative.
     """
 
     EE: tuple[int, int] = eqx.field(static=True)

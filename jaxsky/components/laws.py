@@ -25,6 +25,11 @@ class Dust(Component, law="dust"):
     nu_ref : reference frequency [GHz]
     nu_pivot : pivot of the emissivities [GHz], only for several bodies; default 3000
 
+    Raises
+    ------
+    TypeError, ValueError
+        As for any `Component`, and for tuples of different lengths.
+
     Examples
     --------
     >>> import jax.numpy as jnp

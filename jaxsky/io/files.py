@@ -48,8 +48,8 @@ def check_file(path: Path) -> None:
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
         if path.is_symlink():
-            link = f"is a link to {os.readlink(path)}, which is not there"
-            raise InputError(f"{path}: {link}.") from None
+            aim = os.readlink(path)
+            raise InputError(f"{path}: is a link to {aim}, which is not there.") from None
         raise MissingFileError(f"{path}: no such file.") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
@@ -68,6 +68,11 @@ PARTIAL = ".partial-"
 writer = ""
 #: Functions called before anything is written; if one raises, nothing is written.
 guards: list[Callable[[], None]] = []
+
+
+def partial(name: str) -> str:
+    """Return the name of an incomplete file of this process."""
+    return f"{PARTIAL}{writer or os.getpid()}-{name}"
 
 
 def check_guards() -> None:
@@ -90,7 +95,7 @@ def whole(path: Path) -> Iterator[Path]:
     An existing file survives a killed process and a full disk. Data are flushed to disk before the
     file is renamed, as some file systems report only then that there was no room.
     """
-    beside = path.with_name(f"{PARTIAL}{writer or os.getpid()}-{path.name}")
+    beside = path.with_name(partial(path.name))
     check_guards()
     try:
         yield beside
@@ -262,7 +267,7 @@ class Folder:
         return self.path / self._owner.name
 
     @contextmanager
-    def owned(self) -> Iterator[None]:
+    def owned(self) -> Iterator["Folder"]:
         """Work in the folder, unless another process works on the same part."""
         me, lock = self._owner, _lock(self._place)
         with alone(self.path) as locked:
@@ -276,7 +281,7 @@ class Folder:
             self._place.touch()
         guards.append(self.check)
         try:
-            yield
+            yield self
         except (OSError, ValueError):
             self.check()  # if the folder was removed, that is the reason for the error
             raise
@@ -333,9 +338,8 @@ def occupied(out: Path, part: range = ALL) -> Iterator[Folder]:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OSError(f"{out}: cannot be made ({error.strerror}); choose another --out.") from error
-    folder = Folder(out, part)
     try:
-        with folder.owned():
+        with Folder(out, part).owned() as folder:
             yield folder
     finally:
         for made in missing:

@@ -17,8 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from jaxsky.io import files
-from jaxsky.io.files import PARTIAL, check_guards
+from jaxsky.io.files import check_guards, partial
 
 #: Arrays of more bytes than this lie on disk.
 LIMIT = 1 << 29
@@ -40,12 +39,8 @@ def scratch(folder: Path) -> Iterator[None]:
         yield
     finally:
         _place.remove(folder)
-        for path in folder.glob(f"{PARTIAL}{_writer()}-*.maps"):
+        for path in folder.glob(partial("*.maps")):
             path.unlink(missing_ok=True)
-
-
-def _writer() -> str:
-    return files.writer or str(os.getpid())
 
 
 def ranges(npix: int, size: int = PIECE) -> Iterator[slice]:
@@ -103,7 +98,7 @@ class Stored(Stack):
         super().__init__(shape, dtype)
         check_guards()
         place = _place[-1] if _place else Path(tempfile.gettempdir())
-        self.path = (place / f"{PARTIAL}{_writer()}-{next(_number)}.maps").absolute()
+        self.path = (place / partial(f"{next(_number)}.maps")).absolute()
         length = self.size * self.dtype.itemsize
         try:
             self._open(os.O_RDWR | os.O_CREAT | os.O_EXCL)
@@ -132,11 +127,16 @@ class Stored(Stack):
         rows = index if isinstance(index, tuple) else (index,)
         if len(rows) >= self.ndim or not all(isinstance(row, int | np.integer) for row in rows):
             return None
-        if not all(0 <= row < size for row, size in zip(rows, self.shape, strict=False)):
+        sizes, shape = self.shape[: len(rows)], self.shape[len(rows) :]
+        if not all(0 <= row < size for row, size in zip(rows, sizes, strict=True)):
             return None
-        shape = self.shape[len(rows) :]
-        first = np.ravel_multi_index(rows, self.shape[: len(rows)])
-        return int(first) * int(np.prod(shape)) * self.dtype.itemsize, shape
+        first = int(np.ravel_multi_index(rows, sizes))
+        return first * int(np.prod(shape)) * self.dtype.itemsize, shape
+
+    def _pieces(self, values: np.ndarray, place: int) -> Iterator[tuple[np.ndarray, int]]:
+        """Yield pieces of a flat array that lies in the file from `place` on, and their places."""
+        for part in ranges(values.size):
+            yield values[part], place + part.start * self.dtype.itemsize
 
     @contextmanager
     def _mapped(self, access: int, scattered: bool = False) -> Iterator[np.ndarray]:
@@ -155,10 +155,7 @@ class Stored(Stack):
         if block := self._block(index):
             place, shape = block
             found = aligned(shape, self.dtype)
-            values = found.reshape(-1)
-            for part in ranges(values.size):
-                piece = values[part]
-                start = place + part.start * self.dtype.itemsize
+            for piece, start in self._pieces(found.reshape(-1), place):
                 piece[:] = np.frombuffer(os.pread(self._file, piece.nbytes, start), self.dtype)
             return found
         last = index[-1] if isinstance(index, tuple) else index
@@ -173,10 +170,7 @@ class Stored(Stack):
         if block := self._block(index):
             place, shape = block
             given = np.broadcast_to(np.asarray(value, self.dtype), shape)
-            values = np.ascontiguousarray(given).reshape(-1)
-            for part in ranges(values.size):
-                piece = values[part]
-                start = place + part.start * self.dtype.itemsize
+            for piece, start in self._pieces(np.ascontiguousarray(given).reshape(-1), place):
                 if os.pwrite(self._file, piece.data, start) < piece.nbytes:
                     raise OSError(f"{self.path}: was not written in full; is the disk full?")
             return
@@ -207,9 +201,7 @@ class Computed(Stack):
     def __reduce__(self) -> tuple[Any, ...]:
         # For other processes it is written to a file.
         if self._kept is None:
-            self._kept = Stored(self.shape, self.dtype)
-            for part in ranges(self.shape[-1]):
-                self._kept[..., part] = self._read(part)
+            self._kept = filled(Stored(self.shape, self.dtype), self._read)
         return self._kept.__reduce__()
 
     def __getitem__(self, index: Any) -> np.ndarray:
@@ -223,6 +215,13 @@ class Computed(Stack):
 
 #: An array that is read in pieces: of numpy or JAX, or a `Stack`.
 Maps: TypeAlias = Any
+
+
+def filled(array: Maps, read: Callable[[slice], np.ndarray]) -> Maps:
+    """Fill an array with the pixels that `read` returns, range by range, and return it."""
+    for part in ranges(array.shape[-1]):
+        array[..., part] = read(part)
+    return array
 
 
 def is_large(shape: tuple[int, ...], dtype: Any = float, copies: int = 1) -> bool:
@@ -251,7 +250,4 @@ def computed(
     """Return an array whose pixels `read` returns; if it is large, they are computed when read."""
     if is_large(shape, dtype, copies):
         return Computed(shape, read, dtype)
-    found = np.empty(shape, dtype)
-    for part in ranges(shape[-1]):
-        found[..., part] = read(part)
-    return found
+    return filled(np.empty(shape, dtype), read)

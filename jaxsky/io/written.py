@@ -50,31 +50,24 @@ def write_maps(
     ------
     FileExistsError
         If the file exists and `overwrite` is not set.
-    ValueError
-        If an argument is wrong, or the folder does not exist.
     """
     path, dtype = Path(path), np.dtype(np.float32 if single else np.float64)
     maps = maps if isinstance(maps, Stack) else np.atleast_2d(np.asarray(maps, dtype=dtype))
     names = [names] if isinstance(names, str) else list(names)
     units = [unit_name(x) for x in ([unit] * len(maps) if isinstance(unit, str) else unit)]
-    mask = None if mask is None else np.asarray(mask, dtype=bool)
     npix = maps.shape[-1]
     good = maps.ndim == 2 and healpy.isnpixok(npix)
     check_shape("maps", maps, good, "have shape (field, pix) with 12 nside^2 pixels")
     for name, values in {"names": names, "unit": units}.items():
         if len(values) != len(maps):
             raise ValueError(f"Argument `{name}` has {len(values)} entries for {len(maps)} maps.")
-    if mask is not None:
-        check_shape("mask", mask, mask.shape == (npix,), f"have shape ({npix},)")
-    bad = 0
-    for part in ranges(npix):
-        wrong = ~np.isfinite(np.asarray(maps[..., part], dtype))
-        bad += int(np.count_nonzero(wrong if mask is None else wrong & mask[part]))
-    if bad:
-        counted = f"{bad} of {len(maps) * int(np.sum(mask)) if mask is not None else maps.size}"
+    used = np.broadcast_to(True, npix) if mask is None else np.asarray(mask, dtype=bool)
+    check_shape("mask", used, used.shape == (npix,), f"have shape ({npix},)")
+    wrong = (~np.isfinite(np.asarray(maps[..., part], dtype)) & used[part] for part in ranges(npix))
+    if bad := sum(map(np.count_nonzero, wrong)):
         raise ValueError(
-            f"Argument `maps` has {counted} values that are not finite; leave pixels out with "
-            "`mask`."
+            f"Argument `maps` has {bad} of {len(maps) * used.sum()} values that are not finite; "
+            "leave pixels out with `mask`."
         )
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path}: file exists, and `overwrite` is not set.")
@@ -113,7 +106,7 @@ def write_maps(
                     file.write(header.tostring().encode("ascii"))
                 for part in ranges(npix):  # the whole table may be larger than memory
                     rows = np.asarray(maps[..., part], dtype)
-                    rows = rows if mask is None else np.where(mask[part], rows, healpy.UNSEEN)
+                    rows = np.where(used[part], rows, healpy.UNSEEN)
                     file.write(rows.T.astype(dtype.newbyteorder(">"), order="C").tobytes())
                 file.write(bytes(-npix * len(maps) * dtype.itemsize % BLOCK))
             if tables:

@@ -234,8 +234,6 @@ def fetch(
         If no address has the file, a transfer ends early, or the file cannot be written.
     jaxsky.io.InputError
         If the existing file or the record of hashes is damaged; it is left unchanged.
-    ValueError
-        If the product is unknown, or the mirror is not an http or https address.
     """
     if not isinstance(product, Product):
         if product not in list(catalogue()):

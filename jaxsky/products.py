@@ -60,13 +60,12 @@ def catalogue() -> dict[str, Product]:
     """Return all products by file name."""
     found, table = {}, packaged("products.toml")
     for group, common in table["groups"].items():
-        shared = {key: value for key, value in common.items() if key != "files"}
         for name, entry in common["files"].items():
-            said = {"name": name, "group": group, "columns": ()} | shared | entry
-            said["addresses"] = tuple(
-                table["sources"][source] + name for source in said.pop("sources")
-            )
-            found[name] = Product(**said | {"columns": tuple(said["columns"])})
+            said = common | entry | {"name": name, "group": group}
+            del said["files"]
+            addresses = tuple(table["sources"][source] + name for source in said.pop("sources"))
+            columns = tuple(said.pop("columns", ()))
+            found[name] = Product(**said, addresses=addresses, columns=columns)
     return found
 
 

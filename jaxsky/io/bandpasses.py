@@ -57,11 +57,11 @@ def _frequency_unit(table: TextTable, column: int, given: str | None) -> str | N
     The line directly above the rows must agree with the argument, which overrides lines further
     up. Outside IPAC tables a length is accepted only if the header mentions wavelengths.
     """
-    last = _units(table.header[-1]) if table.header else []
     if table.bars:
-        cells = table.bars[2].split("|")[1:] if len(table.bars) > 2 else []
-        cell = cells[column].strip() if column < len(cells) else ""
-        last = [_known(cell)] if cell else []
+        cells = "".join(table.bars[2:3]).split("|")[1:]
+        last = [_known(cell) for cell in cells[column : column + 1] if cell.strip()]
+    else:
+        last = _units("".join(table.header[-1:]))
     if given is not None:
         if len(last) == 1 and _known(given) != last[0]:
             raise UnfitError(f"argument `unit` is {given!r}, but the file says {last[0]!r}.")
@@ -70,10 +70,10 @@ def _frequency_unit(table: TextTable, column: int, given: str | None) -> str | N
     stated = last if len(last) == 1 or table.bars else _units(words)
     if len(stated) > 1:
         raise UnfitError(f"the header names the units {', '.join(stated)}; give `unit`.")
-    waves = _WAVES.search(words)
-    if stated and stated[0] in ("um", "mm") and not (waves or table.bars):
+    clear = table.bars or _WAVES.search(words)
+    if stated and stated[0] in ("um", "mm") and not clear:
         raise UnfitError(f"what is in {stated[0]} is not said; give `unit`.")
-    if not stated and (waves or table.bars):
+    if clear and not stated:
         raise UnfitError("the unit of the frequencies is missing; give `unit`.")
     return stated[0] if stated else None
 
@@ -89,8 +89,8 @@ def _to_GHz(samples: Float[np.ndarray, "2 sample"], unit: str) -> Float[np.ndarr
     return np.array([nu, samples[1]])[:, :: -1 if falls else 1]
 
 
-#: Frequencies [GHz] and weights of a table.
-Curve: TypeAlias = tuple[np.ndarray, np.ndarray]
+#: Frequencies [GHz], weights and their convention, "" if it is unknown.
+Curve: TypeAlias = tuple[np.ndarray, np.ndarray, str]
 
 #: Unit of a RIMO's WAVENUMBER -> convention. For LFI the column contains frequencies, and the
 #: weights act on antenna temperature; those of HFI act on power.
@@ -106,15 +106,15 @@ _NO_WEIGHT = 1e-6
 _WIDEST = 8
 
 
-def _checked(nu: np.ndarray, weights: np.ndarray) -> Curve:
+def _checked(nu: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the samples at positive frequencies [GHz]; refuse what is not a bandpass."""
     if bad := int(np.sum(~np.isfinite(nu) | ~np.isfinite(weights))):
         raise UnfitError(f"{bad} of {nu.size} samples of the bandpass are not finite.")
     low = nu <= 0
     if low.all():
         raise UnfitError("the bandpass has no sample at a positive frequency.")
-    if np.any(np.abs(weights[low]) > _NO_WEIGHT * np.abs(weights).max()):
-        largest = np.abs(weights[low]).max()
+    largest = np.abs(weights[low]).max(initial=0.0)
+    if largest > _NO_WEIGHT * np.abs(weights).max():
         raise UnfitError(f"{low.sum()} samples at nu <= 0 have weights up to {largest:g}.")
     nu, weights = nu[~low], weights[~low]
     if np.any(steps := np.diff(nu) <= 0):
@@ -126,7 +126,7 @@ def _checked(nu: np.ndarray, weights: np.ndarray) -> Curve:
     return nu, weights
 
 
-def _rimo_samples(hdus: pyfits.HDUList, name: str) -> tuple[Curve, str]:
+def _rimo_samples(hdus: pyfits.HDUList, name: str) -> Curve:
     tables = [select_hdu(hdus, i) for i, h in enumerate(hdus) if h.name == name]
     names = tables[0].columns.names
     for column in ("WAVENUMBER", "TRANSMISSION"):
@@ -143,7 +143,7 @@ def _rimo_samples(hdus: pyfits.HDUList, name: str) -> tuple[Curve, str]:
     # Neighbours that share a frequency, as happens in single precision, are averaged.
     starts = np.flatnonzero(np.concatenate([[True], np.diff(nu) != 0]))
     counts = np.diff(np.append(starts, nu.size))
-    return _checked(nu[starts], np.add.reduceat(weights, starts) / counts), _RIMO[unit]
+    return *_checked(nu[starts], np.add.reduceat(weights, starts) / counts), _RIMO[unit]
 
 
 def _rimo_names(
@@ -174,7 +174,7 @@ def _rimo_names(
     return [single[detector] for detector in asked_for]
 
 
-def _read_rimo(path: Path, band: str | None, detectors: Sequence[str] | None) -> tuple[Curve, str]:
+def _read_rimo(path: Path, band: str | None, detectors: Sequence[str] | None) -> Curve:
     with open_fits(path) as hdus:
         known = list(dict.fromkeys(h.name for h in hdus if h.name.startswith("BANDPASS_")))
         if not known:
@@ -183,15 +183,16 @@ def _read_rimo(path: Path, band: str | None, detectors: Sequence[str] | None) ->
     if len(found) == 1:
         return found[0]
     # The mean of several detectors, each normalised to unit integral, on all their frequencies.
-    tables = [samples for samples, _ in found]
-    grid = np.unique(np.concatenate([nu for nu, _ in tables]))
-    curves = [np.interp(grid, nu, w / np.trapezoid(w, nu), left=0.0, right=0.0) for nu, w in tables]
-    return (grid, np.mean(curves, axis=0)), found[0][1]
+    grid = np.unique(np.concatenate([nu for nu, *_ in found]))
+    unit = [(nu, weights / np.trapezoid(weights, nu)) for nu, weights, _ in found]
+    curves = [np.interp(grid, nu, weights, left=0.0, right=0.0) for nu, weights in unit]
+    return grid, np.mean(curves, axis=0), found[0][2]
 
 
 def _columns(table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
     """Return the numbers of the columns of frequency and weight."""
-    width, names = table.width, table.names()
+    width = table.width
+    names = next((words for words in table.headings() if len(words) == width), [])
     if fields is None:
         shown = f" ({' '.join(names)})" if names else ""
         if width > _WIDEST:
@@ -216,10 +217,8 @@ def _columns(table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
     return columns
 
 
-def _read_text(
-    table: TextTable, fields: Sequence[int | str] | None, given: str | None
-) -> tuple[Curve, str]:
-    """Return frequencies and weights of a table, and the convention of IPAC tables, else ""."""
+def _read_text(path: Path, fields: Sequence[int | str] | None, given: str | None) -> Curve:
+    table = read_text(path)
     columns = _columns(table, fields)
     samples = table.numbers(columns).T
     unit = _frequency_unit(table, columns[0], given)
@@ -230,7 +229,7 @@ def _read_text(
         asked = "" if unit else "; give `unit`, such as MHz or THz, or GHz if it is right"
         middle = f"in {unit or 'GHz'}, the middle of the band is at {center:g} GHz"
         raise UnfitError(f"{middle}, outside of {low:g} to {high:g} GHz{asked}.")
-    return (nu, weights), "power" if table.bars else ""
+    return nu, weights, "power" if table.bars else ""
 
 
 def read_bandpass(
@@ -276,8 +275,6 @@ def read_bandpass(
     ------
     InputError
         If the file has no such bandpass, or convention, unit or columns are not certain.
-    ValueError
-        If `convention` or `trim` is invalid.
     """
     path = Path(path)
     if convention is not None:
@@ -291,11 +288,11 @@ def read_bandpass(
             for name, argument in {"unit": unit, "fields": fields}.items():
                 if argument is not None:
                     raise UnfitError(f"argument `{name}` is for text files, this is FITS.")
-            (nu, weights), found = _read_rimo(path, None if band is None else str(band), detectors)
+            nu, weights, found = _read_rimo(path, None if band is None else str(band), detectors)
         elif band is not None or detectors is not None:
             raise UnfitError("a text table has one band; leave out `band` and `detectors`.")
         else:
-            (nu, weights), found = _read_text(read_text(path), fields, unit)
+            nu, weights, found = _read_text(path, fields, unit)
         if not (convention := convention or found):
             known = ", ".join(CONVENTIONS)
             raise UnfitError(f"the file does not say it; give `convention`, one of {known}.")

@@ -36,6 +36,11 @@ _SCALARS = (
 )
 
 
+def _ordered(letters: str) -> str:
+    """Return the Stokes parameters that letters stand for in the order I, Q, U; "?" for others."""
+    return "".join(sorted((_LETTERS.get(c, "?") for c in letters), key="IQU?".index))
+
+
 def _known() -> dict[str, str]:
     """Map certain names to one Stokes parameter, two of a covariance, or "" for neither."""
     names = dict.fromkeys(("TEMPERATURE", "INTENSITY", "I_MAP", "T_MAP"), "I")
@@ -45,12 +50,11 @@ def _known() -> dict[str, str]:
         # The spread of a Stokes parameter has no sign, so it is treated like a variance.
         names |= {f"{letter}_{word}": one * 2 for word in _SPREADS}
         names |= {f"{word}_{letter}": one * 2 for word in _SPREADS}
-    for (a, first), (b, second) in product(_LETTERS.items(), repeat=2):
-        pair = "".join(sorted(first + second, key="IQU".index))
-        names[a + b] = pair
+    for a, b in product(_LETTERS, repeat=2):
+        names[a + b] = _ordered(a + b)
         for word in _OF_TWO:
             forms = (f"{a}{b}_{word}", f"{word}_{a}{b}", f"{a}{b}{word}", f"{word}{a}{b}")
-            names |= dict.fromkeys((*forms, f"{word}_{a}_{b}", f"{a}_{b}_{word}"), pair)
+            names |= dict.fromkeys((*forms, f"{word}_{a}_{b}", f"{a}_{b}_{word}"), _ordered(a + b))
     return names | dict.fromkeys((*_SCALARS, *PIXELS), "")
 
 
@@ -77,21 +81,14 @@ def parse_stokes(given: str | Sequence[str]) -> list[str]:
     >>> parse_stokes("QU"), parse_stokes("QQ, UQ, UU")
     (['Q', 'U'], ['QQ', 'QU', 'UU'])
     """
-    if isinstance(given, str):
-        words = given.replace(",", " ").split()
-        entries: Sequence[str] = list(words[0]) if len(words) == 1 else words
-    else:
-        entries = given
-    found = []
-    for entry in entries:
-        letters = [_LETTERS.get(c, "?") for c in entry.upper()] if isinstance(entry, str) else ["?"]
-        kind = "".join(sorted(letters, key="IQU?".index))
-        if kind not in _CHOICES:
-            raise InputError(
-                "Argument `stokes` must name I, Q, U or pairs of them in the order of the columns, "
-                f'such as "QU" or "QQ QU UU", but is {given!r}.'
-            )
-        found.append(kind)
+    words = given.replace(",", " ").split() if isinstance(given, str) else given
+    entries = list(words[0]) if isinstance(given, str) and len(words) == 1 else words
+    found = [_ordered(str(entry).upper()) for entry in entries]
+    if not set(found).issubset(_CHOICES):
+        raise InputError(
+            "Argument `stokes` must name I, Q, U or pairs of them in the order of the columns, "
+            f'such as "QU" or "QQ QU UU", but is {given!r}.'
+        )
     return found
 
 
@@ -184,15 +181,12 @@ def default_fields(table: HealpixTable, argument: str = "fields") -> list[int]:
 
     Anything after "_" or "-" is ignored: good enough to choose a column by, but not evidence.
     """
-    kinds = [stokes_of(name) for name in table.names]
-    for i, name in enumerate(table.names):
-        if kinds[i] is None and (beginning := re.match(r"[IQU](?=[_-])", name.upper())):
-            kinds[i] = beginning[0]
+    beginnings = [re.match("([IQU])[_-]", name.upper()) for name in table.names]
+    kinds = [stokes_of(n) or (b and b[1]) for n, b in zip(table.names, beginnings, strict=True)]
     if found := [kinds.index(letter) for letter in "IQU" if letter in kinds]:
         return found
-    columns = [i for i, name in enumerate(table.names) if name.upper() not in PIXELS]
-    if len(columns) == 1:
-        return columns
+    if len(table.fields) == 1:
+        return table.fields
     raise UnfitError(
         f"no column is named as I, Q or U; give `{argument}` out of {', '.join(table.names)}."
     )
@@ -223,18 +217,16 @@ def _several(value: Any) -> list[Any]:
 
 def _split(path: Any, hdu: Any, fields: Any) -> list[tuple[Path, Any, list[Any] | None]]:
     """Return file, HDU and columns of each table, from arguments that may be lists."""
-    wanted = None if fields is None else _several(fields)
-    given: dict[str, list[Any]] = {"path": _several(path), "hdu": _several(hdu)}
-    number = max(map(len, given.values()))
-    if number > 1:
-        given["fields"] = [None] if wanted is None else [[one] for one in wanted]
+    paths, hdus = _several(path), _several(hdu)
+    number, wanted = max(len(paths), len(hdus)), None if fields is None else _several(fields)
+    columns = [wanted] if number == 1 or wanted is None else [[one] for one in wanted]
+    given = {"path": paths, "hdu": hdus, "fields": columns}
     for name, entries in given.items():
         if len(entries) not in (1, number):
             said = f"must be one, or as many as the other names, {number}, but is {len(entries)}"
             raise InputError(f"Argument `{name}` {said}.")
     if wanted == []:
-        raise InputError(f"{given['path'][0]}: argument `fields` is empty.")
-    given.setdefault("fields", [wanted])
+        raise InputError(f"{paths[0]}: argument `fields` is empty.")
     each = (entries * (number // len(entries)) for entries in given.values())
     return [(Path(p), h, c) for p, h, c in zip(*each, strict=True)]
 
@@ -255,8 +247,7 @@ def _read_table(
         order = table.state("ordering", stated["ordering"])
         frame = table.state("coordinates", stated["coordinates"])
         sign = table.state("polarization", stated["polarization"], "COSMO")
-        alone = sum(name.upper() not in PIXELS for name in table.names) == 1
-        rest = (alone, frame, sign, table.nside)
+        rest = (len(table.fields) == 1, frame, sign, table.nside)
         where, names = table.where, table.names
         return [
             Column(where, names[i], text, table.values(i, order, own=own), table.lowest(i), *rest)

@@ -2,7 +2,7 @@
 
 import codecs
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,13 +11,10 @@ from jaxtyping import Float
 
 from jaxsky.io.files import UnfitError, in_file, is_fits
 from jaxsky.io.quantities import unit_factor, unit_name
-from jaxsky.io.tables import TABLES, open_fits, select_hdu
+from jaxsky.io.tables import TABLES, number, open_fits, select_hdu
 
 COMMENTS = ("#", ";", "%", "!", "\\", "|", "//", "*")
 _TRAILING = re.compile(r"\s(?:[#!%\\]|//).*")
-_NUMBER = re.compile(
-    r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:[ed][+-]?\d+)?|nan|inf|infinity)", re.I | re.ASCII
-)
 #: Advice for decimal commas.
 _WRITE = "write decimal points, or semicolons between the columns"
 #: The beginning of a field that looks like a number.
@@ -30,10 +27,6 @@ class TextRow(NamedTuple):
     line: int
     text: str
     cells: list[str]
-
-
-def _words(line: str) -> list[str]:
-    return re.split(r"[\s,;|]+", line.strip(" ,;|"))
 
 
 class TextTable(NamedTuple):
@@ -49,22 +42,17 @@ class TextTable(NamedTuple):
         """Number of columns."""
         return len(self.rows[0].cells)
 
-    def words(self) -> list[list[str]]:
-        """Return the lines above the rows, split into words."""
-        return [_words(line) for line in [*self.bars, *self.header]]
-
-    def names(self) -> list[str]:
-        """Return the column names: the last line of the header with a word per column."""
-        lines = [re.sub(r"[(\[].*?[)\]]", "", line) for line in [*self.bars[:1], *self.header]]
-        named = (words for words in map(_words, reversed(lines)) if len(words) == self.width)
-        return next(named, [])
+    def headings(self) -> Iterator[list[str]]:
+        """Yield the words of lines that may name the columns, last line first, without units."""
+        for line in reversed([*self.bars[:1], *self.header]):
+            yield re.split(r"[\s,;|]+", re.sub(r"[(\[].*?[)\]]", "", line).strip(" ,;|"))
 
     def numbers(self, columns: Sequence[int] | None = None) -> Float[np.ndarray, "row column"]:
         """Return the numbers of some columns; by default all, with equally many in each row."""
         table = []
         for line, text, cells in self.rows:
             wanted = range(len(cells)) if columns is None else columns
-            values = [_number(cells[c]) if c < len(cells) else None for c in wanted]
+            values = [number(cells[c]) if c < len(cells) else None for c in wanted]
             with in_file(f"{self.path}, line {line}"):
                 if None in values:
                     raise UnfitError(f"not a row of numbers: {text!r}.")
@@ -74,21 +62,13 @@ class TextTable(NamedTuple):
         return np.array(table, np.float64)
 
 
-def _number(cell: str) -> float | None:
-    """Return the value of a field, also with a Fortran exponent (1.0D+01); None if not a number."""
-    if not _NUMBER.fullmatch(cell):
-        return None
-    word = cell.lower()
-    return float(word if "n" in word else word.replace("d", "e"))
-
-
 def _cells(text: str) -> list[str]:
     """Split a line at semicolons, commas or blanks; between semicolons, commas are decimal."""
     if ";" in text:
         return [cell.strip().replace(",", ".") for cell in text.strip(" ;").split(";")]
     words = [word.strip(",") for word in text.split()]
     for word in words if len(words) > 1 else ():
-        if "," in word and all(_number(part) is not None for part in word.split(",")):
+        if "," in word and all(number(part) is not None for part in word.split(",")):
             raise UnfitError(f"{word!r} is two numbers or one with a decimal comma; {_WRITE}.")
     return [cell for cell in re.split(r"[\s,]+", text) if cell]
 
@@ -130,7 +110,7 @@ def _add_line(table: TextTable, line: int, text: str) -> None:
             table.header.append(text.lstrip("".join(COMMENTS)).strip())
     else:
         cells = _cells(_TRAILING.sub("", text))
-        if table.rows or any(_number(cell) is not None for cell in cells):
+        if table.rows or any(number(cell) is not None for cell in cells):
             table.rows.append(TextRow(line, text, cells))
         elif all(_DAMAGED.match(cell) for cell in cells):
             raise UnfitError(f"not a row of numbers: {text!r}.")
@@ -151,7 +131,7 @@ def _check_commas(rows: list[TextRow]) -> None:
 
 SPECTRA = ("TT", "EE", "BB", "TE")
 #: First columns of the files that CAMB calls so.
-_CAMB_NAMES = ("L", "TT", "EE", "BB", "TE")
+_CAMB_NAMES = ["L", "TT", "EE", "BB", "TE"]
 #: Column names in upper case -> the package's: HEALPix (IDL, Fortran, healpy), HEALPix C++.
 _NAMES = {
     **dict.fromkeys(("ELL", "INDEX", "MULTIPOLE"), "L"),
@@ -185,35 +165,32 @@ def _up_to(
     return np.concatenate([below, values], axis=-1)[..., : lmax + 1]
 
 
-def _name(word: str) -> str:
-    """Return the package's name for a column."""
-    return _NAMES.get(word.upper(), word.upper())
+def _known(names: Sequence[object]) -> list[str]:
+    """Return the package's names for columns."""
+    words = [str(name).upper() for name in names]
+    return [_NAMES.get(word, word) for word in words]
 
 
 def _located(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
     """Return the numbers of the columns wanted."""
-    known = [_name(name) for name in names]
+    known = _known(names)
     if missing := [name for name in wanted if name not in known]:
         hint = f"; CAMB writes it to {_CAMB}" if missing == ["BB"] else ""
         raise UnfitError(f"no column {', '.join(missing)}; it has {', '.join(names)}{hint}.")
     return [known.index(name) for name in wanted]
 
 
-def _text_order(
-    file: str, header: list[list[str]], columns: int, fields: Sequence[str] | None
-) -> Sequence[str]:
+def _text_order(text: TextTable, fields: list[str] | None) -> list[str]:
     """Return the column names of a text file, from its header, `fields` or the file name."""
-    named = [names for words in header if "TT" in (names := [_name(word) for word in words])]
-    if named:
-        words = named[-1]
-        if len(words) != columns:
-            raise UnfitError(
-                f"the header names {len(words)} columns ({' '.join(words)}), "
-                f"but there are {columns}."
-            )
-        if fields is not None and words[: len(fields)] != list(fields):
-            raise UnfitError(f"`fields` are {' '.join(fields)}, the columns {' '.join(words)}.")
-        return words
+    file, width = text.path.name, text.width
+    if names := next((known for known in map(_known, text.headings()) if "TT" in known), None):
+        listed = " ".join(names)
+        if len(names) != width:
+            said = f"the header names {len(names)} columns ({listed})"
+            raise UnfitError(f"{said}, but there are {width}.")
+        if fields is not None and names[: len(fields)] != fields:
+            raise UnfitError(f"`fields` are {' '.join(fields)}, the columns {listed}.")
+        return names
     if file.endswith("scalCls.dat"):
         raise UnfitError(f"CAMB's scalar spectra have no BB; read {_CAMB}.")
     if fields is None and file.endswith(("lensedCls.dat", "totCls.dat")):
@@ -221,8 +198,8 @@ def _text_order(
     if fields is None:
         example = ", ".join(f'"{name}"' for name in _CAMB_NAMES)
         raise UnfitError(f"no header names the columns; give their names, `fields` = [{example}].")
-    if columns < len(fields):
-        raise UnfitError(f"there are {columns} columns, but the names {' '.join(fields)}.")
+    if width < len(fields):
+        raise UnfitError(f"there are {width} columns, but the names {' '.join(fields)}.")
     return fields
 
 
@@ -256,7 +233,7 @@ def _spectra_of_fits(
             raise UnfitError(f"the header says {stated[0]!r}; spectra in FITS files must be C_l.")
         names = table.columns.names
         columns = _located(names, SPECTRA)
-        multipoles = [table.data.field(n) for n in names if _name(n) == "L"]
+        multipoles = [table.data.field(n) for n in names if _known([n]) == ["L"]]
         factors = [_fits_factor(names[c], table.header.get(f"TUNIT{c + 1}"), unit) for c in columns]
         values = np.array([np.ravel(table.data.field(c)) for c in columns], np.float64)
         ell = np.array(multipoles[0] if multipoles else np.arange(values.shape[1]), float).ravel()
@@ -299,12 +276,10 @@ def read_spectra(
     InputError
         If the file lacks a spectrum or multipoles, if neither file nor arguments state columns
         and units, or if values are negative or not finite, or |TE| exceeds sqrt(TT EE).
-    ValueError
-        If lmax is negative.
     """
     path = Path(path)
     with in_file(path):
-        named = None if fields is None else [_name(str(name)) for name in fields]
+        named = None if fields is None else _known(fields)
         if named is not None and len(set(named)) < len(named):
             raise UnfitError(f"`fields` must differ, but are {', '.join(named)}.")
         if is_fits(path):
@@ -316,8 +291,7 @@ def read_spectra(
                 raise UnfitError("argument `unit` is for FITS files, text is in uK^2.")
             text = read_text(path)
             table = text.numbers()
-            names = _text_order(path.name, text.words(), text.width, named)
-            at, *columns = _located(names, ("L", *SPECTRA))
+            at, *columns = _located(_text_order(text, named), ("L", *SPECTRA))
             ell = table[:, at]
             factor = np.where(ell > 0, 2 * np.pi / np.maximum(ell * (ell + 1), 1), 0)
             values = table[:, columns].T * factor
@@ -376,8 +350,6 @@ def read_beam(path: str | Path, lmax: int, *, hdu: int | str = 1) -> Float[np.nd
     ------
     InputError
         If the file has no such window, or lacks some multipoles.
-    ValueError
-        If lmax is negative.
     """
     path = Path(path)
     with in_file(path):

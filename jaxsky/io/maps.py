@@ -186,8 +186,6 @@ def read_maps(
     InputError
         If a file is not such a map or lacks some of the pixels, or if something needed to use the
         maps is stated neither by header nor argument, or differently by both or by several files.
-    ValueError
-        If `unit` is unknown.
     """
     stated = {"ordering": ordering, "coordinates": coordinates, "polarization": polarization}
     given = None if unit is None else unit_name(unit)

@@ -55,25 +55,21 @@ _PUZZLED = (OSError, ValueError, TypeError, LookupError, AttributeError, pyfits.
 def open_fits(path: Path) -> Iterator[pyfits.HDUList]:
     """Open a FITS file; problems found while it is open become an InputError."""
     check_file(path)
-    damaged = f"{path}: not a FITS file, or a truncated one"
+    hdus = None
     with in_file(path), warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropyUserWarning)
         for message in (".*truncated", ".*[Ee]rror validating header"):
             warnings.filterwarnings("error", message, AstropyUserWarning)
         try:
-            hdus = pyfits.open(path)
-        except (*_DAMAGE, *_PUZZLED) as error:
-            raise InputError(f"{damaged} ({_reason(error)}).") from error
-        try:
-            with hdus:
+            with pyfits.open(path) as hdus:
                 yield hdus
         except InputError:
             raise
-        except _DAMAGE as error:
-            raise InputError(f"{damaged} ({_reason(error)}).") from error
-        except _PUZZLED as error:
-            what = damaged if _is_cut(path, hdus) else f"{path}: cannot be read"
-            raise InputError(f"{what} ({_reason(error)}).") from error
+        except (*_DAMAGE, *_PUZZLED) as error:
+            damaged = hdus is None or isinstance(error, _DAMAGE) or _is_cut(path, hdus)
+            what = "not a FITS file, or a truncated one" if damaged else "cannot be read"
+            reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+            raise InputError(f"{path}: {what} ({reason}).") from error
 
 
 @contextmanager
@@ -83,10 +79,6 @@ def open_table(path: Path, hdu: int | str) -> Iterator["HealpixTable"]:
         table, where = select_hdu(hdus, hdu), f"{path}, HDU {hdu!r}"
         with in_file(where):
             yield HealpixTable(where, table, hdus[0].header)
-
-
-def _reason(error: BaseException) -> str:
-    return " ".join(str(error).split()).rstrip(".") or type(error).__name__
 
 
 def _is_cut(path: Path, hdus: pyfits.HDUList) -> bool:
@@ -101,12 +93,12 @@ def _is_cut(path: Path, hdus: pyfits.HDUList) -> bool:
         return True
 
 
-def _number(text: str) -> float:
-    """Parse a number as in headers, also with exponents D; NaN if it is not a number."""
+def number(text: str) -> float | None:
+    """Parse a number, also with a Fortran exponent (1.0D+01); None if it is not a number."""
     try:
-        return float(text.strip("'\" ").upper().replace("D", "E"))
+        return float(text.lower().replace("d", "e")) if text.isascii() and "_" not in text else None
     except ValueError:
-        return np.nan
+        return None
 
 
 def equals(
@@ -136,12 +128,15 @@ def select_hdu(
     return found
 
 
+def _choices(argument: str) -> str:
+    return ", ".join(dict.fromkeys(_SAID[argument][1].values()))
+
+
 def spelled(argument: str, given: str) -> str:
     """Return the package's spelling of an argument about maps."""
-    spellings = _SAID[argument][1]
-    if (found := spellings.get(str(given).upper())) is None:
-        choices = ", ".join(dict.fromkeys(spellings.values()))
-        raise InputError(f"Argument `{argument}` must be one of {choices}, not {given!r}.")
+    if (found := _SAID[argument][1].get(str(given).upper())) is None:
+        known = _choices(argument)
+        raise InputError(f"Argument `{argument}` must be one of {known}, not {given!r}.")
     return found
 
 
@@ -186,6 +181,8 @@ class HealpixTable:
             number = names.index(None) + 1
             raise UnfitError(f"column {number} has no name, TTYPE{number}.")
         self.names: tuple[str, ...] = tuple(names)
+        #: Numbers of the columns without pixel numbers.
+        self.fields = [i for i, name in enumerate(names) if name.upper() not in PIXELS]
         if (pixtype := self.keyword("PIXTYPE")) not in (None, "HEALPIX"):
             raise UnfitError(f"not a HEALPix map, PIXTYPE is {pixtype}.")
         listed = self._listed()
@@ -196,7 +193,7 @@ class HealpixTable:
         """Return the first of these header keywords that is set, in upper case, or None."""
         for name in names:
             for header in (self._table.header, self._primary):
-                if text := str(header.get(name, "")).strip():
+                if text := str(header.get(name, "")).strip("'\" "):
                     return text.upper()
         return None
 
@@ -204,26 +201,24 @@ class HealpixTable:
         """Return the column of pixel numbers; None if the rows are in pixel order."""
         named = [self.names.index(n) for p in PIXELS for n in self.names if n.upper() == p]
         scheme = self.keyword("INDXSCHM")
-        explicit = scheme == "EXPLICIT" or (named and scheme != "IMPLICIT")
-        if explicit and self.keyword("NSIDE") is None:
-            raise UnfitError("explicit indexing without NSIDE in the header.")
-        if scheme == "EXPLICIT" and not named:
-            listed = ", ".join(self.names)
-            raise UnfitError(f"explicit indexing, but no column 'PIXEL'; it has {listed}.")
-        if not named:
-            return None
-        if not explicit:
-            numbers, order = self._stored(named[0]), np.arange(len(self._table.data))
+        if scheme == "EXPLICIT" or (named and scheme != "IMPLICIT"):
+            if self.keyword("NSIDE") is None:
+                raise UnfitError("explicit indexing without NSIDE in the header.")
+            if not named:
+                listed = ", ".join(self.names)
+                raise UnfitError(f"explicit indexing, but no column 'PIXEL'; it has {listed}.")
+            return named[0]
+        if named:
+            numbers, order = self._field(named[0]).ravel(), np.arange(len(self._table.data))
             if not np.array_equal(numbers, order) and np.array_equal(np.sort(numbers), order):
                 name = self.names[named[0]]
                 raise UnfitError(f"INDXSCHM is IMPLICIT, but column {name} has another order.")
-            return None
-        return named[0]
+        return None
 
     def _nside(self, explicit: bool) -> int:
         text = self.keyword("NSIDE")
-        stated = None if text is None else _number(text)
-        if stated is not None and not (1 <= stated <= LARGEST_NSIDE and stated.is_integer()):
+        stated = number(text or "")
+        if text and not (stated and 1 <= stated <= LARGEST_NSIDE and stated.is_integer()):
             raise UnfitError(f"NSIDE is {text}, but must be a whole number, 1 to {LARGEST_NSIDE}.")
         if explicit and stated is not None:
             return int(stated)
@@ -238,7 +233,7 @@ class HealpixTable:
 
     def _check_pixels(self, column: int) -> Int[np.ndarray, " row"]:
         """Return the pixel numbers, after checking that they are valid and unique."""
-        stored, npix = self._stored(column), healpy.nside2npix(self.nside)
+        stored, npix = self._field(column).ravel(), healpy.nside2npix(self.nside)
         where = f"column {self.names[column]}"
         with np.errstate(invalid="ignore"):
             pixels = stored.astype(np.int64)
@@ -268,18 +263,16 @@ class HealpixTable:
         """Return TUNIT of a column; None if it is missing or blank."""
         return str(self._table.header.get(f"TUNIT{index + 1}", "")).strip() or None
 
-    def _stored(
-        self, index: int, dtype: type | None = None, places: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Return a flat copy of a column of numbers, or some places, in its own or another type."""
+    def _field(self, index: int, logical: bool = False) -> np.ndarray:
+        """Return a column of real numbers, or if `logical` of truths, (row,) or (row, width)."""
         kind, name = self._kinds[index], self.names[index]
-        if kind not in NUMBERS:
+        if kind not in NUMBERS and not (logical and kind == "L"):
             raise UnfitError(f"column {name} holds {KINDS.get(kind, kind)}, not real numbers.")
         found = self._table.data.field(index)
         if found.ndim > 2:
             shape = " x ".join(map(str, found.shape[1:]))
             raise UnfitError(f"column {name} has a table of {shape} in each row.")
-        return np.array(_taken(found, places), dtype=dtype).ravel()
+        return found
 
     def _places(self, pixels: slice, ordering: str) -> Int[np.ndarray, " pix"]:
         """Return the places of RING pixels in the columns; -1 where they are not listed."""
@@ -313,40 +306,36 @@ class HealpixTable:
         and TNULL, NaN and infinity. If `logical`, columns of true and false become 1 and 0. Given
         a range of RING pixels of one's own, only these are read of the mapped file, and returned.
         """
+        npix, pixels = healpy.nside2npix(self.nside), self._pixels
+        size, expected = self._field(index, logical).size, npix if pixels is None else pixels.size
+        if size != expected:
+            name = self.names[index]
+            raise UnfitError(f"column {name} has {size} values for {expected} pixels.")
         if own is not None:
             places = self._places(own, ordering)
-            self._check_size(index, self._table.data.field(index).size)
             return np.where(places < 0, np.nan, self._real(index, places))
-        if logical and self._kinds[index] == "L":
-            column = np.array(self._table.data.field(index), dtype=np.float64).ravel()
-        else:
-            column = self._real(index)
-        self._check_size(index, column.size)
-        npix, pixels = healpy.nside2npix(self.nside), self._pixels
+        column = self._real(index, logical=logical)
         if pixels is not None:
             listed, column = column, np.full(npix, np.nan)
             column[pixels] = listed
         return in_ring(column, ordering)
 
-    def _check_size(self, index: int, size: int) -> None:
-        expected = healpy.nside2npix(self.nside) if self._pixels is None else self._pixels.size
-        if size != expected:
-            name = self.names[index]
-            raise UnfitError(f"column {name} has {size} values for {expected} pixels.")
-
-    def _real(self, index: int, places: np.ndarray | None = None) -> Float[np.ndarray, " row"]:
-        """Return a column of real numbers, or some places of it, NaN where it has no value."""
-        column = self._stored(index, np.float64, places)
+    def _real(
+        self, index: int, places: np.ndarray | None = None, logical: bool = False
+    ) -> Float[np.ndarray, " row"]:
+        """Return a column, or some places of it, NaN where it has no value."""
+        column = np.array(_taken(self._field(index, logical), places), np.float64).ravel()
         bad = ~np.isfinite(column) | equals(column, healpy.UNSEEN, 1e-5)
-        if (text := self.keyword("BAD_DATA")) not in (None, "UNSEEN", "NAN"):
-            if np.isnan(stated := _number(str(text))):
+        text = self.keyword("BAD_DATA") or "UNSEEN"
+        if text not in ("UNSEEN", "NAN"):
+            if (stated := number(text)) is None:
                 raise UnfitError(f"BAD_DATA is {text}, which is not a number.")
             bad |= equals(column, stated, 1e-5)
         key = f"TNULL{index + 1}"
-        if text := str(self._table.header.get(key, "")).strip():
+        if text := str(self._table.header.get(key, "")).strip("'\" "):
             # TNULL is a stored integer, before scaling. By the standard only integer columns have
             # one, but in others its meaning is clear.
-            if not (null := _number(text)).is_integer():
+            if (null := number(text)) is None or not null.is_integer():
                 raise UnfitError(f"{key} is {text}, which is not a whole number.")
             raw = self._table.data.view(np.ndarray)
             stored = _taken(raw[raw.dtype.names[index]], places).ravel()
@@ -361,19 +350,14 @@ class HealpixTable:
         If neither states it, the default is returned; without one that is an error.
         """
         keywords, spellings = _SAID[argument]
-        choices = ", ".join(dict.fromkeys(spellings.values()))
+        keyword, choices = keywords[0], _choices(argument)
         given = None if given is None else spelled(argument, given)
         text = self.keyword(*keywords)
-        found = None if text is None else spellings.get(text)
-        if text is not None and found is None and given is None:
-            raise UnfitError(
-                f"{keywords[0]} is {text}, which is none of {choices}; give `{argument}`."
-            )
-        if given is not None and found is not None and given != found:
+        found = spellings.get(text or "")
+        if text and not found and not given:
+            raise UnfitError(f"{keyword} is {text}, which is none of {choices}; give `{argument}`.")
+        if given and found and given != found:
             raise UnfitError(f"argument `{argument}` is {given}, but the header says {found}.")
-        stated = given or found or default
-        if stated is None:
-            raise UnfitError(
-                f"the header has no {keywords[0]}; give `{argument}`, one of {choices}."
-            )
-        return stated
+        if stated := given or found or default:
+            return stated
+        raise UnfitError(f"the header has no {keyword}; give `{argument}`, one of {choices}.")

@@ -14,18 +14,10 @@ from urllib.parse import urljoin, urlsplit
 import requests
 import urllib3
 
+from jaxsky import products
 from jaxsky.io import InputError
 from jaxsky.io.files import cache_folder, locked
-from jaxsky.products import (
-    DownloadError,
-    Product,
-    catalogue,
-    check_product,
-    checksums,
-    in_words,
-    recorded,
-    remember,
-)
+from jaxsky.products import DownloadError, Product, in_words
 
 #: Seconds to wait for a connection, and for more bytes.
 TIMEOUT = (10.0, 60.0)
@@ -189,17 +181,16 @@ def _reason(error: requests.RequestException) -> str:
         said = f"answers {error.response.status_code}"
         wait = f"{later} s" if later and later.isdecimal() else f"until {later}"
         return f"{said}, and asks to wait {wait}" if later else said
-    for kind, words in {
+    sentences = {
         requests.Timeout: "does not answer in time",
         requests.exceptions.SSLError: "has a certificate that cannot be checked",
         requests.TooManyRedirects: "sends on and on",
         requests.exceptions.InvalidSchema: "is, or sends on to, no http or https address",
         requests.exceptions.InvalidURL: "is no address",
         requests.exceptions.MissingSchema: "is no address",
-    }.items():
-        if isinstance(error, kind):
-            return words
-    return "cannot be reached"
+    }
+    found = (words for kind, words in sentences.items() if isinstance(error, kind))
+    return next(found, "cannot be reached")
 
 
 def fetch(
@@ -236,12 +227,12 @@ def fetch(
         If the existing file or the record of hashes is damaged; it is left unchanged.
     """
     if not isinstance(product, Product):
-        if product not in list(catalogue()):
+        if product not in list(products.catalogue()):
             raise ValueError(
                 "Argument `product` must be the name of a file in jaxsky.products.catalogue(), "
                 f"but is {product!r}."
             )
-        product = catalogue()[product]
+        product = products.catalogue()[product]
     folder = cache_folder() if folder is None else folder
     path, part = folder / product.name, folder / f"{product.name}.part"
     wanted = product._replace(size=None, hash=None) if accept else product
@@ -249,7 +240,7 @@ def fetch(
         if not mirror.lower().startswith(("http://", "https://")):
             raise ValueError(f"--mirror must begin with https:// or http://, but is {mirror!r}.")
         wanted = wanted._replace(addresses=(f"{mirror.rstrip('/')}/{product.name}",))
-    checksums(folder)  # raises for a damaged record before anything is transferred
+    products.checksums(folder)  # raises for a damaged record before anything is transferred
     if os.path.lexists(path):
         return _kept(product, path, part)
     try:
@@ -259,7 +250,7 @@ def fetch(
                 return _kept(product, path, part)
             _download(wanted, part, report)
             if wanted.hash is None:
-                remember(product, folder, part)
+                products.remember(product, folder, part)
             # The final name appears only once the file is complete.
             os.replace(part, path)
             _tidy(part)
@@ -278,7 +269,7 @@ def _kept(product: Product, path: Path, part: Path) -> Path:
     try:
         if not path.is_file():
             raise InputError(f"{path}: is no file, or a link to none.")
-        check_product(recorded(product, path.parent)._replace(hash=None), path)
+        products.check_product(products.recorded(product, path.parent)._replace(hash=None), path)
     except InputError as error:
         raise InputError(f"{error} It is left as it is; move it away and fetch it again.") from None
     with suppress(OSError):  # the cache may belong to someone else
@@ -298,7 +289,7 @@ def _download(product: Product, part: Path, report: Report) -> None:
     for address in sorted(product.addresses, key=lambda a: begun is None or a != begun.address):
         try:
             _transfer(address, part, product.size, report)
-            check_product(product, part, ANEW)
+            products.check_product(product, part, ANEW)
             return
         except InputError as error:
             discard(part)

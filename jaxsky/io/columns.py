@@ -152,19 +152,19 @@ def _marks(rest: np.ndarray, extreme: float, count: int, usual: bool) -> np.ndar
 class Column(NamedTuple):
     """A column of a HEALPix table: values in RING order, NaN where missing, and its metadata.
 
-    `lowest` is the value of the lowest integer that the column can store, None for other types;
-    `alone` is True if its table has no other column.
+    `alone` is True if its table has no other column; `lowest` is the value of the lowest integer
+    that the column can store, None for other types.
     """
 
     where: str
+    nside: int
+    coordinates: str
+    polarization: str
+    alone: bool
     name: str
     unit: str
     values: Float[np.ndarray, " pix"]
     lowest: float | None
-    alone: bool
-    coordinates: str
-    polarization: str
-    nside: int
 
 
 #: Attributes that all columns read together must share, and the advice if they do not.
@@ -231,30 +231,6 @@ def _split(path: Any, hdu: Any, fields: Any) -> list[tuple[Path, Any, list[Any] 
     return [(Path(p), h, c) for p, h, c in zip(*each, strict=True)]
 
 
-def _read_table(
-    path: Path,
-    hdu: int | str,
-    fields: list[int | str] | None,
-    unit: str | None,
-    stated: Mapping[str, str | None],
-    own: slice | None,
-) -> list[Column]:
-    with open_table(path, hdu) as table:
-        wanted = default_fields(table) if fields is None else [table.index(f) for f in fields]
-        if len(set(wanted)) < len(wanted):
-            raise UnfitError(f"`fields` names a column twice: {fields}.")
-        units = {i: _unit(table, i, unit) for i in wanted}
-        order = table.state("ordering", stated["ordering"])
-        frame = table.state("coordinates", stated["coordinates"])
-        sign = table.state("polarization", stated["polarization"], "COSMO")
-        rest = (len(table.fields) == 1, frame, sign, table.nside)
-        where, names = table.where, table.names
-        return [
-            Column(where, names[i], text, table.values(i, order, own=own), table.lowest(i), *rest)
-            for i, text in units.items()
-        ]
-
-
 def read_columns(
     path: Any,
     hdu: Any,
@@ -267,8 +243,21 @@ def read_columns(
 
     `stated` contains ordering, coordinates and polarization; `own` is a range of pixels, or all.
     """
-    tables = [_read_table(*one, unit, stated, own) for one in _split(path, hdu, fields)]
-    first, *others = (column for table in tables for column in table)
+    columns: list[Column] = []
+    for file, number, chosen in _split(path, hdu, fields):
+        with open_table(file, number) as table:
+            wanted = default_fields(table) if chosen is None else [table.index(f) for f in chosen]
+            if len(set(wanted)) < len(wanted):
+                raise UnfitError(f"`fields` names a column twice: {chosen}.")
+            units = {i: _unit(table, i, unit) for i in wanted}
+            order = table.state("ordering", stated["ordering"])
+            frame = table.state("coordinates", stated["coordinates"])
+            sign = table.state("polarization", stated["polarization"], "COSMO")
+            shared = (table.where, table.nside, frame, sign, len(table.fields) == 1)
+            for i, text in units.items():
+                values = table.values(i, order, own=own)
+                columns.append(Column(*shared, table.names[i], text, values, table.lowest(i)))
+    first, *others = columns
     for (name, hint), other in product(_COMMON.items(), others):
         one, two = getattr(first, name), getattr(other, name)
         if one != two:
@@ -276,7 +265,7 @@ def read_columns(
                 f"{other.where}: {name} of column {other.name} is {two}, but that of "
                 f"{first.name} in {first.where} is {one}; {hint}."
             )
-    return [first, *others]
+    return columns
 
 
 def column_stokes(

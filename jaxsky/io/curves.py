@@ -95,7 +95,8 @@ def read_text(path: Path) -> TextTable:
                     _add_line(table, line, text)
         if not table.rows:
             raise UnfitError("no line has numbers.")
-        _check_commas(table.rows)
+        with in_file(f"{path}, line {table.rows[0].line}"):
+            _check_commas(table.rows)
     return table
 
 
@@ -124,9 +125,7 @@ def _check_commas(rows: list[TextRow]) -> None:
     halves = all(len(row.cells) % 2 == 0 and len(row.cells) > 2 for row in rows)
     commas = all(len(row.text.split()) == 1 and "," in row.text for row in rows)
     if halves and commas and all(cell.lstrip("+-").isdigit() for cell in cells):
-        raise UnfitError(
-            f"line {rows[0].line}: {rows[0].text!r} may have decimal commas; {_WRITE}."
-        )
+        raise UnfitError(f"{rows[0].text!r} may have decimal commas; {_WRITE}.")
 
 
 SPECTRA = ("TT", "EE", "BB", "TE")

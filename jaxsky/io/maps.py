@@ -166,26 +166,23 @@ def read_maps(
         TEMPERATURE, Q_POLARISATION, U_ML, ...), or the only column. For several files or HDUs one
         that all have, or one for each.
     hdu : number or name of the table; or a list of them, one per file, or all in one file
-    unit : unit of the columns, for example "mK_CMB". It must be given if the header has a bare
-        "K" or "mK", which does not say which temperature is meant ("K" for a map of dust
-        temperatures, "" for a pure number).
+    unit : unit of the columns, for example "mK_CMB"; must be given if the header has a bare "K" or
+        "mK", which may mean any temperature ("K" for a map of dust temperatures; "": pure number)
     nside : expected resolution
     ordering : "RING" or "NESTED"
     coordinates : "G", "C" or "E" (Galactic, Celestial, Ecliptic)
     polarization : "COSMO" or "IAU"; COSMO, the HEALPix convention, if nothing states it
     stokes : Stokes parameters of the columns in order, "QU", "IQU", "I", or for covariances
-        "QQ QU UU". A column without one, such as hits, may be called "I"; "" says that no column
-        has one. Must agree with names that are certain.
+        "QQ QU UU"; "I" also for hits and the like, "" if no column has one
     missing : number or numbers that mark missing pixels, possibly zero; [] if all values are data
-    zeros_are_data : accept exact zeros, for example in a correction that is zero where there is
-        nothing to correct
+    zeros_are_data : accept exact zeros, as of a correction where there is nothing to correct
     pixels : range of RING pixels to read, of maps in Galactic coordinates; default all
 
     Raises
     ------
     InputError
-        If a file is not such a map or lacks some of the pixels, or if something needed to use the
-        maps is stated neither by header nor argument, or differently by both or by several files.
+        If a file is not such a map or lacks some of the pixels, or if a property is stated neither
+        by header nor argument, or differently by both or by several files.
     """
     stated = {"ordering": ordering, "coordinates": coordinates, "polarization": polarization}
     given = None if unit is None else unit_name(unit)
@@ -240,7 +237,7 @@ def read_mask(
     nside: int | None = None,
     ordering: str | None = None,
 ) -> Bool[np.ndarray, " pix"]:
-    """Read a mask from a FITS file or an .npz archive.
+    """Read a mask from a FITS file or an .npz archive: True in used pixels; RING, Galactic, (pix,).
 
     Pixels without a value are not used: those that a partial map does not list, and those that
     are UNSEEN, NaN, or equal to the header's BAD_DATA or TNULL.
@@ -254,10 +251,6 @@ def read_mask(
     nside : expected resolution
     ordering : "RING" or "NESTED" if the header does not say; archives are RING by default. A
         FITS mask without coordinates is taken to be Galactic.
-
-    Returns
-    -------
-    True in used pixels; RING, Galactic, shape (pix,).
 
     Raises
     ------

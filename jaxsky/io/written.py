@@ -1,7 +1,7 @@
 """Write HEALPix maps, which may be larger than memory."""
 
 import gzip
-import shutil
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from jaxsky.io.files import InputError, whole
 from jaxsky.io.quantities import unit_name
 from jaxsky.io.stacks import Maps, Stack, ranges
 
-#: Bytes of a block of a FITS file.
+#: Bytes of a block of a FITS file; an empty primary HDU has one.
 BLOCK = 2880
 
 
@@ -97,24 +97,14 @@ def write_maps(
         table.header[key] = value
     table.header.update(required)
     table.header["NAXIS2"] = npix
-    with whole(path) as beside:
-        packed = path.suffix == ".gz"
-        plain = beside.with_suffix("") if packed else beside
-        try:
-            with plain.open("wb") as file:
-                for header in (pyfits.PrimaryHDU().header, table.header):
-                    file.write(header.tostring().encode("ascii"))
-                for part in ranges(npix):  # the whole table may be larger than memory
-                    rows = np.asarray(maps[..., part], dtype)
-                    rows = np.where(used[part], rows, healpy.UNSEEN)
-                    file.write(rows.T.astype(dtype.newbyteorder(">"), order="C").tobytes())
-                file.write(bytes(-npix * len(maps) * dtype.itemsize % BLOCK))
-            if tables:
-                with pyfits.open(plain, mode="append") as hdus:
-                    hdus.extend(tables)
-            if packed:
-                with plain.open("rb") as file, gzip.open(beside, "wb") as smaller:
-                    shutil.copyfileobj(file, smaller)
-        finally:
-            if packed:  # also after an error
-                plain.unlink(missing_ok=True)
+    others = io.BytesIO()
+    pyfits.HDUList([pyfits.PrimaryHDU(), *tables]).writeto(others)
+    opened = gzip.open if path.suffix == ".gz" else open
+    with whole(path) as beside, opened(beside, "wb") as file:
+        file.write(others.getvalue()[:BLOCK])
+        file.write(table.header.tostring().encode("ascii"))
+        for part in ranges(npix):  # the whole table may be larger than memory
+            rows = np.where(used[part], np.asarray(maps[..., part], dtype), healpy.UNSEEN)
+            file.write(rows.T.astype(dtype.newbyteorder(">"), order="C").tobytes())
+        file.write(bytes(-npix * len(maps) * dtype.itemsize % BLOCK))
+        file.write(others.getvalue()[BLOCK:])

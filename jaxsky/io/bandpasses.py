@@ -255,7 +255,7 @@ def read_bandpass(
       "nu_GHz"), else GHz, provided that the middle of the band is then between 1 and 3000 GHz.
       Such a file does not state its convention, so it has to be given.
 
-    Samples without weight at nu <= 0 are dropped.
+    Samples without weight at nu <= 0 are dropped. What remains uncertain is an InputError.
 
     Parameters
     ----------
@@ -270,11 +270,6 @@ def read_bandpass(
     trim : cut both ends of the band up to where the weight exceeds this fraction of the largest.
         HFI tables have 12 000 to 17 000 samples up to 18 THz; 1e-6 leaves 360 to 5 400 and
         changes the factors from K_CMB to MJy/sr by less than 5e-6 (1e-4: by up to 8e-4).
-
-    Raises
-    ------
-    InputError
-        If the file has no such bandpass, or convention, unit or columns are not certain.
     """
     path = Path(path)
     if convention is not None:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jaxsky.io.files import UnfitError, in_file, is_fits
 from jaxsky.io.quantities import unit_factor, unit_name
-from jaxsky.io.tables import TABLES, number, open_fits, select_hdu
+from jaxsky.io.tables import TABLES, open_fits, select_hdu, to_number
 
 COMMENTS = ("#", ";", "%", "!", "\\", "|", "//", "*")
 _TRAILING = re.compile(r"\s(?:[#!%\\]|//).*")
@@ -52,7 +52,7 @@ class TextTable(NamedTuple):
         table = []
         for line, text, cells in self.rows:
             wanted = range(len(cells)) if columns is None else columns
-            values = [number(cells[c]) if c < len(cells) else None for c in wanted]
+            values = [to_number(cells[c]) if c < len(cells) else None for c in wanted]
             with in_file(f"{self.path}, line {line}"):
                 if None in values:
                     raise UnfitError(f"not a row of numbers: {text!r}.")
@@ -68,7 +68,7 @@ def _cells(text: str) -> list[str]:
         return [cell.strip().replace(",", ".") for cell in text.strip(" ;").split(";")]
     words = [word.strip(",") for word in text.split()]
     for word in words if len(words) > 1 else ():
-        if "," in word and all(number(part) is not None for part in word.split(",")):
+        if "," in word and all(to_number(part) is not None for part in word.split(",")):
             raise UnfitError(f"{word!r} is two numbers or one with a decimal comma; {_WRITE}.")
     return [cell for cell in re.split(r"[\s,]+", text) if cell]
 
@@ -111,7 +111,7 @@ def _add_line(table: TextTable, line: int, text: str) -> None:
             table.header.append(text.lstrip("".join(COMMENTS)).strip())
     else:
         cells = _cells(_TRAILING.sub("", text))
-        if table.rows or any(number(cell) is not None for cell in cells):
+        if table.rows or any(to_number(cell) is not None for cell in cells):
             table.rows.append(TextRow(line, text, cells))
         elif all(_DAMAGED.match(cell) for cell in cells):
             raise UnfitError(f"not a row of numbers: {text!r}.")
@@ -231,12 +231,11 @@ def _spectra_of_fits(
         if stated := _D_ELL.search(repr(table.header)):
             raise UnfitError(f"the header says {stated[0]!r}; spectra in FITS files must be C_l.")
         names = table.columns.names
-        columns = _located(names, SPECTRA)
-        multipoles = [table.data.field(n) for n in names if _known([n]) == ["L"]]
+        columns, known = _located(names, SPECTRA), _known(names)
         factors = [_fits_factor(names[c], table.header.get(f"TUNIT{c + 1}"), unit) for c in columns]
         values = np.array([np.ravel(table.data.field(c)) for c in columns], np.float64)
-        ell = np.array(multipoles[0] if multipoles else np.arange(values.shape[1]), float).ravel()
-    return ell, values * np.array(factors)[:, None]
+        ell = table.data.field(known.index("L")) if "L" in known else np.arange(values.shape[1])
+        return np.array(ell, float).ravel(), values * np.array(factors)[:, None]
 
 
 def _first(bad: np.ndarray) -> str:
@@ -252,10 +251,9 @@ def read_spectra(
 ) -> Float[np.ndarray, "4 ell"]:
     """Read power spectra C_l of TT, EE, BB, TE from a file [uK_CMB^2], l = 0 ... lmax.
 
-    * Text with l and D_l = l (l+1) C_l / 2 pi [uK^2]: the theory spectra of the Planck Legacy
-      Archive (L TT TE EE BB PP), and the output of CAMB (L TT EE BB TE). The header names the
-      columns. Without one, CAMB's order is assumed for file names that end in totCls.dat or
-      lensedCls.dat; for others the names must be given as `fields`.
+    * Text with l and D_l = l (l+1) C_l / 2 pi [uK^2], as of the Planck Legacy Archive and CAMB. The
+      header names the columns; without one, they are L TT EE BB TE if the file's name ends in
+      totCls.dat or lensedCls.dat (CAMB), and must else be given as `fields`.
     * FITS tables with C_l as written by HEALPix and healpy, from l = 0 unless there is a column
       of multipoles. Units are read from the header; a bare K^2 means K_CMB^2.
 
@@ -267,8 +265,7 @@ def read_spectra(
     lmax : largest multipole
     fields : names of the first columns of a text file without a header, in order, for example
         ["L", "TT", "TE", "EE", "BB"]
-    unit : unit of a FITS table that states none, for example "uK_CMB^2" (`healpy.write_cl` writes
-        none unless asked to)
+    unit : unit of a FITS table that states none (`healpy.write_cl`), for example "uK_CMB^2"
 
     Raises
     ------
@@ -342,13 +339,8 @@ def read_beam(path: str | Path, lmax: int, *, hdu: int | str = 1) -> Float[np.nd
     Parameters
     ----------
     path : text or FITS file
-    lmax : largest multipole; tables are not extrapolated
+    lmax : largest multipole; a table that does not reach it is an InputError
     hdu : number or name of the FITS table, for example "BEAMWF_030X030" of an instrument model
-
-    Raises
-    ------
-    InputError
-        If the file has no such window, or lacks some multipoles.
     """
     path = Path(path)
     with in_file(path):

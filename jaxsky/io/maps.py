@@ -240,7 +240,8 @@ def read_mask(
     """Read a mask from a FITS file or an .npz archive: True in used pixels; RING, Galactic, (pix,).
 
     Pixels without a value are not used: those that a partial map does not list, and those that
-    are UNSEEN, NaN, or equal to the header's BAD_DATA or TNULL.
+    are UNSEEN, NaN, or equal to the header's BAD_DATA or TNULL. Other values than 0 and 1, as of an
+    apodized mask (`read_maps`), are an InputError, and so is a mask without any used pixel.
 
     Parameters
     ----------
@@ -251,12 +252,6 @@ def read_mask(
     nside : expected resolution
     ordering : "RING" or "NESTED" if the header does not say; archives are RING by default. A
         FITS mask without coordinates is taken to be Galactic.
-
-    Raises
-    ------
-    InputError
-        If the file has no such mask, or the mask has values other than 0 and 1 (read an apodized
-        mask with `read_maps`), the wrong nside, or no used pixel.
     """
     path = Path(path)
     frame, others = "G", []

@@ -93,7 +93,7 @@ def _is_cut(path: Path, hdus: pyfits.HDUList) -> bool:
         return True
 
 
-def number(text: str) -> float | None:
+def to_number(text: str) -> float | None:
     """Parse a number, also with a Fortran exponent (1.0D+01); None if it is not a number."""
     try:
         return float(text.lower().replace("d", "e")) if text.isascii() and "_" not in text else None
@@ -217,7 +217,7 @@ class HealpixTable:
 
     def _nside(self, explicit: bool) -> int:
         text = self.keyword("NSIDE")
-        stated = number(text or "")
+        stated = to_number(text or "")
         if text and not (stated and 1 <= stated <= LARGEST_NSIDE and stated.is_integer()):
             raise UnfitError(f"NSIDE is {text}, but must be a whole number, 1 to {LARGEST_NSIDE}.")
         if explicit and stated is not None:
@@ -328,14 +328,14 @@ class HealpixTable:
         bad = ~np.isfinite(column) | equals(column, healpy.UNSEEN, 1e-5)
         text = self.keyword("BAD_DATA") or "UNSEEN"
         if text not in ("UNSEEN", "NAN"):
-            if (stated := number(text)) is None:
+            if (stated := to_number(text)) is None:
                 raise UnfitError(f"BAD_DATA is {text}, which is not a number.")
             bad |= equals(column, stated, 1e-5)
         key = f"TNULL{index + 1}"
         if text := str(self._table.header.get(key, "")).strip("'\" "):
             # TNULL is a stored integer, before scaling. By the standard only integer columns have
             # one, but in others its meaning is clear.
-            if (null := number(text)) is None or not null.is_integer():
+            if (null := to_number(text)) is None or not null.is_integer():
                 raise UnfitError(f"{key} is {text}, which is not a whole number.")
             raw = self._table.data.view(np.ndarray)
             stored = _taken(raw[raw.dtype.names[index]], places).ravel()

@@ -14,7 +14,7 @@ from jaxsky.bandpass import CONVENTIONS, Bandpass
 from jaxsky.checks import check_choice
 from jaxsky.io.curves import TextTable, read_text
 from jaxsky.io.files import UnfitError, in_file, is_fits
-from jaxsky.io.tables import open_fits, select_hdu
+from jaxsky.io.tables import index_of, open_fits, select_hdu
 
 #: astropy's name of a unit -> how files spell it; wavenumbers and wavelengths are converted.
 _UNITS = {
@@ -205,13 +205,8 @@ def _columns(table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
         return [0, 1]
     if isinstance(fields, str) or len(fields) != 2:
         raise UnfitError(f"argument `fields` must name two columns, not {fields!r}.")
-    columns = []
-    for field in fields:
-        column = names.index(field) if isinstance(field, str) and field in names else field
-        if not isinstance(column, int) or isinstance(column, bool) or not 0 <= column < width:
-            known = ", ".join(names) or f"0 to {width - 1}"
-            raise UnfitError(f"no column {field!r}; it has {known}.")
-        columns.append(column)
+    listed = ", ".join(names) or f"0 to {width - 1}"
+    columns = [index_of(field, names or [""] * width, listed) for field in fields]
     if columns[0] == columns[1]:
         raise UnfitError(f"argument `fields` names column {fields[0]!r} twice.")
     return columns

@@ -3,7 +3,7 @@
 import gzip
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -107,6 +107,20 @@ def equals(
     """Return where values equal a number to a relative tolerance; zero must be exact."""
     apart = rtol * abs(number)
     return (values >= number - apart) & (values <= number + apart)
+
+
+def index_of(field: int | str, names: Sequence[str], listed: str) -> int:
+    """Return the number of a column given by name (in any case, if unambiguous) or number."""
+    if isinstance(field, str):
+        same = [i for i, name in enumerate(names) if name == field]
+        same = same or [i for i, name in enumerate(names) if name.upper() == field.upper()]
+        if len(same) > 1:
+            raise UnfitError(f"{len(same)} columns are called {field!r}.")
+        if same:
+            return same[0]
+    elif not isinstance(field, bool) and field in range(len(names)):
+        return int(field)
+    raise UnfitError(f"no column {field!r}; it has {listed}.")
 
 
 def select_hdu(
@@ -247,17 +261,8 @@ class HealpixTable:
         return pixels
 
     def index(self, field: int | str) -> int:
-        """Return the number of a column given by name (in any case, if unambiguous) or number."""
-        if isinstance(field, str):
-            same = [i for i, name in enumerate(self.names) if name == field]
-            same = same or [i for i, n in enumerate(self.names) if n.upper() == field.upper()]
-            if len(same) > 1:
-                raise UnfitError(f"{len(same)} columns are called {field!r}.")
-            if same:
-                return same[0]
-        elif not isinstance(field, bool) and 0 <= field < len(self.names):
-            return int(field)
-        raise UnfitError(f"no column {field!r}; it has {', '.join(self.names)}.")
+        """Return the number of a column; see `index_of`."""
+        return index_of(field, self.names, ", ".join(self.names))
 
     def unit(self, index: int) -> str | None:
         """Return TUNIT of a column; None if it is missing or blank."""

@@ -15,7 +15,7 @@ import requests
 import urllib3
 
 from jaxsky import products
-from jaxsky.io import InputError
+from jaxsky.io import InputError, check_file
 from jaxsky.io.files import cache_folder, locked
 from jaxsky.products import DownloadError, Product, in_words
 
@@ -267,8 +267,7 @@ def fetch(
 def _kept(product: Product, path: Path, part: Path) -> Path:
     """Return the path of an existing file after a quick check (not of its hash)."""
     try:
-        if not path.is_file():
-            raise InputError(f"{path}: is no file, or a link to none.")
+        check_file(path)
         products.check_product(products.recorded(product, path.parent)._replace(hash=None), path)
     except InputError as error:
         raise InputError(f"{error} It is left as it is; move it away and fetch it again.") from None

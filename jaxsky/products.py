@@ -4,18 +4,18 @@ import json
 import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 import pooch
-from astropy.io import fits as pyfits
 from rich.filesize import decimal
 
 from jaxsky.io import InputError, read_spectra
 from jaxsky.io.files import UnfitError, locked
 from jaxsky.io.quantities import unit_name
-from jaxsky.io.tables import HealpixTable, open_fits, open_table
+from jaxsky.io.tables import HealpixTable, is_cut, open_fits, open_table
 from jaxsky.public import packaged
 
 
@@ -185,13 +185,8 @@ def _check_structure(product: Product, path: Path) -> list[str]:
         if not start.startswith((b"SIMPLE", b"\x1f\x8b")):
             raise InputError(f"{path}: is no FITS file, it begins with {shown!r}.")
         with open_fits(path) as hdus:
-            # Reading the last row of each table or image makes astropy notice a truncated file.
-            for hdu in hdus:
-                if isinstance(hdu, pyfits.BinTableHDU):
-                    if len(hdu.columns):
-                        hdu.data[-1:]
-                elif hdu.is_image and hdu.shape:
-                    hdu.section[-1:]
+            if is_cut(path, hdus):
+                raise UnfitError("not a FITS file, or a truncated one.")
         if product.nside is None:
             return ["complete"]
         with open_table(path, 1) as table:
@@ -201,10 +196,8 @@ def _check_structure(product: Product, path: Path) -> list[str]:
         raise InputError(f"{path}: is no table, it begins with {shown!r}.")
     if product.lmax is not None:
         read_spectra(path, product.lmax)
-        with path.open("rb") as file:
-            file.seek(-1, 2)
-            if file.read() != b"\n":
-                raise InputError(f"{path}: ends in the middle of a line.")
+        if not path.read_bytes().endswith(b"\n"):
+            raise InputError(f"{path}: ends in the middle of a line.")
     return ["complete"]
 
 
@@ -217,9 +210,7 @@ def _check_maps(table: HealpixTable, product: Product) -> None:
         other = name.upper() in ("N_OBS", "HITS") or name.endswith("_COV")
         if product.unit is None or other or text is None:
             continue
-        try:
-            unit = unit_name(text)
-        except ValueError:
-            unit = text
-        if unit not in (product.unit, product.unit.replace("_CMB", "").replace("_RJ", "")):
+        with suppress(ValueError):
+            text = unit_name(text)
+        if text not in (product.unit, product.unit.replace("_CMB", "").replace("_RJ", "")):
             raise UnfitError(f"column {name} is in {text}, but {product.unit} is expected.")

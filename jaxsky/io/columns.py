@@ -195,9 +195,8 @@ def default_fields(table: HealpixTable, argument: str = "fields") -> list[int]:
 def _unit(table: HealpixTable, column: int, given: str | None) -> str:
     """Return the unit of a column, from the header or the argument `unit`."""
     text, name, found = table.unit(column), table.names[column], None
-    if text is not None:
-        with suppress(ValueError):
-            found = unit_name(text)
+    with suppress(ValueError):
+        found = unit_name(text) if text else None
     if given is None and (found is None or is_ambiguous(found)):
         says = f"has the unit {text!r}, which leaves open what is meant" if text else "has no unit"
         units = (

@@ -66,7 +66,7 @@ def open_fits(path: Path) -> Iterator[pyfits.HDUList]:
         except InputError:
             raise
         except (*_DAMAGE, *_PUZZLED) as error:
-            damaged = hdus is None or isinstance(error, _DAMAGE) or _is_cut(path, hdus)
+            damaged = hdus is None or isinstance(error, _DAMAGE) or is_cut(path, hdus)
             what = "not a FITS file, or a truncated one" if damaged else "cannot be read"
             reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
             raise InputError(f"{path}: {what} ({reason}).") from error
@@ -81,7 +81,7 @@ def open_table(path: Path, hdu: int | str) -> Iterator["HealpixTable"]:
             yield HealpixTable(where, table, hdus[0].header)
 
 
-def _is_cut(path: Path, hdus: pyfits.HDUList) -> bool:
+def is_cut(path: Path, hdus: pyfits.HDUList) -> bool:
     """Return whether a file ends before the data that its headers announce."""
     try:
         ends = [info["datLoc"] + info["datSpan"] for hdu in hdus if (info := hdu.fileinfo())]

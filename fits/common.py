@@ -18,13 +18,7 @@ from fits.regions import common_holes
 from fits.template_likelihood import CovarianceOf, SkyLikelihood, likelihood
 from jaxsky import Bandpass, Component, Sky, job, observe
 from jaxsky.checks import Numeric
-from jaxsky.harmonics import (
-    Preparation,
-    beam_ratio,
-    gaussian_beam,
-    pixel_window,
-    shortened,
-)
+from jaxsky.harmonics import Preparation, beam_ratio, gaussian_beam, pixel_window, shortened
 from jaxsky.io.stacks import Computed, Maps, Stack, computed, is_large, ranges, stored
 from jaxsky.job import filled
 from jaxsky.mesh import distribute, spread

@@ -27,14 +27,7 @@ from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.checks import UNSEEN, Numeric, check_double, check_finite
-from jaxsky.harmonics import (
-    alm_ell,
-    gaussian_beam,
-    lmax_of,
-    low_multipoles,
-    map_variance,
-    resize,
-)
+from jaxsky.harmonics import alm_ell, gaussian_beam, lmax_of, low_multipoles, map_variance, resize
 
 #: A band is left out where its beam is below this: its weight would be lost in rounding.
 BEAM = 1e-5

@@ -23,15 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from fits import distributed, regions, systems
 from fits.blocks import ON_DISK, Blocks
-from fits.compress import (
-    Layout,
-    Noise,
-    as_noise,
-    band_covariance,
-    bare,
-    compressed,
-    layouts,
-)
+from fits.compress import Layout, Noise, as_noise, band_covariance, bare, compressed, layouts
 from fits.mixing import Mixing, named_bands, spectral_names, unit_sky
 from fits.posterior import Likelihood
 from fits.regions import Cells, check_labels

@@ -194,10 +194,7 @@ def _derivatives(alm: Float[Array, "1 alm"], nside: int) -> Float[np.ndarray, "4
 
 
 def _product(
-    order: int,
-    mask: Float[Array, " pix"],
-    derivatives: Float[Array, "4 pix"] | None,
-    maps: Any,
+    order: int, mask: Float[Array, " pix"], derivatives: Float[Array, "4 pix"] | None, maps: Any
 ) -> Float[Array, "2 pix"]:
     """Return maps (2, pix) times the mask (order 0), or its derivative of an order.
 

@@ -21,11 +21,7 @@ from fits.mixing import nominal
 from fits.multipoles import harmonic_coefficients, harmonic_likelihood, masked_noise
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.regions import apodize, parameter_labels, region_mask
-from fits.separated_maps import (
-    component_maps,
-    emission_maps,
-    harmonic_component_maps,
-)
+from fits.separated_maps import component_maps, emission_maps, harmonic_component_maps
 from jaxsky import Bandpass, Sky, job
 from jaxsky.checks import Numeric
 from jaxsky.harmonics import Preparation, expand, gaussian_beam, lmax_of, low_multipoles, synthesis

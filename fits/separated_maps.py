@@ -221,11 +221,7 @@ def _matrices(like: SpectralLikelihood, params: Mapping[str, Numeric]) -> tuple[
     return matrices_at(like, like.check(params) if like.start else {})
 
 
-def emission_maps(
-    like: SpectralLikelihood,
-    params: Mapping[str, Numeric],
-    amplitude: Maps,
-) -> Maps:
+def emission_maps(like: SpectralLikelihood, params: Mapping[str, Numeric], amplitude: Maps) -> Maps:
     """Return the emission in the bands, in the unit of the data, from maps or coefficients."""
     shape = (len(like.mixing.names), *amplitude.shape[1:])
     known, of_pixel = _matrices(like, params), like.of_pixel

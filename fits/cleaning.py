@@ -11,7 +11,7 @@ import threading
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from contextlib import nullcontext
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -199,22 +199,18 @@ def separate_data(
     others = (np.arange(len(found.components)) != row)[:, None, None]
     foregrounds = computed(amplitude.shape, lambda part: amplitude[..., part] * others)
     emission = data.emission(whole, best, foregrounds)
+    bare = dataclasses.replace(whole, source=None)  # the noise of other data takes its place
+    make = partial(_simulation, data, bare, response, emission, spectra, window, lensed)
     path = None if out is None else out / "simulations.npz"
     kept = spec.nsims, settings.seed, path, _mark(settings, data), progress.advance, executor
-    simulated = simulated_noise(data, whole, response, emission, spectra, window, lensed, *kept)
+    simulated = kept_realisations(make, SimulatedNoise, *kept)
     progress.step("tensor-to-scalar ratio")
     # The model has the mean E in B that the windows know of; only the rest is added.
     EE = lensed[1, : spectra.lmax + 1]
     leaked = simulated.leaked.mean(axis=0) - spectra.windows[1, :, 0] @ EE
-    model = power_model(
-        spectra,
-        window,
-        lensed,
-        tensors,
-        simulated.both.mean(axis=0) + leaked,
-        simulated.spectrum.mean(axis=0),
-        simulated=simulated.total,
-    )
+    additive, noise = simulated.both.mean(axis=0) + leaked, simulated.spectrum.mean(axis=0)
+    known = spectra, window, lensed, tensors, additive, noise
+    model = power_model(*known, simulated=simulated.total)
     left = None
     if data.foregrounds is not None:
         alone = cleaned_cmb(data, whole, best, data.foregrounds)
@@ -225,21 +221,9 @@ def separate_data(
     if spec.sampler != "none" and len(fit.labels) <= SAMPLED and like.source is None:
         progress.step("posterior")
         chain = _chain(settings, data, like, fit, simulated, out, progress)
-    return Separation(
-        data=data,
-        like=whole,
-        fit=fit,
-        sigma=sigma,
-        covariance=covariance,
-        found=found,
-        maps=maps,
-        residuals=data.residuals(whole, best, amplitude),
-        simulated=simulated,
-        spectra=spectra,
-        tensors=ratio,
-        left=left,
-        chain=chain,
-    )
+    residuals = data.residuals(whole, best, amplitude)
+    fitted = data, whole, fit, sigma, covariance, found, maps, residuals
+    return Separation(*fitted, simulated, spectra, ratio, left, chain)
 
 
 def cleaned_cmb(
@@ -253,33 +237,22 @@ def cleaned_cmb(
     return stored(maps[found.components.index("cmb")])
 
 
-@dataclass(frozen=True)
-class _NoiseSimulation:
-    """A simulation as a function of its key, see `simulated_noise`."""
+def _simulation(data, like, response, emission, spectra, window, lensed, key):
+    """Return the fields of `SimulatedNoise` of one realisation of noise, on foregrounds.
 
-    data: PixelData | FullSkyData
-    like: SpectralLikelihood
-    response: Response
-    emission: Maps
-    spectra: MaskedSpectra
-    window: Float[np.ndarray, " ell"]
-    lensed: Float[np.ndarray, "4 ell"]
-
-    def __call__(self, key: Array) -> list[np.ndarray]:
-        # Transforms of large maps use all processors, and much memory: one after the other.
-        with ONE if isinstance(self.emission, Stack) else nullcontext():
-            return self._made(key)
-
-    def _made(self, key: Array) -> list[np.ndarray]:
-        data, like, spectra, theta = self.data, self.like, self.spectra, self.response.theta
+    `response` is that of the best fit to noise, `emission` the foregrounds in the bands, `window`
+    the beam of the maps, and `lensed` C_l of a CMB without tensors up to its end [uK_CMB^2].
+    """
+    # Transforms of large maps use all processors, and much memory: one after the other.
+    with ONE if isinstance(emission, Stack) else nullcontext():
         noise = data.noise_realisation(key)
-        observed = computed(noise.shape, lambda at: self.emission[..., at] + noise[..., at])
-        moved = self.response.moved(data.likelihood(observed), stream(key, "priors"))
-        alone = cleaned_cmb(data, like, like.named(jnp.asarray(theta)), noise)
-        both = cleaned_cmb(data, like, like.named(jnp.asarray(moved)), observed)
+        observed = computed(noise.shape, lambda at: emission[..., at] + noise[..., at])
+        theta = response.moved(data.likelihood(observed), stream(key, "priors"))
+        alone = cleaned_cmb(data, like, like.named(jnp.asarray(response.theta)), noise)
+        both = cleaned_cmb(data, like, like.named(jnp.asarray(theta)), observed)
         nside = healpy.npix2nside(both.shape[-1])
-        alm = realisation(stream(key, "cmb"), self.lensed) * expand(jnp.asarray(self.window))
-        alm = resize(alm, max(2, needed_lmax(self.window)))
+        alm = realisation(stream(key, "cmb"), lensed) * expand(jnp.asarray(window))
+        alm = resize(alm, max(2, needed_lmax(window)))
         # Made one by one, since they may be large.
         every = (
             lambda: alone,
@@ -290,27 +263,7 @@ class _NoiseSimulation:
         )
         powers = [band_powers(spectra, maps())[1] for maps in every]
         mean = mean_spectrum(spectra.mask, both, spectra.lmax)
-        return [moved - theta, *powers, mean]
-
-
-def simulated_noise(
-    data: PixelData | FullSkyData,
-    like: SpectralLikelihood,
-    response: Response,
-    emission: Maps,
-    spectra: MaskedSpectra,
-    window: Float[np.ndarray, " ell"],
-    lensed: Float[np.ndarray, "4 ell"],
-    *kept: Any,
-) -> SimulatedNoise:
-    """Simulate noise on top of the foregrounds found; `kept` is for `kept_realisations`.
-
-    `response` is that of the best fit to noise, `emission` the foregrounds in the bands, `window`
-    the beam of the maps, and `lensed` C_l of a CMB without tensors up to its end [uK_CMB^2].
-    """
-    bare = dataclasses.replace(like, source=None)  # the noise of other data takes its place
-    make = _NoiseSimulation(data, bare, response, emission, spectra, window, lensed)
-    return kept_realisations(make, SimulatedNoise, *kept)
+        return [theta - response.theta, *powers, mean]
 
 
 def _spectra(

@@ -10,7 +10,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -112,16 +112,12 @@ class KeptChain(emcee.backends.Backend):
         self._due = now + max(self.every, 20 * (now - start))
 
 
-@dataclass(frozen=True)
-class _Realisation:
-    """A realisation as a function of its number, for workers."""
-
-    make: Callable[[Array], Sequence[Array | np.ndarray]]
-    seed: int
-
-    def __call__(self, number: int) -> list[np.ndarray]:
-        key = stream(realisation_key(self.seed, number), "realisation")  # not that of observed maps
-        return [np.asarray(x) for x in self.make(key)]
+def _realisation(
+    make: Callable[[Array], Sequence[Array | np.ndarray]], seed: int, number: int
+) -> list[np.ndarray]:
+    """Return a realisation by its number."""
+    key = stream(realisation_key(seed, number), "realisation")  # not that of observed maps
+    return [np.asarray(x) for x in make(key)]
 
 
 def kept_realisations(
@@ -146,8 +142,7 @@ def kept_realisations(
     there = None if path is None else job.of_first(lambda: _load(path, mark, names, "realisations"))
     done = [] if there is None else [list(row) for row in zip(*there, strict=True)]
     held, saved = len(done), time.monotonic()
-
-    one = _Realisation(make, seed)
+    one = partial(_realisation, make, seed)
 
     def made(numbers: range) -> Iterator[list[np.ndarray]]:
         """Yield realisations in order, made by one thread per processor, or by the executor."""

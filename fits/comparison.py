@@ -6,10 +6,9 @@ are compared in the same way with those of the complete model.
 """
 
 import itertools
-import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -19,17 +18,9 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Array, Bool, Float
 
-from fits.common import CommonMaps, Fluctuations
+from fits.common import CommonMaps
 from fits.kept import fingerprint, kept_realisations
-from fits.pseudo_cl import (
-    EDGES,
-    LMIN,
-    bin_centers,
-    bin_edges,
-    cosmic_error,
-    hotelling,
-    polarization_alms,
-)
+from fits.pseudo_cl import EDGES, LMIN, bin_centers, bin_edges, hotelling, polarization_alms
 from fits.results import probability
 from jaxsky.harmonics import power_spectrum
 from jaxsky.programs import QUIET
@@ -200,26 +191,16 @@ def compare(
 
     Raises
     ------
-    SettingsError, jaxsky.io.InputError
-        For a region without pixels, multipoles that the maps do not have, or a file of
-        realisations of other data.
+    SettingsError, jaxsky.io.InputError : for a region without pixels, multipoles that the maps do
+        not have, or a file of realisations of other data
     """
     check_comparison(settings, prepared, regions)
     how = settings.compare
     used = {name: inside & prepared.used for name, inside in regions.items()}
     model = prepared.model()
-    simulated = simulated_fluctuations(
-        prepared,
-        model,
-        used,
-        how.lmax,
-        how.nsims,
-        settings.seed,
-        simulations,
-        f"{fingerprint((prepared, used))} {settings.seed} {how.lmax}",
-        report,
-        executor,
-    )
+    mark = f"{fingerprint((prepared, used))} {settings.seed} {how.lmax}"
+    kept = how.nsims, settings.seed, simulations, mark, report, executor
+    simulated = simulated_fluctuations(prepared, model, used, how.lmax, *kept)
     scatters = compare_pixels(prepared, model, used, simulated)
     spectra = []
     if prepared.used.all():
@@ -227,24 +208,18 @@ def compare(
     return Comparison(prepared, model, used, scatters, spectra)
 
 
-@dataclass(frozen=True)
-class _Fluctuation:
-    """Statistics of a realisation as a function of its key, see `simulated_fluctuations`."""
+def _statistics(fluctuations, foregrounds, sigma, inside, lmax, key):
+    """Return the fields of `ComparisonRealisations` of one realisation, on E and B of foregrounds.
 
-    fluctuations: Fluctuations
-    foregrounds: Float[Array, "band 2 alm"]
-    sigma: Float[Array, "band stokes pix"]
-    inside: Bool[Array, "region pix"]
-    lmax: int
-
-    def __call__(self, key: Array) -> tuple[Array, ...]:
-        noise = jnp.asarray(self.fluctuations.noise_realisation(key))
-        cmb = self.fluctuations.cmb_realisation(key)
-        noise_alms = polarization_alms(noise, self.lmax)
-        alms = self.foregrounds + noise_alms + polarization_alms(cmb, self.lmax)
-        chi2 = _sums_of_squares((noise + cmb) / self.sigma, self.inside)
-        squares = _sums_of_squares(noise + cmb, self.inside)
-        return chi2, squares, power_spectrum(alms), power_spectrum(noise_alms)
+    `sigma` is that of the maps, and `inside` are the pixels of each region.
+    """
+    noise = jnp.asarray(fluctuations.noise_realisation(key))
+    cmb = fluctuations.cmb_realisation(key)
+    noise_alms = polarization_alms(noise, lmax)
+    alms = foregrounds + noise_alms + polarization_alms(cmb, lmax)
+    chi2 = _sums_of_squares((noise + cmb) / sigma, inside)
+    squares = _sums_of_squares(noise + cmb, inside)
+    return chi2, squares, power_spectrum(alms), power_spectrum(noise_alms)
 
 
 def simulated_fluctuations(
@@ -257,8 +232,8 @@ def simulated_fluctuations(
     """Simulate noise and CMB on top of the foregrounds; `kept` is for `kept_realisations`."""
     foregrounds = polarization_alms(model, lmax)
     inside = jnp.asarray(np.stack(list(regions.values())))
-    make = _Fluctuation(prepared.fluctuations, foregrounds, prepared.sigma, inside, lmax)
-    return kept_realisations(make, ComparisonRealisations, *kept)
+    given = prepared.fluctuations, foregrounds, prepared.sigma, inside, lmax
+    return kept_realisations(partial(_statistics, *given), ComparisonRealisations, *kept)
 
 
 @jax.jit
@@ -307,17 +282,10 @@ def compare_pixels(
         _, region, stokes = name
         both = (np.asarray(maps[at[0]])[:, regions[region]] for maps in (model, prepared.data))
         x, y = (maps[["QU".index(s) for s in stokes]].ravel() for maps in both)
-        scatters[name] = Scatter(
-            x.size,
-            float(slopes[at]),
-            float(errors[at]),
-            float(np.corrcoef(x, y)[0, 1]),
-            float(np.sqrt(np.mean((y - x) ** 2))),
-            math.sqrt(float(squares[at]) / x.size),
-            float(found[at]),
-            float(pte[at]),
-            floor,
-        )
+        correlation, rms = np.corrcoef(x, y)[0, 1], np.sqrt(np.mean((y - x) ** 2))
+        of_maps = slopes[at], errors[at], correlation, rms, np.sqrt(squares[at] / x.size)
+        numbers = map(float, (*of_maps, found[at], pte[at], floor))
+        scatters[name] = Scatter(x.size, *numbers)
     return scatters
 
 
@@ -346,7 +314,8 @@ def compare_spectra(
     cmb = np.zeros_like(noise)
     theory = prepared.fluctuations.cmb_power()[..., : lmax + 1]
     cmb[..., : theory.shape[-1]] = theory
-    error = np.asarray(cosmic_error(jnp.asarray(cmb + noise)))
+    total = cmb + noise
+    error = np.sqrt(2 / (2 * np.arange(lmax + 1) + 1) * total * total)
     results = []
     for b, band in enumerate(prepared.bands):
         sims = _binned(simulated.spectra[:, b], edges)
@@ -358,26 +327,10 @@ def compare_spectra(
             _, pte_before = _tested(binned_before, sims)
         binned = _binned(observed[b], edges)
         chi2, pte = _tested(binned, sims)
-        results.append(
-            BandSpectra(
-                band,
-                observed[b],
-                before,
-                foregrounds[b],
-                simulated.spectra[0, b],
-                noise[b],
-                cmb[b],
-                error[b],
-                edges,
-                binned,
-                binned_before,
-                sims.mean(axis=0),
-                sims.std(axis=0, ddof=1),
-                chi2,
-                pte,
-                pte_before,
-            )
-        )
+        of_model = foregrounds[b], simulated.spectra[0, b], noise[b], cmb[b], error[b]
+        bins = binned, binned_before, sims.mean(axis=0), sims.std(axis=0, ddof=1)
+        spectra = band, observed[b], before, *of_model
+        results.append(BandSpectra(*spectra, edges, *bins, chi2, pte, pte_before))
     return results
 
 

@@ -23,7 +23,7 @@ from fits.coupling import (
     pure_coupling_matrices,
     pure_factors,
 )
-from jaxsky.checks import Numeric, check_finite, is_concrete
+from jaxsky.checks import check_finite, is_concrete
 from jaxsky.harmonics import analysis, expand, lmax_of, power_spectrum, synthesis
 from jaxsky.io.stacks import Maps, Stack, aligned, empty, is_large, loaded, ranges
 
@@ -72,25 +72,12 @@ def bin_centers(edges: Sequence[int]) -> Float[np.ndarray, " bin"]:
 
 
 def bin_edges(lmin: int, lmax: int, width: int) -> tuple[int, ...]:
-    """Return edges of bins of one width from lmin to lmax inclusive; the last may be wider.
-
-    Raises
-    ------
-    ValueError : if lmax is below lmin, or the width is not positive
-    """
+    """Return edges of bins of one width from lmin to lmax inclusive; the last may be wider."""
     for name, value, least in (("lmax", lmax, lmin), ("width", width, 1)):
         if value < least:
             raise ValueError(f"Argument `{name}` must be at least {least}, but is {value}.")
     count = max(1, (lmax + 1 - lmin) // width)
     return (*(lmin + width * i for i in range(count)), lmax + 1)
-
-
-def _all_edges(edges: Sequence[int], lmax: int) -> np.ndarray:
-    """Return bins, and equally wide ones below and above, whose power the mask mixes in."""
-    first, last = edges[1] - edges[0], edges[-1] - edges[-2]
-    below = np.arange(edges[0], 2, -first)
-    above = np.arange(edges[-1], lmax + 1, last)
-    return np.unique([2, *below, *edges[1:-1], *above, lmax + 1])
 
 
 def masked_spectra(
@@ -114,9 +101,8 @@ def masked_spectra(
 
     Raises
     ------
-    ValueError
-        For a mask with values outside 0 to 1 or that leaves too few pixels for the bins, edges
-        that do not increase or reach beyond lmax, or a window that ends before lmax.
+    ValueError : for a mask outside 0 to 1 or with too few pixels for the bins, edges that do not
+        increase or reach beyond lmax, or a window that ends before lmax
     """
     mask = np.asarray(mask, dtype=float)
     nside, edges = healpy.npix2nside(mask.size), tuple(int(edge) for edge in edges)
@@ -131,7 +117,10 @@ def masked_spectra(
     # [out, in]: pseudo-EE and pseudo-BB of the sky's EE and BB
     mixing = np.array([[standard[0], standard[1]], [purified[1], purified[0]]])
     of_sky = mixing * window**2
-    every = _all_edges(edges, lmax)
+    # The mask also mixes in power below and above the bins, for which there are equally wide ones.
+    below = np.arange(edges[0], 2, edges[0] - edges[1])
+    above = np.arange(edges[-1], lmax + 1, edges[-1] - edges[-2])
+    every = np.unique([2, *below, *edges[1:-1], *above, lmax + 1])
     ell = np.arange(lmax + 1)
     inside = (ell >= every[:-1, None]) & (ell < every[1:, None])
     to_D = np.maximum(ell * (ell + 1), 1) / (2 * math.pi)
@@ -193,9 +182,7 @@ def _derivatives(alm: Float[Array, "1 alm"], nside: int) -> Float[np.ndarray, "4
     return found
 
 
-def _product(
-    order: int, mask: Float[Array, " pix"], derivatives: Float[Array, "4 pix"] | None, maps: Any
-) -> Float[Array, "2 pix"]:
+def _product(order: int, mask: Any, derivatives: Any, maps: Any) -> Float[Array, "2 pix"]:
     """Return maps (2, pix) times the mask (order 0), or its derivative of an order.
 
     The latter is Q + iU times the conjugate of the derivative; its maps are minus the real and
@@ -203,15 +190,13 @@ def _product(
     """
     # Unused pixels may contain anything, and a purified harmonic reaches a little beyond the mask.
     maps = jnp.where(mask > 0, maps, 0.0)
-    if derivatives is None or not order:
+    if not order:
         return mask * maps
     (Q, U), (real, imaginary) = maps, derivatives[2 * order - 2 : 2 * order]
     return -jnp.stack([Q * real + U * imaginary, U * real - Q * imaginary])
 
 
-def _field(
-    order: int, mask: Any, derivatives: Any, maps: Float[Array, "2 pix"] | Maps
-) -> Float[Array, "2 pix"]:
+def _field(order: int, mask: Any, derivatives: Any, maps: Any) -> Float[Array, "2 pix"]:
     """Return `_product`, made range by range if it is large."""
     if not is_large(maps.shape):
         return _product(order, mask, derivatives, maps)
@@ -222,9 +207,7 @@ def _field(
     return loaded(found)
 
 
-def _alm(
-    mask: Any, derivatives: Any, maps: Float[Array, "2 pix"] | Maps, lmax: int
-) -> Float[Array, "2 alm"]:
+def _alm(mask: Any, derivatives: Any, maps: Any, lmax: int) -> Float[Array, "2 alm"]:
     """Return E and B of masked maps, with B purified if the mask's derivatives are given."""
     E, B = analysis(_field(0, mask, derivatives, maps), lmax, 0)
     if derivatives is not None:
@@ -257,15 +240,14 @@ def band_powers(
 
     Raises
     ------
-    ValueError
-        If values inside the mask are not finite or UNSEEN.
+    ValueError : if values inside the mask are not finite or UNSEEN
     """
     mask = np.asarray(spectra.mask)
-    for name, values in {"maps": maps, "other": maps if other is None else other}.items():
+    given = {"maps": maps} if other is None else {"maps": maps, "other": other}
+    for name, values in given.items():
         for part in ranges(mask.size) if is_concrete(values) else ():
             check_finite(name, np.where(mask[part] > 0, np.asarray(values[..., part]), 0))
-    every = (maps,) if other is None else (maps, other)
-    alms = [_masked_alm(mask, spectra.derivatives, one, spectra.lmax) for one in every]
+    alms = [_masked_alm(mask, spectra.derivatives, one, spectra.lmax) for one in given.values()]
     return np.einsum("ibjl,jl->ib", spectra.inverse, power_spectrum(alms[0], alms[-1]))
 
 
@@ -294,8 +276,6 @@ def prepare_patches(
     window: Float[np.ndarray, " ell"],
     *,
     edges: Sequence[int] = EDGES,
-    lmax: int | None = None,
-    pure: bool = False,
 ) -> PreparedPatches:
     """Prepare patches for the spectra of any number of maps.
 
@@ -304,9 +284,6 @@ def prepare_patches(
     patches : weight of each pixel by the name of the patch, for example `paper_patches(nside)`
     window : window b_l of the maps (beam and pixels)
     edges : first multipole of each bin, and the one after the last; three bins at least
-    lmax : see `masked_spectra`
-    pure : purify B, which makes its errors on the paper's discs 20 to 40 % smaller; of patches
-        other than discs the errors returned for B are then up to a third too small
     """
     if len(edges) < 4:
         raise ValueError(
@@ -318,7 +295,7 @@ def prepare_patches(
         raise ValueError("Argument `patches` has no patch in it.")
     for i, (name, mask) in enumerate(patches.items()):
         try:
-            one = masked_spectra(mask, edges, lmax=lmax, window=window, pure=pure)
+            one = masked_spectra(mask, edges, window=window)
         except ValueError as error:
             raise ValueError(f"Patch {name}: {error}") from error
         close = SAME * np.abs(one.mixing).max()
@@ -334,16 +311,6 @@ def polarization_alms(
 ) -> Float[Array, "band 2 alm"]:
     """Return E and B of each band; at l = 1.5 nside their spectra are good to 1e-3."""
     return jnp.stack([analysis(band, lmax) for band in maps])
-
-
-def cosmic_error(power: Float[Array, "... ell"], signal: Numeric = 0.0) -> Float[Array, "... ell"]:
-    """Return the standard deviation of the full-sky spectrum of a random field, the paper's eq. 9.
-
-    It is sqrt(2 / (2l+1)) C_l; if the field is added to a fixed signal of spectrum F_l, their
-    chance correlation, which the paper leaves out, makes it sqrt(2 / (2l+1) C_l (C_l + 2 F_l)).
-    """
-    ell = jnp.arange(power.shape[-1])
-    return jnp.sqrt(2 / (2 * ell + 1) * power * (power + 2 * signal))
 
 
 def hotelling(

@@ -26,7 +26,7 @@ from fits.blocks import ON_DISK, Blocks
 from fits.compress import Layout, Noise, as_noise, band_covariance, bare, compressed, layouts
 from fits.mixing import Mixing, named_bands, spectral_names, unit_sky
 from fits.posterior import Likelihood
-from fits.regions import Cells, check_labels
+from fits.regions import check_labels
 from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.bandpass import parse_unit
@@ -148,27 +148,26 @@ class SpectralLikelihood(Likelihood):
         """Return -ln L of each cell, and its derivatives in the parameters of the cell."""
         units = jnp.eye(local.shape[1])
 
-        def slope(function, x, unit):
-            return jax.jvp(function, (x,), (jnp.broadcast_to(unit, x.shape),))
+        def with_slopes(function):
+            """Return a function that also returns the derivatives in each parameter of a cell."""
 
-        def first(x):
-            along = partial(slope, self.matrices, x)
-            return jax.vmap(along, out_axes=(None, 1))(units)
+            def along(x, unit):
+                return jax.jvp(function, (x,), (jnp.broadcast_to(unit, x.shape),))
 
-        along = partial(slope, first, local)
-        (matrices, one), (_, two) = jax.vmap(along, out_axes=(None, 1))(units)
+            return lambda x: jax.vmap(partial(along, x), out_axes=(None, 1))(units)
+
+        (matrices, one), (_, two) = with_slopes(with_slopes(self.matrices))(local)
         every = tuple(zip(matrices, one, two, strict=True))
 
         @over_pixels(SUMS)
         def summed(like, every):
             parts = like._mapped(lambda m, own: systems.derivatives(m[0], m[1], m[2], own), every)
-            found = []
-            for part in parts:
+
+            def of_cells(part):
                 cells = like._cell_of_block(len(part.value))
-                found.append(
-                    jax.tree.map(lambda x, c=cells: jax.ops.segment_sum(x, c, len(local)), part)
-                )
-            return over_devices(jax.tree.map(lambda *rows: sum(rows), *found))
+                return jax.tree.map(lambda x: jax.ops.segment_sum(x, cells, len(local)), part)
+
+            return over_devices(jax.tree.map(lambda *rows: sum(rows), *map(of_cells, parts)))
 
         return summed(self._blocks(), every)
 
@@ -201,11 +200,11 @@ def _start_values(
             check_parameter(mixing.sky, name, name, value)
         wanted: tuple[int, ...] = ()
         if name in labels:
-            wanted = value.shape if value.ndim == 1 else (int(labels[name].max()) + 1,)
-            if int(labels[name].max()) >= wanted[0]:
+            last = int(labels[name].max())
+            wanted = value.shape if value.ndim == 1 else (last + 1,)
+            if last >= wanted[0]:
                 raise ValueError(
-                    f"Start of {name!r} has {wanted[0]} values, but its labels go up to "
-                    f"{int(labels[name].max())}."
+                    f"Start of {name!r} has {wanted[0]} values, but its labels go up to {last}."
                 )
         if value.shape not in ((), wanted):
             raise ValueError(
@@ -227,7 +226,7 @@ def spectral_likelihood(
     unit: str = "uK_RJ",
     compress: bool | None = None,
 ) -> SpectralLikelihood:
-    """Return the likelihood of the spectral parameters named in `start`.
+    """Return the likelihood of the spectral parameters named in `start`, to be fitted or sampled.
 
     Parameters
     ----------
@@ -246,25 +245,18 @@ def spectral_likelihood(
     compress : whether vectors replace pixels, which needs separable noise; by default if they are
         fewer
 
-    Returns
-    -------
-    The likelihood, for `best_fit`, `grid_fit` and `sample`.
-
     Raises
     ------
-    RuntimeError
-        If JAX is not in double precision.
-    KeyError
-        For unknown parameters.
-    TypeError, ValueError
-        For shapes that do not match, units, noise that is not positive, data that are not
-        finite, too few bands, components that cannot be told apart, and invalid labels.
+    RuntimeError : without double precision
+    KeyError : for unknown parameters
+    TypeError, ValueError : for shapes that do not match, units, noise that is not positive, data
+        that are not finite, too few bands, components that cannot be told apart, invalid labels
     """
     check_double("fits")
     sky = sky if isinstance(sky, Sky) else Sky(sky)
     bands = named_bands(bands)
     held = get_parameters(sky, [name for name in spectral_names(sky) if name not in start])
-    fixed = {name: np.asarray(value) for name, value in held.items() if value.ndim}
+    fixed: dict[str, Any] = {name: np.asarray(value) for name, value in held.items() if value.ndim}
     # On one accelerator, maps of parameters are taken by the pass on the host.
     data, noise = (data, noise) if fixed else in_place(data, noise)
     data = bare("data", data)
@@ -296,26 +288,26 @@ def spectral_likelihood(
                 f"Parameter {name!r} is a map of {value.size} pixels, but the data have "
                 f"{used.size}."
             )
-        varying[name] = np.unique(value, return_inverse=True)[1]
+        # The values that are there, and which of them each pixel has.
+        fixed[name], varying[name] = np.unique(value, return_inverse=True)
     cells = (distributed if apart else regions).intersections(varying, used)
-    # A pixel of each cell, of which parameters that are maps are taken.
-    first = np.flatnonzero(used)[:1] if fixed else np.zeros(0, int)
-    if cells.of_pixel is not None and fixed:
-        found, at = np.unique(cells.of_pixel, return_index=True)
-        first = at[found >= 0]
+    index, position = np.zeros((cells.number, len(values)), int), 0
+    for column, (name, value) in zip(index.T, values.items(), strict=True):
+        column[:] = position + (cells.labels[name] if value.ndim else 0)
+        position += value.size
     angles = any(name.startswith("angle.") for name in start)
     like = SpectralLikelihood(
-        values,
-        0,
-        mixing,
-        {name: jnp.asarray(value[first]) for name, value in fixed.items()},
-        _index(values, cells),
-        (),
-        None,
-        None if cells.of_pixel is None else jnp.asarray(cells.of_pixel),
-        layouts(data.shape[1], angles or noise.covariance is not None),
-        "QU" if data.shape[1] == 2 else "IQU",
-        (),
+        start=values,
+        values=0,
+        mixing=mixing,
+        fixed={name: jnp.asarray(each[cells.labels[name]]) for name, each in fixed.items()},
+        index=jnp.asarray(index),
+        pixels=(),
+        block_cell=None,
+        of_pixel=None if cells.of_pixel is None else jnp.asarray(cells.of_pixel),
+        layout=layouts(data.shape[1], angles or noise.covariance is not None),
+        stokes="QU" if data.shape[1] == 2 else "IQU",
+        weightless=(),
     )
     matrix = _check_matrices(like)[:, : len(data), :components]
     squares = np.mean(matrix**2, axis=0)
@@ -324,22 +316,22 @@ def spectral_likelihood(
     fewer = cells.number * max(rows) < looked.number
     if compress and not noise.separable:
         raise ValueError("Only noise that is separable into bands and pixels can be compressed.")
-    block_cell = source = None
-    parts = []
     few = noise.separable and (fewer if compress is None else compress)
-    blocks = None
     if apart:
         # A sum over all pixels needs no order.
         ordered = cells.of_pixel is not None or not few
         blocks = distributed.blocks(cells, used) if ordered else distributed.pieces(used)
+    parts, block_cell, source = [], None, None
     for layout in like.layout:
-        if few and blocks is not None:
-            D = distributed.band_covariance(data, noise, blocks, layout=layout, number=cells.number)
-            parts.append(compressed(np.asarray(D), noise, layout))
+        if few and apart:
+            summed = distributed.band_covariance(
+                data, noise, blocks, layout=layout, number=cells.number
+            )
+            parts.append(compressed(np.asarray(summed), noise, layout))
         elif few:
             summed = band_covariance(data, noise, cells, used, layout)
             parts.append(compressed(summed, noise, layout))
-        elif blocks is not None:
+        elif apart:
             parts.append(distributed.gathered(data, noise, blocks, layout=layout))
             block_cell = blocks.cell
         elif isinstance(data, Stack):
@@ -355,15 +347,6 @@ def spectral_likelihood(
         values=number - components * data.shape[1] * looked.number,
         weightless=tuple(name for name, some in zip(bands, heavy, strict=True) if not some),
     )
-
-
-def _index(values: Mapping[str, Array], cells: Cells) -> Array:
-    columns, offset = [], 0
-    for name in sorted(values):
-        label = cells.labels.get(name, np.zeros(cells.number, int))
-        columns.append(offset + (label if values[name].ndim else 0 * label))
-        offset += values[name].size
-    return jnp.asarray(np.stack(columns, axis=1) if columns else np.zeros((cells.number, 0), int))
 
 
 def matrices_at(like: SpectralLikelihood, params: Mapping[str, Array]) -> tuple[Array, ...]:

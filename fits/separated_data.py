@@ -1,12 +1,9 @@
-"""The data of a component separation: pixels at a common resolution, or multipoles.
-
-All kinds have the same methods, so that a separation works on any of them.
-"""
+"""The data of a component separation: pixels at a common resolution, or multipoles."""
 
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import healpy
 import jax
@@ -16,15 +13,15 @@ from jaxtyping import Array, Bool, Float
 
 from fits.common import Fluctuations, MapNoise, prepared_maps
 from fits.compress import Noise
-from fits.inputs import Inputs, inputs_of, modelled_laws
+from fits.inputs import inputs_of, modelled_laws
 from fits.mixing import nominal
 from fits.multipoles import harmonic_coefficients, harmonic_likelihood, masked_noise
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.regions import apodize, parameter_labels, region_mask
-from fits.separated_maps import component_maps, emission_maps, harmonic_component_maps
+from fits.separated_maps import component_maps, emission_maps, harmonic_component_maps, synthesised
 from jaxsky import Bandpass, Sky, job
 from jaxsky.checks import Numeric
-from jaxsky.harmonics import Preparation, expand, gaussian_beam, lmax_of, low_multipoles, synthesis
+from jaxsky.harmonics import Preparation, expand, gaussian_beam, lmax_of, low_multipoles
 from jaxsky.io.stacks import Maps, computed
 from jaxsky.job import by_turns, filled
 from jaxsky.mesh import distribute
@@ -35,15 +32,23 @@ from jaxsky.settings import Experiment, SettingsError
 class _Data:
     """Base class: the laws and bands, start values by name, and the data in `unit`.
 
-    `used` are the pixels of the results, and `mask` the weight of each in spectra, 0 to 1, with
-    smooth edges. For a simulation, `foregrounds` are data with nothing else in them, and `truth`
-    the parameters that are numbers, including "r"; both are None for real maps.
+    Maps of the components have `nside` and `fwhm` [arcmin]. `used` are the pixels of the results,
+    and `mask` the weight of each in spectra, 0 to 1, with smooth edges. For a simulation,
+    `foregrounds` are data with nothing else in them, and `truth` the parameters that are numbers,
+    including "r"; both are None for real maps.
+
+    All kinds have the same methods, so that a separation works on any of them: `likelihood` of
+    data, `noise_realisation` like that of the data, `components`, their amplitudes with errors and
+    their maps, `emission` of amplitudes in the bands, zero in masked pixels, and `residuals`, maps
+    (band, stokes, pix) of the data minus that, NaN where masked.
     """
 
     sky: Sky
     bands: dict[str, Bandpass]
     start: dict[str, float]
     unit: str
+    nside: int
+    fwhm: float
     used: Bool[np.ndarray, " pix"]
     mask: Float[np.ndarray, " pix"]
     observed: Float[np.ndarray, "band stokes _"] | Maps
@@ -91,30 +96,24 @@ class PixelData(_Data):
         return dataclasses.replace(self, observed=observed, noise=noise, labels=labels)
 
     def likelihood(self, data: Float[np.ndarray, "band stokes pix"]) -> SpectralLikelihood:
-        """Return the likelihood of data."""
-        return spectral_likelihood(
-            self.sky, self.bands, data, self.noise, self.start, labels=self.labels, unit=self.unit
-        )
+        given = self.sky, self.bands, data, self.noise, self.start
+        return spectral_likelihood(*given, labels=self.labels, unit=self.unit)
 
     def noise_realisation(self, key: Array) -> Maps:
-        """Return noise like that of the data."""
         noise = self.fluctuations.noise_realisation(key)
         factors = self.factors[:, None, None]
         return computed(noise.shape, lambda part: noise[..., part] * factors)
 
     def components(self, like: SpectralLikelihood, params: Mapping, data, **options):
-        """Return amplitudes of the components with their errors, and their maps."""
         found = component_maps(like, params, data, self.noise, **options)
         return found, found.amplitude
 
     def residuals(self, like: SpectralLikelihood, params: Mapping, amplitude):
-        """Return maps (band, stokes, pix) of the data minus the components; NaN where masked."""
         emission = emission_maps(like, params, amplitude)
         shape = self.observed.shape
         return computed(shape, lambda part: self.observed[..., part] - emission[..., part])
 
     def emission(self, like: SpectralLikelihood, params: Mapping, amplitude):
-        """Return the emission of components in the bands; zero in masked pixels."""
         inside = computed(
             amplitude.shape, lambda part: np.where(self.used[part], amplitude[..., part], 0.0)
         )
@@ -123,7 +122,7 @@ class PixelData(_Data):
 
 @dataclass(frozen=True, kw_only=True)
 class _Multipoles(_Data):
-    """Data that are separated multipole by multipole, into maps of `nside` and `fwhm` [arcmin].
+    """Data that are separated multipole by multipole.
 
     `spectra` is N_l of the noise in the data [unit^2 sr], and `fwhms` are their beams [arcmin].
     """
@@ -131,24 +130,18 @@ class _Multipoles(_Data):
     by_pixel: ClassVar[bool] = False
     spectra: Float[np.ndarray, "band stokes ell"]
     fwhms: Float[np.ndarray, " band"]
-    nside: int
-    fwhm: float
 
     def alm(self, data: Numeric) -> Float[np.ndarray, "_ stokes alm"]:
         """Return the coefficients of data."""
         return np.asarray(data)
 
     def likelihood(self, data: Float[np.ndarray, "band stokes _"]) -> SpectralLikelihood:
-        """Return the likelihood of data."""
-        alm, given = self.alm(data), (self.sky, self.bands)
-        return harmonic_likelihood(
-            *given, alm, self.spectra, self.start, beams=self.fwhms, unit=self.unit
-        )
+        given = self.sky, self.bands, self.alm(data), self.spectra, self.start
+        return harmonic_likelihood(*given, beams=self.fwhms, unit=self.unit)
 
     def components(self, like: SpectralLikelihood, params: Mapping, data, **options):
-        """Return amplitudes of the components with their errors, and their maps."""
-        alm, given = self.alm(data), {"beams": self.fwhms, **options}
-        found = harmonic_component_maps(like, params, alm, self.spectra, **given)
+        given = self.alm(data), self.spectra
+        found = harmonic_component_maps(like, params, *given, beams=self.fwhms, **options)
         return found, found.maps(self.nside, self.fwhm)
 
 
@@ -168,39 +161,32 @@ class MaskedSkyData(_Multipoles, PixelData):
         return np.stack([np.asarray(low_multipoles(jnp.asarray(rows), lmax)) for rows in seen])
 
     def components(self, like, params, data, **options):
-        """Return amplitudes of the components with their errors, and their maps.
-
-        Maps are those of pixels, their multipoles replaced by the harmonic ones: signals are the
-        same, so only the noise changes, and no signal is lost beyond the last multipole.
-        """
+        # Maps are those of pixels, their multipoles replaced by the harmonic ones: signals are the
+        # same, so only the noise changes, and no signal is lost beyond the last multipole.
         found, whole = super().components(like, params, data, **options)
         _, maps = PixelData.components(self, like, params, data, covariance=False)
-        pixels = [np.asarray(synthesis(jnp.asarray(a), self.nside)) for a in self.alm(maps)]
         weight = np.where(self.used, self.mask, np.nan)
-        return found, maps + (whole - np.stack(pixels)) / weight
+        return found, maps + (whole - synthesised(self.alm(maps), self.nside)) / weight
 
 
 @dataclass(frozen=True, kw_only=True)
 class FullSkyData(_Multipoles):
     """Multipoles of the full sky, each band with its own beam; the likelihood is exact.
 
-    `noises` are those of the bands as observed, in `unit`, for realisations.
+    `noises` are those of the bands as observed, in `unit`, for realisations; emission and residuals
+    of each band have its own beam.
     """
 
     exact: ClassVar[bool] = True
     noises: dict[str, MapNoise]
 
     def noise_realisation(self, key: Array) -> Float[np.ndarray, "band stokes alm"]:
-        """Return noise like that of the data."""
         return np.stack([noise.alm(key, name) for name, noise in self.noises.items()])
 
     def residuals(self, like: SpectralLikelihood, params: Mapping, amplitude):
-        """Return maps (band, stokes, pix) of the data minus components, each at its own beam."""
-        rest = self.observed - self.emission(like, params, amplitude)
-        return np.stack([np.asarray(synthesis(jnp.asarray(alm), self.nside)) for alm in rest])
+        return synthesised(self.observed - self.emission(like, params, amplitude), self.nside)
 
     def emission(self, like: SpectralLikelihood, params: Mapping, amplitude):
-        """Return the emission of components in the bands, with their beams."""
         windows = jnp.stack([gaussian_beam(f, lmax_of(amplitude)) for f in self.fwhms])
         return emission_maps(like, params, amplitude) * np.asarray(expand(windows))[:, None]
 
@@ -215,13 +201,12 @@ def separation_data(settings: Experiment) -> PixelData | FullSkyData:
     free = settings.free_in("separate")
     if not free:
         raise SettingsError("free: name at least one parameter to fit.")
-    if spec.domain == "harmonic":
-        for name, parameter in free.items():
-            if parameter.regions:
-                raise SettingsError(
-                    f"free.{name}: regions are those of pixels; the domain 'harmonic' takes one "
-                    "value for the whole sky."
-                )
+    regions = [name for name, parameter in free.items() if parameter.regions]
+    if spec.domain == "harmonic" and regions:
+        raise SettingsError(
+            f"free.{regions[0]}: regions are those of pixels; the domain 'harmonic' takes one "
+            "value for the whole sky."
+        )
     inside = region_mask(settings, spec.region, common.nside)
     _check_some(inside)
     sky, known = modelled_laws(settings)
@@ -236,6 +221,8 @@ def separation_data(settings: Experiment) -> PixelData | FullSkyData:
         "bands": {name: band.bandpass for name, band in inputs.bands.items()},
         "start": settings.start("separate"),
         "unit": spec.unit,
+        "nside": common.nside,
+        "fwhm": common.fwhm,
         "truth": truth,
         "description": inputs.description,
     }
@@ -250,24 +237,14 @@ def _check_some(pixels: np.ndarray, words: str = "") -> None:
         raise SettingsError(f"separate.region: leaves no pixel{words}.")
 
 
-def _mask(settings: Experiment, used: Bool[np.ndarray, " pix"]) -> Float[np.ndarray, " pix"]:
-    mask = apodize(used, settings.separate.apodization)
-    _check_some(mask)
-    return mask
-
-
-def _pixel_data(
-    settings: Experiment,
-    inputs: Inputs,
-    inside: Bool[np.ndarray, " pix"],
-    factors: Float[np.ndarray, " band"],
-    shared: dict[str, Any],
-) -> PixelData:
+def _pixel_data(settings, inputs, inside, factors, shared) -> PixelData:
     """Return maps at the common resolution; `factors` are the unit of the data per uK_RJ."""
-    prepared, common = prepared_maps(settings, inputs), settings.common
+    prepared = prepared_maps(settings, inputs)
     used = prepared.used & inside
     _check_some(used)
-    mask, fluctuations = _mask(settings, used), prepared.fluctuations
+    mask = apodize(used, settings.separate.apodization)
+    _check_some(mask)
+    fluctuations = prepared.fluctuations
 
     def scaled(maps):
         def inside(part):
@@ -300,21 +277,13 @@ def _pixel_data(
     return MaskedSkyData(
         **shared,
         spectra=masked_noise(prepared, mask, factors),
-        fwhms=np.full(len(factors), common.fwhm),
-        nside=common.nside,
-        fwhm=common.fwhm,
+        fwhms=np.full(len(factors), settings.common.fwhm),
     )
 
 
-def _full_sky_data(
-    settings: Experiment,
-    inputs: Inputs,
-    inside: Bool[np.ndarray, " pix"],
-    factors: Float[np.ndarray, " band"],
-    shared: dict[str, Any],
-) -> FullSkyData:
+def _full_sky_data(settings, inputs, inside, factors, shared) -> FullSkyData:
     """Return coefficients of the bands as observed."""
-    bands, common = inputs.bands, settings.common
+    bands, nside = inputs.bands, settings.common.nside
     for name, band in bands.items():
         if np.ndim(band.beam):
             raise SettingsError(
@@ -327,7 +296,7 @@ def _full_sky_data(
                 "only; choose the domain 'pixel'."
             )
     nsides = [healpy.npix2nside(band.used.size) for band in bands.values()]
-    lmax = 2 * min(common.nside, *nsides)
+    lmax = 2 * min(nside, *nsides)
     spectra, noises = np.zeros((len(nsides), 2, lmax + 1)), {}
     for i, (name, band) in enumerate(bands.items()):
         size, noise, correlated = factors[i], band.noise, None
@@ -341,7 +310,7 @@ def _full_sky_data(
         if band.correlated is not None:
             correlated = band.correlated[: lmax + 1] * size**2
             spectra[i] += correlated
-        as_observed = Preparation(jnp.ones(lmax + 1), nsides[i], common.nside)
+        as_observed = Preparation(jnp.ones(lmax + 1), nsides[i], nside)
         noises[name] = MapNoise(as_observed, noise, correlated)
 
     def coefficients(maps):
@@ -356,12 +325,10 @@ def _full_sky_data(
     return FullSkyData(
         **shared,
         used=inside,
-        mask=_mask(settings, inside),
+        mask=inside.astype(float),
         observed=coefficients([band.maps for band in bands.values()]),
         foregrounds=None if alone is None else coefficients(alone.values()),
         fwhms=np.array([float(band.beam) for band in bands.values()]),
         spectra=spectra,
         noises=noises,
-        nside=common.nside,
-        fwhm=common.fwhm,
     )

@@ -1,6 +1,6 @@
 """Maps of components for given spectral parameters, with their errors and chi^2."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -180,8 +180,7 @@ def component_maps(
 
     Raises
     ------
-    KeyError, TypeError, ValueError
-        For unknown parameters, and what `spectral_likelihood` refuses.
+    KeyError, TypeError, ValueError : for unknown parameters, and what `spectral_likelihood` refuses
     """
     data, noise = in_place(data, noise)
     data, wanted = bare("data", data), (len(like.mixing.names), len(like.stokes))
@@ -264,8 +263,12 @@ class HarmonicMaps(ComponentMaps):
         check_finite("beam", as_array("beam", beam))
         lmax = min(lmax_of(self.amplitude), 2 * nside)
         window = expand(beam_ratio(beam, 0.0, lmax))
-        maps = [synthesis(resize(alm, lmax) * window, nside) for alm in self.amplitude]
-        return np.stack([np.asarray(each) for each in maps])
+        return synthesised((resize(alm, lmax) * window for alm in self.amplitude), nside)
+
+
+def synthesised(alms: Iterable[Numeric], nside: int) -> Float[np.ndarray, "row stokes pix"]:
+    """Return maps of packed coefficients, synthesised one by one."""
+    return np.stack([np.asarray(synthesis(jnp.asarray(alm), nside)) for alm in alms])
 
 
 def harmonic_component_maps(
@@ -318,19 +321,13 @@ def harmonic_component_maps(
         for each in (found.chi2, found.dof)
     )
     probability = np.where(count > 0, scipy.special.chdtrc(count, square), np.nan)
-    return HarmonicMaps(
-        names,
-        np.where(ell >= lmin, found.amplitude, 0.0),
-        of_noise.covariance,
-        of_noise.alone,
-        square,
-        count,
-        probability,
-    )
+    amplitude = np.where(ell >= lmin, found.amplitude, 0.0)
+    errors = of_noise.covariance, of_noise.alone
+    return HarmonicMaps(names, amplitude, *errors, square, count, probability)
 
 
 class Separated(NamedTuple):
-    """Result of `separate`: the fit of the laws, and the maps of the components."""
+    """Result of `separate`: the fit of the laws, and maps of the components [uK]."""
 
     fit: FitResult
     maps: ComponentMaps
@@ -359,16 +356,10 @@ def separate(
         the white noise of the instrument
     unit : unit of the data, "uK_RJ", "uK_CMB" or the like
 
-    Returns
-    -------
-    The fit, and maps of the components: amplitudes in uK at their reference frequencies.
-
     Raises
     ------
-    TypeError
-        If a string is given for a list of names.
-    ValueError
-        For unknown laws, bands without noise, and what `spectral_likelihood` refuses.
+    TypeError, ValueError : for a string in place of a list of names, unknown laws, bands without
+        noise, and what `spectral_likelihood` refuses
     """
     data = bare("data", data)
     check_names("components", components)

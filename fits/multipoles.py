@@ -26,7 +26,7 @@ from fits.mixing import named_bands, spectral_names
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
-from jaxsky.checks import UNSEEN, Numeric, check_double, check_finite
+from jaxsky.checks import UNSEEN, Numeric, check_double, check_finite, check_shape
 from jaxsky.harmonics import alm_ell, gaussian_beam, lmax_of, low_multipoles, map_variance, resize
 
 #: A band is left out where its beam is below this: its weight would be lost in rounding.
@@ -50,12 +50,13 @@ def white_spectrum(level: Numeric) -> Float[np.ndarray, "..."]:
 def harmonic_coefficients(
     maps: Sequence[Numeric] | Array | np.ndarray, lmax: int | None = None
 ) -> Float[np.ndarray, "band stokes alm"]:
-    """Return packed coefficients of the maps of all bands, computed band by band.
+    """Return packed coefficients E, B or I, E, B of the maps of all bands, in double precision.
 
-    For a map without multipoles above 2 nside their rms error is 1e-6 of their rms at nside 16,
-    and 1e-7 from nside 64 on; see `jaxsky.harmonics.analysis`. Power of a map above 2 nside leaks
-    into them, most at 2 nside, where it is 1e-3 of that power. White noise of pixels remains white,
-    with N_l its variance times the area of a pixel.
+    They are in the order of `jaxsky.harmonics`, and computed band by band. For a map without
+    multipoles above 2 nside their rms error is 1e-6 of their rms at nside 16, and 1e-7 from nside
+    64 on; see `jaxsky.harmonics.analysis`. Power of a map above 2 nside leaks into them, most at
+    2 nside, where it is 1e-3 of that power. White noise of pixels remains white, with N_l its
+    variance times the area of a pixel.
 
     Parameters
     ----------
@@ -63,22 +64,17 @@ def harmonic_coefficients(
         (stokes, pix), which may differ in nside
     lmax : largest multipole; by default 2 nside of the coarsest map, and not above
 
-    Returns
-    -------
-    Coefficients E, B or I, E, B in double precision, in the order of `jaxsky.harmonics`.
-
     Raises
     ------
-    RuntimeError
-        If JAX is not in double precision.
-    TypeError, ValueError
-        For units, shapes that are no maps, an lmax above 2 nside, and masked pixels.
+    RuntimeError : without double precision
+    TypeError, ValueError : for units, no maps, an lmax above 2 nside, and masked pixels
     """
     check_double("fits")
     rows = [bare("maps", each) for each in maps]
     shapes = {each.shape for each in rows}
     alike = len({shape[:-1] for shape in shapes}) == 1
-    if not (alike and all(len(s) == 2 and s[0] in (2, 3) and _is_map(s[1]) for s in shapes)):
+    sizes = {12 * 4**k for k in range(30)}  # of maps whose nside is a power of 2
+    if not (alike and all(len(s) == 2 and s[0] in (2, 3) and s[1] in sizes for s in shapes)):
         raise ValueError(
             "Argument `maps` must have shape (band, stokes, pix) with Stokes Q, U or I, Q, U, "
             f"but has {len(rows)} bands of shape {', '.join(map(str, sorted(shapes)))}."
@@ -101,11 +97,6 @@ def harmonic_coefficients(
             )
         result[i] = low_multipoles(jnp.asarray(each, float), lmax)
     return result
-
-
-def _is_map(npix: int) -> bool:
-    """Return True if this is the number of pixels of an nside that is a power of 2."""
-    return healpy.isnpixok(npix) and healpy.isnsideok(healpy.npix2nside(npix), nest=True)
 
 
 class Multipoles(NamedTuple):
@@ -142,24 +133,19 @@ class Multipoles(NamedTuple):
 def check_alm(alm: Numeric, bands: int) -> np.ndarray:
     """Return packed coefficients (band, stokes, alm) unchanged, after checking their shape."""
     array = bare("alm", alm)
-    shape = array.shape
-    known = array.ndim == 3 and shape[0] == bands and shape[1] in (2, 3)
-    if not known or (lmax_of(array) + 1) ** 2 != shape[2]:
-        raise ValueError(
-            f"Argument `alm` must have shape (band, stokes, (lmax + 1)^2) with {bands} bands and "
-            f"rows E, B or I, E, B, as from `harmonic_coefficients`, but has shape {shape}."
-        )
+    good = array.ndim == 3 and len(array) == bands and array.shape[1] in (2, 3)
+    good = good and (lmax_of(array) + 1) ** 2 == array.shape[2]
+    form = f"shape (band, stokes, (lmax + 1)^2) with {bands} bands and rows E, B or I, E, B"
+    check_shape("alm", array, good, f"have {form}, as from `harmonic_coefficients`")
     return array
 
 
 def _windows(beams: Numeric, bands: int, lmax: int) -> Float[np.ndarray, "band ell"]:
     array = bare("beams", beams).astype(float)
     tables = array.ndim == 2 and len(array) == bands and array.shape[1] > lmax
-    if array.shape != (bands,) and not tables:
-        raise ValueError(
-            f"Argument `beams` must have shape ({bands},), widths [arcmin], or ({bands}, ell), "
-            f"tables b_l from l = 0 to {lmax} or above, but has shape {array.shape}."
-        )
+    known = f"({bands},), widths [arcmin], or ({bands}, ell), tables b_l from l = 0 to {lmax}"
+    good = tables or array.shape == (bands,)
+    check_shape("beams", array, good, f"have shape {known} or above")
     check_finite("beams", array)
     if tables:
         return array[:, : lmax + 1]
@@ -173,11 +159,9 @@ def _spectra(
 ) -> Float[np.ndarray, "band stokes #ell"]:
     array = bare("noise", noise).astype(float)
     tables = array.ndim == 3 and array.shape[:2] == (bands, stokes) and array.shape[2] > lmax
-    if array.shape not in ((bands,), (bands, stokes)) and not tables:
-        raise ValueError(
-            f"Argument `noise` must have shape ({bands},), ({bands}, {stokes}) or ({bands}, "
-            f"{stokes}, ell) from l = 0 to {lmax} or above, but has shape {array.shape}."
-        )
+    good = tables or array.shape in ((bands,), (bands, stokes))
+    known = f"({bands},), ({bands}, {stokes}) or ({bands}, {stokes}, ell) from l = 0 to {lmax}"
+    check_shape("noise", array, good, f"have shape {known} or above")
     spectra = array[..., lmin : lmax + 1] if tables else array.reshape(bands, -1, 1)
     if bad := int(np.sum(~(spectra > 0))):
         raise ValueError(f"Argument `noise` has {bad} of {spectra.size} values that are not > 0.")
@@ -253,38 +237,25 @@ def harmonic_likelihood(
 
     -2 ln L = sum_lm [d^T W d - (A^T W d)^T (A^T W A)^-1 (A^T W d)] with d = d_lm / b_l and
     W = b_l^2 / N_l: that of Stompor et al. (2009, MNRAS 392, 216) with multipoles for pixels. A
-    band is left out where its beam is below 1e-5.
+    band is left out where its beam is below 1e-5. Maps of the components come from
+    `harmonic_component_maps`.
 
     Parameters
     ----------
-    sky : components by name. Their laws count, not their amplitudes; parameters that are not
-        free keep their values, which must be numbers.
-    bands : the bands by name, or as a list
+    sky, bands, start, unit : as for `spectral_likelihood`; all parameters must be numbers
     alm : packed coefficients (band, stokes, alm) of the maps as observed, E, B or I, E, B; see
         `harmonic_coefficients`
     noise : N_l of the maps as observed [square of `unit` times sr], shape (band,), (band, stokes)
         or (band, stokes, ell) from l = 0; infinite where a band is not to be used. See
         `white_spectrum`.
-    start : start values of the free parameters by name, as for `spectral_likelihood`
     beams : full widths at half maximum of Gaussian beams [arcmin], (band,), or tables b_l,
         (band, ell) from l = 0, with the window of the pixels if the maps have one
-    unit : unit of the data ("uK_RJ", "K_CMB", ...); amplitudes are uK in any case (CMB: uK_CMB)
     lmin, lmax : smallest and largest multipole that is used; by default 2 and that of `alm`
-
-    Returns
-    -------
-    The likelihood, for `best_fit`, `grid_fit` and `sample`. Maps of the components come from
-    `fits.separated_maps.harmonic_component_maps`.
 
     Raises
     ------
-    RuntimeError
-        If JAX is not in double precision.
-    KeyError
-        For unknown parameters.
-    TypeError, ValueError
-        For shapes that do not match, units, noise that is not positive, coefficients that are not
-        finite, parameters that are maps, too few bands, or too few that resolve a multipole.
+    RuntimeError, KeyError, TypeError, ValueError : for what `spectral_likelihood` refuses,
+        parameters that are maps, and multipoles that too few bands resolve
     """
     sky = sky if isinstance(sky, Sky) else Sky(sky)
     bands = named_bands(bands)
@@ -298,21 +269,16 @@ def harmonic_likelihood(
             )
     # The laws and their parameters, on a pixel without data.
     nothing = np.zeros((len(bands), alm.shape[1], 1))
-    like = spectral_likelihood(
-        sky, bands, nothing, np.ones(len(bands)), start, unit=unit, compress=False
-    )
+    given = sky, bands, nothing, np.ones(len(bands)), start
+    like = spectral_likelihood(*given, unit=unit, compress=False)
     components = len(sky.components)
     multipoles = multipoles_of(alm, noise, beams, components, lmin, lmax)
     rows = multipoles.without_beams(alm)
     pixels = tuple(_compressed(rows, multipoles, layout) for layout in like.layout)
     bands_used = (multipoles.weights > 0).sum(axis=0)[..., multipoles.ell]
     values = bands_used - components * (multipoles.ell >= lmin)
-    return dataclasses.replace(
-        like,
-        pixels=pixels,
-        block_cell=jnp.zeros(len(pixels[0].data), int),
-        values=int(values.sum()),
-    )
+    cells, number = jnp.zeros(len(pixels[0].data), int), int(values.sum())
+    return dataclasses.replace(like, pixels=pixels, block_cell=cells, values=number)
 
 
 def masked_noise(

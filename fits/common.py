@@ -17,7 +17,7 @@ from fits.mixing import TemplateErrors, template_errors
 from fits.regions import common_holes
 from fits.template_likelihood import CovarianceOf, SkyLikelihood, likelihood
 from jaxsky import Bandpass, Component, Sky, job, observe
-from jaxsky.checks import Numeric
+from jaxsky.checks import Numeric, check_choice
 from jaxsky.harmonics import Preparation, beam_ratio, gaussian_beam, pixel_window, shortened
 from jaxsky.io.stacks import Computed, Maps, Stack, computed, is_large, ranges, stored
 from jaxsky.job import filled
@@ -74,27 +74,18 @@ class CommonMaps(NamedTuple):
         region : pixels to use, among those usable; default all
         kind : "exact", or "diagonal" for the paper's sum over pixels
         """
-        if kind not in ("exact", "diagonal"):
-            raise ValueError(f"Argument `kind` must be 'exact' or 'diagonal', not {kind!r}.")
+        check_choice("kind", kind, ("exact", "diagonal"))
         used: Any = self.used if region is None else self.used & region
         assert self.sky is not None  # there are templates
         sky, data, sigma = _own_pixels(self.sky, self.data, self.sigma)
+        masked: Any
         if isinstance(sigma, Stack):
-            masked: Any = Computed(
-                sigma.shape, lambda at: np.where(used[at], sigma[..., at], np.inf)
-            )
+            masked = Computed(sigma.shape, lambda at: np.where(used[at], sigma[..., at], np.inf))
         else:
             masked = jnp.where(distribute(used) if spread(data) else used, sigma, jnp.inf)
-        return likelihood(
-            sky,
-            self.bands,
-            data,
-            masked,
-            start,
-            stokes=stokes,
-            covariance_of=self.covariance_of if kind == "exact" else None,
-            template_errors=self.template_errors,
-        )
+        given = sky, self.bands, data, masked, start
+        exact, errors = self.covariance_of if kind == "exact" else None, self.template_errors
+        return likelihood(*given, stokes=stokes, covariance_of=exact, template_errors=errors)
 
     def pixel_noise(
         self, used: Bool[np.ndarray, " pix"], factors: Float[np.ndarray, " band"]
@@ -147,9 +138,7 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
     templates = {f"template {name!r}": t for name, t in inputs.templates.items()}
     bands = {f"band {name!r}": b for name, b in inputs.bands.items()}
     leaked = {f"leakage of {what}": b.leakage for what, b in bands.items() if b.leakage is not None}
-    given: dict[str, tuple[Bool[np.ndarray, " pix"], Any]] = {
-        what: (t.used, t.fwhm) for what, t in templates.items()
-    }
+    given: dict[str, Any] = {what: (t.used, t.fwhm) for what, t in templates.items()}
     given |= {what: (each.used, each.beam) for what, each in (bands | leaked).items()}
     nsides = {what: healpy.npix2nside(used.size) for what, (used, _) in given.items()}
     lmax = min(3 * nside - 1, 2 * min(nsides.values()))
@@ -188,11 +177,11 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         for name, band in inputs.bands.items()
         if band.leakage is not None
     }
-    names = list(inputs.bands)
 
     def observed(i: int) -> Array:
-        maps = brought(f"band {names[i]!r}", inputs.bands[names[i]].maps)
-        return maps - leakage[names[i]] if names[i] in leakage else maps
+        name, band = list(inputs.bands.items())[i]
+        maps = brought(f"band {name!r}", band.maps)
+        return maps - leakage[name] if name in leakage else maps
 
     # Band by band: JAX would otherwise prepare the input of all transforms at once.
     data = filled((many, 2, npix), observed)
@@ -212,8 +201,8 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         return MapNoise(operator, noise, spectrum)
 
     noises = [noise_of(what, band.noise, band.correlated) for what, band in bands.items()]
-    each, cmb = zip(*noises, strict=True), _cmb(inputs, nside, fwhm, reach)
-    preparations, noise, correlated = each
+    preparations, noise, correlated = zip(*noises, strict=True)
+    cmb = _cmb(inputs, nside, fwhm, reach)
     fluctuations = Fluctuations(preparations, noise, correlated, *cmb, tuple(inputs.bands))
     sigma = fluctuations.sigma()
     known = np.ones(npix, bool)
@@ -224,18 +213,13 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         for name, one in inputs.template_noise.items()
         if one.own
     }
-    return CommonMaps(
-        Sky(sky) if sky else None,
-        {name: band.bandpass for name, band in inputs.bands.items()},
-        _in_memory(data),
-        _in_memory(computed(sigma.shape, lambda at: np.where(known[at], sigma[..., at], np.inf))),
-        used & known,
-        fluctuations,
-        leakage,
-        nsides,
-        remembered(fluctuations.covariance),
-        template_errors(list(sky), inputs.template_noise, own_noise, fluctuations.noises),
-    )
+    errors = template_errors(list(sky), inputs.template_noise, own_noise, fluctuations.noises)
+    bandpasses = {name: band.bandpass for name, band in inputs.bands.items()}
+    seen = computed(sigma.shape, lambda at: np.where(known[at], sigma[..., at], np.inf))
+    maps = _in_memory(data), _in_memory(seen), used & known
+    covariance = remembered(fluctuations.covariance)
+    model = Sky(sky) if sky else None
+    return CommonMaps(model, bandpasses, *maps, fluctuations, leakage, nsides, covariance, errors)
 
 
 #: The maps that were distributed last, and what they are then.

@@ -308,31 +308,14 @@ def fit_tensors(model: PowerModel, powers: Float[np.ndarray, " bin"]) -> TensorF
         r, before = float(solved @ (powers - model.mean(0.0))) * sigma**2, r
     rest = powers - model.mean(r)
     chi2, dof = float(rest @ np.linalg.solve(covariance, rest)), powers.size - 1
-    grid, posterior = _posterior(model, powers, max(r, 0.0) + WIDTHS * sigma)
-    held = np.cumsum(posterior) / posterior.sum()
-    return TensorFit(
-        r,
-        sigma,
-        float(np.interp(0.95, held, grid)),
-        grid,
-        posterior,
-        chi2,
-        dof,
-        float(scipy.special.chdtrc(dof, chi2)) if dof else np.nan,
-        powers,
-        covariance,
-        model,
-        solved * sigma**2,
-    )
-
-
-def _posterior(model: PowerModel, powers: np.ndarray, upper: float) -> tuple[np.ndarray, ...]:
-    """Return values of r from 0 to `upper`, and the posterior with a flat prior, at most 1."""
-    grid = np.linspace(0.0, upper, POINTS)
-    mean = model.mean(0.0) + grid[:, None] * model.tensors
-    modes = 2 * model.mean(0.0) ** 2 / np.diagonal(model.covariance(0.0))
-    ratio = powers / mean
+    grid = np.linspace(0.0, max(r, 0.0) + WIDTHS * sigma, POINTS)
+    zero = model.mean(0.0)
+    ratio = powers / (zero + grid[:, None] * model.tensors)
+    modes = 2 * zero**2 / np.diagonal(model.covariance(0.0))
     # Decoupling from the mask may make a power negative; its logarithm is then cut.
-    log = np.log(np.maximum(ratio, 1e-3))
-    log_posterior = -0.5 * np.sum(modes * (ratio - log), axis=1)
-    return grid, np.exp(log_posterior - log_posterior.max())
+    log_posterior = -0.5 * np.sum(modes * (ratio - np.log(np.maximum(ratio, 1e-3))), axis=1)
+    posterior = np.exp(log_posterior - log_posterior.max())
+    upper = float(np.interp(0.95, np.cumsum(posterior) / posterior.sum(), grid))
+    probability = float(scipy.special.chdtrc(dof, chi2)) if dof else np.nan
+    numbers = r, sigma, upper, grid, posterior, chi2, dof, probability
+    return TensorFit(*numbers, powers, covariance, model, weights=solved * sigma**2)

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from fits.kept import KeptChain, fingerprint, kept_realisations
 from fits.optimize import best_fit
 from fits.posterior import Likelihood, Posterior, value_and_gradient
-from fits.priors import Gaussian, Prior, priors_of
+from fits.priors import Gaussian, priors_of
 from fits.profile_likelihood import SpectralLikelihood
 from fits.pseudo_cl import (
     LEAST_WINDOW,
@@ -40,7 +40,7 @@ from fits.separated_data import FullSkyData, PixelData
 from fits.systems import Factor
 from fits.tensor_ratio import TensorFit, fit_tensors, power_model
 from jaxsky import job
-from jaxsky.checks import Numeric, check_double
+from jaxsky.checks import check_double
 from jaxsky.cmb import realisation, tensor_spectra
 from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import expand, gaussian_beam, needed_lmax, resize, synthesis
@@ -62,12 +62,7 @@ class Response:
     `theta` is the vector of the best fit, with start values in regions without a pixel.
     """
 
-    def __init__(
-        self,
-        like: Likelihood,
-        params: Mapping[str, Numeric],
-        priors: Mapping[str, Prior] | None = None,
-    ) -> None:
+    def __init__(self, like: Likelihood, params: Mapping, priors: Mapping | None = None) -> None:
         posterior = Posterior(like, priors)
         # Without the likelihood, which is large, since workers are sent this.
         self._priors, self._low, self._high = posterior.priors, posterior.low, posterior.high
@@ -227,12 +222,9 @@ def separate_data(
 
 
 def cleaned_cmb(
-    data: PixelData | FullSkyData,
-    like: SpectralLikelihood,
-    params: Mapping[str, Array],
-    observed: np.ndarray,
-) -> Float[np.ndarray, "stokes pix"] | Maps:
-    """Return the map of the CMB in `observed`, separated with these parameters."""
+    data: PixelData | FullSkyData, like: SpectralLikelihood, params: Mapping, observed: Maps
+) -> Maps:
+    """Return the map (stokes, pix) of the CMB in `observed`, separated with these parameters."""
     found, maps = data.components(like, params, observed, covariance=False)
     return stored(maps[found.components.index("cmb")])
 

@@ -72,7 +72,10 @@ def bin_centers(edges: Sequence[int]) -> Float[np.ndarray, " bin"]:
 
 
 def bin_edges(lmin: int, lmax: int, width: int) -> tuple[int, ...]:
-    """Return edges of bins of one width from lmin to lmax inclusive; the last may be wider."""
+    """Return edges of bins of one width from lmin to lmax inclusive; the last may be wider.
+
+    A ValueError is raised if lmax is below lmin, or the width is not positive.
+    """
     for name, value, least in (("lmax", lmax, lmin), ("width", width, 1)):
         if value < least:
             raise ValueError(f"Argument `{name}` must be at least {least}, but is {value}.")

@@ -254,7 +254,7 @@ class HealpixTable:
         if bad := np.flatnonzero(~((pixels == stored) & (pixels >= 0) & (pixels < npix))).tolist():
             odd = f"{len(bad)} of {pixels.size} values that are no pixels, 0 to {npix - 1}"
             raise UnfitError(f"{where} has {odd}, such as {stored[bad[0]]:g}.")
-        if stored.dtype == np.float32 and npix > 2**24:
+        if self._kinds[column] == "E" and npix > 2**24:
             raise UnfitError(f"{where} is in single precision, which cannot hold all pixels.")
         if twice := pixels.size - np.unique(pixels).size:
             raise UnfitError(f"{where} has {twice} pixels more than once.")

@@ -157,8 +157,8 @@ def kept_realisations(
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             yield from pool.map(one, numbers[1:])
 
-    def stacked() -> list[np.ndarray]:
-        return list(map(np.stack, zip(*done, strict=True)))
+    def stacked() -> dict[str, np.ndarray]:
+        return dict(zip(names, map(np.stack, zip(*done, strict=True)), strict=True))
 
     try:
         report(held, count)
@@ -166,12 +166,12 @@ def kept_realisations(
             done.append(result)
             report(len(done), count)
             if path is not None and time.monotonic() - saved > SAVED_EVERY:
-                _save(path, mark, dict(zip(names, stacked(), strict=True)))
+                _save(path, mark, stacked())
                 held, saved = len(done), time.monotonic()
     finally:
         if path is not None and len(done) > held:
-            _save(path, mark, dict(zip(names, stacked(), strict=True)))
-    return kind._make(array[:count] for array in stacked())
+            _save(path, mark, stacked())
+    return kind._make(array[:count] for array in stacked().values())
 
 
 def _save(path: Path, mark: str, arrays: Mapping[str, np.ndarray]) -> None:

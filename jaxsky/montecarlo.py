@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -118,16 +118,15 @@ def _header(settings: Experiment, setup: SimulationInputs, name: str, index: int
         "SIM": (index, "number of the realisation"),
         "CONTENT": ", ".join(settings.included()),
     }
-    if not np.ndim(channel.map_beam):
-        header["FWHM"] = (float(channel.map_beam), "[arcmin] beam of the maps")
-    else:
+    if np.ndim(channel.map_beam):
         header["BEAM"] = ("table", "beam, in the table BEAM")
+    else:
+        header["FWHM"] = (float(channel.map_beam), "[arcmin] beam of the maps")
     if noise is not None and not np.ndim(noise):
         header["NOISE"] = (float(noise), "[uK_RJ arcmin] noise before smoothing")
     to_CMB = float(channel.band.conversion("uK_RJ", "uK_CMB"))
     header["RJ2CMB"] = (to_CMB, "uK_CMB per uK_RJ in this band")
-    header["COMMENT"] = _ascii(setup.description)
-    return header
+    return header | {"COMMENT": _ascii(setup.description)}
 
 
 def _ascii(text: str) -> str:
@@ -213,8 +212,11 @@ class _Maker:
             source.small_scales is not None for source in setup.sources.values()
         )
         self._correlated = [name for name, one in setup.sources.items() if one.correlated_with]
-        self._terms: Mapping[str, Terms | None] | None = None
         self._sources: Mapping[str, HarmonicSource] | None = None
+
+    @cached_property
+    def _terms(self) -> Mapping[str, Terms | None]:
+        return plan_terms(self.setup.sources, self.setup.observation)
 
     def __call__(self, index: int) -> tuple[list[bool], list[str]]:
         """Return for each file of a realisation whether it was written, and notes."""
@@ -223,21 +225,17 @@ class _Maker:
 
     def prepare(self, note: Callable[[str], None]) -> None:
         """Make what all realisations share."""
-        self._terms = plan_terms(self.setup.sources, self.setup.observation)
+        _ = self._terms
         if not self._random:
             self.sources(realisation_key(self.settings.seed), note)
 
     def sources(self, key: Array, note: Callable[[str], None]) -> Mapping[str, HarmonicSource]:
         """Return the sources of the realisation with this key in harmonic space."""
-        sources, observation = self.setup.sources, self.setup.observation
+        setup = self.setup
         if self._sources is None or self._random:
-            if self._terms is None:
-                self._terms = plan_terms(sources, observation)
-            scales = self.setup.small_scales_key(key)
             self._sources = None  # or there would be two of them in memory
-            ready = harmonic_sources(
-                scales, sources, observation, self._terms, release=not self._random
-            )
+            given = setup.small_scales_key(key), setup.sources, setup.observation, self._terms
+            ready = harmonic_sources(*given, release=not self._random)
             for name in self._correlated:
                 if repaired := int(ready[name].repaired):
                     note(

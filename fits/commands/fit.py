@@ -226,11 +226,11 @@ def plot_posterior(
     """Draw the chains, if any, with the most Stokes parameters, one colour per region."""
     with_chain = [f for f in fits if "mcmc" in f.results and "chain" in f.results["mcmc"].details]
     most = max((f.stokes for f in with_chain), key=len, default="")
-    shown = [f for f in with_chain if f.stokes == most]
-    results = {f"{f.region}, {' + '.join(most)}": f.results["mcmc"] for f in shown}
-    if shown:
+    said = " + ".join(most)
+    results = {f"{f.region}, {said}": f.results["mcmc"] for f in with_chain if f.stokes == most}
+    if results:
         plot_chains(path, results, truth, title)
-    return bool(shown)
+    return bool(results)
 
 
 #: Pictures and the functions that draw them.

@@ -112,15 +112,13 @@ def _kept(
     out: Path, settings: dict[str, Any], overwrite: bool
 ) -> tuple[dict[str, PaperFigure], set[str]]:
     """Return the figures in a folder made with these settings, and pictures of other settings."""
-    path = out / KEPT
-    if not path.exists():
-        return {}, set()
+    path, made_with, figures = out / KEPT, settings, list[PaperFigure]()
     try:
-        made_with, figures = FILE.validate_json(path.read_bytes())
+        if path.exists():
+            made_with, figures = FILE.validate_json(path.read_bytes())
     except ValidationError:
-        if overwrite:
-            return {}, set()
-        raise ValueError(f"{path}: is damaged; start again with --overwrite.") from None
+        if not overwrite:
+            raise ValueError(f"{path}: is damaged; start again with --overwrite.") from None
     if made_with == settings:
         return {figure.label: figure for figure in figures}, set()
     if not overwrite:

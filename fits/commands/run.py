@@ -31,7 +31,7 @@ from fits.commands.report import (
     warn,
     write_page,
 )
-from fits.results import write_json, write_log
+from fits.results import FitError, write_json, write_log
 from jaxsky import job
 from jaxsky.io import files
 from jaxsky.io.stacks import scratch
@@ -257,8 +257,6 @@ def results_folder(
 
 def _sentence(error: BaseException) -> tuple[str, bool]:
     """Return an error on one line, and True if it names the file, key or argument at fault."""
-    from fits.results import FitError
-
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}.", True
     package, raised = raised_in(error)

@@ -21,7 +21,8 @@ from jaxsky.settings import Experiment, changed_settings, check_log, circumstanc
 from jaxsky.simulation import HarmonicSource, harmonic_sources, observe_bands, plan_terms
 from jaxsky.workers import realised
 
-LOG = "simulation.json"
+#: Settings of the realisations in a folder, and the pattern of their maps.
+LOG, MAPS = "simulation.json", "sim_*/*.fits"
 #: Settings that do not affect the maps.
 LAYOUT: Any = {"simulate": {"sheet"}}
 #: Settings that affect only the realisation or the output.
@@ -40,21 +41,21 @@ def _content(settings: Experiment) -> dict[str, Any]:
 
 
 def check_folder(
-    out: Path, settings: Experiment, resume: bool, overwrite: bool, indices: range | None = None
+    out: Path, settings: Experiment, resume: bool, overwrite: bool, indices: range
 ) -> None:
-    """Raise ValueError unless realisations (by default all) may be written to a folder."""
+    """Raise ValueError unless realisations may be written to a folder."""
     # Others with the same settings may exist: this is how a Monte Carlo is split over processes.
     log = out / LOG
     if overwrite:
         return
     if log.exists():
-        if not resume and any(_maps(out, indices)):
+        if not resume and any(any(out.glob(f"sim_{index:05d}/*.fits")) for index in indices):
             raise ValueError(
                 f"{out}: holds a simulation already; go on with --resume, replace it with "
                 "--overwrite, or choose another --out."
             )
         check_log(log, _content(settings), "a simulation")
-    elif any(_maps(out)):
+    elif any(out.glob(MAPS)):
         raise ValueError(
             f"{out}: holds maps of unknown settings, for {LOG} is missing; choose another --out, "
             "or start again with --overwrite."
@@ -79,25 +80,17 @@ def other_sky(settings: Experiment) -> list[str]:
     return [said] if changed else []
 
 
-def _maps(out: Path, indices: range | None = None) -> Iterator[Path]:
-    """Yield the map files of some realisations, by default all."""
-    for path in out.glob("sim_*/*.fits"):
-        number = path.parent.name.removeprefix("sim_")
-        if indices is None or (number.isdecimal() and int(number) in indices):
-            yield path
-
-
 def _claim(out: Path, settings: Experiment, overwrite: bool) -> None:
     """Create the folder and write the log of its settings, unless it exists."""
     check_guards()
     out.mkdir(parents=True, exist_ok=True)
     with alone(out):
         if overwrite:
-            for path in (*_maps(out), *out.glob("sim_*.png"), *out.glob("log*.txt")):
+            for path in (*out.glob(MAPS), *out.glob("sim_*.png"), *out.glob("log*.txt")):
                 path.unlink()
         elif (out / LOG).exists():
             # Another process may have written it since the folder was checked.
-            check_folder(out, settings, resume=True, overwrite=False)
+            check_log(out / LOG, _content(settings), "a simulation")
             return
         content = circumstances(settings) | {"settings": _content(settings)}
         write_text(out / LOG, json.dumps(content, indent=2) + "\n")

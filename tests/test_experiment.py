@@ -511,7 +511,7 @@ def test_a_folder_with_results_is_left_alone(folder, tmp_path, run, refused):
     assert run(moved, out, "--resume") == 0
     assert content(out) == before
     pictured = load(write(folder, ("sheet = false", "sheet = true"), name="sheet"))
-    montecarlo.check_folder(out, pictured, resume=True, overwrite=False)
+    montecarlo.check_folder(out, pictured, True, False, range(1))
     assert run(path, out, "--overwrite", "--set", "seed=4") == 0
     assert content(out).keys() == before.keys()
     assert all(content(out)[name] != before[name] for name in before)

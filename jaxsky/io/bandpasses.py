@@ -3,7 +3,6 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from astropy import units as u
@@ -90,7 +89,7 @@ def _to_GHz(samples: Float[np.ndarray, "2 sample"], unit: str) -> Float[np.ndarr
 
 
 #: Frequencies [GHz], weights and their convention, "" if it is unknown.
-Curve: TypeAlias = tuple[np.ndarray, np.ndarray, str]
+Curve = tuple[np.ndarray, np.ndarray, str]
 
 #: Unit of a RIMO's WAVENUMBER -> convention. For LFI the column contains frequencies, and the
 #: weights act on antenna temperature; those of HFI act on power.

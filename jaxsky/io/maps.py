@@ -239,9 +239,8 @@ def read_mask(
 ) -> Bool[np.ndarray, " pix"]:
     """Read a mask from a FITS file or an .npz archive: True in used pixels; RING, Galactic, (pix,).
 
-    Pixels without a value are not used: those that a partial map does not list, and those that
-    are UNSEEN, NaN, or equal to the header's BAD_DATA or TNULL. Other values than 0 and 1, as of an
-    apodized mask (`read_maps`), are an InputError, and so is a mask without any used pixel.
+    Pixels without a value (`read_maps`) are not used. Other values than 0 and 1, as of an apodized
+    mask, are an InputError, and so is a mask without any used pixel.
 
     Parameters
     ----------

@@ -307,9 +307,8 @@ class HealpixTable:
     ) -> Float[np.ndarray, " pix"]:
         """Return a column over the full sky in RING order, float64; `ordering` is the file's.
 
-        It is NaN where there is no value: pixels that are not listed, UNSEEN, the header's BAD_DATA
-        and TNULL, NaN and infinity. If `logical`, columns of true and false become 1 and 0. Given
-        a range of RING pixels of one's own, only these are read of the mapped file, and returned.
+        It is NaN where there is no value, see `read_maps`. If `logical`, true and false become 1
+        and 0. Of `own` RING pixels only, these are read of the mapped file, and returned.
         """
         npix, pixels = healpy.nside2npix(self.nside), self._pixels
         size, expected = self._field(index, logical).size, npix if pixels is None else pixels.size
@@ -350,10 +349,7 @@ class HealpixTable:
         return column
 
     def state(self, argument: str, given: str | None, default: str | None = None) -> str:
-        """Return a property of the maps from the header or the argument, which must agree.
-
-        If neither states it, the default is returned; without one that is an error.
-        """
+        """Return a property from the header or the argument, which must agree, or the default."""
         keywords, spellings = _SAID[argument]
         keyword, choices = keywords[0], _choices(argument)
         given = None if given is None else spelled(argument, given)

@@ -123,8 +123,9 @@ class SpectraTable(SettingsTable):
 
     @model_validator(mode="after")
     def _increase(self) -> "SpectraTable":
-        if self.lmax is not None and not self.lmin < self.lmax:
-            raise ValueError(f"lmax, {self.lmax}, must be above lmin, {self.lmin}")
+        for key, most in self:
+            if key.endswith("lmax") and most is not None and most <= self.lmin:
+                raise ValueError(f"{key}, {most}, must be above lmin, {self.lmin}")
         return self
 
 
@@ -172,12 +173,6 @@ class ForecastTable(SpectraTable, WindowTable):
     )
     spectra: Several[Literal["EE", "BB"]] = Field(["BB"])
     fisher_lmax: int = Field(300, ge=2, le=3000)
-
-    @model_validator(mode="after")
-    def _ranges(self) -> "ForecastTable":
-        if not self.lmin < self.fisher_lmax:
-            raise ValueError(f"fisher_lmax, {self.fisher_lmax}, must be above lmin, {self.lmin}")
-        return self
 
 
 class RadioIndexMap(BeamedMap):

@@ -200,10 +200,12 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
             spectrum = spectrum[: last + 1] * window_of(operator, last) ** 2
         return MapNoise(operator, noise, spectrum)
 
-    noises = [noise_of(what, band.noise, band.correlated) for what, band in bands.items()]
-    preparations, noise, correlated = zip(*noises, strict=True)
+    noises = {
+        name: noise_of(f"band {name!r}", band.noise, band.correlated)
+        for name, band in inputs.bands.items()
+    }
     cmb = _cmb(inputs, nside, fwhm, reach)
-    fluctuations = Fluctuations(preparations, noise, correlated, *cmb, tuple(inputs.bands))
+    fluctuations = Fluctuations(tuple(noises.values()), *cmb, tuple(noises))
     sigma = fluctuations.sigma()
     known = np.ones(npix, bool)
     for part in ranges(npix):
@@ -213,7 +215,7 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         for name, one in inputs.template_noise.items()
         if one.own
     }
-    errors = template_errors(list(sky), inputs.template_noise, own_noise, fluctuations.noises)
+    errors = template_errors(list(sky), inputs.template_noise, own_noise, noises)
     bandpasses = {name: band.bandpass for name, band in inputs.bands.items()}
     seen = computed(sigma.shape, lambda at: np.where(known[at], sigma[..., at], np.inf))
     maps = _in_memory(data), _in_memory(seen), used & known

@@ -159,7 +159,8 @@ def _patch_noise(
     band: Band, prepared: CommonMaps, patches: PreparedPatches
 ) -> Float[np.ndarray, "patch 2 ell"]:
     """Return the noise spectrum in the prepared maps on each patch, from its own pixels."""
-    (preparation,), lmax = prepared.fluctuations.preparations, patches.spectra[0].lmax
+    (noise,), lmax = prepared.fluctuations.noises, patches.spectra[0].lmax
+    preparation = noise.preparation
     covariance = pixel_covariance(band.noise, preparation.nside_in)
     variance = average_pixels(jnp.stack([covariance[0, 0], covariance[1, 1]]), preparation.nside)
     weights = np.stack([one.mask**2 for one in patches.spectra])
@@ -167,8 +168,8 @@ def _patch_noise(
     mean = np.asarray(variance).mean(axis=0) @ weights.T / weights.sum(axis=1)
     white = mean * healpy.nside2pixarea(preparation.nside_in)
     total = white[:, None] * np.asarray(window_of(preparation, lmax)) ** 2
-    if (correlated := prepared.fluctuations.correlated[0]) is not None:
-        total[:, : correlated.size] += np.asarray(correlated)[: lmax + 1]
+    if noise.correlated is not None:
+        total[:, : noise.correlated.size] += np.asarray(noise.correlated)[: lmax + 1]
     return np.repeat(total[:, None], 2, axis=1)
 
 

@@ -118,32 +118,29 @@ class MapNoise(NamedTuple):
 class Fluctuations(eqx.Module):
     """Noise and CMB: what Q, U maps in several bands contain besides the model.
 
-    Bands have the fields of `MapNoise`, `cmb_windows` with the beam and pixel window of their
-    prepared maps, `cmb_factors` in uK_RJ per uK_CMB, and `names`, from which the random numbers of
-    each are derived. `cmb_spectra` are C_l of EE and BB [uK_CMB^2], None without CMB.
+    Bands have `noises`, `cmb_windows` with the beam and pixel window of their prepared maps,
+    `cmb_factors` in uK_RJ per uK_CMB, and `names`, from which the random numbers of each are
+    derived. `cmb_spectra` are C_l of EE and BB [uK_CMB^2], None without CMB.
     """
 
-    preparations: tuple[Preparation, ...]
-    noise: tuple[Numeric, ...]
-    correlated: tuple[Float[Array, " ell"] | None, ...]
+    noises: tuple[MapNoise, ...]
     cmb_spectra: Float[Array, "stokes ell"] | None
     cmb_windows: Float[Array, "band ell"] | None
     cmb_factors: Float[Array, " band"]
     names: tuple[str, ...] = eqx.field(static=True)
 
     @property
-    def noises(self) -> dict[str, MapNoise]:
-        """The noise of each band by name."""
-        each = map(MapNoise, self.preparations, self.noise, self.correlated)
-        return dict(zip(self.names, each, strict=True))
+    def nside(self) -> int:
+        """Resolution of the prepared maps."""
+        return self.noises[0].preparation.nside
 
     # Not one program: XLA would keep the maps of all rows and bands in memory at once.
     def covariance(
         self, rows: Float[Array, "band row stokes pix"]
     ) -> Float[np.ndarray, "bandrow bandrow"]:
         """Return the covariance of the inner products of rows with the fluctuations."""
-        npix = healpy.nside2npix(self.preparations[0].nside)  # without padding
-        noises, blocks = list(self.noises.values()), list[np.ndarray]()
+        npix, noises = healpy.nside2npix(self.nside), self.noises  # without padding
+        blocks = list[np.ndarray]()
         modes: Any = None
         if self.cmb_spectra is not None and self.cmb_windows is not None:
             # As far as the beams leave some.
@@ -172,8 +169,9 @@ class Fluctuations(eqx.Module):
     # Not one program: there XLA would draw the normals anew for each row.
     def noise_realisation(self, key: Array) -> Maps:
         """Return noise of all bands at the common resolution [uK_RJ]."""
-        shape = len(self.names), 2, healpy.nside2npix(self.preparations[0].nside)
-        each = (noise.realisation(key, name) for name, noise in self.noises.items())
+        shape = len(self.names), 2, healpy.nside2npix(self.nside)
+        named = zip(self.noises, self.names, strict=True)
+        each = (noise.realisation(key, name) for noise, name in named)
         if not is_large(shape):
             return jnp.stack(list(each))
         found = empty(shape)
@@ -184,19 +182,18 @@ class Fluctuations(eqx.Module):
     @eqx.filter_jit
     def cmb_realisation(self, key: Array) -> Float[Array, "band stokes pix"]:
         """Return the CMB in all bands at the common resolution [uK_RJ]; zero without CMB."""
-        nside = self.preparations[0].nside
         if self.cmb_spectra is None or self.cmb_windows is None:
-            return jnp.zeros((len(self.preparations), 2, healpy.nside2npix(nside)))
+            return jnp.zeros((len(self.names), 2, healpy.nside2npix(self.nside)))
         EE, BB = self.cmb_spectra
         zero = jnp.zeros_like(EE)
         alm = realisation(stream(key, "cmb"), jnp.stack([zero, EE, BB, zero]))
         seen = self.cmb_factors[:, None] * self.cmb_windows
-        return jnp.stack([synthesis(alm * expand(window), nside) for window in seen])
+        return jnp.stack([synthesis(alm * expand(window), self.nside) for window in seen])
 
     def cmb_power(self) -> Float[np.ndarray, "band 2 ell"]:
         """Return mean spectra EE and BB of the CMB in the maps of each band [uK_RJ^2]."""
         if self.cmb_spectra is None or self.cmb_windows is None:
-            return np.zeros((len(self.preparations), 2, 1))
+            return np.zeros((len(self.names), 2, 1))
         seen = np.asarray(self.cmb_factors)[:, None] * np.asarray(self.cmb_windows)
         return seen[:, None] ** 2 * np.asarray(self.cmb_spectra)
 
@@ -206,12 +203,12 @@ class Fluctuations(eqx.Module):
         NaN where it is unknown: next to steps of the noise by more than a factor of about 100,
         where the smoothed map of variances rings below zero.
         """
-        shape = len(self.names), 2, healpy.nside2npix(self.preparations[0].nside)
-        uniform = not any(map(np.ndim, self.noise))
-        noises, size = list(self.noises.values()), 1 if uniform else shape[-1]
+        shape = len(self.names), 2, healpy.nside2npix(self.nside)
+        uniform = not any(np.ndim(one.noise) for one in self.noises)
+        size = 1 if uniform else shape[-1]
 
         def of_band(i: int) -> np.ndarray:
-            total = noises[i].variance()[:, :size]
+            total = self.noises[i].variance()[:, :size]
             return np.sqrt(np.where(total > 0, total, np.nan))
 
         found = filled((*shape[:2], size), of_band)

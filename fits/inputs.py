@@ -4,10 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import healpy
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -68,12 +67,8 @@ class Band(NamedTuple):
 
     def of_many(self, number: int) -> "Band":
         """Return the band, of which there are as many, with its maps on disk if all are large."""
-
-        def moved(leaf: Any) -> Any:
-            return stored(leaf, number) if np.ndim(leaf) > 1 else leaf
-
         used = np.broadcast_to(True, self.used.shape) if self.used.all() else self.used
-        return jax.tree.map(moved, self._replace(used=used))
+        return reading.of_many(self._replace(used=used), number)
 
 
 class TemplateNoise(NamedTuple):

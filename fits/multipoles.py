@@ -288,7 +288,7 @@ def masked_noise(
 
     They are in a unit of which uK_RJ is `factors`.
     """
-    noises = prepared.fluctuations.noises.values()
+    noises = prepared.fluctuations.noises
     lmax = 2 * min(healpy.npix2nside(mask.size), *(n.preparation.nside_in for n in noises))
     area, spectra = np.mean(mask**2), np.zeros((len(noises), 2, lmax + 1))
     sigma = np.where(mask > 0, prepared.sigma, 0.0) * factors[:, None, None] * mask

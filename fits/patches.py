@@ -12,7 +12,6 @@ import math
 from functools import partial
 from typing import NamedTuple
 
-import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -88,11 +87,19 @@ def fit_patches(
         bounds alpha where noise hides the signal; it moves alpha by 0.1 where the truth is 1 from
         its mean and the error is 1
     """
-    maps = _checked("maps", maps, patches)
-    other = None if other is None else _checked("other", other, patches)
+    npix, maps = patches.spectra[0].mask.size, jnp.asarray(maps, float)
+    check_shape("maps", maps, maps.shape == (2, npix), f"have shape (2, {npix})")
+    if other is not None:
+        other = jnp.asarray(other, float)
+        check_shape("other", other, other.shape == (2, npix), f"have shape (2, {npix})")
     if not slope[1] > 0 or not np.isfinite(slope).all():
         raise ValueError(f"Argument `slope` must be a mean and a positive width, not {slope}.")
-    powers = np.stack([band_powers(one, maps, other) for one in patches.spectra])
+    powers = np.zeros((len(patches.names), 2, len(patches.spectra[0].edges) - 1))
+    for i, (patch, one) in enumerate(zip(patches.names, patches.spectra, strict=True)):
+        try:
+            powers[i] = band_powers(one, maps, other)
+        except ValueError as error:
+            raise ValueError(f"Patch {patch}: {error}") from None
     noises = _noise_spectra(noise, maps, other, patches)
     if other is None:
         bias = [
@@ -101,19 +108,6 @@ def fit_patches(
         ]
         powers = powers - np.stack(bias)
     return _fit_powers(powers, noises, patches, other is not None, slope)
-
-
-def _checked(name: str, maps: Float[Array, "2 pix"], patches: PreparedPatches) -> Array:
-    maps = jnp.asarray(maps, float)
-    npix = patches.spectra[0].mask.size
-    check_shape(name, maps, maps.shape == (2, npix), f"have shape (2, {npix})")
-    bad = ~np.isfinite(maps).all(axis=0) | (np.asarray(maps) == healpy.UNSEEN).any(axis=0)
-    for patch, one in zip(patches.names, patches.spectra, strict=True):
-        if count := int(np.sum(bad & (one.mask > 0))):
-            raise ValueError(
-                f"Argument `{name}` has no value in {count} pixels of the patch {patch}."
-            )
-    return maps
 
 
 def _noise_spectra(

@@ -257,7 +257,7 @@ def _pixel_data(settings, inputs, inside, factors, shared) -> PixelData:
         each = list(inputs.foregrounds.values())
 
         def brought(i):
-            return fluctuations.preparations[i](jnp.asarray(np.asarray(each[i])))
+            return fluctuations.noises[i].preparation(jnp.asarray(np.asarray(each[i])))
 
         alone = scaled(filled(prepared.data.shape, brought))
     by_pixel = settings.separate.domain == "pixel"

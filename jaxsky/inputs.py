@@ -95,12 +95,10 @@ class Template(NamedTuple):
     used: Bool[np.ndarray, " pix"]
     unit: str = "uK_RJ"
 
-    def of_many(self, number: int) -> "Template":
-        """Return it with its map on disk if it is large, were there so many."""
-        component = jax.tree.map(
-            lambda leaf: stored(leaf, number) if leaf.ndim == 2 else leaf, self.component
-        )
-        return self._replace(component=component)
+
+def of_many(tree: Any, number: int) -> Any:
+    """Return templates or maps with their rows of pixels on disk if so many would be large."""
+    return jax.tree.map(lambda leaf: stored(leaf, number) if np.ndim(leaf) > 1 else leaf, tree)
 
 
 def read(
@@ -177,7 +175,7 @@ def read_sky(
         if spec.file is not None:
             known[name] = _read_template(folder, name, spec, known, stokes, dtype)
         if number is not None:
-            known[name] = known[name].of_many(number)
+            known[name] = of_many(known[name], number)
     found = {name: known[name] for name in wanted}
     with at_key("fixed"):
         return set_parameters_of(found, settings.fixed, tables), description

@@ -107,7 +107,7 @@ def test_realisations_have_the_covariance(prepared, realised):
 @pytest.mark.slow
 def test_noise_is_prepared_as_maps_are(prepared):
     """White noise keeps its spectrum without the refinement of the analysis."""
-    (op, *_), unit = prepared.fluctuations.preparations, uniform_covariance(1.0, 32)
+    op, unit = prepared.fluctuations.noises[0].preparation, uniform_covariance(1.0, 32)
     powers = []
     for key in jax.random.split(jax.random.key(5), 8):
         fast = white_alm(key, unit, op.window.size - 1) * expand(op.window)

@@ -182,9 +182,7 @@ def correlations(templates) -> Calls:
 def fluctuations(own) -> Calls:
     prepared = Preparation.smoothing(NSIDE, 0.0, NSIDE, 2000.0, LMAX)
     found = own.Fluctuations(
-        (prepared,),
-        (jnp.eye(2)[..., None] * jnp.ones(NPIX),),
-        (jnp.asarray(FALLING),),
+        (own.MapNoise(prepared, jnp.eye(2)[..., None] * jnp.ones(NPIX), jnp.asarray(FALLING)),),
         jnp.stack([FALLING] * 2),
         jnp.asarray(FALLING[None]),
         jnp.ones(1),

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import systems
-from fits.common import Fluctuations
+from fits.fluctuations import Fluctuations, MapNoise
 from fits.multipoles import harmonic_likelihood
 from fits.posterior import chi2, hessian
 from fits.profile_likelihood import spectral_likelihood
@@ -62,9 +62,7 @@ def fluctuations():
     noise = jnp.eye(2)[..., None] * jnp.asarray(rng.uniform(1.0, 2.0, npix))
     spectra = jnp.asarray(np.outer([1.0, 0.1], 1 / (1.0 + np.arange(lmax + 1)) ** 2))
     return Fluctuations(
-        (operator, operator),
-        (noise, 2 * noise),
-        (None, spectra[0]),
+        (MapNoise(operator, noise, None), MapNoise(operator, 2 * noise, spectra[0])),
         spectra,
         jnp.stack([gaussian_beam(900.0, lmax)] * 2),
         jnp.array([0.9, 0.7]),

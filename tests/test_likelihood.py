@@ -12,7 +12,7 @@ import scipy.linalg
 from jax.test_util import check_grads
 
 import systems
-from fits.common import Fluctuations
+from fits.fluctuations import Fluctuations, MapNoise
 from fits.mixing import NOMINAL
 from fits.optimize import best_fit
 from fits.posterior import Gaussian, chi2
@@ -80,15 +80,9 @@ def fluctuations(cmb: bool = True) -> Fluctuations:
     spectra = jnp.asarray(camb_spectra(lmax))[1:3] * 1e4
     windows = jnp.stack([gaussian_beam(fwhm, lmax) for fwhm in (1500.0, 1200.0)])
     correlated = (None, jnp.zeros(lmax + 1).at[2:].set(3.0 / jnp.arange(2, lmax + 1) ** 2))
-    return Fluctuations(
-        preparations,
-        noise,
-        correlated,
-        spectra if cmb else None,
-        windows,
-        jnp.array([0.95, 0.9]),
-        ("44", "70"),
-    )
+    noises = tuple(map(MapNoise, preparations, noise, correlated))
+    seen = spectra if cmb else None, windows, jnp.array([0.95, 0.9])
+    return Fluctuations(noises, *seen, ("44", "70"))
 
 
 @functools.cache
@@ -96,8 +90,7 @@ def dense_covariance(cmb: bool = True) -> np.ndarray:
     """Covariance of all values (band, stokes, pix) of the prepared maps, mode by mode."""
     model, blocks = fluctuations(cmb), []
     Y, ell = synthesis_matrix(8), alm_ell(8)
-    each = zip(model.preparations, model.noise, model.correlated, strict=True)
-    for preparation, noise, correlated in each:
+    for preparation, noise, correlated in model.noises:
         npix_in = noise.shape[-1]
         basis = jnp.eye(2 * npix_in).reshape(-1, 2, npix_in)
         A = np.asarray(jax.lax.map(preparation, basis, batch_size=256))

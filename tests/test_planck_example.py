@@ -12,7 +12,7 @@ from commands import experiment
 from fits import inputs as fit_inputs
 from fits.commands.fit import _table, fit_numbers, fit_warnings
 from fits.commands.run import DEFAULTS
-from fits.common import Fluctuations, common_maps
+from fits.common import Fluctuations, MapNoise, common_maps
 from fits.inputs import Band, Inputs, TemplateNoise, level_spectrum, read_band
 from fits.plots import label
 from fits.posterior import chi2
@@ -328,7 +328,8 @@ def test_a_level_is_seen_through_the_beam():
     preparation = Preparation.smoothing(16, own, NSIDE, fwhm, lmax)
     before = level_spectrum(1000.0, own, lmax)
     spectrum = before * preparation.window**2
-    noise = Fluctuations((preparation,), (0.0,), (spectrum,), None, None, jnp.ones(1), ("x",))
+    noises = (MapNoise(preparation, 0.0, spectrum),)
+    noise = Fluctuations(noises, None, None, jnp.ones(1), ("x",))
     variance = noise.sigma() ** 2
     ell = alm_ell(48)
     level = np.radians(1000.0 / 60)

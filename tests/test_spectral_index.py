@@ -11,7 +11,7 @@ import pytest
 
 from commands import jaxsky
 from fits.commands.run import DEFAULTS
-from fits.common import Fluctuations, common_maps, prepare_component
+from fits.common import Fluctuations, MapNoise, common_maps, prepare_component
 from fits.inputs import Band, Inputs, inputs_of
 from fits.optimize import best_fit
 from fits.regions import region_masks
@@ -79,9 +79,8 @@ def test_variance_of_prepared_noise():
         Preparation(None, nside_in, nside),
     ):
         draws = jax.lax.map(lambda k, p=preparation: p(draw(k, covariance)), keys, batch_size=50)
-        model = Fluctuations(
-            (preparation,), (covariance,), (None,), None, None, jnp.ones(1), ("44",)
-        )
+        noises = (MapNoise(preparation, covariance, None),)
+        model = Fluctuations(noises, None, None, jnp.ones(1), ("44",))
         ratio = np.asarray(draws.var(axis=0) / model.sigma()[0] ** 2)
         inside = np.abs(healpy.pix2ang(nside, np.arange(ratio.shape[1]), lonlat=True)[1])
         for low in (0, 30, 60):
@@ -96,7 +95,7 @@ def test_uniform_noise_is_drawn_by_multipoles():
     nside_in, nside, lmax = 32, 16, 47
     preparation = Preparation.smoothing(nside_in, 60.0, nside, 400.0, lmax)
     model, pixels = (
-        Fluctuations((preparation,), (noise,), (None,), None, None, jnp.ones(1), ("44",))
+        Fluctuations((MapNoise(preparation, noise, None),), None, None, jnp.ones(1), ("44",))
         for noise in (1000.0, uniform_covariance(1000.0, nside_in))
     )
     np.testing.assert_allclose(model.sigma(), pixels.sigma(), rtol=1e-6)
@@ -118,8 +117,8 @@ def test_noise_of_a_band_is_that_of_its_name():
 
     def drawn(names, noise):
         count = len(names)
-        parts = (how,) * count, (noise,) * count, (None,) * count, None, None
-        model = Fluctuations(*parts, jnp.ones(count), names)
+        noises = (MapNoise(how, noise, None),) * count
+        model = Fluctuations(noises, None, None, jnp.ones(count), names)
         return dict(zip(names, np.asarray(model.noise_realisation(jax.random.key(5))), strict=True))
 
     for noise in (1000.0, uniform_covariance(1000.0, 16)):

@@ -23,7 +23,6 @@ from jaxsky.cmb import realisation
 from jaxsky.harmonics import (
     Preparation,
     adjoint_synthesis,
-    alm_ell,
     average_pixels,
     expand,
     map_variance,
@@ -60,7 +59,7 @@ class MapNoise(NamedTuple):
         block, modes, before = np.zeros((count, count)), None, None
         if self.correlated is not None:
             spectra = np.stack([self.correlated] * 2)
-            modes = _modes_of((count,), spectra.shape[-1] - 1)
+            modes = empty((count, 2 * spectra.shape[-1] ** 2))
         covariance = pixel_covariance(self.noise, self.preparation.nside_in)
         npix = covariance.shape[-1]
         if np.ndim(self.noise) or self.noise:
@@ -146,7 +145,7 @@ class Fluctuations(eqx.Module):
             # As far as the beams leave some.
             last = max(len(shortened(window)) for window in self.cmb_windows)
             spectra = self.cmb_power()[..., :last]
-            modes = _modes_of(rows.shape[:2], last - 1)
+            modes = empty((*rows.shape[:2], 2 * last**2))
         for start in range(0, len(noises), job.number()):
             # As many bands at a time as there are processes, which take turns.
             bands = range(len(noises))[start : start + job.number()]
@@ -215,11 +214,6 @@ class Fluctuations(eqx.Module):
         return np.broadcast_to(found[...], shape) if uniform else found
 
 
-def _modes_of(rows: tuple[int, ...], lmax: int) -> Maps:
-    """Return an array for the projections of so many rows, on disk if it is large."""
-    return empty((*rows, 2 * alm_ell(lmax).size))
-
-
 def _products(modes: Maps) -> Float[np.ndarray, "row row"]:
     """Return the inner products of all rows, projected on modes."""
     number, size = int(np.prod(modes.shape[:-1])), modes.shape[-1]
@@ -232,5 +226,4 @@ def _modes(
     row: Float[Array, "stokes pix"], spectra: Float[Array, "stokes ell"]
 ) -> Float[Array, " mode"]:
     """Project a row on independent modes of unit variance, with the spectra of E and B."""
-    lmax = spectra.shape[-1] - 1
-    return (jnp.sqrt(spectra)[:, alm_ell(lmax)] * adjoint_synthesis(row, lmax)).ravel()
+    return (expand(jnp.sqrt(spectra)) * adjoint_synthesis(row, spectra.shape[-1] - 1)).ravel()

@@ -22,17 +22,14 @@ NEGLIGIBLE = 1e-12
 FINER = 0.01
 
 
-def gaussian_beam(fwhm: ArrayLike, lmax: int) -> Window:
+@partial(jax.jit, static_argnames="lmax")
+def gaussian_beam(fwhm: ArrayLike, lmax: int, own: ArrayLike = 0.0) -> Window:
     """Return the window b_l = exp(-l (l+1) sigma^2 / 2) of a Gaussian beam of `fwhm` [arcmin].
 
     The same window serves temperature and polarization, as in the paper; healpy's window for
-    polarization differs by exp(2 sigma^2), 1.0001 for 1 degree. Differentiable in the width.
+    polarization differs by exp(2 sigma^2), 1.0001 for 1 degree. With a beam `own` it is that of
+    sqrt(fwhm^2 - own^2). Differentiable in the widths.
     """
-    return _gaussian_ratio(fwhm, 0.0, lmax)
-
-
-@partial(jax.jit, static_argnames="lmax")
-def _gaussian_ratio(fwhm: ArrayLike, own: ArrayLike, lmax: int) -> Window:
     variance = (jnp.square(fwhm) - jnp.square(own)) * math.radians(1 / 60) ** 2 / (8 * math.log(2))
     ell = jnp.arange(lmax + 1)
     return jnp.exp(-ell * (ell + 1) * variance / 2)
@@ -51,7 +48,7 @@ def beam_ratio(target: ArrayLike, own: ArrayLike, lmax: int, what: str = "the ma
                 f"The target beam of {float(target):g} arcmin is finer than that of {what}, "
                 f"{float(own):g} arcmin."
             )
-        return _gaussian_ratio(target, own, lmax)
+        return gaussian_beam(target, lmax, own)
     over, under = _window(target, lmax, "the target"), _window(own, lmax, what)
     empty = jnp.abs(under) < NEGLIGIBLE
     ratio = jnp.where(empty, 0.0, over / jnp.where(empty, 1.0, under))

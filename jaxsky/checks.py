@@ -48,6 +48,12 @@ def listed(words: Iterable[str]) -> str:
     return " and ".join(filter(None, (", ".join(first[:-1]), *first[-1:])))
 
 
+def check_type(what: str, value: object, kind: type, form: str) -> None:
+    """Raise TypeError, stating what a value must be, unless it is of a kind."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{what} must be {form}, but is {type(value).__name__}.")
+
+
 def check_shape(name: str, array: Any, good: bool, form: str) -> None:
     """Raise ValueError, stating the form that an array must have, unless `good`."""
     if not good:

@@ -12,7 +12,15 @@ from jaxtyping import Array
 
 from jaxsky.arrays import Beam, Covariance, Scalar
 from jaxsky.bandpass import Bandpass
-from jaxsky.checks import Printed, check_choice, check_names, check_not_negative, check_nside, shown
+from jaxsky.checks import (
+    Printed,
+    check_choice,
+    check_names,
+    check_not_negative,
+    check_nside,
+    check_type,
+    shown,
+)
 from jaxsky.components import Component
 from jaxsky.public import packaged
 from jaxsky.small_scales import SmallScales
@@ -136,13 +144,9 @@ class Observation(eqx.Module):
 
 def check_sources(sources: Mapping[str, Source], observation: Observation) -> None:
     """Raise TypeError or ValueError unless the components can be observed together."""
-    if not isinstance(sources, Mapping):
-        raise TypeError(
-            f"Argument `sources` must be a dictionary of Source, but is {type(sources).__name__}."
-        )
+    check_type("Argument `sources`", sources, Mapping, "a dictionary of Source")
     for name, source in sources.items():
-        if not isinstance(source, Source):
-            raise TypeError(f"Component {name!r} must be a Source, not {type(source).__name__}.")
+        check_type(f"Component {name!r}", source, Source, "a Source")
         rows, wanted = len(source.component.template), observation.stokes
         if rows != len(wanted):
             raise ValueError(

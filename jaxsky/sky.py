@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,7 +11,7 @@ from jaxtyping import Array, ArrayLike
 
 from jaxsky.arrays import BandMaps, StokesMaps
 from jaxsky.bandpass import Bandpass
-from jaxsky.checks import Printed, as_array, check_names
+from jaxsky.checks import Printed, as_array, check_names, check_type
 from jaxsky.components import Component, check_value, declared
 from jaxsky.interpolation import Nodes, Plan, band_sed, choose_nodes
 from jaxsky.mesh import maps_of, over_pixels, typed
@@ -35,11 +36,8 @@ class Sky(Printed, eqx.Module):
     components: dict[str, Component]
 
     def __init__(self, components: Mapping[str, Component]) -> None:
-        if not isinstance(components, Mapping):
-            raise TypeError(
-                "Argument `components` must be a dictionary of components by name, but is "
-                f"{type(components).__name__}."
-            )
+        form = "a dictionary of components by name"
+        check_type("Argument `components`", components, Mapping, form)
         # JAX sorts dictionaries when it flattens them; sorted here, the order is always the same.
         self.components = {name: components[name] for name in sorted(components)}
         if not self.components:
@@ -50,9 +48,7 @@ class Sky(Printed, eqx.Module):
                     f"A component's name is the first part of dotted names of parameters, so it "
                     f"must be text without dots, not {name!r}."
                 )
-            if not isinstance(component, Component):
-                what = type(component).__name__
-                raise TypeError(f"Component {name!r} must be a jaxsky Component, but is {what}.")
+            check_type(f"Component {name!r}", component, Component, "a jaxsky Component")
         shapes = {name: component.amplitude.shape for name, component in self.components.items()}
         if len(set(shapes.values())) > 1:
             raise ValueError(f"Amplitudes must share one shape (stokes, pix), but have {shapes}.")
@@ -79,9 +75,8 @@ def interpolation_nodes(sky: Sky, bands: Sequence[Bandpass], tolerance: float) -
     return tuple(choose_nodes(c, tuple(bands), tolerance) for c in sky.components.values())
 
 
-def _check_bands(sky: object, bands: object) -> tuple[Bandpass, ...]:
-    if not isinstance(sky, Sky):
-        raise TypeError(f"Argument `sky` must be a Sky, but is {type(sky).__name__}.")
+def _check_bands(sky: object, bands: Any) -> tuple[Bandpass, ...]:
+    check_type("Argument `sky`", sky, Sky, "a Sky")
     # A dictionary would lose its order under jit, and with it the order of the result.
     if isinstance(bands, Bandpass) or not isinstance(bands, Sequence):
         raise TypeError(
@@ -89,8 +84,7 @@ def _check_bands(sky: object, bands: object) -> tuple[Bandpass, ...]:
             "for a dictionary list(bands.values())."
         )
     for i, band in enumerate(bands):
-        if not isinstance(band, Bandpass):
-            raise TypeError(f"Entry {i} of `bands` must be a Bandpass, not {type(band).__name__}.")
+        check_type(f"Entry {i} of `bands`", band, Bandpass, "a Bandpass")
     if not bands:
         raise ValueError("Argument `bands` must have at least one band.")
     return tuple(bands)

@@ -68,7 +68,7 @@ def sky():
         ("`components` must be a dict.* is list", TypeError, lambda: Sky([1])),
         ("`sources` .* is Sky", TypeError, lambda: simulate(KEY, sky(), Observation(BANDS, 2))),
         (
-            "'x' must be a Source, not int",
+            "'x' must be a Source, but is int",
             TypeError,
             lambda: simulate(KEY, {"x": 1}, Observation(BANDS, 2)),
         ),

@@ -95,7 +95,7 @@ def test_unknown_names_are_answered_with_the_known_ones():
         (lambda s: observe(s, Bandpass.delta(30.0)), TypeError,
          "a list of Bandpass; .*observe_band"),
         (lambda s: observe(s, [30.0]), TypeError,
-         "Entry 0 of `bands` must be a Bandpass, not float"),
+         "Entry 0 of `bands` must be a Bandpass, but is float"),
         (lambda s: observe(s, []), ValueError, "at least one band"),
         (lambda s: set_parameters(s, {"dust.beta_dust": np.ones(5)}), ValueError,
          r"'dust.beta_dust' must be a number or of shape \(48,\), but has shape \(5,\)"),

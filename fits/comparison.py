@@ -209,10 +209,7 @@ def compare(
 
 
 def _statistics(fluctuations, foregrounds, sigma, inside, lmax, key):
-    """Return the fields of `ComparisonRealisations` of one realisation, on E and B of foregrounds.
-
-    `sigma` is that of the maps, and `inside` are the pixels of each region.
-    """
+    """Return a realisation's `ComparisonRealisations`, on E and B of the foregrounds."""
     noise = jnp.asarray(fluctuations.noise_realisation(key))
     cmb = fluctuations.cmb_realisation(key)
     noise_alms = polarization_alms(noise, lmax)

@@ -134,10 +134,7 @@ def choose_nodes(component: Component, bands: tuple[Bandpass, ...], tolerance: f
 def _series(
     component: Component, band: Bandpass | Samples, counts: tuple[int, ...]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Return Chebyshev coefficients of the band average, and its values at the nodes.
-
-    There is one axis per parameter that is a map, as long as its node count.
-    """
+    """Return coefficients of the band average and values at the nodes, an axis per map."""
     maps, rebuild = _split(component)
     if not maps:
         value = average(component.sed, band)

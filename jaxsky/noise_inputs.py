@@ -129,10 +129,7 @@ def _covariance(folder, noise, at, nside, stokes, where, factor, own):
 def _read_columns(
     folder: Path, spec: NoiseColumns, own: MapKeys | None, kind: str, unit: str | None, where: str
 ) -> Maps:
-    """Read the columns of noise, with Stokes parameters as implied by the kind of noise.
-
-    Without a file of their own, they are read from that of the map.
-    """
+    """Read the columns of a kind of noise, from the map's file if they have none of their own."""
     said = spec.model_dump(exclude={"sigma0"}, exclude_none=True)
     # Hits and weights are numbers, whatever the header calls them.
     implied = {"rms": unit, "covariance": unit and f"{unit}^2"}.get(kind, "")

@@ -87,11 +87,8 @@ def fit_patches(
         bounds alpha where noise hides the signal; it moves alpha by 0.1 where the truth is 1 from
         its mean and the error is 1
     """
-    npix, maps = patches.spectra[0].mask.size, jnp.asarray(maps, float)
-    check_shape("maps", maps, maps.shape == (2, npix), f"have shape (2, {npix})")
-    if other is not None:
-        other = jnp.asarray(other, float)
-        check_shape("other", other, other.shape == (2, npix), f"have shape (2, {npix})")
+    maps = jnp.asarray(maps, float)
+    other = None if other is None else jnp.asarray(other, float)
     if not slope[1] > 0 or not np.isfinite(slope).all():
         raise ValueError(f"Argument `slope` must be a mean and a positive width, not {slope}.")
     powers = np.zeros((len(patches.names), 2, len(patches.spectra[0].edges) - 1))

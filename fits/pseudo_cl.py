@@ -23,7 +23,7 @@ from fits.coupling import (
     pure_coupling_matrices,
     pure_factors,
 )
-from jaxsky.checks import check_finite, is_concrete
+from jaxsky.checks import check_finite, check_shape, is_concrete
 from jaxsky.harmonics import analysis, expand, lmax_of, power_spectrum, synthesis
 from jaxsky.io.stacks import Maps, Stack, aligned, empty, is_large, loaded, ranges
 
@@ -243,11 +243,13 @@ def band_powers(
 
     Raises
     ------
-    ValueError : if values inside the mask are not finite or UNSEEN
+    ValueError : for maps of another shape, and values inside the mask not finite or UNSEEN
     """
     mask = np.asarray(spectra.mask)
     given = {"maps": maps} if other is None else {"maps": maps, "other": other}
     for name, values in given.items():
+        good, form = values.shape == (2, mask.size), f"have shape (2, {mask.size})"
+        check_shape(name, values, good, form)
         for part in ranges(mask.size) if is_concrete(values) else ():
             check_finite(name, np.where(mask[part] > 0, np.asarray(values[..., part]), 0))
     alms = [_masked_alm(mask, spectra.derivatives, one, spectra.lmax) for one in given.values()]

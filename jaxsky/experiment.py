@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxsky.cmb import camb_spectra
 from jaxsky.galaxy import EmbeddedSky
-from jaxsky.harmonics import gaussian_beam, resample
+from jaxsky.harmonics import beam_ratio, resample
 from jaxsky.inputs import Template, bandpass_of, beam_of, read_sky, set_parameters_of
 from jaxsky.io import read_spectra
 from jaxsky.io.maps import tangents
@@ -253,9 +253,8 @@ def _leakage(
         maps = {}
         for name, fraction in fractions.items():
             channel = observation.channels[name]
-            beam = channel.map_beam
             leaked = leak(fraction * observe_band(sky, channel.band)[0])
-            window = beam if jnp.ndim(beam) else gaussian_beam(beam, 2 * observation.nside)
+            window = beam_ratio(channel.map_beam, 0.0, 2 * observation.nside)
             maps[name] = resample(leaked, window, observation.nside)
     return maps
 

@@ -91,18 +91,6 @@ class SmallScales(eqx.Module):
         check_not_negative("amplitude", self.amplitude)
 
 
-class Ranges(NamedTuple):
-    """Ranges of l over which power laws are fitted."""
-
-    EE: tuple[int, int]
-    BB: tuple[int, int]
-
-
-#: The paper's ranges for its templates.
-SYNCHROTRON = Ranges(EE=(10, 120), BB=(4, 40))
-DUST = Ranges(EE=(60, 600), BB=(60, 600))
-
-
 class PowerLaw(NamedTuple):
     """C_l = exp(log_amplitude) (l / pivot)^slope, with the covariance of the two numbers."""
 

@@ -11,7 +11,6 @@ from jaxsky import harmonics as h
 from jaxsky.galaxy import embedded_sky
 from jaxsky.io import read_maps
 from jaxsky.small_scales import (
-    SYNCHROTRON,
     SmallScales,
     continue_templates,
     extrapolate,
@@ -224,7 +223,7 @@ def test_final_spectra_of_the_real_sky(data_dir, name):
 def test_final_spectra_of_the_embedded_sky():
     # With fewer steps along the line of sight than usual, for speed; slopes are the same in 0.06.
     maps = h.smooth(embedded_sky(512, steps=12).synchrotron[1:], 60.0)
-    known, small = 600, SmallScales(*SYNCHROTRON)
+    known, small = 600, SmallScales((10, 120), (4, 40))
     original = h.analysis(maps, known) / h.expand(h.gaussian_beam(60.0, known))
     # Many realisations of the multipoles near the joins, one of all.
     near, (part,), _ = many([maps], [60.0], [small], 128, 12)

@@ -37,7 +37,7 @@ from jaxsky.settings import (
     at_key,
     find_file,
 )
-from jaxsky.small_scales import DUST, SYNCHROTRON, Continued, SmallScales, continue_templates
+from jaxsky.small_scales import Continued, SmallScales, continue_templates
 from jaxsky.templates import dust_index, from_pysm_beta, polarization_template, steepening
 
 #: Titles, captions, differences from the paper, and numbers from its text, by label.
@@ -48,7 +48,10 @@ WORDS = TEXTS["sky"]
 #: Beams of the paper's templates [arcmin].
 PAPER_FWHM = {"dust": 10.0, "synchrotron": 60.0}
 #: The paper's ranges of the fits of power laws.
-RANGES = {"synchrotron": SYNCHROTRON, "dust": DUST}
+RANGES = {
+    "synchrotron": SmallScalesTable(EE=(10, 120), BB=(4, 40)),
+    "dust": SmallScalesTable(EE=(60, 600), BB=(60, 600)),
+}
 #: Reference frequency [GHz] and resolution [arcmin] of the AME; nside of random indices, and of the
 #: embedded model next to templates from files.
 NU_AME, AME_FWHM, NSIDE = 23.0, 60.0, 64
@@ -154,8 +157,7 @@ class PaperSky:
     @property
     def small_scales(self) -> dict[str, SmallScalesTable]:
         """Small scales by law: those of the settings, or with the paper's ranges."""
-        papers = {law: SmallScalesTable(EE=one.EE, BB=one.BB) for law, one in RANGES.items()}
-        return papers | self.settings.paper.small_scales
+        return RANGES | self.settings.paper.small_scales
 
     @property
     def description(self) -> str:

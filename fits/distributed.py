@@ -27,6 +27,12 @@ ALL = slice(None)
 LEAST_SHARE = 1e-6
 
 
+def carry_weight(weights: Float[np.ndarray, "band component"]) -> Bool[np.ndarray, " band"]:
+    """Return True for the bands that carry weight for any component, next to the others."""
+    total = weights.sum(axis=0)
+    return (weights / np.where(total > 0, total, 1.0)).max(axis=1) >= LEAST_SHARE
+
+
 def _seen(weights, components):
     """Return used pixels, their number, those in too few bands, and sums over bands."""
     seen = (weights > 0).sum(axis=0)
@@ -53,12 +59,6 @@ class Looked(NamedTuple):
     number: int
     weights: Float[np.ndarray, " band"]
     counts: Int[np.ndarray, " band"]
-
-    def heavy(self, squares: Float[np.ndarray, "band component"]) -> tuple[np.ndarray, int]:
-        """Return the bands that carry weight, given squares of the laws, and the data in them."""
-        share = self.weights[:, None] * squares
-        heavy = (share >= LEAST_SHARE * share.sum(axis=0)).any(axis=1)
-        return heavy, int(self.counts[heavy].sum())
 
 
 def look(data: Any, noise: Noise, components: int) -> Looked:

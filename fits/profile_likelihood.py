@@ -310,8 +310,7 @@ def spectral_likelihood(
         weightless=(),
     )
     matrix = _check_matrices(like)[:, : len(data), :components]
-    squares = np.mean(matrix**2, axis=0)
-    heavy, number = looked.heavy(squares)
+    heavy = distributed.carry_weight(looked.weights[:, None] * np.mean(matrix**2, axis=0))
     rows = [len(data) * len(layout.groups[0]) for layout in like.layout]
     fewer = cells.number * max(rows) < looked.number
     if compress and not noise.separable:
@@ -344,13 +343,14 @@ def spectral_likelihood(
         pixels=tuple(parts),
         block_cell=block_cell,
         source=source,
-        values=number - components * data.shape[1] * looked.number,
+        values=int(looked.counts[heavy].sum()) - components * data.shape[1] * looked.number,
         weightless=tuple(name for name, some in zip(bands, heavy, strict=True) if not some),
     )
 
 
-def matrices_at(like: SpectralLikelihood, params: Mapping[str, Array]) -> tuple[Array, ...]:
+def matrices_at(like: SpectralLikelihood, params: Mapping[str, Numeric]) -> tuple[Array, ...]:
     """Return mixing matrices (cell, row, unknown) for parameters, for each of `layout`."""
+    params = like.check(params) if params and like.start else {}
     # Without data: compiled programs keep what is static, such as the source.
     return _matrices(dataclasses.replace(like, pixels=(), block_cell=None, source=None), params)
 

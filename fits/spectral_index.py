@@ -16,6 +16,7 @@ import scipy.stats
 from jaxtyping import Bool
 
 from fits.common import CommonMaps
+from fits.distributed import carry_weight
 from fits.grid import grid_fit
 from fits.inputs import Inputs
 from fits.kept import KeptChain, fingerprint
@@ -32,8 +33,6 @@ from jaxsky.job import by_turns
 from jaxsky.programs import QUIET, Progress
 from jaxsky.settings import Experiment, SettingsError, at_key
 
-#: A band with less than this fraction of the weight of every template counts as weightless.
-WEIGHTLESS = 1e-6
 #: A fit on which its own errors depend is repeated until it moves by less than this [sigma].
 SETTLED = 0.01
 
@@ -193,16 +192,14 @@ def _look(
 
     parts = zip(*by_turns(of_part, list(ranges(used.size))), strict=True)
     weight, power, *squares = (np.sum(part, axis=0) for part in parts)
-    total = power.sum(axis=1, keepdims=True)
-    share = np.max(power / np.where(total > 0, total, 1.0), axis=0)
-    weightless = tuple(n for n, s in zip(prepared.bands, share, strict=True) if s < WEIGHTLESS)
+    heavy = carry_weight(power.T)
+    weightless = tuple(n for n, some in zip(prepared.bands, heavy, strict=True) if not some)
     cmb = prepared.fluctuations.cmb_power().sum(axis=1)
     # Q and U each have half the variance of E and B.
     variance = cmb @ (2 * np.arange(cmb.shape[-1]) + 1) / (8 * np.pi)
-    counted = [name not in weightless for name in prepared.bands]
     ratio = variance[:, None] * weight / used.sum()
     shares = (squares[1] / squares[0]).tolist() if squares else []
-    return weightless, 1.0 + float(ratio[counted].mean()), dict(zip(sky, shares, strict=False))
+    return weightless, 1.0 + float(ratio[heavy].mean()), dict(zip(sky, shares, strict=False))
 
 
 def fit_regions(

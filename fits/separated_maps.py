@@ -187,7 +187,7 @@ def component_maps(
     good = data.ndim == 3 and data.shape[:2] == wanted
     check_shape("data", data, good, f"have shape (band, stokes, pix) = {(*wanted, 'pix')}")
     names, (bands, stokes, npix) = tuple(like.mixing.sky), data.shape
-    noise, known = along(data, as_noise(noise, data.shape)), _matrices(like, params)
+    noise, known = along(data, as_noise(noise, data.shape)), matrices_at(like, params)
     uniform = noise.separable and noise.pixel_sigma is None and like.of_pixel is None
     each, cells = covariance and not uniform, like.of_pixel
     if spread(data):
@@ -215,15 +215,10 @@ def component_maps(
     return found._replace(covariance=blocks, alone=alone)
 
 
-def _matrices(like: SpectralLikelihood, params: Mapping[str, Numeric]) -> tuple[Array, ...]:
-    """Return the mixing matrices of all cells, for each of `like.layout`."""
-    return matrices_at(like, like.check(params) if like.start else {})
-
-
 def emission_maps(like: SpectralLikelihood, params: Mapping[str, Numeric], amplitude: Maps) -> Maps:
     """Return the emission in the bands, in the unit of the data, from maps or coefficients."""
     shape = (len(like.mixing.names), *amplitude.shape[1:])
-    known, of_pixel = _matrices(like, params), like.of_pixel
+    known, of_pixel = matrices_at(like, params), like.of_pixel
 
     def emission(part):
         maps = amplitude[..., part]

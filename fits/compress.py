@@ -129,10 +129,10 @@ def as_noise(
                 f"Argument `pixel_sigma` must have shape ({npix},) and go with `noise` of shape "
                 f"(band,) or (band, stokes), but they have shapes {pixel.shape} and {array.shape}."
             )
-        _check_positive("pixel_sigma", pixel)
+        check_sigma("pixel_sigma", pixel)
     if array.ndim == 4:
         return _covariance(array)
-    _check_positive("noise", array)
+    check_sigma("noise", array)
     if spread(array):
         return Noise(array)
     if array.ndim < 3:
@@ -143,7 +143,8 @@ def as_noise(
     return _separated(array) or Noise(array)
 
 
-def _check_positive(name: str, sigma: np.ndarray) -> None:
+def check_sigma(name: str, sigma: np.ndarray) -> None:
+    """Raise ValueError, with their number, for values that are not > 0; infinite ones are."""
     parts = ranges(sigma.shape[-1], PIECE) if isinstance(sigma, Stack) else [slice(None)]
     if bad := int(sigma.size - sum((sigma[..., part] > 0).sum() for part in parts)):
         raise ValueError(f"Argument `{name}` has {bad} of {sigma.size} values that are not > 0.")
@@ -230,11 +231,11 @@ def refuse_data(data: np.ndarray, noise: Noise) -> None:
     raise wrong_data(bad)
 
 
-def wrong_data(bad: int) -> ValueError:
-    """Return the error for a number of data that are not finite."""
+def wrong_data(bad: int, noise: str = "noise") -> ValueError:
+    """Return the error for a number of data that are not finite where `noise` is."""
     return ValueError(
         f"Argument `data` has {bad} values that are not finite (or UNSEEN) in pixels that are "
-        "used; mask them with an infinite `noise`."
+        f"used; mask them with an infinite `{noise}`."
     )
 
 

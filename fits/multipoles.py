@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits.common import CommonMaps, window_of
-from fits.compress import Layout, bare
+from fits.compress import Layout, bare, check_sigma
 from fits.mixing import named_bands, spectral_names
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.systems import Pixels
@@ -163,8 +163,7 @@ def _spectra(
     known = f"({bands},), ({bands}, {stokes}) or ({bands}, {stokes}, ell) from l = 0 to {lmax}"
     check_shape("noise", array, good, f"have shape {known} or above")
     spectra = array[..., lmin : lmax + 1] if tables else array.reshape(bands, -1, 1)
-    if bad := int(np.sum(~(spectra > 0))):
-        raise ValueError(f"Argument `noise` has {bad} of {spectra.size} values that are not > 0.")
+    check_sigma("noise", spectra)
     return spectra
 
 

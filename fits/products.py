@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from fits.compress import wrong_data
 from jaxsky import job
 from jaxsky.checks import EXACT, UNSEEN, as_array
 from jaxsky.io.stacks import Computed, Maps, Stack, empty, ranges
@@ -104,10 +105,7 @@ def checked_weights(data: Any, sigma: Any) -> tuple[Any, Int[np.ndarray, "band s
     if wrong:
         raise ValueError(f"Argument `sigma` has {wrong} of {sigma.size} values that are not > 0.")
     if unseen:
-        raise ValueError(
-            f"Argument `data` has {unseen} values that are not finite (or UNSEEN) in pixels that "
-            "are used; mask them with an infinite `sigma`."
-        )
+        raise wrong_data(unseen, "sigma")
     if not used.any():
         raise ValueError("No pixel is left: the mask, or an infinite `sigma`, covers the map.")
     if isinstance(data, Stack) or isinstance(sigma, Stack):

@@ -8,6 +8,7 @@ parameters is assembled from these. A likelihood without regions is a single cel
 import dataclasses
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial, reduce
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -127,10 +128,8 @@ def _cell_derivatives(like, theta) -> Derivatives:
 
 def _summed(function: Callable, like: Likelihood, theta: Numeric) -> Any:
     """Return the sum over the pieces of a likelihood of a function that is additive."""
-    total, *others = (function(piece, theta) for piece in like.pieces())
-    for part in others:
-        total = jax.tree.map(operator.add, total, part)
-    return total
+    parts = (function(piece, theta) for piece in like.pieces())
+    return reduce(partial(jax.tree.map, operator.add), parts)
 
 
 def value_and_gradient(

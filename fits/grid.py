@@ -82,15 +82,6 @@ def _narrowed(like: Likelihood, ranges: Ranges, points: int) -> tuple[Axes, np.n
     return axes, chi2s
 
 
-def _around(found: FitResult, limits: Ranges) -> Ranges:
-    """Return ranges of 7 standard deviations about a best fit, within the limits."""
-    ranges = {}
-    for name, (low, high) in limits.items():
-        value, reach = float(found.best_fit[name]), 7 * float(found.sigma[name])
-        ranges[name] = (max(low, value - reach), min(high, value + reach))
-    return ranges
-
-
 def _is_settled(axes: Axes, chi2s: np.ndarray, limits: Ranges) -> bool:
     """Whether the grid contains all of the posterior, and is fine enough for its peak."""
     lowest = np.unravel_index(np.argmin(chi2s), chi2s.shape)
@@ -161,7 +152,11 @@ def grid_fit(
         # A ridge much narrower than the first grid is lost between its points.
         found = best_fit(like, _highest(axes, chi2s), priors=priors, throw=False)
         if np.isfinite(list(found.sigma.values())).all():
-            axes, chi2s = _narrowed(like, _around(found, limits), points)
+            around: Ranges = {}
+            for name, (low, high) in limits.items():
+                value, reach = found.best_fit[name], 7 * found.sigma[name]
+                around[name] = (max(low, value - reach), min(high, value + reach))
+            axes, chi2s = _narrowed(like, around, points)
             settled = _is_settled(axes, chi2s, limits)
     log_posterior = (chi2s.min() - chi2s) / 2
     weights = np.exp(log_posterior)

@@ -174,11 +174,9 @@ class Mixing(eqx.Module):
         moving = any(name.split(".")[0] in ("shift", "width") for name in params)
         if cells > CELLS and not moving:
             return self._interpolated(params, cells)
-        if not params:
-            one = self.one({})
+        if cells == 1 or not params:
+            one = self.one({name: value[0] for name, value in params.items()})
             return jnp.broadcast_to(one, (cells, *one.shape))
-        if cells == 1:
-            return self.one({name: value[0] for name, value in params.items()})[None]
         if cells <= CELLS:
             return jax.vmap(lambda p: self.one(p))(params)
         return jax.lax.map(jax.checkpoint(lambda p: self.one(p)), params, batch_size=CELLS)

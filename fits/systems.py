@@ -25,6 +25,8 @@ from jaxtyping import Array, Float
 
 #: Matrices up to this size are dense.
 DENSE = 1500
+#: Least eigenvalue of a matrix scaled to a unit diagonal whose parameters are not degenerate.
+DEGENERATE = 1e-10
 #: Columns solved at a time, and most columns for the variances of a sparse matrix.
 COLUMNS, MOST = 64, 4096
 
@@ -149,7 +151,7 @@ def inverse_gram(
 
 def residuals(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, "group row pix"]:
     """Return whitened residuals: their sum of squares is chi^2."""
-    rest = pixels.data - _model(mixing, solve(mixing, pixels))
+    _, rest, _ = fitted(mixing, pixels)
     if pixels.cross is None:
         return jnp.sqrt(pixels.weights) * rest
     half = rest.shape[1] // 2
@@ -322,13 +324,8 @@ class Factor:
         return scale * solution
 
 
-def degenerate(
-    matrix: np.ndarray | scipy.sparse.csc_matrix, names: Sequence[str], threshold: float = 1e-10
-) -> list[str]:
-    """Return names of degenerate parameters, from the curvature of -log posterior.
-
-    `threshold` is the least eigenvalue of the matrix scaled to a unit diagonal.
-    """
+def degenerate(matrix: np.ndarray | scipy.sparse.csc_matrix, names: Sequence[str]) -> list[str]:
+    """Return names of degenerate parameters, from the curvature of -log posterior."""
     diagonal = matrix.diagonal()
     if (bad := ~(diagonal > 0)).any():
         return [name for name, wrong in zip(names, bad, strict=True) if wrong]
@@ -339,7 +336,7 @@ def degenerate(
     found = []
     for at in _independent(scaled):
         values, vectors = np.linalg.eigh(scaled[np.ix_(at, at)])
-        if not values[0] > threshold:
+        if not values[0] > DEGENERATE:
             share = np.abs(vectors[:, 0])
             found += at[share > 0.05 * share.max()].tolist()
     return [names[i] for i in sorted(found)]

@@ -133,32 +133,26 @@ def _separated(of_pixel, known, data, noise, used, layouts, errors):
 
 
 @partial(jax.jit, static_argnames=("layouts", "errors"))
-def _over_devices(of_pixel, known, data, noise, layouts, errors):
+@over_pixels((maps_of(3), maps_of(4), maps_of(3), *[maps_of(1)] * 3))
+def _over_devices(of_pixel, known, data, noise, *, layouts, errors):
     """Return the fields of `ComponentMaps` but the first, for distributed pixels."""
+    npix = data.shape[-1]
+    size = min(at_once(PIECE), npix)
 
-    @over_pixels((maps_of(3), maps_of(4), maps_of(3), maps_of(1), maps_of(1), maps_of(1)))
-    def on_device(of_pixel, known, data, noise):
-        npix = data.shape[-1]
-        size = min(at_once(PIECE), npix)
+    def some(start):
+        own = jnp.minimum(start + np.arange(size), npix - 1)
+        used = (noise.weights(own) > 0).any(axis=(0, 1))
+        cells = None if of_pixel is None else of_pixel[own]
+        maps, kept = data[..., own], noise.at(own)
+        *found, square, count = _separated(cells, known, maps, kept, used, layouts, errors)
+        exceeding = jax.scipy.special.gammaincc(jnp.maximum(count, 1) / 2, square / 2)
+        probability = jnp.where(count > 0, exceeding, 0.0 * count)  # NaN where not used
+        return *found, square, count, probability
 
-        def some(start):
-            own = jnp.minimum(start + np.arange(size), npix - 1)
-            used = (noise.weights(own) > 0).any(axis=(0, 1))
-            cells = None if of_pixel is None else of_pixel[own]
-            maps, kept = data[..., own], noise.at(own)
-            *found, square, count = _separated(cells, known, maps, kept, used, layouts, errors)
-            exceeding = jax.scipy.special.gammaincc(jnp.maximum(count, 1) / 2, square / 2)
-            probability = jnp.where(count > 0, exceeding, 0.0 * count)  # NaN where not used
-            return *found, square, count, probability
+    def joined(x):
+        return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :npix]
 
-        parts = jax.lax.map(some, jnp.arange(0, npix, size))
-
-        def joined(x):
-            return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :npix]
-
-        return jax.tree.map(joined, parts)
-
-    return on_device(of_pixel, known, data, noise)
+    return jax.tree.map(joined, jax.lax.map(some, jnp.arange(0, npix, size)))
 
 
 def component_maps(
@@ -192,7 +186,8 @@ def component_maps(
     each, cells = covariance and not uniform, like.of_pixel
     if spread(data):
         cells = along(data, cells)
-        found = ComponentMaps(names, *_over_devices(cells, known, data, noise, like.layout, each))
+        how = {"layouts": like.layout, "errors": each}
+        found = ComponentMaps(names, *_over_devices(cells, known, data, noise, **how))
     else:
         looked, size = look(data, noise, len(names)), len(names)
         whole = looked.number == npix

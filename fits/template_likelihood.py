@@ -261,7 +261,7 @@ def likelihood(
         covariance = covariance + template_errors.covariance(rows, seen)
         blocks = blocks - template_errors.mean_products(weights)[:, :, used]
         check_signal(blocks[:, keep, :count, used][..., :count])
-    whitening = _whitening(_of_kept(covariance, rows, keep))
+    whitening = _whitening(covariance, rows, keep)
     matrix = _matrix(blocks[:, keep], keep, len(labels), whitening)
     if covariance_of is not None:
         return dataclasses.replace(like, values=jnp.asarray(len(whitening)), matrix=matrix)
@@ -283,16 +283,12 @@ def _matrix(blocks, keep, stokes, whitening=None):
     return jnp.asarray(full.reshape(len(matrix), -1))
 
 
-def _of_kept(covariance, rows, keep):
-    """Return the covariance of rows of the kept Stokes parameters; that of all rows is reused."""
+def _whitening(covariance, rows, keep):
+    """Return W with W^T W the inverse covariance of the products of rows of kept Stokes."""
     bands, count, stokes, _ = rows.shape
     split = covariance.reshape(2 * (bands, stokes, count // stokes))
     size = bands * len(keep) * count // stokes
-    return split[:, keep][:, :, :, :, keep].reshape(size, size)
-
-
-def _whitening(covariance: Float[np.ndarray, "row row"]) -> Float[np.ndarray, "row row"]:
-    """Return W with W^T W the inverse of a covariance of products."""
+    covariance = split[:, keep][:, :, :, :, keep].reshape(size, size)
     scale = np.sqrt(np.diagonal(covariance))
     safe = np.where(scale > 0, scale, 1.0)
     correlation = covariance / safe[:, None] / safe
@@ -324,8 +320,7 @@ def _on_pixels(like, data, weights, keep, covariance_of):
         if any(name.startswith("offset.") for name in params):
             maps.append(jnp.ones_like(data))
         rows = products.one_stokes_each(jnp.stack(maps, axis=1), weights)
-        covariance = _of_kept(np.asarray(covariance_of(rows)), rows, keep)
-        whitening = jnp.asarray(_whitening(covariance))
+        whitening = jnp.asarray(_whitening(np.asarray(covariance_of(rows)), rows, keep))
         kept = (keep[:, None] * len(maps) + np.arange(len(maps))).ravel()
         rows = rows[:, kept]
         values = jnp.array(len(whitening))

@@ -134,9 +134,7 @@ class SpectralLikelihood(Likelihood):
     def _cell_of_block(self, blocks: int) -> Int[Array, " block"]:
         return jnp.arange(blocks) if self.block_cell is None else self.block_cell
 
-    def total(self, local: Float[Array, "cell free"]) -> Float[Array, ""]:
-        """Return -2 ln L for parameters of each cell."""
-
+    def total(self, local):
         @over_pixels(SUMS)
         def summed(like, matrices):
             parts = like._mapped(systems.least_chi2, matrices)
@@ -144,8 +142,7 @@ class SpectralLikelihood(Likelihood):
 
         return summed(self._blocks(), self.matrices(local))
 
-    def derivatives(self, local: Float[Array, "cell free"]) -> systems.Derivatives:
-        """Return -ln L of each cell, and its derivatives in the parameters of the cell."""
+    def derivatives(self, local):
         units = jnp.eye(local.shape[1])
 
         def with_slopes(function):
@@ -323,13 +320,13 @@ def spectral_likelihood(
     parts, block_cell, source = [], None, None
     for layout in like.layout:
         if few and apart:
-            summed = distributed.band_covariance(
-                data, noise, blocks, layout=layout, number=cells.number
-            )
+            sizes = {"layout": layout, "number": cells.number}
+            summed = distributed.band_covariance(data, noise, blocks, **sizes)
             parts.append(compressed(np.asarray(summed), noise, layout))
         elif few:
-            summed = band_covariance(data, noise, cells, used, layout)
-            parts.append(compressed(summed, noise, layout))
+            parts.append(
+                compressed(band_covariance(data, noise, cells, used, layout), noise, layout)
+            )
         elif apart:
             parts.append(distributed.gathered(data, noise, blocks, layout=layout))
             block_cell = blocks.cell

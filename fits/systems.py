@@ -143,10 +143,8 @@ def inverse_gram(
 ) -> Float[Array, "group unknown unknown pix"]:
     """Return the covariance (M^T W M)^-1 of amplitudes; one pixel if weights are uniform."""
     lower = _cholesky(_gram(mixing, pixels))
-    size, one = len(lower), jnp.ones_like(lower[0][0])[:, None]
-    units = jnp.eye(size)[:, :, None]
-    columns = [_back_substituted(lower, one * unit) for unit in units]
-    return jnp.stack(columns, axis=2)
+    one, units = jnp.ones_like(lower[0][0])[:, None], jnp.eye(len(lower))[:, :, None]
+    return jnp.stack([_back_substituted(lower, one * unit) for unit in units], axis=2)
 
 
 def residuals(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, "group row pix"]:

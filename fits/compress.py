@@ -4,25 +4,32 @@ Where noise is separable, a number per band times a map, the likelihood depends 
 through the covariance of bands D = sum_p d_p d_p^T / sigma_p^2 of each cell. Any few vectors with
 the same covariance give the same chi^2, exactly and at all parameters: the columns of a square root
 of D replace the pixels. Everything else is streamed over pixels, from disk if need be.
+
+Other pixels are arranged in blocks of one cell each. They are gathered in memory, or read anew
+whenever they are needed if the maps are on disk.
 """
 
+import dataclasses
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from fits.regions import Cells
 from fits.systems import Pixels, square_root
 from jaxsky.checks import UNSEEN, Numeric, check_shape
-from jaxsky.io.stacks import Stack, ranges
+from jaxsky.io.stacks import Maps, Stack, ranges
 from jaxsky.mesh import as_double, module_of, spread, typed
 from jaxsky.public import refuse_unit, takes_quantities
 
 #: Pixels per pass over data, and in a block of the likelihood: few enough for the cache, enough for
 #: its loops.
 PIECE, BLOCK = 1 << 15, 4096
+#: Pixels in memory at once if the maps are on disk.
+STREAM = 1 << 17
 #: Ratios of sigma between bands that are constant to this accuracy make noise separable: smoothed
 #: maps of the variance of uniform noise ring by 1e-7.
 ROUNDING = 1e-6
@@ -196,6 +203,14 @@ class Layout(NamedTuple):
     joint: bool
     stokes: tuple[int, ...]
 
+    @classmethod
+    def of(cls, stokes: int, joint: bool) -> tuple["Layout", ...]:
+        """Return those of all Stokes parameters; `joint` if Q and U depend on each other."""
+        if not joint:
+            return (cls(False, tuple(range(stokes))),)
+        polarized = cls(True, (stokes - 2, stokes - 1))
+        return (polarized,) if stokes == 2 else (cls(False, (0,)), polarized)
+
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:
         """Stokes parameters of each system."""
@@ -211,14 +226,6 @@ class Layout(NamedTuple):
         if self.joint:
             rows = rows.reshape(2, -1, rows.shape[-1])
         return rows.swapaxes(0, 1)
-
-
-def layouts(stokes: int, joint: bool) -> tuple[Layout, ...]:
-    """Return groups of the Stokes parameters; `joint` if Q and U depend on each other."""
-    if not joint:
-        return (Layout(False, tuple(range(stokes))),)
-    polarized = Layout(True, (stokes - 2, stokes - 1))
-    return (polarized,) if stokes == 2 else (Layout(False, (0,)), polarized)
 
 
 def refuse_data(data: np.ndarray, noise: Noise) -> None:
@@ -303,3 +310,77 @@ def pixel_rows(data: Any, noise: Noise, layout: Layout, pixels: Any, used: Any) 
         cross = None if cross is None else xp.where(used, cross, 0.0)
     rows: Any = layout.rows(values), layout.rows(weights), None if cross is None else cross[None]
     return Pixels(*rows)
+
+
+def block_size(counts: np.ndarray) -> int:
+    """Return the number of pixels in a block, from those in each cell."""
+    return min(BLOCK, int(np.median(counts[counts > 0]))) if counts.any() else 1
+
+
+def arranged(
+    own: np.ndarray, counts: np.ndarray, size: int, number: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixels of each block, -1 in the padding, and the cell of each block.
+
+    `own` is the cell of each pixel, -1 where not used, and `counts` are the pixels of each cell;
+    there are at least `number` blocks.
+    """
+    blocks = -(-counts // size)
+    order = np.argsort(own, kind="stable")[len(own) - counts.sum() :]
+    own = own[order]
+    begin, first = (np.cumsum(n) - n for n in (blocks * size, counts))
+    cell = np.repeat(np.arange(len(counts)), blocks)
+    cell = np.pad(cell, (0, max(0, number - len(cell))))
+    flat = np.full(len(cell) * size, -1, np.int32)
+    flat[(begin - first)[own] + np.arange(own.size)] = order
+    return flat.reshape(-1, size), cell
+
+
+class Blocks:
+    """Used pixels in blocks, each of a single cell and padded with zeros of unit weight.
+
+    `where` are the pixels of each block, -1 for padding, and `cell` is the cell of each block.
+    """
+
+    def __init__(self, data: Maps, noise: Noise, cells: Cells, used: np.ndarray) -> None:
+        self._data, self._noise = data, noise
+        own = np.where(used, 0, -1).astype(np.int32) if cells.of_pixel is None else cells.of_pixel
+        counts = np.bincount(own[own >= 0], minlength=cells.number)
+        self.where, self.cell = arranged(own, counts, block_size(counts))
+
+    def read(self, layout: Layout, blocks: slice) -> Pixels:
+        """Return the pixels of some blocks, (block, group, row, pix), as arrays of numpy."""
+        index = self.where[blocks].ravel()
+        used, size = index >= 0, self.where.shape[1]
+        whole = used.all() and index[-1] - index[0] == len(index) - 1 and np.all(np.diff(index) > 0)
+        where = slice(int(index[0]), int(index[-1]) + 1) if whole else index
+        found = pixel_rows(self._data, self._noise, layout, where, used)
+        if not np.isfinite(found.data).all() or found.data.min() < UNSEEN:
+            refuse_data(self._data, self._noise)
+
+        def shaped(rows: np.ndarray) -> np.ndarray:
+            rows = np.broadcast_to(rows, (*rows.shape[:2], index.size))
+            return np.moveaxis(rows.reshape(*rows.shape[:2], -1, size), 2, 0)
+
+        return jax.tree.map(shaped, found)
+
+    def pieces(self, like: Any) -> Iterator[Any]:
+        """Yield a `SpectralLikelihood` with a few blocks at a time, as many but for the last."""
+        number, size = self.where.shape
+        for blocks in ranges(number, max(1, STREAM // size)):
+            read = tuple(self.read(each, blocks) for each in like.layout)
+            pixels, cells = jax.tree.map(jnp.asarray, (read, self.cell[blocks]))
+            yield dataclasses.replace(like, pixels=pixels, block_cell=cells, source=None)
+
+    def gathered(self, layout: Layout) -> tuple[Pixels, Array | None]:
+        """Return all pixels, and the cell of each block, None if they are in order."""
+        number, size = self.where.shape
+        every: Any = None
+        for some in ranges(number, max(1, BLOCK // size)):
+            read = self.read(layout, some)
+            if every is None:
+                every = jax.tree.map(lambda own: np.empty((number, *own.shape[1:])), read)
+            for target, own in zip(*map(jax.tree.leaves, (every, read)), strict=True):
+                target[some] = own
+        in_order = np.array_equal(self.cell, np.arange(number))
+        return jax.tree.map(jnp.asarray, every), None if in_order else jnp.asarray(self.cell)

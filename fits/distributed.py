@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from fits.blocks import arranged, block_size
-from fits.compress import PIECE, Layout, Noise, pixel_rows, wrong_data
+from fits.compress import PIECE, Layout, Noise, arranged, block_size, pixel_rows, wrong_data
 from fits.regions import Cells
 from fits.systems import Pixels
 from jaxsky import mesh

@@ -22,8 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from fits import distributed, regions, systems
-from fits.blocks import ON_DISK, Blocks
-from fits.compress import Layout, Noise, as_noise, band_covariance, bare, compressed, layouts
+from fits.compress import Blocks, Layout, Noise, as_noise, band_covariance, bare, compressed
 from fits.mixing import Mixing, named_bands, spectral_names, unit_sky
 from fits.posterior import Likelihood
 from fits.regions import check_labels
@@ -108,7 +107,10 @@ class SpectralLikelihood(Likelihood):
     def _mapped(self, function, matrices):
         """Apply a function of (matrices, pixels) to all blocks, for each of `layout`."""
         if self.source is not None:
-            raise ValueError(ON_DISK)
+            raise ValueError(
+                "Maps on disk whose noise differs from pixel to pixel and from band to band can be "
+                'fitted by fits.Newton() only, and not sampled (separate.sampler = "none").'
+            )
         results = []
         for of_cell, pixels in zip(matrices, self.pixels, strict=True):
             blocks, *_, size = pixels.data.shape
@@ -302,7 +304,7 @@ def spectral_likelihood(
         pixels=(),
         block_cell=None,
         of_pixel=None if cells.of_pixel is None else jnp.asarray(cells.of_pixel),
-        layout=layouts(data.shape[1], angles or noise.covariance is not None),
+        layout=Layout.of(data.shape[1], angles or noise.covariance is not None),
         stokes="QU" if data.shape[1] == 2 else "IQU",
         weightless=(),
     )
@@ -324,9 +326,8 @@ def spectral_likelihood(
             summed = distributed.band_covariance(data, noise, blocks, **sizes)
             parts.append(compressed(np.asarray(summed), noise, layout))
         elif few:
-            parts.append(
-                compressed(band_covariance(data, noise, cells, used, layout), noise, layout)
-            )
+            summed = band_covariance(data, noise, cells, used, layout)
+            parts.append(compressed(summed, noise, layout))
         elif apart:
             parts.append(distributed.gathered(data, noise, blocks, layout=layout))
             block_cell = blocks.cell

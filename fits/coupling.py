@@ -27,13 +27,8 @@ def coupling_matrices(
 def pure_factors(lmax: int) -> Float[np.ndarray, "3 ell"]:
     """Return the factors of the three terms of a purified harmonic."""
     ell = np.maximum(np.arange(lmax + 1), 2.0)
-    return np.stack(
-        [
-            np.ones_like(ell),
-            2 / np.sqrt((ell - 1) * (ell + 2)),
-            1 / np.sqrt((ell - 1) * ell * (ell + 1) * (ell + 2)),
-        ]
-    )
+    first, second = (ell - 1) * (ell + 2), (ell - 1) * ell * (ell + 1) * (ell + 2)
+    return np.stack([np.ones_like(ell), 2 / np.sqrt(first), 1 / np.sqrt(second)])
 
 
 def derivative_factors(count: int) -> Float[np.ndarray, "3 ell"]:

@@ -20,7 +20,7 @@ from fits.optimize import best_fit
 from fits.profile_likelihood import SpectralLikelihood, matrices_at, spectral_likelihood
 from fits.results import FitResult
 from jaxsky import Bandpass, Component, Sky, get_parameters
-from jaxsky.checks import Numeric, as_array, check_finite, check_names, check_shape
+from jaxsky.checks import Numeric, as_array, check_finite, check_names, check_nside, check_shape
 from jaxsky.components import component_class
 from jaxsky.harmonics import beam_ratio, expand, lmax_of, resize, synthesis
 from jaxsky.io.stacks import Maps, computed, empty, ranges
@@ -248,8 +248,7 @@ class HarmonicMaps(ComponentMaps):
         Multipoles above 2 nside are cut; the beam is a full width at half maximum [arcmin], or a
         table b_l from l = 0.
         """
-        if not healpy.isnsideok(nside, nest=True):
-            raise ValueError(f"Argument `nside` must be a power of 2, but is {nside}.")
+        check_nside("nside", nside)
         check_finite("beam", as_array("beam", beam))
         lmax = min(lmax_of(self.amplitude), 2 * nside)
         window = expand(beam_ratio(beam, 0.0, lmax))

@@ -267,7 +267,7 @@ def shared_pixels(distributed) -> Calls:
 @of("fits.profile_likelihood")
 def separations(profile_likelihood) -> Calls:
     like = separation()
-    yield profile_likelihood.matrices_at, like, dict(like.start)
+    yield profile_likelihood._matrices, like, dict(like.start)
 
 
 @of("fits.separated_maps")

@@ -18,7 +18,7 @@ lint: .venv/.dev
 # Slow checks, 30 minutes on two cores: kills at random moments, and statistics of many skies.
 validate: .venv/.dev
 	$(BIN)/pytest validation tests -m slow -n auto --maxprocesses 4 --dist loadfile \
-		--no-loadscope-reorder --durations 20
+		--no-loadscope-reorder --durations 40
 
 # Huge pages for all that is allocated: numpy asks for them itself, XLA and numba do not.
 bench: .venv/.bench

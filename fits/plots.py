@@ -3,7 +3,7 @@
 import re
 import textwrap
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -169,8 +169,23 @@ def _image(axes, pixels, limit, label, middle, **options):
     bar.set_label(label)
 
 
+def draw_map(
+    axes: Axes, values: Map, limit: float, label: str, middle: float | None = None
+) -> None:
+    """Draw a map of the full sky in Galactic coordinates, centred on l = 0, l growing leftwards.
+
+    With a middle, the colours are linear about it.
+    """
+    nside = healpy.npix2nside(values.size)
+    projector = healpy.projector.MollweideProj(xsize=600)
+    pixels = projector.projmap(np.asarray(values), lambda x, y, z: healpy.vec2pix(nside, x, y, z))
+    pixels = np.ma.masked_invalid(np.where(pixels == -np.inf, np.nan, pixels))
+    _image(axes, pixels, limit, label, middle)
+    axes.axis("off")
+
+
 class MapPanel(NamedTuple):
-    """A map with its title, the label of its colours, their middle and limit; see `draw_map`."""
+    """A map with its title and the arguments of `draw_map`; by default the limit fits the map."""
 
     title: str
     values: Map
@@ -179,23 +194,8 @@ class MapPanel(NamedTuple):
     limit: float | None = None
 
 
-def draw_map(axes: Axes, panel: MapPanel) -> None:
-    """Draw a map of the full sky in Galactic coordinates, centred on l = 0, l growing leftwards.
-
-    With a middle, the colours are linear about it; by default their limit fits the map.
-    """
-    title, values, label, middle, limit = panel
-    nside = healpy.npix2nside(values.size)
-    projector = healpy.projector.MollweideProj(xsize=600)
-    pixels = projector.projmap(np.asarray(values), lambda x, y, z: healpy.vec2pix(nside, x, y, z))
-    pixels = np.ma.masked_invalid(np.where(pixels == -np.inf, np.nan, pixels))
-    _image(axes, pixels, limit or color_limit(values - (middle or 0.0)), label, middle)
-    axes.set_title(title)
-    axes.axis("off")
-
-
 def stokes_panels(
-    name: str, maps: Iterable[Map], limit: float, unit: str, middle: float | None = None
+    name: str, maps: Sequence[Map], limit: float, unit: str, middle: float | None = None
 ) -> list[MapPanel]:
     """Return panels of Q and U."""
     return [
@@ -224,7 +224,9 @@ def plot_maps(path: Path, rows: Sequence[Sequence[MapPanel]], title: str = "") -
     size = columns * COLUMN, len(rows) * MAP_HEIGHT + (0.4 if title else 0.0)
     with draw_panels(path, title, size, len(rows), columns) as panels:
         for axes, panel in zip(panels.flat, (one for row in rows for one in row), strict=True):
-            draw_map(axes, panel)
+            limit = panel.limit or color_limit(panel.values - (panel.middle or 0.0))
+            draw_map(axes, panel.values, limit, panel.label, panel.middle)
+            axes.set_title(panel.title)
 
 
 def draw_patch(

@@ -85,9 +85,9 @@ def _draw_sheet(path: Path, files: Mapping[str, Path], lmax: int, settings: Expe
             # Without refinement this is good to 1e-3, which no eye can see.
             largest = min(lmax, LMAX_SHOWN, 2 * healpy.npix2nside(maps.shape[-1]))
             spectra[name] = np.asarray(power_spectrum(analysis(jnp.asarray(maps), largest, 0)))
-            shown = plots.stokes_panels(name, maps, plots.color_limit(maps), unit)
-            for axes, panel in zip(row, shown, strict=True):
-                plots.draw_map(axes, panel)
+            for axes, values, which in zip(row, maps, "QU", strict=True):
+                plots.draw_map(axes, values, plots.color_limit(maps), plots.UNITS[unit])
+                axes.set_title(plots.plain(f"{name}: {which}"))
         power = rf"$\ell(\ell+1)C_\ell/2\pi$ [{plots.UNITS[unit]}$^2$]"
         for index, (axes, which) in enumerate(zip(panels[-1], ("EE", "BB"), strict=True)):
             curves: list[plots.Curve] = [

@@ -23,8 +23,6 @@ from jaxsky.io.stacks import Maps, ranges
 
 #: A map of the full sky.
 Map: TypeAlias = Float[np.ndarray, " pix"]
-#: Label, C_l, and style of a curve.
-Curve: TypeAlias = tuple[str, Float[np.ndarray, " ell"], Mapping[str, Any]]
 STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 9,
@@ -44,7 +42,6 @@ FINEST = 512
 #: Height of a map in it, with its title [inch].
 MAP_HEIGHT = 1.85
 UNITS = {"uK_RJ": r"$\mu{\rm K}_{\rm RJ}$", "uK_CMB": r"$\mu{\rm K}_{\rm CMB}$"}
-MULTIPOLE = r"multipole $\ell$"
 #: Symbols of parameters of bands, and their units.
 BAND_SYMBOLS = {
     "gain": ("g", ""),
@@ -270,18 +267,22 @@ def round_numbers(axis: Axis, digits: Sequence[float] = (1, 2, 5)) -> None:
 
 def label_b_modes(axes: Axes, first: float, last: float, columns: int) -> None:
     """Label axes of BB as D_l in uK_CMB^2 between two multipoles, and draw a legend below."""
-    axes.set(yscale="log", xlim=(first, last), xlabel=MULTIPOLE)
+    axes.set(yscale="log", xlim=(first, last), xlabel=r"multipole $\ell$")
     axes.set_ylabel(rf"$\ell(\ell+1)C_\ell^{{BB}}/2\pi$ [{UNITS['uK_CMB']}$^2$]")
     axes.yaxis.set_major_locator(mpl.ticker.LogLocator(numticks=20))
     legend_below(axes, columns, fontsize=7)
 
 
-def draw_spectra(axes: Axes, curves: Sequence[Curve], digits: Sequence[float] = (1, 2, 5)) -> None:
-    """Draw spectra as D_l = l (l+1) C_l / 2 pi against l, both logarithmic; see `round_numbers`."""
-    for name, spectrum, style in curves:
-        axes.plot(*with_powers(spectrum), label=name, **style)
+def draw_spectra(
+    axes: Axes, spectra: Mapping[str, Float[np.ndarray, " ell"]], unit: str, **options: Any
+) -> None:
+    """Draw spectra as D_l = l (l+1) C_l / 2 pi against l, both logarithmic; one colour each."""
+    for (name, spectrum), color in zip(spectra.items(), COLORS, strict=False):
+        axes.plot(*with_powers(spectrum), label=plain(name), **{"color": color, **options})
     axes.set(xscale="log", yscale="log")
-    round_numbers(axes.xaxis, digits)
+    round_numbers(axes.xaxis, (1, 3))
+    axes.set_xlabel(r"multipole $\ell$")
+    axes.set_ylabel(rf"$\ell(\ell+1)C_\ell/2\pi$ [{UNITS[unit]}$^2$]")
 
 
 def plot_chains(

@@ -29,10 +29,13 @@ UNLIKELY = 0.01
 OBSERVED, MODEL, FOREGROUNDS, NOISE = plots.COLORS[1], plots.COLORS[2], plots.COLORS[0], "0.55"
 UNIT = plots.UNITS["uK_RJ"]
 POWER = rf"$D_\ell$ [{UNIT}$^2$]"
+MULTIPOLE = r"multipole $\ell$"
 #: Largest nside of the maps that are drawn.
 NSIDE = 32
 #: Panels per row.
 COLUMNS = 3
+#: Label, C_l of EE and BB, and style.
+Curve = tuple[str, np.ndarray, dict[str, Any]]
 #: Patches in a picture: name, which are shown, and x and y, each a fit and EE (0) or BB (1).
 Series = tuple[str, np.ndarray, tuple[PatchFits, int], tuple[PatchFits, int]]
 
@@ -180,6 +183,14 @@ def plot_model_maps(
     plots.plot_maps(path, rows, title)
 
 
+def _draw_curves(axes: Axes, curves: Sequence[Curve], field: int, width: float) -> None:
+    """Draw spectra of EE (0) or BB (1) as D_l, on logarithmic axes."""
+    for name, spectra, style in curves:
+        axes.plot(*plots.with_powers(spectra[field]), label=name, **{"lw": width, **style})
+    axes.set(xscale="log", yscale="log")
+    plots.round_numbers(axes.xaxis)
+
+
 def plot_full_sky(path: Path, spectra: Sequence[BandSpectra], title: str) -> None:
     """Draw EE and BB per band, observed and of the complete model (the paper's figs. 7 and 8)."""
     size = 7.2, 2.3 * len(spectra) + 0.8
@@ -189,7 +200,7 @@ def plot_full_sky(path: Path, spectra: Sequence[BandSpectra], title: str) -> Non
                 _draw_spectrum(axes, one, index)
             row[0].set_ylabel(POWER)
         for axes in grid[-1]:
-            axes.set_xlabel(plots.MULTIPOLE)
+            axes.set_xlabel(MULTIPOLE)
         plots.legend_below(grid[0, 0])
 
 
@@ -199,13 +210,13 @@ def _draw_spectrum(axes: Axes, spectra: BandSpectra, index: int) -> None:
     low = np.maximum(observed - error, 1e-3 * observed)
     axes.fill_between(ell, low, observed + error, color=OBSERVED, alpha=0.3, lw=0)
     name = r"observed $\pm\,\Delta C_\ell$"
-    curves: list[plots.Curve] = [
-        (name, spectra.observed[index], {"color": OBSERVED, "lw": 2.2, "alpha": 0.8}),
-        ("foregrounds + CMB + noise", spectra.complete[index], {"color": MODEL, "lw": 1}),
-        ("foregrounds", spectra.foregrounds[index], {"color": FOREGROUNDS, "lw": 1, "ls": "--"}),
-        ("noise", spectra.noise[index], {"color": NOISE, "lw": 1, "ls": ":"}),
+    curves: list[Curve] = [
+        (name, spectra.observed, {"color": OBSERVED, "lw": 2.2, "alpha": 0.8}),
+        ("foregrounds + CMB + noise", spectra.complete, {"color": MODEL}),
+        ("foregrounds", spectra.foregrounds, {"color": FOREGROUNDS, "ls": "--"}),
+        ("noise", spectra.noise, {"color": NOISE, "ls": ":"}),
     ]
-    plots.draw_spectra(axes, curves)
+    _draw_curves(axes, curves, index, 1.0)
     _, foregrounds = plots.with_powers(spectra.foregrounds[index])
     axes.set_ylim(bottom=0.3 * min(observed.min(), foregrounds.min()))
     chi2, pte = f"{spectra.chi2[index]:.1f}", probability(spectra.pte[index])
@@ -220,15 +231,14 @@ def plot_leakage(path: Path, spectra: Sequence[BandSpectra], title: str) -> None
             assert one.uncorrected is not None  # as chosen by the caller
             assert one.pte_uncorrected is not None
             before, after = (probability(p[1]) for p in (one.pte_uncorrected, one.pte))
-            blue, red, green = ({"color": color, "lw": 1.2} for color in plots.COLORS[:3])
-            curves: list[plots.Curve] = [
-                (f"before correction, PTE {before}", one.uncorrected[1], red),
-                (f"after correction, PTE {after}", one.observed[1], blue),
-                ("foregrounds", one.foregrounds[1], {"color": "k", "lw": 0.9, "ls": "--"}),
-                ("noise", one.noise[1], {**green, "ls": ":"}),
+            curves: list[Curve] = [
+                (f"before correction, PTE {before}", one.uncorrected, {"color": plots.COLORS[1]}),
+                (f"after correction, PTE {after}", one.observed, {"color": plots.COLORS[0]}),
+                ("foregrounds", one.foregrounds, {"color": "k", "lw": 0.9, "ls": "--"}),
+                ("noise", one.noise, {"color": plots.COLORS[2], "ls": ":"}),
             ]
-            plots.draw_spectra(axes, curves)
-            axes.set(xlabel=plots.MULTIPOLE, title=plots.plain(f"{one.band}: BB"))
+            _draw_curves(axes, curves, 1, 1.2)
+            axes.set(xlabel=MULTIPOLE, title=plots.plain(f"{one.band}: BB"))
             axes.legend(frameon=False)
         grid[0, 0].set_ylabel(POWER)
 

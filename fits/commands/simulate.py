@@ -9,8 +9,8 @@ import healpy
 import jax.numpy as jnp
 import numpy as np
 
-from fits import plots
 from fits.commands.run import Report, Run
+from fits.plots import UNITS, color_limit, draw_map, draw_panels, draw_spectra, plain, spread
 from jaxsky import experiment, montecarlo
 from jaxsky.harmonics import analysis, power_spectrum
 from jaxsky.io import read_maps
@@ -75,9 +75,9 @@ def make_realisations(settings: Experiment, command: Run, *, only: str | None) -
 
 def _draw_sheet(path: Path, files: Mapping[str, Path], lmax: int, settings: Experiment) -> None:
     """Draw Q and U of some bands, read from their files, and the spectra of their totals."""
-    names, unit, spectra = plots.spread(list(files), SHOWN), settings.simulate.unit, {}
+    names, unit, spectra = spread(list(files), SHOWN), settings.simulate.unit, {}
     size, heights = (7.2, 1.75 * len(names) + 3.2), [1.0] * len(names) + [1.6]
-    with plots.draw_panels(
+    with draw_panels(
         path, settings.title, size, len(names) + 1, 2, fontsize=10, height_ratios=heights
     ) as panels:
         for row, name in zip(panels, names, strict=False):
@@ -86,16 +86,11 @@ def _draw_sheet(path: Path, files: Mapping[str, Path], lmax: int, settings: Expe
             largest = min(lmax, LMAX_SHOWN, 2 * healpy.npix2nside(maps.shape[-1]))
             spectra[name] = np.asarray(power_spectrum(analysis(jnp.asarray(maps), largest, 0)))
             for axes, values, which in zip(row, maps, "QU", strict=True):
-                plots.draw_map(axes, values, plots.color_limit(maps), plots.UNITS[unit])
-                axes.set_title(plots.plain(f"{name}: {which}"))
-        power = rf"$\ell(\ell+1)C_\ell/2\pi$ [{plots.UNITS[unit]}$^2$]"
+                draw_map(axes, values, color_limit(maps), UNITS[unit])
+                axes.set_title(plain(f"{name}: {which}"))
         for index, (axes, which) in enumerate(zip(panels[-1], ("EE", "BB"), strict=True)):
-            curves: list[plots.Curve] = [
-                (plots.plain(name), both[index], {"color": color})
-                for (name, both), color in zip(spectra.items(), plots.COLORS, strict=False)
-            ]
-            plots.draw_spectra(axes, curves, (1, 3))
-            axes.set(title=which, xlabel=plots.MULTIPOLE, ylabel=power)
+            draw_spectra(axes, {n: s[index] for n, s in spectra.items()}, unit)
+            axes.set_title(which)
             low, high = axes.get_ylim()
             axes.set_ylim(bottom=max(low, high * DEPTH))
         panels[-1, 0].legend(title="band", ncols=2, frameon=False)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import healpy
 import jax.numpy as jnp
@@ -108,14 +109,13 @@ def figure_spectra(paper: PaperSky, picture: Path) -> PaperFigure:
             original = analysis(layer.maps, part.measured.shape[-1] - 1)
             law = np.where(np.arange(lmax + 1) < start, np.nan, part.target[0])
             final = np.asarray(power_spectrum(alm[:1])[0] * gaussian_beam(fwhm, lmax) ** 2)
-            measured, (blue, red, green, *_) = np.asarray(power_spectrum(original)[0]), plots.COLORS
-            curves: list[plots.Curve] = [
-                (f"with small scales, {fwhm:g}'", final, {"color": red, "lw": 0.9}),
-                (f"template, {layer.fwhm:g}'", measured, {"color": green, "lw": 1.8}),
-                ("power law, no beam", law, {"color": blue, "lw": 1.4, "ls": "--"}),
-            ]
-            plots.draw_spectra(axes, curves, (1, 3))
-            axes.set_ylabel(rf"$\ell(\ell+1)C_\ell/2\pi$ [{UNIT}$^2$]")
+            for label, spectrum, color, lw, ls in (
+                (f"with small scales, {fwhm:g}'", final, 1, 0.9, "-"),
+                (f"template, {layer.fwhm:g}'", power_spectrum(original)[0], 2, 1.8, "-"),
+                ("power law, no beam", law, 0, 1.4, "--"),
+            ):
+                style: Any = {"color": plots.COLORS[color], "lw": lw, "ls": ls}
+                plots.draw_spectra(axes, {label: spectrum}, "uK_RJ", **style)
             axes.axvline(join, color="0.4", ls=":", lw=1)
             shown = plots.with_powers(final)[1]
             axes.set_ylim(shown[-1] * 1e-2, shown.max() * 2)
@@ -128,7 +128,7 @@ def figure_spectra(paper: PaperSky, picture: Path) -> PaperFigure:
                 note += "" if used == theirs else f"; the paper: {theirs[0]} to {theirs[1]}"
                 ours = with_error(float(slope), float(error))
                 numbers.append(Number(f"slope of {name} {kind}", ours, note))
-        panels[1, 0].set_xlabel(plots.MULTIPOLE)
+        panels[0, 0].set_xlabel("")
     return paper.described("Figure 2", numbers, ranges=_ranges(paper))
 
 
@@ -285,12 +285,12 @@ def figure_patch(paper: PaperSky, picture: Path) -> PaperFigure:
 def _brightest(band: str, inside: Mapping[str, Float[np.ndarray, " inside"]]) -> Number:
     """Return what dominates a band in the patch, by its rms including the mean."""
     rms = {which: float(np.sqrt(np.mean(values**2))) for which, values in inside.items()}
-    parts = {"CMB" if which == "cmb" else which: size for which, size in rms.items()}
-    noise, _ = parts.pop("noise"), parts.pop("total")
-    order = sorted(parts, key=parts.__getitem__, reverse=True)
-    each = ", ".join(f"{name} {parts[name]:.2g}" for name in order)
-    note = f"rms of Q [µK_RJ]: {each}, noise {noise:.2g} a pixel"
-    return Number(f"brightest in the patch at {band} GHz", order[0], note)
+    parts = [which for which in rms if which not in ("total", "noise")]
+    order = sorted(parts, key=rms.__getitem__, reverse=True)
+    names = ["CMB" if which == "cmb" else which for which in order]
+    each = ", ".join(f"{n} {rms[which]:.2g}" for n, which in zip(names, order, strict=True))
+    note = f"rms of Q [µK_RJ]: {each}, noise {rms['noise']:.2g} a pixel"
+    return Number(f"brightest in the patch at {band} GHz", names[0], note)
 
 
 def table_core(paper: PaperSky, picture: Path) -> PaperFigure:

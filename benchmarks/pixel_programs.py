@@ -77,7 +77,9 @@ def programs(nside: int) -> dict[str, jax.stages.Lowered]:
         ),
         "likelihood with gradient": jax.jit(value_and_gradient).lower(like, theta),
         "second derivatives": _cell_derivatives.lower(like, theta),
-        "maps of components": _over_devices.lower(None, (matrix,), data, noise, (layout,), True),
+        "maps of components": _over_devices.lower(
+            None, (matrix,), data, noise, layouts=(layout,), errors=True
+        ),
     }
 
 

@@ -11,7 +11,7 @@ compares the two as the paper does.
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import healpy
 import jax
@@ -32,6 +32,8 @@ from jaxsky.components import Component, component_class
 from jaxsky.harmonics import beam_ratio, resample, shortened
 from jaxsky.public import packaged
 
+#: First and last frequency of an interval [GHz].
+Interval: TypeAlias = tuple[ArrayLike, ArrayLike] | Float[Array, "2"]
 #: Intervals of the paper's steepening [GHz]: that of Giardino's map, and that of the sky model.
 LOW, HIGH = (0.49, 2.12), (20.0, 30.0)
 #: Jacobi steps per analysis, more than elsewhere as templates are made once. Each gains a factor
@@ -106,12 +108,14 @@ def dust_index(
     return smoothed / weight
 
 
-def steepening(nu: ArrayLike, temperature: ArrayLike) -> Float[Array, ""]:
-    """Return how much steeper a spectrum T ~ nu^-beta is at `HIGH` than at `LOW` frequencies.
+def steepening(
+    nu: ArrayLike, temperature: ArrayLike, low: Interval = LOW, high: Interval = HIGH
+) -> Float[Array, ""]:
+    """Return how much steeper a spectrum T ~ nu^-beta is in one frequency interval than in another.
 
     beta = -ln(T_2/T_1) / ln(nu_2/nu_1) between the ends of each interval, with ln T interpolated
-    against ln nu. The paper finds 0.13 for GALPROP's synchrotron. Frequencies in GHz, strictly
-    increasing; differentiable in both arguments.
+    against ln nu; the result is beta of `high` minus beta of `low`. The paper finds 0.13 for
+    GALPROP's synchrotron. Frequencies in GHz, strictly increasing; differentiable in all arguments.
     """
     nu, temperature = as_array("nu", nu), as_array("temperature", temperature)
     if nu.ndim != 1 or nu.shape != temperature.shape or nu.size < 2:
@@ -123,15 +127,25 @@ def steepening(nu: ArrayLike, temperature: ArrayLike) -> Float[Array, ""]:
     check_positive("temperature", temperature)
     if is_concrete(nu) and not bool(jnp.all(jnp.diff(nu) > 0)):
         raise ValueError("Argument `nu` must increase strictly from sample to sample.")
-    if is_concrete(nu) and not nu[0] <= LOW[0] < HIGH[1] <= nu[-1]:
-        raise ValueError(
-            f"Argument `nu` must reach from {LOW[0]:g} to {HIGH[1]:g} GHz, "
-            f"but reaches from {nu[0]:g} to {nu[-1]:g} GHz."
-        )
-    ends = jnp.log(jnp.array([LOW, HIGH]))
-    values = jnp.interp(ends, jnp.log(nu), jnp.log(temperature))
-    low, high = -(values[:, 1] - values[:, 0]) / (ends[:, 1] - ends[:, 0])
-    return high - low
+
+    def index(name: str, interval: Interval) -> Array:
+        ends = as_array(name, interval)
+        check_shape(name, ends, ends.shape == (2,), "be two frequencies [GHz]")
+        if is_concrete(ends) and not 0 < ends[0] < ends[1]:
+            raise ValueError(
+                f"Argument `{name}` must be two increasing frequencies [GHz], "
+                f"but is {ends[0]:g}, {ends[1]:g}."
+            )
+        if is_concrete(nu) and is_concrete(ends) and not nu[0] <= ends[0] < ends[1] <= nu[-1]:
+            raise ValueError(
+                f"Argument `{name}` reaches from {ends[0]:g} to {ends[1]:g} GHz, "
+                f"but the spectrum only from {nu[0]:g} to {nu[-1]:g} GHz."
+            )
+        ends = jnp.log(ends)
+        first, last = jnp.interp(ends, jnp.log(nu), jnp.log(temperature))
+        return -(last - first) / (ends[1] - ends[0])
+
+    return index("high", high) - index("low", low)
 
 
 class Correlation(NamedTuple):

@@ -160,18 +160,20 @@ def test_smoothed_index_gradients():
 NU = np.geomspace(0.4, 40.0, 2001)
 
 
-def test_steepening_of_a_broken_power_law():
-    for steeper in (0.13, 0.0, -0.13):
-        T = 7e3 * np.where(NU < 5, (NU / 5) ** -2.7, (NU / 5) ** (-2.7 - steeper))
-        assert float(steepening(NU, T)) == pytest.approx(steeper, abs=1e-12)
+@pytest.mark.parametrize("interval", [LOW, (0.6, 1.0)])
+def test_steepening_of_a_broken_power_law(interval):
+    T = 7e3 * np.where(NU < 5, (NU / 5) ** -2.7, (NU / 5) ** -2.83)
+    assert float(steepening(NU, T, low=interval)) == pytest.approx(0.13, abs=1e-12)
+    assert float(steepening(NU, T, low=(10.0, 20.0), high=HIGH)) == pytest.approx(0, abs=1e-12)
+    assert float(steepening(NU, T, low=HIGH, high=interval)) == pytest.approx(-0.13, abs=1e-12)
 
 
 def test_steepening_across_the_break():
     """An interval with its break inside has the mean index in ln nu; two samples make a law."""
     nu, T = np.array([0.1, 1.0, 100.0]), np.array([10.0**2.6, 1.0, 100.0**-3.1])
-    first, last = LOW
-    inside = (2.6 * np.log(1 / first) + 3.1 * np.log(last / 1)) / np.log(last / first)
-    assert float(steepening(nu, T)) == pytest.approx(3.1 - inside, abs=1e-12)
+    inside = (2.6 * np.log(1 / 0.5) + 3.1 * np.log(2 / 1)) / np.log(2 / 0.5)
+    result = float(steepening(nu, T, low=(0.5, 2.0)))
+    assert result == pytest.approx(3.1 - inside, abs=1e-12)
 
 
 def test_steepening_of_a_curved_spectrum():
@@ -186,10 +188,11 @@ def test_steepening_of_a_curved_spectrum():
 def test_steepening_gradients():
     nu = jnp.geomspace(0.4, 40.0, 12)
     T = nu**-2.7 * (1 + nu / 5) ** -0.3
-    by_logarithm = jax.jit(lambda nu, log_T: steepening(nu, jnp.exp(log_T)))
+    ends = (jnp.array(LOW), jnp.array(HIGH))
+    by_logarithm = jax.jit(lambda nu, log_T, *ends: steepening(nu, jnp.exp(log_T), *ends))
     # In ln T, since a finite step in T itself would make it negative.
-    check_grads(by_logarithm, (nu, jnp.log(T)), order=1, rtol=1e-5)
-    np.testing.assert_allclose(jax.jit(steepening)(nu, T), steepening(nu, T), rtol=1e-12)
+    check_grads(by_logarithm, (nu, jnp.log(T), *ends), order=1, rtol=1e-5)
+    np.testing.assert_allclose(jax.jit(steepening)(nu, T, *ends), steepening(nu, T), rtol=1e-12)
 
 
 def brute_force(x, y, blocks):
@@ -330,8 +333,11 @@ def test_holes_wider_than_the_beam_are_refused():
         ((-NU[::-1], T), "`nu` must be positive, but its smallest value is -40"),
         ((NU, T - T[5]), "`temperature` must be positive"),
         ((NU, T * np.nan), "`temperature` has 2001 of 2001 values that are not finite"),
-        ((NU[NU > 0.5], T[NU > 0.5]), "`nu` must reach from 0.49 to 30 GHz, but reaches from 0.5"),
-        ((NU[NU < 25], T[NU < 25]), "must reach from 0.49 to 30 GHz, .* from 0.4 to 24"),
+        ((NU, T, (0.3, 2.0)), "`low` reaches from 0.3 to 2 GHz, but the spectrum only from 0.4"),
+        ((NU, T, LOW, (20, 44)), "`high` reaches from 20 to 44 GHz, .* from 0.4 to 40 GHz"),
+        ((NU, T, (2.0, 1.0)), "`low` must be two increasing frequencies .*, but is 2, 1"),
+        ((NU, T, LOW, (0.0, 1.0)), "`high` must be two increasing frequencies .*, but is 0, 1"),
+        ((NU, T, 3.0), r"`low` must be two frequencies .*, but has shape \(\)"),
     ],
 )
 def test_refused_spectra(arguments, message):

@@ -20,7 +20,15 @@ from jaxtyping import Array, Bool, Float
 
 from fits.common import CommonMaps
 from fits.kept import fingerprint, kept_realisations
-from fits.pseudo_cl import EDGES, LMIN, bin_centers, bin_edges, hotelling, polarization_alms
+from fits.pseudo_cl import (
+    EDGES,
+    LMIN,
+    bin_centers,
+    bin_edges,
+    cosmic_error,
+    hotelling,
+    polarization_alms,
+)
 from fits.results import probability
 from jaxsky.harmonics import power_spectrum
 from jaxsky.programs import QUIET
@@ -198,9 +206,18 @@ def compare(
     how = settings.compare
     used = {name: inside & prepared.used for name, inside in regions.items()}
     model = prepared.model()
-    mark = f"{fingerprint((prepared, used))} {settings.seed} {how.lmax}"
-    kept = how.nsims, settings.seed, simulations, mark, report, executor
-    simulated = simulated_fluctuations(prepared, model, used, how.lmax, *kept)
+    simulated = simulated_fluctuations(
+        prepared,
+        model,
+        used,
+        how.lmax,
+        how.nsims,
+        settings.seed,
+        simulations,
+        f"{fingerprint((prepared, used))} {settings.seed} {how.lmax}",
+        report,
+        executor,
+    )
     scatters = compare_pixels(prepared, model, used, simulated)
     spectra = []
     if prepared.used.all():
@@ -279,10 +296,17 @@ def compare_pixels(
         _, region, stokes = name
         both = (np.asarray(maps[at[0]])[:, regions[region]] for maps in (model, prepared.data))
         x, y = (maps[["QU".index(s) for s in stokes]].ravel() for maps in both)
-        correlation, rms = np.corrcoef(x, y)[0, 1], np.sqrt(np.mean((y - x) ** 2))
-        of_maps = slopes[at], errors[at], correlation, rms, np.sqrt(squares[at] / x.size)
-        numbers = map(float, (*of_maps, found[at], pte[at], floor))
-        scatters[name] = Scatter(x.size, *numbers)
+        scatters[name] = Scatter(
+            pixels=x.size,
+            slope=float(slopes[at]),
+            error=float(errors[at]),
+            correlation=float(np.corrcoef(x, y)[0, 1]),
+            rms=float(np.sqrt(np.mean((y - x) ** 2))),
+            expected=float(np.sqrt(squares[at] / x.size)),
+            chi2=float(found[at]),
+            pte=float(pte[at]),
+            floor=floor,
+        )
     return scatters
 
 
@@ -311,8 +335,7 @@ def compare_spectra(
     cmb = np.zeros_like(noise)
     theory = prepared.fluctuations.cmb_power()[..., : lmax + 1]
     cmb[..., : theory.shape[-1]] = theory
-    total = cmb + noise
-    error = np.sqrt(2 / (2 * np.arange(lmax + 1) + 1) * total * total)
+    error = np.asarray(cosmic_error(jnp.asarray(cmb + noise)))
     results = []
     for b, band in enumerate(prepared.bands):
         sims = _binned(simulated.spectra[:, b], edges)
@@ -324,10 +347,26 @@ def compare_spectra(
             _, pte_before = _tested(binned_before, sims)
         binned = _binned(observed[b], edges)
         chi2, pte = _tested(binned, sims)
-        of_model = foregrounds[b], simulated.spectra[0, b], noise[b], cmb[b], error[b]
-        bins = binned, binned_before, sims.mean(axis=0), sims.std(axis=0, ddof=1)
-        spectra = band, observed[b], before, *of_model
-        results.append(BandSpectra(*spectra, edges, *bins, chi2, pte, pte_before))
+        results.append(
+            BandSpectra(
+                band=band,
+                observed=observed[b],
+                uncorrected=before,
+                foregrounds=foregrounds[b],
+                complete=simulated.spectra[0, b],
+                noise=noise[b],
+                cmb=cmb[b],
+                error=error[b],
+                edges=edges,
+                binned=binned,
+                binned_uncorrected=binned_before,
+                mean=sims.mean(axis=0),
+                std=sims.std(axis=0, ddof=1),
+                chi2=chi2,
+                pte=pte,
+                pte_uncorrected=pte_before,
+            )
+        )
     return results
 
 

@@ -23,7 +23,7 @@ from fits.coupling import (
     pure_coupling_matrices,
     pure_factors,
 )
-from jaxsky.checks import check_finite, check_shape, is_concrete
+from jaxsky.checks import Numeric, check_finite, check_shape, is_concrete
 from jaxsky.harmonics import analysis, expand, lmax_of, power_spectrum, synthesis
 from jaxsky.io.stacks import Maps, Stack, aligned, empty, is_large, loaded, ranges
 
@@ -316,6 +316,16 @@ def polarization_alms(
 ) -> Float[Array, "band 2 alm"]:
     """Return E and B of each band; at l = 1.5 nside their spectra are good to 1e-3."""
     return jnp.stack([analysis(band, lmax) for band in maps])
+
+
+def cosmic_error(power: Float[Array, "... ell"], signal: Numeric = 0.0) -> Float[Array, "... ell"]:
+    """Return the standard deviation of the full-sky spectrum of a random field, the paper's eq. 9.
+
+    It is sqrt(2 / (2l+1)) C_l; if the field is added to a fixed signal of spectrum F_l, their
+    chance correlation, which the paper leaves out, makes it sqrt(2 / (2l+1) C_l (C_l + 2 F_l)).
+    """
+    ell = jnp.arange(power.shape[-1])
+    return jnp.sqrt(2 / (2 * ell + 1) * power * (power + 2 * signal))
 
 
 def hotelling(

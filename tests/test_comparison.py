@@ -24,7 +24,7 @@ from fits.discs import (
 )
 from fits.inputs import inputs_of
 from fits.patches import PatchFits, fit_patches
-from fits.pseudo_cl import band_powers, hotelling, polarization_alms, prepare_patches
+from fits.pseudo_cl import band_powers, cosmic_error, hotelling, polarization_alms, prepare_patches
 from fits.regions import region_masks
 from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis
 from jaxsky.io import InputError
@@ -164,6 +164,31 @@ def test_numbers_of_a_scatter(prepared, model, regions, few):
     # A rank among the simulations, of which none is as far off as three times the model.
     triple = compare_pixels(prepared._replace(data=3 * model), model, regions, few)
     assert triple["44", "strip", "Q"].pte == pytest.approx(1 / 41)
+
+
+def test_the_paper_s_error_and_the_chance_correlation():
+    """The scatter of spectra of a Gaussian field, alone and on top of a signal that is fixed."""
+    lmax = 12
+    rng = np.random.default_rng(2)
+    ell = np.concatenate([np.arange(lmax + 1), np.repeat(*_counted(lmax))])
+    fixed = rng.normal(size=ell.size) * 2.0
+    power = np.where(np.arange(lmax + 1) > 1, 1.0 / (1 + np.arange(lmax + 1.0)), 0.0)
+    white = rng.normal(size=(4000, ell.size)) * np.sqrt(power)[ell]
+
+    def spectrum(alm):
+        return np.array([np.bincount(ell, a**2) for a in alm]) / (2 * np.arange(lmax + 1) + 1)
+
+    signal = spectrum(fixed[None])[0]
+    for sky, own in ((white, 0.0), (white + fixed, signal)):
+        expected = np.asarray(cosmic_error(jnp.asarray(power), jnp.asarray(own)))[2:]
+        # 4000 draws know a standard deviation to some 1.5 %.
+        np.testing.assert_allclose(spectrum(sky).std(axis=0)[2:], expected, rtol=0.07)
+
+
+def _counted(lmax):
+    m = np.arange(1, lmax + 1)
+    degrees = np.concatenate([np.arange(k, lmax + 1) for k in m])
+    return degrees, np.full(degrees.size, 2)
 
 
 def test_hotelling_is_exact():

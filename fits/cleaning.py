@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from fits.kept import KeptChain, fingerprint, kept_realisations
 from fits.optimize import best_fit
 from fits.posterior import Likelihood, Posterior, value_and_gradient
-from fits.priors import Gaussian, priors_of
+from fits.priors import Gaussian, Prior, priors_of
 from fits.profile_likelihood import SpectralLikelihood
 from fits.pseudo_cl import (
     LEAST_WINDOW,
@@ -40,7 +40,7 @@ from fits.separated_data import FullSkyData, PixelData
 from fits.systems import Factor
 from fits.tensor_ratio import TensorFit, fit_tensors, power_model
 from jaxsky import job
-from jaxsky.checks import check_double
+from jaxsky.checks import Numeric, check_double
 from jaxsky.cmb import realisation, tensor_spectra
 from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import expand, gaussian_beam, needed_lmax, resize, synthesis
@@ -62,7 +62,12 @@ class Response:
     `theta` is the vector of the best fit, with start values in regions without a pixel.
     """
 
-    def __init__(self, like: Likelihood, params: Mapping, priors: Mapping | None = None) -> None:
+    def __init__(
+        self,
+        like: Likelihood,
+        params: Mapping[str, Numeric],
+        priors: Mapping[str, Prior] | None = None,
+    ) -> None:
         posterior = Posterior(like, priors)
         # Without the likelihood, which is large, since workers are sent this.
         self._priors, self._low, self._high = posterior.priors, posterior.low, posterior.high
@@ -203,9 +208,15 @@ def separate_data(
     # The model has the mean E in B that the windows know of; only the rest is added.
     EE = lensed[1, : spectra.lmax + 1]
     leaked = simulated.leaked.mean(axis=0) - spectra.windows[1, :, 0] @ EE
-    additive, noise = simulated.both.mean(axis=0) + leaked, simulated.spectrum.mean(axis=0)
-    known = spectra, window, lensed, tensors, additive, noise
-    model = power_model(*known, simulated=simulated.total)
+    model = power_model(
+        spectra,
+        window,
+        lensed,
+        tensors,
+        additive=simulated.both.mean(axis=0) + leaked,
+        noise=simulated.spectrum.mean(axis=0),
+        simulated=simulated.total,
+    )
     left = None
     if data.foregrounds is not None:
         alone = cleaned_cmb(data, whole, best, data.foregrounds)
@@ -216,15 +227,30 @@ def separate_data(
     if spec.sampler != "none" and len(fit.labels) <= SAMPLED and like.source is None:
         progress.step("posterior")
         chain = _chain(settings, data, like, fit, simulated, out, progress)
-    residuals = data.residuals(whole, best, amplitude)
-    fitted = data, whole, fit, sigma, covariance, found, maps, residuals
-    return Separation(*fitted, simulated, spectra, ratio, left, chain)
+    return Separation(
+        data=data,
+        like=whole,
+        fit=fit,
+        sigma=sigma,
+        covariance=covariance,
+        found=found,
+        maps=maps,
+        residuals=data.residuals(whole, best, amplitude),
+        simulated=simulated,
+        spectra=spectra,
+        tensors=ratio,
+        left=left,
+        chain=chain,
+    )
 
 
 def cleaned_cmb(
-    data: PixelData | FullSkyData, like: SpectralLikelihood, params: Mapping, observed: Maps
-) -> Maps:
-    """Return the map (stokes, pix) of the CMB in `observed`, separated with these parameters."""
+    data: PixelData | FullSkyData,
+    like: SpectralLikelihood,
+    params: Mapping[str, Array],
+    observed: np.ndarray,
+) -> Float[np.ndarray, "stokes pix"] | Maps:
+    """Return the map of the CMB in `observed`, separated with these parameters."""
     found, maps = data.components(like, params, observed, covariance=False)
     return stored(maps[found.components.index("cmb")])
 

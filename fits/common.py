@@ -83,9 +83,16 @@ class CommonMaps(NamedTuple):
             masked = Computed(sigma.shape, lambda at: np.where(used[at], sigma[..., at], np.inf))
         else:
             masked = jnp.where(distribute(used) if spread(data) else used, sigma, jnp.inf)
-        given = sky, self.bands, data, masked, start
-        exact, errors = self.covariance_of if kind == "exact" else None, self.template_errors
-        return likelihood(*given, stokes=stokes, covariance_of=exact, template_errors=errors)
+        return likelihood(
+            sky,
+            self.bands,
+            data,
+            masked,
+            start,
+            stokes=stokes,
+            covariance_of=self.covariance_of if kind == "exact" else None,
+            template_errors=self.template_errors,
+        )
 
     def pixel_noise(
         self, used: Bool[np.ndarray, " pix"], factors: Float[np.ndarray, " band"]
@@ -215,13 +222,19 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         for name, one in inputs.template_noise.items()
         if one.own
     }
-    errors = template_errors(list(sky), inputs.template_noise, own_noise, noises)
-    bandpasses = {name: band.bandpass for name, band in inputs.bands.items()}
     seen = computed(sigma.shape, lambda at: np.where(known[at], sigma[..., at], np.inf))
-    maps = _in_memory(data), _in_memory(seen), used & known
-    covariance = remembered(fluctuations.covariance)
-    model = Sky(sky) if sky else None
-    return CommonMaps(model, bandpasses, *maps, fluctuations, leakage, nsides, covariance, errors)
+    return CommonMaps(
+        sky=Sky(sky) if sky else None,
+        bands={name: band.bandpass for name, band in inputs.bands.items()},
+        data=_in_memory(data),
+        sigma=_in_memory(seen),
+        used=used & known,
+        fluctuations=fluctuations,
+        leakage=leakage,
+        sources=nsides,
+        covariance_of=remembered(fluctuations.covariance),
+        template_errors=template_errors(list(sky), inputs.template_noise, own_noise, noises),
+    )
 
 
 #: The maps that were distributed last, and what they are then.

@@ -227,8 +227,8 @@ def _simulated(
         noise, correlated = _noise_of(observed, observation.nside, f"bands.{name}.noise")
         if (leakage := _leakage_of(observed, used)) is not None:
             total = total + leakage.maps
-        said = observed.bandpass, observed.beam, noise, correlated, leakage
-        return Band(total, used, *said).of_many(many)
+        own = Band(total, used, observed.bandpass, observed.beam, noise, correlated, leakage)
+        return own.of_many(many)
 
     bands = dict(zip(names, by_turns(band_of, names), strict=True))
     if not foregrounds or not sky:

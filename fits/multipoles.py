@@ -267,9 +267,8 @@ def harmonic_likelihood(
                 "it must be a number: laws that vary over the sky mix multipoles."
             )
     # The laws and their parameters, on a pixel without data.
-    nothing = np.zeros((len(bands), alm.shape[1], 1))
-    given = sky, bands, nothing, np.ones(len(bands)), start
-    like = spectral_likelihood(*given, unit=unit, compress=False)
+    nothing, one = np.zeros((len(bands), alm.shape[1], 1)), np.ones(len(bands))
+    like = spectral_likelihood(sky, bands, nothing, one, start, unit=unit, compress=False)
     components = len(sky.components)
     multipoles = multipoles_of(alm, noise, beams, components, lmin, lmax)
     rows = multipoles.without_beams(alm)

@@ -185,13 +185,21 @@ def _fit_powers(powers, noises, patches, cross, slope):
     spreads = turn @ errors @ np.swapaxes(turn, -1, -2)
     derivatives, variance = np.stack([seen, slopes], -1), 2 / nu * ((offset + d) ** 2 + width**2)
     parameters = _sandwich(derivatives, variance, spreads, spread)
-    detected = DETECTION * np.sqrt(parameters[..., 0, 0]) < A
     rest = data - model
     chi2 = np.sum(rest * np.linalg.solve(spreads, rest[..., None])[..., 0], axis=-1)
-    pte = scipy.stats.chi2.sf(chi2, len(first.edges) - 3)
-    errors = np.sqrt(np.einsum("pibb->pib", errors))
-    fits = A, alpha, parameters, chi2, pte, detected, converged
-    return PatchFits(patches.names, *fits, powers, errors, first.centers)
+    return PatchFits(
+        names=patches.names,
+        A=A,
+        alpha=alpha,
+        covariance=parameters,
+        chi2=chi2,
+        pte=scipy.stats.chi2.sf(chi2, len(first.edges) - 3),
+        detected=DETECTION * np.sqrt(parameters[..., 0, 0]) < A,
+        converged=converged,
+        powers=powers,
+        errors=np.sqrt(np.einsum("pibb->pib", errors)),
+        centers=first.centers,
+    )
 
 
 def _covariance_terms(

@@ -310,9 +310,15 @@ def harmonic_component_maps(
         for each in (found.chi2, found.dof)
     )
     probability = np.where(count > 0, scipy.special.chdtrc(count, square), np.nan)
-    amplitude = np.where(ell >= lmin, found.amplitude, 0.0)
-    errors = of_noise.covariance, of_noise.alone
-    return HarmonicMaps(names, amplitude, *errors, square, count, probability)
+    return HarmonicMaps(
+        components=names,
+        amplitude=np.where(ell >= lmin, found.amplitude, 0.0),
+        covariance=of_noise.covariance,
+        alone=of_noise.alone,
+        chi2=square,
+        dof=count,
+        probability=probability,
+    )
 
 
 class Separated(NamedTuple):

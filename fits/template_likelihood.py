@@ -238,8 +238,8 @@ def likelihood(
     inner = products.summed(products.gram, data, products.stacked(templates), weights)
     inner, count = np.asarray(inner), len(templates)
     values = jnp.asarray(int(counts[:, keep].sum()))
-    known = params, values, mixing, labels, bool(angles)
-    like = TemplateLikelihood(*known, matrix=jnp.zeros((0, 0)))  # until there is one
+    none = jnp.zeros((0, 0))  # until there is one
+    like = TemplateLikelihood(params, values, mixing, labels, bool(angles), none)
     if covariance_of is None and template_errors is None:
         matrix = _matrix(np.asarray(square_root(inner[:, keep])), keep, len(labels))
         return dataclasses.replace(like, matrix=matrix)

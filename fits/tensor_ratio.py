@@ -316,6 +316,17 @@ def fit_tensors(model: PowerModel, powers: Float[np.ndarray, " bin"]) -> TensorF
     log_posterior = -0.5 * np.sum(modes * (ratio - np.log(np.maximum(ratio, 1e-3))), axis=1)
     posterior = np.exp(log_posterior - log_posterior.max())
     upper = float(np.interp(0.95, np.cumsum(posterior) / posterior.sum(), grid))
-    probability = float(scipy.special.chdtrc(dof, chi2)) if dof else np.nan
-    numbers = r, sigma, upper, grid, posterior, chi2, dof, probability
-    return TensorFit(*numbers, powers, covariance, model, weights=solved * sigma**2)
+    return TensorFit(
+        r=r,
+        sigma=sigma,
+        upper_95=upper,
+        grid=grid,
+        posterior=posterior,
+        chi2=chi2,
+        dof=dof,
+        probability=float(scipy.special.chdtrc(dof, chi2)) if dof else np.nan,
+        powers=powers,
+        covariance=covariance,
+        model=model,
+        weights=solved * sigma**2,
+    )

@@ -110,6 +110,11 @@ class EmbeddedSky(eqx.Module):
             f"seed {self.seed}, scaled to the polarized rms of the real sky."
         )
 
+    @property
+    def nside(self) -> int:
+        """Resolution of the maps."""
+        return healpy.npix2nside(self.dust.shape[-1])
+
     def sky(self, stokes: str = "QU") -> Sky:
         """Return a sky ("QU" or "IQU") with the paper's baseline spectral parameters."""
         check_choice("stokes", stokes, ("QU", "IQU"))
@@ -262,8 +267,10 @@ def _emission(model, basis, turbulence, step):
 
 
 def _check(nside: int, seed: int, steps: int) -> None:
-    for name, value in {"seed": seed, "nside": nside, "steps": steps}.items():
-        check_seed(name, value)  # or another integer that is not negative
+    check_seed("seed", seed)
+    for name, value in {"nside": nside, "steps": steps}.items():
+        if not isinstance(value, int | np.integer) or isinstance(value, bool):
+            raise TypeError(f"Argument `{name}` must be an int, but is {value!r}.")
     check_nside("nside", nside)
     if steps < 1:
         raise ValueError(f"Argument `steps` must be positive, but is {steps}.")

@@ -236,6 +236,7 @@ def test_sky_has_the_baseline_of_the_paper(galaxy):
     assert float(sky["dust"].T_dust) == 21.0
     assert float(sky["synchrotron"].beta_syn) == 3.10
     assert (galaxy.nu_dust, galaxy.nu_synchrotron) == (353.0, 30.0)
+    assert galaxy.nside == 64
     assert "not data" in galaxy.description
     assert "seed 0" in galaxy.description
     only = observe_band(sky, Bandpass.delta(30.0)) - galaxy.synchrotron[1:]

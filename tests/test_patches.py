@@ -200,8 +200,12 @@ def test_refusals():
     hole = np.where(mask == 1, healpy.UNSEEN, maps)
     for given, options, words in (
         (maps[:1], {}, "Argument `maps` must have shape (2, 49152), but has shape (1, 49152)"),
-        (hole, {}, "Patch north: Argument `maps` has"),
-        (maps, {"other": np.where(mask > 0, np.nan, maps)}, "Patch north: Argument `other` has"),
+        (hole, {}, "Patch north: Argument `maps` has 120 of 98304 values that are"),
+        (
+            maps,
+            {"other": np.where(mask > 0, np.nan, maps)},
+            "Argument `other` has 1680 of 98304 values",
+        ),
         (maps, {"noise": -1.0}, "Argument `noise` has values that are negative or not finite"),
         (maps, {"noise": np.ones(100)}, "reach l = 128, but has shape (100,)"),
         (maps, {"noise": np.ones((3, 2, 200))}, "Argument `noise` must be a level or have shape"),

@@ -115,9 +115,9 @@ def test_names_that_are_long_dotted_or_taken(tmp_path, text):
 
 
 def test_names_that_are_alike(tmp_path):
-    for name in ("30a", "30A"):
+    for name, words in [("30a", "must differ, but"), ("30A", "must differ by more than capitals")]:
         path = settings_in(tmp_path, MAP.replace("{band}", name) + MAP, "30a")
-        check_refused(path, "names of the bands must differ by more than capitals")
+        check_refused(path, f"names of the bands {words}")
     path = settings_in(tmp_path, '[sky.Dust]\nlaw = "dust"\n' + TEMPLATE)
     check_refused(path, "names of the components must differ by more than")
 

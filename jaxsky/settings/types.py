@@ -172,10 +172,11 @@ def mistakes(raw: Any, error: ValidationError, assigned: Collection[str] = ()) -
 def check_names(kind: str, names: Iterable[str]) -> None:
     """Raise ValueError if names are the same, or differ by capital letters only."""
     names = list(names)
-    if len({name.lower() for name in names}) < len(names):
-        raise ValueError(
-            f"the names of the {kind} must differ by more than capitals, but are {', '.join(names)}"
-        )
+    for known, more in ((set(names), ""), ({n.lower() for n in names}, " by more than capitals")):
+        if len(known) < len(names):
+            raise ValueError(
+                f"the names of the {kind} must differ{more}, but are {', '.join(names)}"
+            )
 
 
 def check_signs(values: Mapping[str, Any], table: str = "") -> None:

@@ -139,9 +139,16 @@ def _fit_pixels(settings, prepared, used, region, stokes, out, mark, progress):
                 said = spec.likelihood, settings.free, settings.seed
                 own = f"{mark} {fingerprint(used)} {stokes} {said}"
                 chain = KeptChain(out / f"chain_{region}_{stokes}.npz", own)
-            run: dict[str, Any] = {"seed": settings.seed, "progress": progress.advance}
-            run |= {"priors": priors, "nsteps": spec.nsteps, "backend": chain}
-            results[method] = sample(like, start, throw=False, **run)
+            results[method] = sample(
+                like,
+                start,
+                priors=priors,
+                nsteps=spec.nsteps,
+                seed=settings.seed,
+                backend=chain,
+                progress=progress.advance,
+                throw=False,
+            )
     if not results:
         raise SettingsError(
             "fit.methods: a grid alone takes one or two free parameters with uniform priors."

@@ -94,8 +94,13 @@ class Unbounded(NamedTuple):
             return self
         root[np.ix_(rest, first)] = slopes[:, : len(first)] @ root[np.ix_(first, first)]
         lean[np.ix_(rest, first)] = slopes[:, len(first) :] / width
-        numbers = (center, root * spread[:, None], cut, middle, lean * spread[:, None])
-        return Unbounded(self.density, *map(jnp.asarray, numbers))
+        return self._replace(
+            center=jnp.asarray(center),
+            root=jnp.asarray(root * spread[:, None]),
+            cut=jnp.asarray(cut),
+            middle=jnp.asarray(middle),
+            lean=jnp.asarray(lean * spread[:, None]),
+        )
 
 
 def unbounded_posterior(posterior: Posterior, theta: np.ndarray) -> tuple[Unbounded, list[str]]:

@@ -1,6 +1,6 @@
 """Names of the arrays that the package passes on, by what they hold.
 
-Maps are in HEALPix RING order. Coefficients are packed, see `jaxsky.harmonics.transforms`.
+Maps are in HEALPix RING order. Coefficients are packed, see `jaxsky.harmonics`.
 """
 
 from typing import TypeAlias

@@ -1,7 +1,7 @@
 """Keep compiled programs on disk through JAX's own cache, and define how progress is reported.
 
 Compilation takes longer than the computations of most commands. Programs with a transform are not
-kept, see `jaxsky.harmonics.primitives`.
+kept, see `jaxsky.ducc`.
 """
 
 import contextlib

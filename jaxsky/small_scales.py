@@ -31,6 +31,7 @@ from jaxsky.checks import (
 )
 from jaxsky.cmb import Spectra, gaussian_fields, repair
 from jaxsky.harmonics import (
+    NEGLIGIBLE,
     analysis,
     expand,
     gaussian_beam,
@@ -41,7 +42,6 @@ from jaxsky.harmonics import (
     shortened,
     synthesis,
 )
-from jaxsky.harmonics.resolution import NEGLIGIBLE
 from jaxsky.noise import positive_root
 
 

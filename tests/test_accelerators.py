@@ -25,13 +25,13 @@ from jaxsky import (
     Sky,
     Source,
     checks,
+    ducc,
     harmonics,
     mesh,
     observe,
     set_parameters,
     simulate,
 )
-from jaxsky.harmonics import primitives
 from systems import bands, dust_and_synchrotron
 
 NSIDE, LMAX = 8, 16
@@ -46,11 +46,11 @@ CALLBACK, DIRECT = "xla_ffi_python_cpu_callback", "cpu_pycall"
 @contextlib.contextmanager
 def as_on_accelerators():
     """Programs made here call transforms as those for a GPU do."""
-    mlir.register_lowering(jaxbind._prim, primitives._lower_callback, platform="cpu")
+    mlir.register_lowering(jaxbind._prim, ducc._lower_callback, platform="cpu")
     try:
         yield
     finally:
-        mlir.register_lowering(jaxbind._prim, primitives._lower, platform="cpu")
+        mlir.register_lowering(jaxbind._prim, ducc._lower, platform="cpu")
 
 
 def simulated(beta):

@@ -114,8 +114,9 @@ def observed(sky) -> Calls:
     yield sky.observe_components, everything, BANDS
 
 
-@of("jaxsky.harmonics.transforms")
+@of("jaxsky.harmonics")
 def transforms(harmonics) -> Calls:
+    prepared = Preparation.smoothing(NSIDE, 0.0, NSIDE // 2, 2000.0, LMAX)
     yield harmonics.expand, ELL
     yield partial(harmonics.resize, lmax=5), ALM
     yield harmonics.power_spectrum, ALM, ALM
@@ -124,11 +125,6 @@ def transforms(harmonics) -> Calls:
     yield partial(harmonics.analysis, lmax=LMAX), MAPS
     yield jax.grad(lambda alm: jnp.sum(harmonics.synthesis(alm, NSIDE) ** 3)), ALM
     yield jax.vmap(partial(harmonics.analysis, lmax=LMAX)), MAPS[None]
-
-
-@of("jaxsky.harmonics.resolution")
-def resolution(harmonics) -> Calls:
-    prepared = Preparation.smoothing(NSIDE, 0.0, NSIDE // 2, 2000.0, LMAX)
     yield lambda fwhm, own: harmonics.beam_ratio(fwhm, own, LMAX), 2000.0, 1000.0
     yield partial(harmonics.resample, nside=2), MAPS, ELL
     yield partial(harmonics.average_pixels, nside=2), MAPS

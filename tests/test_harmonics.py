@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from jaxsky import ducc
 from jaxsky import harmonics as h
-from jaxsky.harmonics import primitives
 
 NSIDE, LMAX = 32, 64
 ROWS = pytest.mark.parametrize(
@@ -135,18 +135,18 @@ def test_rings_in_groups_are_those_of_the_sphere(rows, monkeypatch):
     maps = jnp.asarray(np.random.default_rng(1).normal(size=(len(alm), 12 * NSIDE**2)))
 
     def results():
-        primitives._groups.cache_clear()
+        ducc._groups.cache_clear()
         yield h.synthesis(alm, NSIDE)
         yield h.adjoint_synthesis(maps, LMAX)
         yield h.analysis(maps, LMAX, 2)
         yield jax.linear_transpose(lambda m: h.analysis(m, LMAX, 2), maps)(alm)[0]
 
     whole = list(map(np.asarray, results()))
-    monkeypatch.setattr(primitives, "GROUP", 1 << 15)
+    monkeypatch.setattr(ducc, "GROUP", 1 << 15)
     for found, expected in zip(results(), whole, strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-13 * np.abs(expected).max())
-    assert len(primitives._groups(NSIDE, LMAX, 0, 16, False)) > 3
-    primitives._groups.cache_clear()
+    assert len(ducc._groups(NSIDE, LMAX, 0, 16, False)) > 3
+    ducc._groups.cache_clear()
 
 
 def test_vmap_is_a_loop():

@@ -25,7 +25,7 @@ from jaxsky.programs import keep_programs
 if transforms == "callback":
     from jax.interpreters import mlir
     from jaxbind import jaxbind
-    from jaxsky.harmonics.primitives import _lower_callback
+    from jaxsky.ducc import _lower_callback
     mlir.register_lowering(jaxbind._prim, _lower_callback, platform="cpu")
 keep_programs(Path(folder))
 alm = jnp.asarray(np.random.default_rng(1).normal(size=(2, 81)))

@@ -13,7 +13,7 @@ import sys
 if sys.argv.pop(1) == "callback":
     from jax.interpreters import mlir
     from jaxbind import jaxbind
-    from jaxsky.harmonics.primitives import _lower_callback
+    from jaxsky.ducc import _lower_callback
     mlir.register_lowering(jaxbind._prim, _lower_callback, platform="cpu")
 from fits.app import main
 main()

@@ -1,8 +1,18 @@
-"""Change the resolution of maps: smooth, band-limit or average over pixels; windows in l."""
+"""Spherical harmonics of HEALPix maps: synthesis, analysis, smoothing, resolution.
+
+The transforms are those of ducc0 (`jaxsky.ducc`), so they can be jitted and differentiated and have
+exact transposes; healpy supplies the bookkeeping (ring weights, sizes). Q and U are one spin-2
+field with coefficients E and B: smoothing them as two scalars would be wrong by several percent.
+
+Coefficients are packed as real numbers: for each m the a_lm of l = m ... lmax, and for m > 0 their
+real and imaginary parts times sqrt(2), so that the sum of squares of the packed numbers is the sum
+of |a_lm|^2 over all m.
+"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache, partial
+from typing import Any
 
 import ducc0
 import equinox as eqx
@@ -12,14 +22,152 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxsky import ducc
 from jaxsky.arrays import Alm, Beam, Map, StokesMaps, Window
-from jaxsky.checks import check_finite, check_shape, is_concrete
-from jaxsky.harmonics.transforms import analysis, expand, map_variance, resize, synthesis
+from jaxsky.checks import check_double, check_finite, check_shape, is_concrete
 
 #: A window below this is treated as zero: what it lets through is lost in rounding.
 NEGLIGIBLE = 1e-12
 #: A tabulated target may exceed a map's own window by this fraction, as measured tables do.
 FINER = 0.01
+
+
+# Packed coefficients.
+
+
+def alm_ell(lmax: int) -> np.ndarray:
+    """Return the multipole l of each packed coefficient, shape (alm,)."""
+    ell, m = healpy.Alm.getlm(lmax)
+    return np.concatenate([ell[m == 0], np.repeat(ell[m > 0], 2)])
+
+
+def degrees(lmax: int) -> tuple[Array, Array, Array]:
+    """Return l, m and part (0 real, 1 imaginary) of each packed coefficient."""
+    # Computed inside the program: as constants they would be as large as the coefficients.
+    i = jnp.arange((lmax + 1) ** 2)
+    pair, part = jnp.divmod(jnp.maximum(i - (lmax + 1), 0), 2)
+    # Counted from the end, m = lmax has one pair, m = lmax - 1 two, ...: triangular numbers.
+    back = lmax * (lmax + 1) // 2 - 1 - pair
+    length = jnp.floor((1 + jnp.sqrt(1.0 + 8 * back)) / 2).astype(i.dtype)
+    ell = lmax - (back - length * (length - 1) // 2)
+    zonal = i <= lmax
+    return jnp.where(zonal, i, ell), jnp.where(zonal, 0, lmax + 1 - length), part
+
+
+def lmax_of(alm: Array | np.ndarray) -> int:
+    """Return the largest multipole of packed coefficients."""
+    return math.isqrt(alm.shape[-1]) - 1
+
+
+@jax.jit
+def expand(values: Float[Array, "... ell"]) -> Float[Array, "... alm"]:
+    """Return the values of a function of l = 0 ... lmax at each packed coefficient."""
+    return values[..., degrees(values.shape[-1] - 1)[0]]
+
+
+@partial(jax.jit, static_argnames="lmax")
+def resize(alm: Float[Array, "... alm"], lmax: int) -> Float[Array, "... alm"]:
+    """Cut packed coefficients at another lmax, or pad them with zeros."""
+    own = lmax_of(alm)
+    ell, m, part = degrees(lmax)
+    pairs = (m - 1) * (own + 1) - m * (m - 1) // 2 + ell - m
+    index = jnp.where(m == 0, ell, own + 1 + 2 * pairs + part)
+    return jnp.where(ell <= own, alm[..., jnp.where(ell <= own, index, 0)], 0)
+
+
+@jax.jit
+def power_spectrum(
+    alm: Float[Array, "... alm"], other: Float[Array, "... alm"] | None = None
+) -> Float[Array, "... ell"]:
+    """Return C_l of packed coefficients, or the cross-spectrum with others, row by row."""
+    lmax = lmax_of(alm)
+    product = (alm * (alm if other is None else other)).reshape(-1, alm.shape[-1])
+    ell = degrees(lmax)[0]
+    sums = jax.vmap(lambda row: jnp.zeros(lmax + 1, row.dtype).at[ell].add(row))(product)
+    return sums.reshape(*alm.shape[:-1], -1) / (2 * jnp.arange(lmax + 1) + 1)
+
+
+def map_variance(spectrum: Float[Array | np.ndarray, " ell"]) -> float:
+    """Return the variance of a pixel in maps with a given spectrum."""
+    return float(np.sum((2 * np.arange(spectrum.size) + 1) * np.asarray(spectrum)) / (4 * np.pi))
+
+
+def alm_from_healpy(alm: np.ndarray, lmax: int) -> Float[np.ndarray, "... alm"]:
+    """Convert healpy's complex coefficients to packed real ones, along the last axis."""
+    alm = np.asarray(alm, dtype=complex)
+    high = np.sqrt(2) * alm[..., lmax + 1 :]
+    pairs = np.stack([high.real, high.imag], axis=-1).reshape(*alm.shape[:-1], -1)
+    return np.concatenate([alm[..., : lmax + 1].real, pairs], axis=-1)
+
+
+def alm_to_healpy(alm: ArrayLike, lmax: int) -> np.ndarray:
+    """Convert packed real coefficients to healpy's complex ones, along the last axis."""
+    alm = np.asarray(alm, dtype=float)
+    pairs = alm[..., lmax + 1 :] / np.sqrt(2)
+    return np.concatenate([alm[..., : lmax + 1], pairs[..., ::2] + 1j * pairs[..., 1::2]], axis=-1)
+
+
+# Transforms.
+
+
+def _by_spin(transform: Callable[..., Any], rows: Array, spin: int, **how: Any) -> Array:
+    """Transform the rows I, or Q, U (or E, B), or both: the first is scalar, two have a spin."""
+    scalar, polarized = (slice(0, 1), 0), (slice(-2, None), spin)
+    blocks = {1: [scalar], 2: [polarized], 3: [scalar, polarized]}[len(rows)]
+    return jnp.concatenate([transform(rows[block], spin=s, **how)[0] for block, s in blocks])
+
+
+def _transform(alm: Alm, nside: int, spin: int, weighted: bool) -> StokesMaps:
+    """Return the maps of coefficients, each ring times its weight if `weighted`."""
+    check_double("A spherical harmonic transform")
+    ducc.finish_at_exit()
+    how = {"nside": nside, "lmax": lmax_of(alm), "weighted": weighted}
+    return _by_spin(ducc.synthesis, alm, spin, **how)
+
+
+def _transposed(maps: StokesMaps, lmax: int, spin: int = 2, weighted: bool = False) -> Alm:
+    nside = healpy.npix2nside(maps.shape[-1])
+    alm = jax.ShapeDtypeStruct((maps.shape[0], (lmax + 1) ** 2), maps.dtype)
+    forward = partial(_transform, nside=nside, spin=spin, weighted=weighted)
+    return jax.linear_transpose(forward, alm)(maps)[0]
+
+
+@partial(jax.jit, static_argnames=("nside", "spin"))
+def synthesis(alm: Alm, nside: int, spin: int = 2) -> StokesMaps:
+    """Return maps of I, or Q, U, or I, Q, U from packed coefficients I, or E, B, or I, E, B.
+
+    With lmax > 3 nside - 1 the maps are undersampled. `spin` is that of the last two rows.
+    """
+    return _transform(alm, nside, spin, weighted=False)
+
+
+@partial(jax.jit, static_argnames="lmax")
+def adjoint_synthesis(maps: StokesMaps, lmax: int) -> Alm:
+    """Apply the transpose of `synthesis`: inner products of maps with the spherical harmonics."""
+    return _transposed(maps, lmax)
+
+
+@partial(jax.jit, static_argnames=("lmax", "iterations", "spin"))
+def analysis(maps: StokesMaps, lmax: int, iterations: int | None = None, spin: int = 2) -> Alm:
+    """Return packed coefficients of maps of I, or Q, U, or I, Q, U: the inverse of `synthesis`.
+
+    Uses ring-weighted quadrature, refined by Jacobi steps on the residual map. For a map without
+    multipoles above lmax <= 2 nside the rms error is below 1e-6 of the rms coefficient, and about
+    1e-7 at nside 512; for higher lmax no number of steps (`iterations`) suffices. By default there
+    is one step up to lmax = 1.5 nside and two above, plus one below nside 128, where the
+    quadrature is worse. Maps are in RING order, lmax at most 3 nside - 1.
+    """
+    nside = healpy.npix2nside(maps.shape[-1])
+    if iterations is None:
+        iterations = 1 + (2 * lmax > 3 * nside) + (nside < 128)
+    alm = _transposed(maps, lmax, spin, weighted=True)
+    if not iterations:
+        return alm
+    how = {"nside": nside, "lmax": lmax, "iterations": iterations}
+    return _by_spin(ducc.refined, alm, spin, **how)
+
+
+# Beams and windows in l.
 
 
 @partial(jax.jit, static_argnames="lmax")

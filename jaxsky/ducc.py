@@ -1,14 +1,21 @@
 """Primitives of JAX for ducc's transforms, with exact transposes: group by group of rings.
 
 Only the Fourier coefficients of one group of rings are in memory, next to maps and coefficients;
-those of all rings would take more than a map. Coefficients are packed as in `transforms`.
+those of all rings would take more than a map. Coefficients are packed as in `jaxsky.harmonics`.
 """
 
+import atexit
+import contextlib
+import ctypes
 import math
+import os
 import pickle
+import threading
+import time
 from collections.abc import Iterable
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import ducc0
@@ -144,3 +151,59 @@ def _same(alm, **_):
 
 synthesis = get_linear_call(_synthesise, _synthesise_transposed, _pixels, _coefficients)
 refined = get_linear_call(_refine, _refine, _same, _same)
+
+
+# Ending a Python process in which transforms may still run.
+
+#: Linux's record of each thread of this process; on other systems, threads are not unwound.
+_THREADS = Path("/proc/self/task")
+
+
+@cache
+def finish_at_exit() -> None:
+    """Make the interpreter wait at exit for transforms that are still running.
+
+    JAX returns before a computation is done. A transform is Python code called by a thread of JAX.
+    If that thread asks for the interpreter while it shuts down, Python unwinds the thread through
+    C++ frames that do not allow it, and the process aborts ("terminate called without an active
+    exception", exit code 134).
+    """
+    atexit.register(_finish)  # handlers run in reverse order, so this one before JAX's own
+
+
+def _finish() -> None:
+    """Wait for the computations of this thread, then for those of others."""
+    # JAX runs the computations of a thread on a device one after the other, even those whose
+    # results were dropped; only the cheapest skip the queue, and none that calls Python.
+    last = jax.jit(lambda: jax.pure_callback(lambda: np.int32(0), np.int32(0)))
+    for platform in {jax.default_backend(), "cpu"}:
+        with contextlib.suppress(Exception):
+            for device in jax.local_devices(backend=platform):
+                with jax.default_device(device):
+                    last().block_until_ready()
+    daemons = [thread for thread in threading.enumerate() if thread.daemon]
+    if _THREADS.is_dir() and not _calm(seconds=1.0 if daemons else 60.0):
+        for thread in daemons:  # they end where they next run Python code
+            ident, error = ctypes.c_ulong(thread.ident or 0), ctypes.py_object(SystemExit)
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ident, error)
+        _calm(seconds=10.0)
+
+
+def _calm(seconds: float) -> bool:
+    """Wait until no other thread computes; False if some still do after `seconds`."""
+    end, looks = time.monotonic() + seconds, 0
+    while looks < 5 and time.monotonic() < end:  # a thread may just have waited for this one
+        time.sleep(0.003)
+        looks = 0 if _computing() else looks + 1
+    return looks == 5
+
+
+def _computing() -> bool:
+    """Whether a thread other than this one runs or waits for a processor."""
+    own = str(threading.get_native_id())
+    for thread in set(os.listdir(_THREADS)) - {own}:
+        with contextlib.suppress(OSError):  # it has just ended
+            state = (_THREADS / thread / "stat").read_text().rpartition(")")[2].split()[0]
+            if state in "RD":
+                return True
+    return False

@@ -13,7 +13,7 @@ sign of the field itself is not observable here.
 """
 
 import dataclasses
-from functools import cache, partial
+from functools import partial
 
 import equinox as eqx
 import healpy
@@ -192,7 +192,6 @@ def _turbulence(key, slope, basis):
     return jax.lax.map(shell, jnp.arange(len(SHELLS)))
 
 
-@cache
 def _path(steps: int) -> dict[str, np.ndarray]:
     """Return distances and lengths of the steps [kpc], and the two shells around each."""
     step = np.log1p(FARTHEST / STEP_SCALE) / steps
@@ -211,13 +210,11 @@ def _path(steps: int) -> dict[str, np.ndarray]:
 def _integrate(
     model: GalaxyModel, key: Array, angles: tuple[np.ndarray, np.ndarray], steps: int
 ) -> Float[Array, "2 3 pix"]:
-    dtype = jnp.result_type(float)
-    theta, phi = (jnp.asarray(angle, dtype) for angle in angles)
+    theta, phi = angles
     st, ct, sp, cp = jnp.sin(theta), jnp.cos(theta), jnp.sin(phi), jnp.cos(phi)
     rows = [ct * cp, ct * sp, -st], [-sp, cp, jnp.zeros_like(sp)], [st * cp, st * sp, ct]
     basis = jnp.array(rows)
     turbulence = _turbulence(key, model.slope, basis)
-    path = {name: jnp.asarray(values) for name, values in _path(steps).items()}
 
     def integral(pixels):
         """Integrate a few pixels, which stay in the processor's cache from step to step."""
@@ -226,8 +223,8 @@ def _integrate(
             return tuple(map(jnp.add, total, _emission(model, *pixels, step))), None
 
         # Six maps rather than one array, which XLA would fill in one pass per row.
-        start = (jnp.zeros(pixels[0].shape[-1], dtype),) * 6
-        return jnp.stack(jax.lax.scan(add, start, path)[0])
+        start = (jnp.zeros(pixels[0].shape[-1], basis.dtype),) * 6
+        return jnp.stack(jax.lax.scan(add, start, _path(steps))[0])
 
     blocks = theta.size // min(theta.size, BLOCK)
     apart = [jnp.moveaxis(x.reshape(*x.shape[:2], blocks, -1), 2, 0) for x in (basis, turbulence)]

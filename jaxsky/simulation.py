@@ -10,7 +10,7 @@ small scales, beams, band centres.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import NamedTuple
 
 import healpy
@@ -115,12 +115,10 @@ def plan_terms(
     """Choose the terms of each source for `harmonic_sources`, from values that are not traced."""
     # Terms depend on the ranges of the parameter maps at the resolution at which they are used.
     components = {n: _at(source.component, observation.nside) for n, source in sources.items()}
-    if any(leaf.ndim == 1 for leaf in jax.tree.leaves(components)):
-        importance = _importance(components, stack_bands(observation.bands))
-    else:
-        importance = dict.fromkeys(components)
+    varying = any(leaf.ndim == 1 for leaf in jax.tree.leaves(components))
+    importance = _importance(components, stack_bands(observation.bands)) if varying else {}
     return {
-        name: choose_terms(component, observation.bands, importance[name], tolerance)
+        name: choose_terms(component, observation.bands, importance.get(name), tolerance)
         for name, component in components.items()
     }
 
@@ -294,25 +292,23 @@ def observe_bands(
             parts["cmb"] = _Part((cmb_alm,), (factor,), beam_ratio(channel.map_beam, 0.0, lmax))
         noise = _noise(stream(key, "noise", name), channel, observation)
         if isinstance(noise, _Part):
-            parts["noise"] = noise
+            parts["noise"], noise = noise, None
         yield name, _maps(parts, noise, nside, components)
 
 
 def _maps(
-    parts: Mapping[str, _Part], noise: _Part | StokesMaps | None, nside: int, components: bool
+    parts: Mapping[str, _Part], noise: StokesMaps | None, nside: int, components: bool
 ) -> dict[str, StokesMaps]:
     """Return the total of a band, and its components on request."""
-    maps: dict[str, Array] = {}
-    total: Array | float = 0.0
+    maps: dict[str, StokesMaps] = {}
     if components:
         maps = {which: synthesis(_summed((part,)), nside) for which, part in parts.items()}
-        total = sum(maps.values())
     elif parts:
-        total = synthesis(_summed(tuple(parts.values())), nside)
-    if noise is not None and not isinstance(noise, _Part):
-        total = total + noise
-        maps |= {"noise": noise} if components else {}
-    return {**maps, "total": jnp.asarray(total)}
+        maps = {"sky": synthesis(_summed(tuple(parts.values())), nside)}
+    if noise is not None:
+        maps["noise"] = noise
+    total = reduce(jnp.add, maps.values())
+    return {**maps, "total": total} if components else {"total": total}
 
 
 def _seen(source: HarmonicSource, channel: ObservedBand, index: int, lmax: int, name: str) -> _Part:

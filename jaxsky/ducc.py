@@ -149,7 +149,9 @@ def _same(alm, **_):
     return ((alm.shape, alm.dtype),)
 
 
+#: Maps of coefficients, each ring times its weight if `weighted`, the transpose, and Jacobi steps.
 synthesis = get_linear_call(_synthesise, _synthesise_transposed, _pixels, _coefficients)
+adjoint_synthesis = get_linear_call(_synthesise_transposed, _synthesise, _coefficients, _pixels)
 refined = get_linear_call(_refine, _refine, _same, _same)
 
 

@@ -112,24 +112,11 @@ def alm_to_healpy(alm: ArrayLike, lmax: int) -> np.ndarray:
 
 def _by_spin(transform: Callable[..., Any], rows: Array, spin: int, **how: Any) -> Array:
     """Transform the rows I, or Q, U (or E, B), or both: the first is scalar, two have a spin."""
+    check_double("A spherical harmonic transform")
+    ducc.finish_at_exit()
     scalar, polarized = (slice(0, 1), 0), (slice(-2, None), spin)
     blocks = {1: [scalar], 2: [polarized], 3: [scalar, polarized]}[len(rows)]
     return jnp.concatenate([transform(rows[block], spin=s, **how)[0] for block, s in blocks])
-
-
-def _transform(alm: Alm, nside: int, spin: int, weighted: bool) -> StokesMaps:
-    """Return the maps of coefficients, each ring times its weight if `weighted`."""
-    check_double("A spherical harmonic transform")
-    ducc.finish_at_exit()
-    how = {"nside": nside, "lmax": lmax_of(alm), "weighted": weighted}
-    return _by_spin(ducc.synthesis, alm, spin, **how)
-
-
-def _transposed(maps: StokesMaps, lmax: int, spin: int = 2, weighted: bool = False) -> Alm:
-    nside = healpy.npix2nside(maps.shape[-1])
-    alm = jax.ShapeDtypeStruct((maps.shape[0], (lmax + 1) ** 2), maps.dtype)
-    forward = partial(_transform, nside=nside, spin=spin, weighted=weighted)
-    return jax.linear_transpose(forward, alm)(maps)[0]
 
 
 @partial(jax.jit, static_argnames=("nside", "spin"))
@@ -138,13 +125,15 @@ def synthesis(alm: Alm, nside: int, spin: int = 2) -> StokesMaps:
 
     With lmax > 3 nside - 1 the maps are undersampled. `spin` is that of the last two rows.
     """
-    return _transform(alm, nside, spin, weighted=False)
+    how = {"nside": nside, "lmax": lmax_of(alm)}
+    return _by_spin(ducc.synthesis, alm, spin, **how, weighted=False)
 
 
 @partial(jax.jit, static_argnames="lmax")
 def adjoint_synthesis(maps: StokesMaps, lmax: int) -> Alm:
     """Apply the transpose of `synthesis`: inner products of maps with the spherical harmonics."""
-    return _transposed(maps, lmax)
+    how = {"nside": healpy.npix2nside(maps.shape[-1]), "lmax": lmax}
+    return _by_spin(ducc.adjoint_synthesis, maps, 2, **how, weighted=False)
 
 
 @partial(jax.jit, static_argnames=("lmax", "iterations", "spin"))
@@ -160,11 +149,9 @@ def analysis(maps: StokesMaps, lmax: int, iterations: int | None = None, spin: i
     nside = healpy.npix2nside(maps.shape[-1])
     if iterations is None:
         iterations = 1 + (2 * lmax > 3 * nside) + (nside < 128)
-    alm = _transposed(maps, lmax, spin, weighted=True)
-    if not iterations:
-        return alm
-    how = {"nside": nside, "lmax": lmax, "iterations": iterations}
-    return _by_spin(ducc.refined, alm, spin, **how)
+    how = {"nside": nside, "lmax": lmax}
+    alm = _by_spin(ducc.adjoint_synthesis, maps, spin, **how, weighted=True)
+    return _by_spin(ducc.refined, alm, spin, **how, iterations=iterations) if iterations else alm
 
 
 # Beams and windows in l.

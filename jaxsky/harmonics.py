@@ -30,6 +30,12 @@ from jaxsky.checks import check_double, check_finite, check_shape, is_concrete
 NEGLIGIBLE = 1e-12
 #: A tabulated target may exceed a map's own window by this fraction, as measured tables do.
 FINER = 0.01
+#: An analysis extends to this times the largest multipole kept, as far as the map resolves it.
+MARGIN = 3
+#: Up to this fraction of nside, quadrature needs neither iterations nor a margin: a multipole up to
+#: three times as high leaks by some 1e-6 at nside 128, and less with finer pixels. Variances, whose
+#: spectra are steep, allow a larger fraction.
+FINE, FINE_VARIANCE = 0.25, 0.375
 
 
 # Packed coefficients.
@@ -223,14 +229,6 @@ def pixel_window(nside: int, lmax: int) -> Float[np.ndarray, " ell"]:
     ell, radius = np.arange(lmax + 1), math.sqrt(healpy.nside2pixarea(nside) / np.pi)
     x = np.sqrt(ell * (ell + 1)) * radius
     return np.where(x > 0, 2 * j1(x) / np.where(x > 0, x, 1), 1.0)
-
-
-#: An analysis extends to this times the largest multipole kept, as far as the map resolves it.
-MARGIN = 3
-#: Up to this fraction of nside, quadrature needs neither iterations nor a margin: a multipole up to
-#: three times as high leaks by some 1e-6 at nside 128, and less with finer pixels. Variances, whose
-#: spectra are steep, allow a larger fraction.
-FINE, FINE_VARIANCE = 0.25, 0.375
 
 
 def low_multipoles(maps: StokesMaps, lmax: int, iterations: int | None = None) -> Alm:

@@ -13,8 +13,8 @@ import numpy as np
 from benchmarks.table import Row, time_text
 from benchmarks.timing import interleave, seconds, usage
 from fits.discs import paper_patches
-from fits.patches import fit_patches
-from fits.pseudo_cl import coupling_matrices, prepare_patches, pure_coupling_matrices
+from fits.patches import fit_patches, prepare_patches
+from fits.pseudo_cl import coupling_matrices, pure_coupling_matrices
 from jaxsky.galaxy import embedded_sky
 from jaxsky.harmonics import gaussian_beam, smooth
 

@@ -20,8 +20,8 @@ from jaxtyping import Array, Bool, Float
 
 from fits.common import CommonMaps
 from fits.kept import fingerprint, kept_realisations
+from fits.patches import EDGES
 from fits.pseudo_cl import (
-    EDGES,
     LMIN,
     bin_centers,
     bin_edges,

@@ -13,8 +13,7 @@ from numpy.polynomial import legendre
 
 from fits.common import CommonMaps, common_maps, window_of
 from fits.inputs import Band, Inputs
-from fits.patches import PatchFits, fit_patches
-from fits.pseudo_cl import PreparedPatches, prepare_patches
+from fits.patches import PatchFits, PreparedPatches, fit_patches, prepare_patches
 from jaxsky.harmonics import average_pixels, beam_ratio, gaussian_beam, pixel_window, smooth
 from jaxsky.noise import pixel_covariance, realisation_key, stream
 from jaxsky.settings import Experiment

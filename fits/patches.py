@@ -9,6 +9,7 @@ correlated by -0.4, and are replaced by uncorrelated combinations.
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -19,10 +20,14 @@ import optimistix as optx
 import scipy.stats
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from fits.pseudo_cl import PIVOT, PreparedPatches, band_powers, mean_spectrum
+from fits.pseudo_cl import PIVOT, MaskedSpectra, band_powers, masked_spectra, mean_spectrum
 from fits.tensor_ratio import covariance_terms
 from jaxsky.checks import check_shape
 
+#: The paper's multipoles, 40 to 100, in four bins.
+EDGES = (40, 55, 70, 85, 101)
+#: Coupling matrices that agree to this belong to the same mask at another place.
+SAME = 2e-3
 #: Least width in the variance of a power (`BandCombinations`), relative to the expected power:
 #: otherwise a band in which the law predicts nothing would decide alone.
 FLOOR = 0.3
@@ -33,6 +38,53 @@ SLOPE = (-2.4, 3.0)
 DETECTION = 2.0
 #: Least amplitude for errors, as a fraction of the rms of the bands.
 LEAST = 0.1
+
+
+class PreparedPatches(NamedTuple):
+    """Patches with everything that does not depend on the maps; from `prepare_patches`.
+
+    `shapes` is the index of the first patch of the same shape, and `window` is b_l of the maps.
+    """
+
+    names: tuple[str, ...]
+    spectra: tuple[MaskedSpectra, ...]
+    shapes: tuple[int, ...]
+    window: Float[np.ndarray, " ell"]
+
+
+def prepare_patches(
+    patches: Mapping[str, Float[np.ndarray, " pix"]],
+    window: Float[np.ndarray, " ell"],
+    *,
+    edges: Sequence[int] = EDGES,
+) -> PreparedPatches:
+    """Prepare patches for the spectra of any number of maps.
+
+    Parameters
+    ----------
+    patches : weight of each pixel by the name of the patch, for example `paper_patches(nside)`
+    window : window b_l of the maps (beam and pixels)
+    edges : first multipole of each bin, and the one after the last; three bins at least
+    """
+    if len(edges) < 4:
+        raise ValueError(
+            f"Argument `edges` must give three bins at least, for two parameters, not {edges}."
+        )
+    spectra: list[MaskedSpectra] = []
+    shapes: list[int] = []
+    if not patches:
+        raise ValueError("Argument `patches` has no patch in it.")
+    for i, (name, mask) in enumerate(patches.items()):
+        try:
+            one = masked_spectra(mask, edges, window=window)
+        except ValueError as error:
+            raise ValueError(f"Patch {name}: {error}") from error
+        close = SAME * np.abs(one.mixing).max()
+        same = (j for j in set(shapes) if np.allclose(spectra[j].mixing, one.mixing, 0, close))
+        shapes.append(next(same, i))
+        spectra.append(one)
+    window = np.asarray(window, float)[: spectra[0].lmax + 1]
+    return PreparedPatches(tuple(patches), tuple(spectra), tuple(shapes), window)
 
 
 class PatchFits(NamedTuple):

@@ -7,7 +7,7 @@ inverted in bins that are wide compared with the width of the mask's own spectru
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import healpy
@@ -15,14 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.stats
+from ducc0.misc import wigner3j_int
+from ducc0.misc.experimental import coupling_matrix_rect
 from jaxtyping import Array, Float
 
-from fits.coupling import (
-    coupling_matrices,
-    derivative_factors,
-    pure_coupling_matrices,
-    pure_factors,
-)
 from jaxsky.checks import Numeric, check_finite, check_shape, is_concrete
 from jaxsky.harmonics import analysis, expand, lmax_of, power_spectrum, synthesis
 from jaxsky.io.stacks import Maps, Stack, aligned, empty, is_large, loaded, ranges
@@ -33,10 +29,6 @@ PIVOT = 80
 LEAST_WINDOW = 0.05
 #: Fewest modes of a field in a bin for a mean power.
 LEAST_MODES = 4.0
-#: The paper's multipoles, 40 to 100, in four bins.
-EDGES = (40, 55, 70, 85, 101)
-#: Coupling matrices that agree to this belong to the same mask at another place.
-SAME = 2e-3
 #: Lowest multipole of polarization.
 LMIN = 2
 FIELDS = ("EE", "BB")
@@ -81,6 +73,65 @@ def bin_edges(lmin: int, lmax: int, width: int) -> tuple[int, ...]:
             raise ValueError(f"Argument `{name}` must be at least {least}, but is {value}.")
     count = max(1, (lmax + 1 - lmin) // width)
     return (*(lmin + width * i for i in range(count)), lmax + 1)
+
+
+def coupling_matrices(
+    power: Float[np.ndarray, " ell"], lmax: int
+) -> Float[np.ndarray, "2 ell ell"]:
+    """Return the effect of a mask: pseudo-EE = M[0] EE + M[1] BB, and with E and B exchanged.
+
+    `power` is C_l of the mask, at best up to 2 lmax, with lmax that of the spectra.
+    """
+    spectrum = np.zeros(2 * lmax + 1)
+    kept = min(len(power), len(spectrum))
+    spectrum[:kept] = power[:kept]
+    matrices = np.empty((2, lmax + 1, lmax + 1))
+    coupling_matrix_rect(spectrum[None], (4,), matrices, nthreads=0)
+    matrices[:, :2] = matrices[:, :, :2] = 0  # a field of spin 2 has no multipoles below 2
+    return matrices * (2 * np.arange(lmax + 1) + 1)
+
+
+def pure_factors(lmax: int) -> Float[np.ndarray, "3 ell"]:
+    """Return the factors of the three terms of a purified harmonic."""
+    ell = np.maximum(np.arange(lmax + 1), 2.0)
+    first, second = (ell - 1) * (ell + 2), (ell - 1) * ell * (ell + 1) * (ell + 2)
+    return np.stack([np.ones_like(ell), 2 / np.sqrt(first), 1 / np.sqrt(second)])
+
+
+def derivative_factors(count: int) -> Float[np.ndarray, "3 ell"]:
+    """Return sqrt((l + n)! / (l - n)!), for n-th derivatives in harmonics of spin n = 0, 1, 2."""
+    ell = np.arange(count, dtype=float)
+    second = (ell - 1) * ell * (ell + 1) * (ell + 2)
+    return np.stack([np.ones(count), np.sqrt(ell * (ell + 1)), np.sqrt(np.maximum(second, 0))])
+
+
+def pure_coupling_matrices(
+    power: Float[np.ndarray, " ell"], lmax: int
+) -> Float[np.ndarray, "2 ell ell"]:
+    """Return `coupling_matrices` of a purified field (Smith 2006).
+
+    The mask times a harmonic of spin 2 is replaced by the second derivative of the mask times a
+    scalar harmonic, three terms with a Wigner symbol each. M[1] is zero to rounding if all
+    multipoles of the mask are given: that is the purpose of purifying.
+    """
+    count = min(len(power), 2 * lmax + 1)
+    weights = power[:count] * (2 * np.arange(count) + 1) / (4 * math.pi)
+    factors, rises = pure_factors(lmax), derivative_factors(count)
+    matrices = np.zeros((2, lmax + 1, lmax + 1))
+    degree = np.arange(count)
+    for ell in range(2, lmax + 1):
+        others = np.arange(max(2, ell - count + 1), min(lmax, ell + count - 1) + 1)
+        symbols = np.zeros((len(others), count))
+        for row, other in zip(symbols, others, strict=True):
+            for n in range(3):
+                first, values = wigner3j_int(int(other), ell, -2, 2 - n)
+                stop = min(first + len(values), count)
+                row[first:stop] += factors[n, ell] * rises[n, first:stop] * values[: stop - first]
+        squares = symbols**2 * weights
+        odd = (ell + others[:, None] + degree) % 2 == 1
+        matrices[0, ell, others] = np.where(odd, 0, squares).sum(axis=1)
+        matrices[1, ell, others] = np.where(odd, squares, 0).sum(axis=1)
+    return matrices * (2 * np.arange(lmax + 1) + 1)
 
 
 def masked_spectra(
@@ -262,53 +313,6 @@ def mean_spectrum(
     """Return C_l of a masked map, the mean of EE and BB, over the mean square of the mask."""
     power = np.asarray(power_spectrum(_masked_alm(mask, None, maps, lmax)))
     return power.mean(axis=0) / np.mean(np.square(mask))
-
-
-class PreparedPatches(NamedTuple):
-    """Patches with everything that does not depend on the maps; from `prepare_patches`.
-
-    `shapes` is the index of the first patch of the same shape, and `window` is b_l of the maps.
-    """
-
-    names: tuple[str, ...]
-    spectra: tuple[MaskedSpectra, ...]
-    shapes: tuple[int, ...]
-    window: Float[np.ndarray, " ell"]
-
-
-def prepare_patches(
-    patches: Mapping[str, Float[np.ndarray, " pix"]],
-    window: Float[np.ndarray, " ell"],
-    *,
-    edges: Sequence[int] = EDGES,
-) -> PreparedPatches:
-    """Prepare patches for the spectra of any number of maps.
-
-    Parameters
-    ----------
-    patches : weight of each pixel by the name of the patch, for example `paper_patches(nside)`
-    window : window b_l of the maps (beam and pixels)
-    edges : first multipole of each bin, and the one after the last; three bins at least
-    """
-    if len(edges) < 4:
-        raise ValueError(
-            f"Argument `edges` must give three bins at least, for two parameters, not {edges}."
-        )
-    spectra: list[MaskedSpectra] = []
-    shapes: list[int] = []
-    if not patches:
-        raise ValueError("Argument `patches` has no patch in it.")
-    for i, (name, mask) in enumerate(patches.items()):
-        try:
-            one = masked_spectra(mask, edges, window=window)
-        except ValueError as error:
-            raise ValueError(f"Patch {name}: {error}") from error
-        close = SAME * np.abs(one.mixing).max()
-        same = (j for j in set(shapes) if np.allclose(spectra[j].mixing, one.mixing, 0, close))
-        shapes.append(next(same, i))
-        spectra.append(one)
-    window = np.asarray(window, float)[: spectra[0].lmax + 1]
-    return PreparedPatches(tuple(patches), tuple(spectra), tuple(shapes), window)
 
 
 def polarization_alms(

@@ -23,8 +23,8 @@ from fits.discs import (
     template_patches,
 )
 from fits.inputs import inputs_of
-from fits.patches import PatchFits, fit_patches
-from fits.pseudo_cl import band_powers, cosmic_error, hotelling, polarization_alms, prepare_patches
+from fits.patches import PatchFits, fit_patches, prepare_patches
+from fits.pseudo_cl import band_powers, cosmic_error, hotelling, polarization_alms
 from fits.regions import region_masks
 from jaxsky.harmonics import expand, gaussian_beam, power_spectrum, synthesis
 from jaxsky.io import InputError

@@ -10,8 +10,14 @@ import numpy as np
 import pytest
 
 from fits.discs import BICEP2, bicep2_mask, disc_centers, disc_mask, paper_patches
-from fits.patches import BandCombinations, decorrelate, fit_patches, minimise
-from fits.pseudo_cl import EDGES, prepare_patches
+from fits.patches import (
+    EDGES,
+    BandCombinations,
+    decorrelate,
+    fit_patches,
+    minimise,
+    prepare_patches,
+)
 from fits.tensor_ratio import ring_functions, zonal
 from jaxsky.cmb import gaussian_fields
 from jaxsky.harmonics import alm_from_healpy, analysis, gaussian_beam, smooth, synthesis

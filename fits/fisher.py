@@ -33,7 +33,7 @@ from jaxtyping import Array, Float
 
 from fits.mixing import Mixing
 from fits.pseudo_cl import FIELDS, PIVOT, MaskedSpectra, band_powers
-from jaxsky import Bandpass, Sky, get_parameters, observe_band, parameter_names
+from jaxsky import Sky, get_parameters, parameter_names
 from jaxsky.checks import check_double
 from jaxsky.harmonics import beam_ratio
 from jaxsky.observation import ObservedBand
@@ -268,19 +268,6 @@ class BandLaw(NamedTuple):
     slope: float
 
 
-def foreground_powers(
-    sky: Sky, bands: Mapping[str, Bandpass], spectra: MaskedSpectra
-) -> dict[str, Float[np.ndarray, "2 bin"]]:
-    """Return band powers D_b of EE and BB of a sky in each band [uK_CMB^2].
-
-    All foregrounds must have the beam that the window of `spectra` contains.
-    """
-    return {
-        name: band_powers(spectra, observe_band(sky, band) * band.conversion("uK_RJ", "uK_CMB"))
-        for name, band in bands.items()
-    }
-
-
 def noise_weights(band: ObservedBand, lmax: int) -> Float[np.ndarray, " ell"]:
     """Return the beam over the noise of Q and U in a band, b_l / sqrt(N_l) [1 / (uK_CMB rad)].
 
@@ -331,30 +318,19 @@ def fit_law(
     return BandLaw(float(np.exp(logarithm)), float(slope) - 2)
 
 
-def band_correlation(
-    spectra: MaskedSpectra,
-    cross: Float[np.ndarray, " bin"],
-    first: Float[np.ndarray, " bin"],
-    second: Float[np.ndarray, " bin"],
-    fit: tuple[int, int],
-) -> float:
-    """Return the mean correlation coefficient of two fields, bins weighted by number of modes."""
-    inside = _inside(spectra, fit, "correlated components")
-    coefficients = cross[inside] / np.sqrt(first[inside] * second[inside])
-    return float(np.average(coefficients, weights=_modes(spectra)[inside]))
-
-
 def foreground_laws(
     sky: Sky, spectra: MaskedSpectra, fields: Sequence[str], fit: tuple[int, int]
 ) -> dict[str, float]:
     """Return the power laws of the components' spectra and the correlation of each pair, by name.
 
-    The names are those of `fiducial`.
+    The names are those of `fiducial`. A correlation is the mean coefficient of the bins that are
+    fitted, weighted by their number of modes.
     """
     maps = {name: sky[name].amplitude for name in sky}
     auto = {name: band_powers(spectra, values) for name, values in maps.items()}
     pairs = itertools.combinations(maps, 2)
     cross = {(a, b): band_powers(spectra, maps[a], maps[b]) for a, b in pairs}
+    inside = _inside(spectra, fit, "foregrounds")
     found: dict[str, float] = {}
     for field in fields:
         row = FIELDS.index(field)
@@ -362,9 +338,10 @@ def foreground_laws(
             law = fit_law(spectra, D[row], fit, f"{field} of {name!r}")
             found |= {f"{field}.{name}.{kind}": value for kind, value in law._asdict().items()}
         for (a, b), D in cross.items():
-            found[f"{field}.{a}.{b}.correlation"] = band_correlation(
-                spectra, D[row], auto[a][row], auto[b][row], fit
-            )
+            first, second = auto[a][row, inside], auto[b][row, inside]
+            coefficients = D[row, inside] / np.sqrt(first * second)
+            rho = np.average(coefficients, weights=_modes(spectra)[inside])
+            found[f"{field}.{a}.{b}.correlation"] = float(rho)
     return found
 
 

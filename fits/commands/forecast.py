@@ -16,7 +16,7 @@ from fits.common import prepare_component
 from fits.mixing import Mixing, unit_sky
 from fits.regions import apodize, region_mask
 from fits.results import with_error
-from jaxsky import Sky
+from jaxsky import Sky, observe_band
 from jaxsky.checks import check_double
 from jaxsky.cmb import camb_spectra, tensor_spectra
 from jaxsky.components import declared
@@ -134,26 +134,24 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
     edges = pseudo_cl.bin_edges(spec.lmin, spec.lmax, spec.width)
     window = np.asarray(gaussian_beam(inputs.fwhm, 2 * edges[-1]))
     spectra = pseudo_cl.masked_spectra(inputs.mask, edges, window=window)
-    bands = {name: inputs.bands[name].band for name in inputs.shown}
-    powers = fisher.foreground_powers(inputs.sky, bands, spectra)
-    with at_key("forecast.fit"):
-        laws = {
-            name: fisher.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
-            for name, D in powers.items()
-        }
     highest = max(spectra.lmax, spec.fisher_lmax, pseudo_cl.PIVOT)
     with at_key("cmb.cosmology"):
         tensors = tensor_spectra(highest, **settings.cmb.cosmology)
         lensed = camb_spectra(highest, **settings.cmb.cosmology)
-    equal = {
-        name: fisher.equal_r(spectra, powers[name], law, tensors) for name, law in laws.items()
-    }
+    bandpasses = {name: band.band for name, band in inputs.bands.items()}
+    powers, laws, equal = {}, {}, {}
+    for name in inputs.shown:
+        band = bandpasses[name]
+        emission = observe_band(inputs.sky, band) * band.conversion("uK_RJ", "uK_CMB")
+        powers[name] = D = pseudo_cl.band_powers(spectra, emission)
+        with at_key("forecast.fit"):
+            laws[name] = fisher.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
+        equal[name] = fisher.equal_r(spectra, D, laws[name], tensors)
     progress.step("Fisher matrix")
     fields = tuple(field for field in pseudo_cl.FIELDS if field in spec.spectra)
     ell = np.arange(spec.lmin, spec.fisher_lmax + 1)
     rows = [1 + pseudo_cl.FIELDS.index(field) for field in fields]
     weights = [fisher.noise_weights(b, spec.fisher_lmax)[ell] for b in inputs.bands.values()]
-    bandpasses = {name: band.band for name, band in inputs.bands.items()}
     model = fisher.ForecastModel(
         Mixing.of(unit_sky(inputs.sky, mask=inputs.mask), bandpasses, "uK_CMB"),
         jnp.asarray(np.stack(weights, axis=1)),

@@ -89,15 +89,11 @@ def forecast_inputs(settings: Experiment) -> ForecastInputs:
     shown = spec.bands or plots.spread(tuple(bands), SHOWN)
     fwhm = max(template.fwhm for template in templates.values())
     nside = min(healpy.npix2nside(template.used.size) for template in templates.values())
-    if spec.lmax > 2 * nside - 1:
+    window = gaussian_beam(fwhm, 2 * nside - 1)
+    if spec.lmax > (reach := int(np.flatnonzero(window >= pseudo_cl.LEAST_WINDOW).max())):
         raise SettingsError(
-            f"forecast.lmax: {spec.lmax} is beyond what templates of nside {nside} resolve, "
-            f"{2 * nside - 1}."
-        )
-    if (window := float(gaussian_beam(fwhm, spec.lmax)[-1])) < pseudo_cl.LEAST_WINDOW:
-        raise SettingsError(
-            f"forecast.lmax: the templates' beam of {fwhm:g} arcmin leaves {window:.2g} of the "
-            f"amplitude at l = {spec.lmax}; a correction takes {pseudo_cl.LEAST_WINDOW:g}."
+            f"forecast.lmax: {spec.lmax} is beyond what templates of nside {nside} and a beam of "
+            f"{fwhm:g} arcmin resolve, {reach}."
         )
     used = region_mask(settings, spec.region, nside, coarser=True)
     components = {}

@@ -219,9 +219,7 @@ def compare(
         executor,
     )
     scatters = compare_pixels(prepared, model, used, simulated)
-    spectra = []
-    if prepared.used.all():
-        spectra = compare_spectra(prepared, model, simulated, how.width, how.lmin)
+    spectra = compare_spectra(prepared, model, simulated, how.width, how.lmin)
     return Comparison(prepared, model, used, scatters, spectra)
 
 
@@ -319,14 +317,11 @@ def compare_spectra(
 ) -> list[BandSpectra]:
     """Compare spectra of the observed maps with those of the complete model.
 
-    They are of the full sky, as in the paper: no E modes leak into B there. The first bin begins at
-    `lmin`, and each has `width` multipoles.
+    They are of the full sky, as in the paper: no E modes leak into B there. If pixels are missing,
+    there are none. The first bin begins at `lmin`, and each has `width` multipoles.
     """
-    if missing := int(np.sum(~prepared.used)):
-        raise ValueError(
-            f"Spectra of the full sky need all pixels, but {missing} of {prepared.used.size} have "
-            "no value."
-        )
+    if not prepared.used.all():
+        return []
     lmax = simulated.spectra.shape[-1] - 1
     edges = bin_edges(lmin, lmax, width)
     observed = np.asarray(power_spectrum(polarization_alms(prepared.data, lmax)))

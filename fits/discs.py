@@ -8,7 +8,7 @@ from typing import NamedTuple
 import healpy
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from numpy.polynomial import legendre
 
 from fits.common import CommonMaps, common_maps, window_of
@@ -108,25 +108,21 @@ class PatchComparison(NamedTuple):
     model: PatchFits
     overlap: Float[np.ndarray, "patch patch"]
 
-    def detected(self, index: int) -> np.ndarray:
-        """Return True for patches where EE (0) or BB (1) is detected in both."""
-        return self.observed.detected[:, index] & self.model.detected[:, index]
-
     @property
-    def any_detected(self) -> bool:
-        """True if EE or BB of any patch is detected in both."""
-        return bool((self.observed.detected & self.model.detected).any())
+    def detected(self) -> Bool[np.ndarray, "patch 2"]:
+        """True where EE, or BB, of a patch is detected in both."""
+        return self.observed.detected & self.model.detected
 
     def _pairs(self, name: str, index: int) -> Float[np.ndarray, "2 patch"]:
         """Return A or alpha, observed and of the model, where EE (0) or BB (1) is detected."""
-        both = self.detected(index)
+        both = self.detected[:, index]
         return np.array([getattr(fit, name)[both, index] for fit in (self.observed, self.model)])
 
     def _mean(self, values: np.ndarray, index: int) -> tuple[float, float]:
         """Return the mean over these patches, and its error; NaN for fewer than two."""
         if (count := len(values)) < 2:
             return float("nan"), float("nan")
-        both = self.detected(index)
+        both = self.detected[:, index]
         shared = self.overlap[np.ix_(both, both)].sum() / count
         return float(values.mean()), float(values.std(ddof=1) * np.sqrt(shared / count))
 
@@ -147,7 +143,7 @@ class PatchComparison(NamedTuple):
 
     def correlation(self, index: int) -> tuple[float, float]:
         """Return Pearson's coefficients of log A and of alpha between map and model."""
-        if self.detected(index).sum() < 3:
+        if self.detected[:, index].sum() < 3:
             return float("nan"), float("nan")
         pairs = np.log(self._pairs("A", index)), self._pairs("alpha", index)
         A, alpha = (float(np.corrcoef(pair)[0, 1]) for pair in pairs)

@@ -282,13 +282,14 @@ def _plot_patch_pairs(
 
 def plot_patches(path: Path, patches: PatchComparison, title: str) -> bool:
     """Draw A and alpha of detected patches, if any, map against model (the paper's fig. 10)."""
-    if not patches.any_detected:
+    if not patches.detected.any():
         return False
     title = f"{title}\n{patches.band}: patches of 400 square degrees"
     model, observed = patches.model, patches.observed
-    series = [(n, patches.detected(i), (model, i), (observed, i)) for i, n in enumerate(FIELDS)]
+    shown = patches.detected.T
+    series = [(n, shown[i], (model, i), (observed, i)) for i, n in enumerate(FIELDS)]
     found = {"observed / model": patches.ratio, "observed - model": patches.slope_difference}
-    several = [i for i in range(len(FIELDS)) if patches.detected(i).sum() > 1]
+    several = [i for i in range(len(FIELDS)) if shown[i].sum() > 1]
     heads = [
         f"{what}: {', '.join(f'{FIELDS[i]} {with_error(*of(i))}' for i in several) or 'too few'}"
         for what, of in found.items()
@@ -336,7 +337,7 @@ def _work(settings: Experiment, command: Run) -> Report:
     if settings.compare.patches is not None:
         command.steps.step("patches")
         patches = compare_patches(settings, inputs)
-        if not patches.any_detected:
+        if not patches.detected.any():
             warnings.append(f"{patches.band}: neither EE nor BB is detected in any patch.")
     return Report(
         inputs.description,

@@ -40,8 +40,8 @@ Curve = tuple[str, np.ndarray, dict[str, Any]]
 Series = tuple[str, np.ndarray, tuple[PatchFits, int], tuple[PatchFits, int]]
 
 
-def _numbers(comparison: Comparison, patches: PatchComparison | None) -> dict[str, Any]:
-    """Return `pixels` by band, region and Stokes parameter, `spectra` by band, and `patches`."""
+def _numbers(comparison: Comparison) -> dict[str, Any]:
+    """Return `pixels` by band, region and Stokes parameter, and `spectra` by band."""
     pixels: dict[str, Any] = {}
     for (band, region, stokes), s in comparison.scatters.items():
         numbers = s._asdict() | {"slope_pte": s.slope_pte}
@@ -50,17 +50,17 @@ def _numbers(comparison: Comparison, patches: PatchComparison | None) -> dict[st
     spectra = {
         s.band: s._asdict() | {key: getattr(s, key) for key in derived} for s in comparison.spectra
     }
-    found: dict[str, Any] = {"pixels": pixels, "spectra": spectra}
-    if patches is not None:
-        found["patches"] = {
-            "band": patches.band,
-            "observed": patches.observed._asdict(),
-            "model": patches.model._asdict(),
-        }
-        means = ("ratio", "slope_difference", "correlation")
-        for i, name in enumerate(FIELDS):
-            found["patches"][name] = {key: getattr(patches, key)(i) for key in means}
-    return found
+    return {"pixels": pixels, "spectra": spectra}
+
+
+def _patch_numbers(patches: PatchComparison) -> dict[str, Any]:
+    """Return the fits to map and model, and for EE and BB how they compare."""
+    fits = {"observed": patches.observed._asdict(), "model": patches.model._asdict()}
+    means = ("ratio", "slope_difference", "correlation")
+    compared = {
+        name: {key: getattr(patches, key)(i) for key in means} for i, name in enumerate(FIELDS)
+    }
+    return {"band": patches.band, **fits, **compared}
 
 
 def _table(comparison: Comparison) -> ResultTable:
@@ -304,25 +304,6 @@ def plot_template_patches(path: Path, fit: PatchFits, heads: Sequence[str], titl
     _plot_patch_pairs(path, series, *FIELDS, heads, f"{title}\npatches of 400 square degrees")
 
 
-def _pictures(
-    found: Comparison, settings: Experiment, patches: PatchComparison | None
-) -> dict[str, tuple[Any, ...]]:
-    """Return the pictures that can be drawn, in the form of `fits.commands.run.Report`."""
-    bands, title = list(found.prepared.bands), settings.title
-    drawn: dict[str, tuple[Any, ...]] = {
-        f"scatter_{region}.png": (plot_scatter, found, region, bands, f"{title}\n{region}")
-        for region in found.regions
-    }
-    drawn |= {f"maps_{s}.png": (plot_model_maps, found, s, bands, title) for s in "QU"}
-    if found.spectra:
-        drawn["spectra.png"] = plot_full_sky, found.spectra, title
-    if leaky := [s for s in found.spectra if s.uncorrected is not None]:
-        drawn["leakage.png"] = plot_leakage, leaky, title
-    if patches is not None:
-        drawn["patches.png"] = plot_patches, patches, title
-    return drawn
-
-
 def _work(settings: Experiment, command: Run) -> Report:
     command.steps.step("reading and preparing maps")
     regions = region_masks(settings, settings.compare.regions)
@@ -333,19 +314,25 @@ def _work(settings: Experiment, command: Run) -> Report:
     command.steps.step("realisations")
     simulations, report = command.out / "simulations.npz", command.steps.advance
     found = compare(settings, prepared, regions, simulations, report, command.executor)
-    patches, warnings = None, comparison_warnings(found, settings)
+    numbers, warnings = _numbers(found), comparison_warnings(found, settings)
+    bands, title = list(prepared.bands), settings.title
+    pictures: dict[str, tuple[Any, ...]] = {
+        f"scatter_{region}.png": (plot_scatter, found, region, bands, f"{title}\n{region}")
+        for region in regions
+    }
+    pictures |= {f"maps_{s}.png": (plot_model_maps, found, s, bands, title) for s in "QU"}
+    if found.spectra:
+        pictures["spectra.png"] = plot_full_sky, found.spectra, title
+    if leaky := [s for s in found.spectra if s.uncorrected is not None]:
+        pictures["leakage.png"] = plot_leakage, leaky, title
     if settings.compare.patches is not None:
         command.steps.step("patches")
         patches = compare_patches(settings, inputs)
+        numbers["patches"] = _patch_numbers(patches)
+        pictures["patches.png"] = plot_patches, patches, title
         if not patches.detected.any():
             warnings.append(f"{patches.band}: neither EE nor BB is detected in any patch.")
-    return Report(
-        inputs.description,
-        [_table(found)],
-        warnings,
-        _numbers(found, patches),
-        _pictures(found, settings, patches),
-    )
+    return Report(inputs.description, [_table(found)], warnings, numbers, pictures)
 
 
 PICTURES = ("scatter_*.png", "maps_[QU].png", "spectra.png", "leakage.png", "patches.png")

@@ -139,10 +139,10 @@ def forecast(settings: Experiment, progress: Progress = QUIET) -> Forecast:
     for name in inputs.shown:
         band = bandpasses[name]
         emission = observe_band(inputs.sky, band) * band.conversion("uK_RJ", "uK_CMB")
-        powers[name] = D = pseudo_cl.band_powers(spectra, emission)
+        powers[name] = pseudo_cl.band_powers(spectra, emission)
         with at_key("forecast.fit"):
-            laws[name] = fisher.fit_law(spectra, D[1], spec.fit, f"BB in band {name!r}")
-        equal[name] = fisher.equal_r(spectra, D, laws[name], tensors)
+            laws[name] = fisher.fit_law(spectra, powers[name][1], spec.fit, f"BB in band {name!r}")
+        equal[name] = fisher.equal_r(spectra, powers[name], laws[name], tensors)
     progress.step("Fisher matrix")
     fields = tuple(field for field in pseudo_cl.FIELDS if field in spec.spectra)
     ell = np.arange(spec.lmin, spec.fisher_lmax + 1)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from pydantic_core import to_jsonable_python
 
 from jaxsky.checks import Numeric, Summary, as_html, as_text, check_choice
 from jaxsky.io import write_text
@@ -279,22 +280,10 @@ def probability(value: float) -> str:
     return f"{value:.2f}" if value >= 0.01 else f"{value:.0e}"
 
 
-def _plain(value: Any) -> Any:
-    """Return arrays as lists, and numbers that are not finite as None, for JSON."""
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, Convergence):
-        return bool(value)
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
 def write_json(path: Path, results: dict[str, Any]) -> None:
     """Write results of a run; arrays become lists, and numbers that are not finite null."""
-    write_text(path, json.dumps(_plain(results), indent=2, allow_nan=False) + "\n")
+    plain = to_jsonable_python(results, inf_nan_mode="null", fallback=lambda array: array.tolist())
+    write_text(path, json.dumps(plain, indent=2, allow_nan=False) + "\n")
 
 
 def write_log(path: Path, settings: Experiment, seconds: float) -> None:

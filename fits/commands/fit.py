@@ -27,7 +27,7 @@ STOKES_COLORS = {"Q": COLORS[0], "U": COLORS[1], "QU": COLORS[6]}
 def _result(fit: RegionFit, method: str) -> dict[str, Any]:
     result = fit.results[method]
     kept = ("free", "best_fit", "interval_68", "covariance", "converged", "message")
-    numbers = {key: getattr(result, key) for key in kept}
+    numbers = {key: value for key, value in result.to_dict().items() if key in kept}
     numbers |= {"chi2": fit.chi2[method], "dof": fit.dof}
     if fit.dof_amplitudes is not None:
         numbers |= {

@@ -51,7 +51,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
         },
         "labels": fit.labels,
         "covariance": found.covariance,
-        **{key: getattr(fit, key) for key in ("chi2", "dof", "converged", "message")},
+        **{key: fit.to_dict()[key] for key in ("chi2", "dof", "converged", "message")},
         "solver": {key: fit.details[key] for key in ("solver", "steps", "distance")},
         "pixels_with_small_probability": small,
         "cmb_noise_degradation": found.degradation,
@@ -84,7 +84,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
         results["posterior"] = {
             "sampler": chain.method,
             "interval_68": {n: chain.of_row(chain.interval_68, n) for n in chain.labels},
-            "converged": chain.converged,
+            "converged": bool(chain.converged),
             "message": chain.message,
         }
     return results

@@ -23,8 +23,7 @@ from jaxtyping import Array, Float
 
 from fits.kept import KeptChain, fingerprint, kept_realisations
 from fits.optimize import best_fit
-from fits.posterior import Likelihood, Posterior, value_and_gradient
-from fits.priors import Gaussian, Prior, priors_of
+from fits.posterior import Gaussian, Likelihood, Posterior, Prior, priors_of, value_and_gradient
 from fits.profile_likelihood import SpectralLikelihood
 from fits.pseudo_cl import (
     LEAST_WINDOW,

@@ -22,8 +22,7 @@ from fits.inputs import Inputs
 from fits.kept import KeptChain, fingerprint
 from fits.mixing import nominal
 from fits.optimize import best_fit
-from fits.posterior import chi2
-from fits.priors import Prior, Uniform, priors_of
+from fits.posterior import Prior, Uniform, chi2, priors_of
 from fits.results import FitResult
 from fits.sampling import sample
 from fits.template_likelihood import SkyLikelihood, TemplateLikelihood

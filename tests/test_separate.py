@@ -16,7 +16,7 @@ from fits.commands import separate as command
 from fits.commands.run import DEFAULTS
 from fits.commands.separate import separation_warnings
 from fits.optimize import best_fit
-from fits.priors import priors_of
+from fits.posterior import priors_of
 from fits.pseudo_cl import band_powers
 from fits.results import widened
 from fits.separated_data import separation_data

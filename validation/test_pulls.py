@@ -12,7 +12,7 @@ from fits.commands.run import DEFAULTS
 from fits.common import common_maps
 from fits.inputs import inputs_of
 from fits.optimize import best_fit
-from fits.priors import priors_of
+from fits.posterior import priors_of
 from fits.regions import region_masks
 from fits.spectral_index import settled
 from jaxsky.galaxy import EmbeddedSky, embedded_sky

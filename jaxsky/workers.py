@@ -20,7 +20,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent import futures
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
-from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
@@ -118,7 +117,6 @@ def _lost(executor: Executor) -> bool:
 def _written(work: Callable[[int], Any], folder: Path) -> Iterator["_Task"]:
     """Write what workers need to a file, removed at the end, and yield their task."""
     path = folder.absolute() / f"{files.PARTIAL}{os.getpid()}-{uuid.uuid4().hex}"
-    programs = files.cache_folder() / "programs"
     try:
         with path.open("wb") as file:
             try:
@@ -128,14 +126,7 @@ def _written(work: Callable[[int], Any], folder: Path) -> Iterator["_Task"]:
                     f"Argument `work` cannot be sent to workers ({error}); it has to be made of "
                     "functions and classes of modules."
                 ) from None
-        yield _Task(
-            path,
-            (os.getpid(), _HERE),
-            _versions(),
-            (*sys.path, os.getcwd()),  # a law of one's own may be in the current folder
-            jax.config.jax_enable_x64,  # type: ignore[attr-defined]
-            programs if jax.config.jax_compilation_cache_dir else None,  # type: ignore[attr-defined]
-        )
+        yield _Task(path)
     finally:
         path.unlink(missing_ok=True)
 
@@ -154,16 +145,17 @@ def _check_versions(worker: str, there: Mapping[str, Any], here: Mapping[str, st
             )
 
 
-@dataclass(frozen=True)
 class _Task:
     """Makes realisations in a worker as in the process that asks for them."""
 
-    state: Path  # the file of the function that makes one
-    owner: tuple[int, str]  # the number and the word of the process that asks
-    versions: Mapping[str, str]
-    modules: tuple[str, ...]  # folders where these are found
-    double: bool
-    programs: Path | None  # the cache
+    def __init__(self, state: Path) -> None:
+        self.state = state  # the file of the function that makes one
+        self.owner = os.getpid(), _HERE  # the process that asks
+        self.versions = _versions()
+        self.modules = *sys.path, os.getcwd()  # a law of one's own may be in the current folder
+        self.double = jax.config.jax_enable_x64  # type: ignore[attr-defined]
+        cached = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+        self.programs = files.cache_folder() / "programs" if cached else None
 
     def __call__(self, numbers: Sequence[int]) -> list[Any]:
         try:

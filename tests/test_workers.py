@@ -4,7 +4,6 @@ import logging
 import os
 import sys
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -109,7 +108,8 @@ def test_workers_of_another_version_are_refused(two, tmp_path, monkeypatch):
 def test_workers_have_to_see_the_folder(tmp_path):
     class Elsewhere(ThreadPoolExecutor):
         def submit(self, task, part):
-            return super().submit(replace(task, state=tmp_path / "elsewhere" / "state"), part)
+            task.state = tmp_path / "elsewhere" / "state"
+            return super().submit(task, part)
 
     words = f"^{tmp_path}/elsewhere: process .* does not see this folder"
     with Elsewhere(1) as executor, refused(words, FileNotFoundError):

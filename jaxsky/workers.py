@@ -263,30 +263,27 @@ def _attend(ended: Connection) -> None:
     return_memory()
 
 
-@contextlib.contextmanager
 def workers_of(
     text: str | None, note: Callable[[str], None] = lambda sentence: None
-) -> Iterator[Executor | None]:
-    """Yield the executor that `--workers` names: a number of processes, or the address of Dask.
+) -> contextlib.AbstractContextManager[Executor | None]:
+    """Return the executor that `--workers` names: a number of processes, or the address of Dask.
 
-    None for None. `note` is called with sentences for the user. ValueError if it is neither, Dask
-    is not installed or its workers have another version; ConnectionError if no scheduler answers.
+    To be entered by `with`, which gives None for None. `note` is called with sentences for the
+    user. ValueError if it is neither, Dask is not installed or its workers have another version;
+    ConnectionError if no scheduler answers.
     """
     if text is None:
-        yield None
-    elif "://" in text:
-        with _cluster(text, note) as executor:
-            yield executor
-    elif text.isdecimal() and int(text) > 0:
-        if int(text) > (most := processors()):
-            note(f"--workers {text}: more than the {most} processors there are.")
-        with Processes(int(text)) as processes:
-            yield processes
-    else:
+        return contextlib.nullcontext()
+    if "://" in text:
+        return _cluster(text, note)
+    if not text.isdecimal() or int(text) < 1:
         raise ValueError(
             f"--workers {text}: must be a number of processes, at least 1, or the address of a "
             "Dask scheduler, tcp://host:port."
         )
+    if int(text) > (most := processors()):
+        note(f"--workers {text}: more than the {most} processors there are.")
+    return Processes(int(text))
 
 
 @contextlib.contextmanager

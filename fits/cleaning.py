@@ -320,8 +320,7 @@ def _errors(data, like, fit, simulated):
         return fit.sigma, fit.covariance
     sigma = simulated.theta.std(axis=0, ddof=1)
     determined = np.isfinite(np.asarray(like.flat(fit.best_fit))) & (sigma > 0)
-    named = like.named(np.where(determined, sigma, np.nan))
-    sizes = {n: float(v) if v.ndim == 0 else np.asarray(v) for n, v in named.items()}
+    sizes = Posterior(like, None).named(np.where(determined, sigma, np.nan))
     if fit.covariance is None:
         return sizes, None
     covariance = np.atleast_2d(np.cov(simulated.theta.T))

@@ -66,17 +66,15 @@ class Unbounded(NamedTuple):
 
     def _unbounded(self, values: np.ndarray) -> np.ndarray:
         bounded, low, high = map(np.asarray, self.density[4:])
-        unit = np.where(bounded, (values - low) / (high - low), 0.5)
         # At an edge to rounding, the number stays finite.
-        return np.where(bounded, scipy.special.logit(np.clip(unit, 1e-15, 1 - 1e-15)), values)
+        unit = np.clip((values - low) / (high - low), 1e-15, 1 - 1e-15)
+        return np.where(bounded, scipy.special.logit(unit), values)
 
     def adapted(self, values: Float[np.ndarray, "sample par"]) -> "Unbounded":
-        """Adapt to the covariance of samples; unchanged if they are too few, or do not move."""
-        if self.root.ndim == 1 or len(values) < ENOUGH * values.shape[1]:
-            return self
+        """Adapt to the covariance of samples, as a matrix; unchanged if too few, or not moving."""
         y = self._unbounded(values)
         center, middle, spread = y.mean(axis=0), values.mean(axis=0), y.std(axis=0)
-        if not np.isfinite(spread).all() or not spread.min() > 0:
+        if len(y) < ENOUGH * len(spread) or not np.isfinite(spread).all() or not spread.min() > 0:
             return self
         y = (y - center) / spread
         cut = np.asarray(self.density.bounded) & (spread > NEAR)

@@ -7,7 +7,7 @@ parameters is assembled from these. A likelihood without regions is a single cel
 
 import dataclasses
 import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial, reduce
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
@@ -92,9 +92,9 @@ def priors_of(settings: Experiment, command: str) -> dict[str, Prior]:
     return priors
 
 
-def check_priors(priors: Mapping[str, Prior] | None, free: Iterable[str]) -> dict[str, Prior]:
+def check_priors(priors: Mapping[str, Prior] | None, free: Sequence[str]) -> dict[str, Prior]:
     """Return the priors, after checking that each belongs to a free parameter."""
-    priors, free = dict(priors or {}), list(free)
+    priors = dict(priors or {})
     for name in priors:
         if name not in free:
             raise KeyError(

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -44,7 +44,7 @@ def help_by_prior(names: tuple[str, ...]) -> str:
     return f"a Gaussian prior on {' or '.join(names)} (mean, standard deviation) would help"
 
 
-class Convergence(Enum):
+class Convergence(StrEnum):
     """How a fit ended, as a sentence; true if its numbers can be relied on."""
 
     converged = "The fit converged."
@@ -59,9 +59,6 @@ class Convergence(Enum):
 
     def __bool__(self) -> bool:
         return self is Convergence.converged
-
-    def __str__(self) -> str:
-        return str(self.value)
 
 
 class FitError(RuntimeError):

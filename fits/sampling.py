@@ -190,15 +190,14 @@ def _no_u_turn(unbounded, labels, seed, report, nsteps=1000, nwarmup=300, nchain
             f"nsteps={nsteps}, nwarmup={nwarmup}, nchains={nchains}."
         )
     z = SPREAD * np.random.default_rng(seed).normal(size=(nchains, len(labels)))
-    key, total, pilot = jax.random.key(seed), nwarmup + nsteps, nwarmup // 2 // BLOCK * BLOCK
+    key, total = jax.random.key(seed), nwarmup + nsteps
     parts = partial(_course, key=key, nwarmup=nwarmup, report=lambda done: report(done, total))
-    if pilot and unbounded.root.ndim == 2:
-        # Half of the warm-up measures the covariance of the parameters.
+    # Half of the warm-up measures the covariance of the parameters, if these are few.
+    pilot = nwarmup // 2 // BLOCK * BLOCK if unbounded.root.ndim == 2 else 0
+    if pilot:
         chain = parts(unbounded, z, first=0, last=pilot, nwarmup=pilot)["chain"]
         unbounded = unbounded.adapted(chain[pilot // 3 :].reshape(-1, len(labels)))
         z = unbounded.coordinates(chain[-1])
-    else:
-        pilot = 0
     course = parts(unbounded, z, first=pilot, last=total)
     course = {name: values[nwarmup - pilot :] for name, values in course.items()}
     ratio, effective = map(np.asarray, agreement(course["chain"]))

@@ -70,7 +70,7 @@ def programs(nside: int) -> dict[str, jax.stages.Lowered]:
         "inner products": jax.jit(gram).lower(data, templates, jnp.abs(data)),
         "used pixels": distributed._look.lower(data, noise, components=2),
         "band covariances": jax.jit(
-            partial(distributed.band_covariance, layout=layout, number=3)
+            partial(distributed._band_covariance, layout=layout, number=3)
         ).lower(data, noise, blocks),
         "pixels in blocks": jax.jit(partial(distributed.gathered, layout=layout)).lower(
             data, noise, blocks

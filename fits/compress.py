@@ -9,14 +9,13 @@ Other pixels are arranged in blocks of one cell each. They are gathered in memor
 whenever they are needed if the maps are on disk.
 """
 
-import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from fits.regions import Cells
 from fits.systems import Pixels, square_root
@@ -312,75 +311,81 @@ def pixel_rows(data: Any, noise: Noise, layout: Layout, pixels: Any, used: Any) 
     return Pixels(*rows)
 
 
-def block_size(counts: np.ndarray) -> int:
-    """Return the number of pixels in a block, from those in each cell."""
-    return min(BLOCK, int(np.median(counts[counts > 0]))) if counts.any() else 1
+class Blocks(NamedTuple):
+    """Pixels in blocks of a single cell, -1 in the padding, and the cell of each block."""
+
+    pixels: Int[Array | np.ndarray, "block size"]
+    cell: Int[Array | np.ndarray, " block"]
 
 
 def arranged(
-    own: np.ndarray, counts: np.ndarray, size: int, number: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels of each block, -1 in the padding, and the cell of each block.
+    parts: Sequence[np.ndarray], cells: int, most: Callable[[list[int]], int] = max
+) -> list[Blocks]:
+    """Return the pixels of each part in blocks; all parts have as many, of one size.
 
-    `own` is the cell of each pixel, -1 where not used, and `counts` are the pixels of each cell;
-    there are at least `number` blocks.
+    A part has the cell of each pixel, -1 where not used. `most` returns the largest of numbers.
     """
-    blocks = -(-counts // size)
-    order = np.argsort(own, kind="stable")[len(own) - counts.sum() :]
-    own = own[order]
-    begin, first = (np.cumsum(n) - n for n in (blocks * size, counts))
-    cell = np.repeat(np.arange(len(counts)), blocks)
-    cell = np.pad(cell, (0, max(0, number - len(cell))))
-    flat = np.full(len(cell) * size, -1, np.int32)
-    flat[(begin - first)[own] + np.arange(own.size)] = order
-    return flat.reshape(-1, size), cell
+    counts = [np.bincount(own[own >= 0], minlength=cells) for own in parts]
+    size = most([min(BLOCK, int(np.median(n[n > 0]))) if n.any() else 1 for n in counts])
+    blocks = [-(-n // size) for n in counts]
+    number = most([int(n.sum()) for n in blocks])
+    found = []
+    for own, pixels, of_cell in zip(parts, counts, blocks, strict=True):
+        order = np.argsort(own, kind="stable")[len(own) - pixels.sum() :]
+        own = own[order]
+        begin, first = (np.cumsum(n) - n for n in (of_cell * size, pixels))
+        cell = np.repeat(np.arange(cells), of_cell)
+        cell = np.pad(cell, (0, number - len(cell)))
+        flat = np.full(number * size, -1, np.int32)
+        flat[(begin - first)[own] + np.arange(own.size)] = order
+        found.append(Blocks(flat.reshape(-1, size), cell))
+    return found
 
 
-class Blocks:
-    """Used pixels in blocks, each of a single cell and padded with zeros of unit weight.
+def blocks(cells: Cells, used: np.ndarray) -> Blocks:
+    """Arrange the used pixels by cells."""
+    own = np.where(used, 0, -1).astype(np.int32) if cells.of_pixel is None else cells.of_pixel
+    return arranged([own], cells.number)[0]
 
-    `where` are the pixels of each block, -1 for padding, and `cell` is the cell of each block.
+
+def _read(data: Maps, noise: Noise, layout: Layout, where: Any) -> Pixels:
+    """Return the pixels of some blocks, (block, group, row, pix), as arrays of numpy."""
+    index = where.ravel()
+    used = index >= 0
+    whole = used.all() and index[-1] - index[0] == len(index) - 1 and np.all(np.diff(index) > 0)
+    pixels = slice(int(index[0]), int(index[-1]) + 1) if whole else index
+    found = pixel_rows(data, noise, layout, pixels, used)
+    if not np.isfinite(found.data).all() or found.data.min() < UNSEEN:
+        refuse_data(data, noise)
+
+    def shaped(rows: np.ndarray) -> np.ndarray:
+        rows = np.broadcast_to(rows, (*rows.shape[:2], index.size))
+        return np.moveaxis(rows.reshape(*rows.shape[:2], *where.shape), 2, 0)
+
+    return jax.tree.map(shaped, found)
+
+
+def streamed(
+    data: Maps, noise: Noise, blocks: Blocks, layouts: Sequence[Layout]
+) -> Iterator[tuple[tuple[Pixels, ...], Array]]:
+    """Yield the pixels of a few blocks at a time, for each layout, and the cells of the blocks.
+
+    Pixels in the padding are zero, of weight 1. There are as many blocks each time but the last.
     """
+    number, size = blocks.pixels.shape
+    for some in ranges(number, max(1, STREAM // size)):
+        read = tuple(_read(data, noise, layout, blocks.pixels[some]) for layout in layouts)
+        yield jax.tree.map(jnp.asarray, (read, blocks.cell[some]))
 
-    def __init__(self, data: Maps, noise: Noise, cells: Cells, used: np.ndarray) -> None:
-        self._data, self._noise = data, noise
-        own = np.where(used, 0, -1).astype(np.int32) if cells.of_pixel is None else cells.of_pixel
-        counts = np.bincount(own[own >= 0], minlength=cells.number)
-        self.where, self.cell = arranged(own, counts, block_size(counts))
 
-    def read(self, layout: Layout, blocks: slice) -> Pixels:
-        """Return the pixels of some blocks, (block, group, row, pix), as arrays of numpy."""
-        index = self.where[blocks].ravel()
-        used, size = index >= 0, self.where.shape[1]
-        whole = used.all() and index[-1] - index[0] == len(index) - 1 and np.all(np.diff(index) > 0)
-        where = slice(int(index[0]), int(index[-1]) + 1) if whole else index
-        found = pixel_rows(self._data, self._noise, layout, where, used)
-        if not np.isfinite(found.data).all() or found.data.min() < UNSEEN:
-            refuse_data(self._data, self._noise)
-
-        def shaped(rows: np.ndarray) -> np.ndarray:
-            rows = np.broadcast_to(rows, (*rows.shape[:2], index.size))
-            return np.moveaxis(rows.reshape(*rows.shape[:2], -1, size), 2, 0)
-
-        return jax.tree.map(shaped, found)
-
-    def pieces(self, like: Any) -> Iterator[Any]:
-        """Yield a `SpectralLikelihood` with a few blocks at a time, as many but for the last."""
-        number, size = self.where.shape
-        for blocks in ranges(number, max(1, STREAM // size)):
-            read = tuple(self.read(each, blocks) for each in like.layout)
-            pixels, cells = jax.tree.map(jnp.asarray, (read, self.cell[blocks]))
-            yield dataclasses.replace(like, pixels=pixels, block_cell=cells, source=None)
-
-    def gathered(self, layout: Layout) -> tuple[Pixels, Array | None]:
-        """Return all pixels, and the cell of each block, None if they are in order."""
-        number, size = self.where.shape
-        every: Any = None
-        for some in ranges(number, max(1, BLOCK // size)):
-            read = self.read(layout, some)
-            if every is None:
-                every = jax.tree.map(lambda own: np.empty((number, *own.shape[1:])), read)
-            for target, own in zip(*map(jax.tree.leaves, (every, read)), strict=True):
-                target[some] = own
-        in_order = np.array_equal(self.cell, np.arange(number))
-        return jax.tree.map(jnp.asarray, every), None if in_order else jnp.asarray(self.cell)
+def gathered(data: np.ndarray, noise: Noise, blocks: Blocks, *, layout: Layout) -> Pixels:
+    """Return the pixels in blocks, padded with zeros of unit weight."""
+    number, size = blocks.pixels.shape
+    every: Any = None
+    for some in ranges(number, max(1, BLOCK // size)):
+        read = _read(data, noise, layout, blocks.pixels[some])
+        if every is None:
+            every = jax.tree.map(lambda own: np.empty((number, *own.shape[1:])), read)
+        for target, own in zip(*map(jax.tree.leaves, (every, read)), strict=True):
+            target[some] = own
+    return jax.tree.map(jnp.asarray, every)

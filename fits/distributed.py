@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from fits.compress import PIECE, Layout, Noise, arranged, block_size, pixel_rows, wrong_data
+from fits.compress import PIECE, Blocks, Layout, Noise, arranged, pixel_rows, wrong_data
 from fits.regions import Cells
 from fits.systems import Pixels
 from jaxsky import mesh
@@ -115,26 +115,15 @@ def _numbered(there, key, used):
     return jnp.where(used, jnp.searchsorted(there, key), -1).astype(jnp.int32)
 
 
-class Blocks(NamedTuple):
-    """Pixels of each device in blocks of a single cell, -1 in the padding, and their cell."""
-
-    pixels: Int[Array, "block size"]
-    cell: Int[Array, " block"]
-
-
 def blocks(cells: Cells, used: Bool[Array, " pix"]) -> Blocks:
     """Arrange the used pixels of each device by cells; all devices have as many blocks."""
     of_pixel: Any = jnp.where(used, 0, -1) if cells.of_pixel is None else cells.of_pixel
-    own = mesh.parts_of(of_pixel)
-    sizes = [np.bincount(each[each >= 0], minlength=cells.number) for each in own]
 
     def most(numbers: list[int]) -> int:
         return int(mesh.from_parts([np.array([n]) for n in numbers], of_pixel).max())
 
-    size = most(list(map(block_size, sizes)))
-    number = most([int(np.sum(-(-n // size))) for n in sizes])
-    each = [arranged(*one, size, number) for one in zip(own, sizes, strict=True)]
-    return Blocks(*(mesh.from_parts(parts, of_pixel) for parts in zip(*each, strict=True)))
+    each = arranged(mesh.parts_of(of_pixel), cells.number, most)
+    return jax.tree.map(lambda *parts: mesh.from_parts(parts, of_pixel), *each)
 
 
 @jax.jit
@@ -148,10 +137,19 @@ def pieces(used: Bool[Array, " pix"]) -> Blocks:
     return Blocks(own, jnp.zeros(len(own), int))
 
 
+def band_covariance(
+    data: Array, noise: Noise, cells: Cells, used: Bool[Array, " pix"], layout: Layout
+) -> Float[np.ndarray, "cell group row row"]:
+    """Return what `fits.compress.band_covariance` does."""
+    # A sum over all pixels needs no order.
+    own = pieces(used) if cells.of_pixel is None else blocks(cells, used)
+    return np.asarray(_band_covariance(data, noise, own, layout=layout, number=cells.number))
+
+
 @partial(jax.jit, static_argnames=("layout", "number"))
 @mesh.over_pixels(mesh.SUMS)
-def band_covariance(data, noise, blocks, *, layout, number):
-    """Return what `fits.compress.band_covariance` does, for a number of cells."""
+def _band_covariance(data, noise, blocks, *, layout, number):
+    """Return the sums over blocks, for a number of cells."""
 
     def add(found, block):
         own, cell = block

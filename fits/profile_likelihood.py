@@ -11,7 +11,7 @@ pixels (`fits.compress`), and the cost does not depend on nside.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -21,8 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from fits import compress as in_memory
 from fits import distributed, regions, systems
-from fits.compress import Blocks, Layout, Noise, as_noise, band_covariance, bare, compressed
+from fits.compress import Layout, Noise, as_noise, bare, compressed, streamed
 from fits.mixing import Mixing, named_bands, spectral_names, unit_sky
 from fits.posterior import Likelihood
 from fits.regions import check_labels
@@ -49,7 +50,7 @@ class SpectralLikelihood(Likelihood):
     index: Int[Array, "cell free"]
     #: data and weights, for each of `layout`
     pixels: tuple[Pixels, ...]
-    #: cell of each block of pixels, None if they are in order; of each pixel, -1 where masked
+    #: cell of each block of pixels, and of each pixel, -1 where masked
     block_cell: Int[Array, " block"] | None
     of_pixel: Int[Array, " pix"] | None
     layout: tuple[Layout, ...] = eqx.field(static=True)
@@ -58,7 +59,7 @@ class SpectralLikelihood(Likelihood):
     #: bands that carry no weight next to the others, and are not counted
     weightless: tuple[str, ...] = eqx.field(static=True)
     #: where `pixels` and `block_cell` are read from, piece by piece, if they are too many
-    source: Blocks | None = eqx.field(static=True, default=None)
+    source: Callable[[], Iterator[tuple[Any, Array]]] | None = eqx.field(static=True, default=None)
 
     profiled = True
 
@@ -102,47 +103,26 @@ class SpectralLikelihood(Likelihood):
         )
 
     def pieces(self):
-        yield from (self,) if self.source is None else self.source.pieces(self)
+        own = [(self.pixels, self.block_cell)] if self.source is None else self.source()
+        for pixels, cells in own:
+            yield dataclasses.replace(self, pixels=pixels, block_cell=cells, source=None)
 
-    def _mapped(self, function, matrices):
-        """Apply a function of (matrices, pixels) to all blocks, for each of `layout`."""
+    def _blocks(self):
+        """Return what passes take: the pixels in blocks, for each of `layout`, and their cells."""
         if self.source is not None:
             raise ValueError(
                 "Maps on disk whose noise differs from pixel to pixel and from band to band can be "
                 'fitted by fits.Newton() only, and not sampled (separate.sampler = "none").'
             )
-        results = []
-        for of_cell, pixels in zip(matrices, self.pixels, strict=True):
-            blocks, *_, size = pixels.data.shape
-            cells = self._cell_of_block(blocks)
-
-            def one(inputs, of_cell=of_cell):
-                cell, own = inputs
-                return function(jax.tree.map(lambda x: x[cell], of_cell), own)
-
-            most = at_once(PASS)
-            if blocks * size <= most:
-                results.append(jax.vmap(one)((cells, pixels)))
-                continue
-            # With a batch size of 1 XLA copies all data and weights first.
-            batch = most // size if 2 * size <= most else None
-            results.append(jax.lax.map(one, (cells, pixels), batch_size=batch))
-        return tuple(results)
-
-    def _blocks(self) -> "SpectralLikelihood":
-        """Return it without the map of cells, which passes over blocks of pixels do not take."""
-        return dataclasses.replace(self, of_pixel=None)
-
-    def _cell_of_block(self, blocks: int) -> Int[Array, " block"]:
-        return jnp.arange(blocks) if self.block_cell is None else self.block_cell
+        return self.pixels, self.block_cell
 
     def total(self, local):
         @over_pixels(SUMS)
-        def summed(like, matrices):
-            parts = like._mapped(systems.least_chi2, matrices)
+        def summed(matrices, pixels, cells):
+            parts = _mapped(systems.least_chi2, matrices, pixels, cells)
             return over_devices(sum((jnp.sum(part) for part in parts), jnp.zeros(())))
 
-        return summed(self._blocks(), self.matrices(local))
+        return summed(self.matrices(local), *self._blocks())
 
     def derivatives(self, local):
         units = jnp.eye(local.shape[1])
@@ -159,24 +139,45 @@ class SpectralLikelihood(Likelihood):
         every = tuple(zip(matrices, one, two, strict=True))
 
         @over_pixels(SUMS)
-        def summed(like, every):
-            parts = like._mapped(lambda m, own: systems.derivatives(m[0], m[1], m[2], own), every)
-
+        def summed(every, pixels, cells):
             def of_cells(part):
-                cells = like._cell_of_block(len(part.value))
                 return jax.tree.map(lambda x: jax.ops.segment_sum(x, cells, len(local)), part)
 
+            def of_block(m, own):
+                return systems.derivatives(m[0], m[1], m[2], own)
+
+            parts = _mapped(of_block, every, pixels, cells)
             return over_devices(jax.tree.map(lambda *rows: sum(rows), *map(of_cells, parts)))
 
-        return summed(self._blocks(), every)
+        return summed(every, *self._blocks())
 
     def residuals(self, params):
         @over_pixels(maps_of(1))
-        def rows(like, matrices):
-            parts = like._mapped(systems.residuals, matrices)
+        def rows(matrices, pixels, cells):
+            parts = _mapped(systems.residuals, matrices, pixels, cells)
             return jnp.concatenate([part.ravel() for part in parts])
 
-        return rows(self._blocks(), self.matrices(self.flat(params)[self.index]))
+        return rows(self.matrices(self.flat(params)[self.index]), *self._blocks())
+
+
+def _mapped(function, matrices, pixels, cells):
+    """Apply a function of (matrices, pixels) to all blocks, for each layout."""
+    results = []
+    for of_cell, own in zip(matrices, pixels, strict=True):
+        blocks, *_, size = own.data.shape
+
+        def one(inputs, of_cell=of_cell):
+            cell, block = inputs
+            return function(jax.tree.map(lambda x: x[cell], of_cell), block)
+
+        most = at_once(PASS)
+        if blocks * size <= most:
+            results.append(jax.vmap(one)((cells, own)))
+            continue
+        # With a batch size of 1 XLA copies all data and weights first.
+        batch = most // size if 2 * size <= most else None
+        results.append(jax.lax.map(one, (cells, own), batch_size=batch))
+    return tuple(results)
 
 
 def _start_values(
@@ -289,6 +290,7 @@ def spectral_likelihood(
             )
         # The values that are there, and which of them each pixel has.
         fixed[name], varying[name] = np.unique(value, return_inverse=True)
+    passes: Any = distributed if apart else in_memory
     cells = (distributed if apart else regions).intersections(varying, used)
     index, position = np.zeros((cells.number, len(values)), int), 0
     for column, (name, value) in zip(index.T, values.items(), strict=True):
@@ -314,28 +316,19 @@ def spectral_likelihood(
     fewer = cells.number * max(rows) < looked.number
     if compress and not noise.separable:
         raise ValueError("Only noise that is separable into bands and pixels can be compressed.")
-    few = noise.separable and (fewer if compress is None else compress)
-    if apart:
-        # A sum over all pixels needs no order.
-        ordered = cells.of_pixel is not None or not few
-        blocks = distributed.blocks(cells, used) if ordered else distributed.pieces(used)
     parts, block_cell, source = [], None, None
-    for layout in like.layout:
-        if few and apart:
-            sizes = {"layout": layout, "number": cells.number}
-            summed = distributed.band_covariance(data, noise, blocks, **sizes)
-            parts.append(compressed(np.asarray(summed), noise, layout))
-        elif few:
-            summed = band_covariance(data, noise, cells, used, layout)
+    if noise.separable and (fewer if compress is None else compress):
+        for layout in like.layout:
+            summed = passes.band_covariance(data, noise, cells, used, layout)
             parts.append(compressed(summed, noise, layout))
-        elif apart:
-            parts.append(distributed.gathered(data, noise, blocks, layout=layout))
-            block_cell = blocks.cell
-        elif isinstance(data, Stack):
-            source = Blocks(data, noise, cells, used)
+        block_cell = jnp.arange(cells.number)
+    else:
+        blocks = passes.blocks(cells, used)
+        if isinstance(data, Stack):
+            source = partial(streamed, data, noise, blocks, like.layout)
         else:
-            pixels, block_cell = Blocks(data, noise, cells, used).gathered(layout)
-            parts.append(pixels)
+            block_cell = jnp.asarray(blocks.cell)
+            parts = [passes.gathered(data, noise, blocks, layout=each) for each in like.layout]
     return dataclasses.replace(
         like,
         pixels=tuple(parts),

@@ -23,7 +23,7 @@ from jax.interpreters import mlir
 
 import fits
 import jaxsky
-from fits.compress import Layout, Noise
+from fits.compress import Blocks, Layout, Noise
 from fits.mixing import Mixing
 from fits.posterior import Posterior
 from fits.unbounded import unbounded_posterior
@@ -251,12 +251,12 @@ def decompositions(systems) -> Calls:
 def shared_pixels(distributed) -> Calls:
     data, layout = np.ones((4, 2, NPIX)), Layout(False, (0, 1))
     noise, used = Noise(np.ones((4, 2, 1)), np.ones(NPIX)), np.ones(NPIX, bool)
-    blocks = distributed.Blocks(np.arange(NPIX).reshape(2, -1), np.arange(2))
+    blocks = Blocks(np.arange(NPIX).reshape(2, -1), np.arange(2))
     yield partial(distributed._look, components=2), data, noise
     yield partial(distributed.counted, number=3), np.arange(NPIX)
     yield distributed.pieces, used
     yield distributed._numbered, np.arange(3), np.arange(NPIX), used
-    yield partial(distributed.band_covariance, layout=layout, number=2), data, noise, blocks
+    yield partial(distributed._band_covariance, layout=layout, number=2), data, noise, blocks
     yield partial(distributed.gathered, layout=layout), data, noise, blocks
 
 

@@ -171,15 +171,13 @@ class Mixing(eqx.Module):
     ) -> Float[Array, "cell band component"]:
         """Return matrices of cells with their own parameters; others keep their values."""
         params = dict(params)
-        moving = any(name.split(".")[0] in ("shift", "width") for name in params)
-        if cells > CELLS and not moving:
-            return self._interpolated(params, cells)
-        if cells == 1 or not params:
-            one = self.one({name: value[0] for name, value in params.items()})
-            return jnp.broadcast_to(one, (cells, *one.shape))
+        if cells == 1:
+            return self.one({name: value[0] for name, value in params.items()})[None]
         if cells <= CELLS:
             return jax.vmap(lambda p: self.one(p))(params)
-        return jax.lax.map(jax.checkpoint(lambda p: self.one(p)), params, batch_size=CELLS)
+        if any(name.split(".")[0] in ("shift", "width") for name in params):
+            return jax.lax.map(jax.checkpoint(lambda p: self.one(p)), params, batch_size=CELLS)
+        return self._interpolated(params, cells)
 
     def rotated(
         self, matrix: Float[Array, "cell band component"], params: Mapping[str, Array]
@@ -213,12 +211,9 @@ class TemplateErrors(NamedTuple):
         if mesh is not None:
             variance = distribute(variance, mesh, fill=0.0)
         power = np.asarray(summed(weighted, weights, variance))
-        bands, stokes, _ = power.shape
-        size = len(self.parts) + 2
-        total = np.zeros((bands, stokes, size, size))
-        total[..., 1:-1, 1:-1] = np.einsum("bsu,ku,ju->bskj", power, self.parts, self.parts)
-        with_data = np.einsum("bsu,bu,ku->bsk", power, self.of_band, self.parts)
-        total[..., 0, 1:-1] = total[..., 1:-1, 0] = with_data
+        rows = np.stack([np.vstack([own, self.parts, 0 * own]) for own in self.of_band])
+        total = np.einsum("bsu,bru,bqu->bsrq", power, rows, rows)
+        total[..., 0, 0] = 0.0  # noise of the data, which is in their own products only
         return total
 
     def covariance(

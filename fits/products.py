@@ -52,20 +52,19 @@ def summed(sums: Callable[..., Any], *maps: Any) -> Any:
     return reduce(partial(jax.tree.map, jnp.add), map(of_part, ranges(npix)))
 
 
-@partial(jax.jit, static_argnames="chunk")
+@jax.jit
 @over_pixels(SUMS)
 def gram(
     data: Float[Array, "band stokes pix"],
     templates: Float[Array, "template stokes pix"],
     weights: Float[Array, "band stokes pix"],
-    chunk: int | None = None,
 ) -> Float[Array, "band stokes row row"]:
     """Return weighted inner products of (data, templates, 1), per band and Stokes parameter.
 
     After this one pass over the pixels, a fit with constant laws does not depend on their number:
     a model is a sum of templates, so chi^2 is a quadratic form in their coefficients.
-    Weights are 1/sigma^2, zero where masked, and broadcast against the data; `chunk` pixels are
-    taken at once. Results for disjoint sets of pixels add up to that of their union.
+    Weights are 1/sigma^2, zero where masked, and broadcast against the data. Results for disjoint
+    sets of pixels add up to that of their union.
     """
     bands, _, npix = data.shape
     weights = jnp.broadcast_to(weights, data.shape)
@@ -77,7 +76,7 @@ def gram(
         rows = jnp.where(w[:, :, None] > 0, rows, 0)
         return jnp.einsum("bsip,bsp,bsjp->bsij", rows, w, rows, precision=EXACT)
 
-    chunk = min(chunk or at_once(CHUNK), npix)
+    chunk = min(at_once(CHUNK), npix)
     whole = npix // chunk * chunk
 
     def add(found, start):

@@ -250,10 +250,10 @@ def intersections(labels: Mapping[str, Int[np.ndarray, " pix"]], used: np.ndarra
     """Return the intersections of the regions of several parameters, among used pixels."""
     if not labels:
         return Cells(None, {}, 1)
-    key = np.zeros(int(used.sum()), np.int64)
+    cell = np.zeros(int(used.sum()), np.int64)
     for array in labels.values():
-        _, key = np.unique(key * (int(array.max()) + 1) + array[used], return_inverse=True)
-    _, first, cell = np.unique(key, return_index=True, return_inverse=True)
+        key = cell * (int(array.max()) + 1) + array[used]
+        _, first, cell = np.unique(key, return_index=True, return_inverse=True)
     where = np.flatnonzero(used)[first]
     of_pixel = np.full(used.shape, -1, np.int32)
     of_pixel[used] = cell

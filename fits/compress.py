@@ -253,15 +253,12 @@ def band_covariance(
     `data` are maps (band, stokes, pix), of any precision and on disk if need be; `noise` is
     separable, and its factor per band is not applied.
     """
-    groups = layout.groups
-    size = len(data) * len(groups[0])
-    total = np.zeros((cells.number, len(groups), size, size))
+    size = len(data) * len(layout.groups[0])
+    total = np.zeros((cells.number, len(layout.groups), size, size))
     for part in ranges(data.shape[-1], PIECE):
         root = np.sqrt(noise.pixel_weights(part))
         values = np.asarray(data[..., part], float)
-        for g, group in enumerate(groups):
-            rows = [values[:, s] for s in group]
-            x = rows[0] if len(rows) == 1 else np.concatenate(rows)
+        for g, x in enumerate(layout.rows(values)):
             if noise.pixel_sigma is not None:
                 x = np.where(used[part], x * root, 0)
             if x.min() < UNSEEN:
@@ -357,12 +354,7 @@ def _read(data: Maps, noise: Noise, layout: Layout, where: Any) -> Pixels:
     found = pixel_rows(data, noise, layout, pixels, used)
     if not np.isfinite(found.data).all() or found.data.min() < UNSEEN:
         refuse_data(data, noise)
-
-    def shaped(rows: np.ndarray) -> np.ndarray:
-        rows = np.broadcast_to(rows, (*rows.shape[:2], index.size))
-        return np.moveaxis(rows.reshape(*rows.shape[:2], *where.shape), 2, 0)
-
-    return jax.tree.map(shaped, found)
+    return jax.tree.map(lambda x: np.moveaxis(x.reshape(*x.shape[:2], *where.shape), 2, 0), found)
 
 
 def streamed(

@@ -167,9 +167,4 @@ def _band_covariance(data, noise, blocks, *, layout, number):
 @mesh.over_pixels(mesh.maps_of(1))
 def gathered(data: Array, noise: Noise, blocks: Blocks, *, layout: Layout) -> Pixels:
     """Return the pixels in blocks, padded with zeros of unit weight."""
-
-    def one(own):
-        rows = pixel_rows(data, noise, layout, own, own >= 0)
-        return jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], own.size)), rows)
-
-    return jax.lax.map(one, blocks.pixels)
+    return jax.lax.map(lambda own: pixel_rows(data, noise, layout, own, own >= 0), blocks.pixels)

@@ -270,12 +270,14 @@ def assembled(
     return scipy.sparse.csc_matrix(matrix + scipy.sparse.diags(diagonal))
 
 
-def _independent(matrix: np.ndarray) -> list[np.ndarray]:
-    """Return positions of the independent blocks of a matrix, such as those of regions."""
-    graph = scipy.sparse.csr_matrix(matrix != 0)
+def _independent(matrix: np.ndarray, scale: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return positions and scaled values of independent blocks, such as those of regions."""
+    scaled = matrix * scale * scale[:, None]
+    graph = scipy.sparse.csr_matrix(scaled != 0)
     count, block = scipy.sparse.csgraph.connected_components(graph, directed=False)
     order = np.argsort(block, kind="stable")
-    return np.split(order, np.cumsum(np.bincount(block, minlength=count))[:-1])
+    every = np.split(order, np.cumsum(np.bincount(block, minlength=count))[:-1])
+    return [(at, scaled[np.ix_(at, at)]) for at in every]
 
 
 class Factor:
@@ -289,11 +291,8 @@ class Factor:
         self._scale = 1 / np.sqrt(diagonal)
         try:
             if isinstance(matrix, np.ndarray):
-                scaled = matrix * self._scale * self._scale[:, None]
-                self._blocks = [
-                    (at, scipy.linalg.cho_factor(scaled[np.ix_(at, at)]))
-                    for at in _independent(scaled)
-                ]
+                blocks = _independent(matrix, self._scale)
+                self._blocks = [(at, scipy.linalg.cho_factor(block)) for at, block in blocks]
                 return
             scale = scipy.sparse.diags(self._scale)
             # Without pivoting the factors are those of L D L^T, and the signs of D tell.
@@ -329,11 +328,9 @@ def degenerate(matrix: np.ndarray | scipy.sparse.csc_matrix, names: Sequence[str
         return [name for name, wrong in zip(names, bad, strict=True) if wrong]
     if not isinstance(matrix, np.ndarray):
         return [] if Factor(matrix).positive else list(names)
-    scale = 1 / np.sqrt(diagonal)
-    scaled = matrix * scale * scale[:, None]
     found = []
-    for at in _independent(scaled):
-        values, vectors = np.linalg.eigh(scaled[np.ix_(at, at)])
+    for at, block in _independent(matrix, 1 / np.sqrt(diagonal)):
+        values, vectors = np.linalg.eigh(block)
         if not values[0] > DEGENERATE:
             share = np.abs(vectors[:, 0])
             found += at[share > 0.05 * share.max()].tolist()

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import healpy
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from fits.common import CommonMaps, window_of
 from fits.compress import Layout, bare, check_sigma
@@ -100,34 +100,15 @@ def harmonic_coefficients(
 
 
 class Multipoles(NamedTuple):
-    """Beams and noise of the bands at l = 0 ... lmax, of which those from lmin on are used.
+    """Beam-deconvolved coefficients and their weights b_l^2 / N_l at l = 0 ... lmax.
 
-    `inverse` is 1 / b_l and `weights` b_l^2 / N_l, both 0 where a band is left out.
+    Both are 0 below lmin, and where a band is left out. `ell` is the multipole of each coefficient.
     """
 
     lmin: int
-    inverse: Float[np.ndarray, "band ell"]
+    ell: Int[np.ndarray, " alm"]
+    alm: Float[np.ndarray, "band stokes alm"]
     weights: Float[np.ndarray, "band stokes ell"]
-
-    @property
-    def ell(self) -> np.ndarray:
-        """Multipole of each packed coefficient."""
-        return alm_ell(self.inverse.shape[-1] - 1)
-
-    @property
-    def sigma(self) -> Float[np.ndarray, "band stokes ell"]:
-        """Standard deviation of beam-deconvolved coefficients; infinite where left out."""
-        with np.errstate(divide="ignore"):
-            return 1 / np.sqrt(self.weights)
-
-    def without_beams(self, alm: np.ndarray) -> Float[np.ndarray, "band stokes alm"]:
-        """Return beam-deconvolved coefficients up to lmax; zero below lmin."""
-        short = np.asarray(resize(jnp.asarray(alm), self.inverse.shape[-1] - 1))
-        rows = np.where(self.ell >= self.lmin, short * self.inverse[:, None, self.ell], 0.0)
-        if not np.isfinite(rows).all():
-            bad = int(np.sum(~np.isfinite(alm)))
-            raise ValueError(f"Argument `alm` has {bad} of {alm.size} values that are not finite.")
-        return rows
 
 
 def check_alm(alm: Numeric, bands: int) -> np.ndarray:
@@ -175,7 +156,7 @@ def multipoles_of(
     lmin: int,
     lmax: int | None,
 ) -> Multipoles:
-    """Return beams and noise for coefficients, after checking them."""
+    """Return coefficients of maps as observed without their beams, after checking all of it."""
     (bands, stokes), own = alm.shape[:2], lmax_of(alm)
     lmax = own if lmax is None else lmax
     if not 2 <= lmin <= lmax <= own:
@@ -196,14 +177,20 @@ def multipoles_of(
             f"components, the others having `beams` below {BEAM:g} or infinite `noise`; choose "
             f"another `lmin` or `lmax` than {lmin} and {lmax}."
         )
-    return Multipoles(lmin, np.where(seen, 1 / np.where(seen, window, 1), 0.0), weights)
+    ell, inverse = alm_ell(lmax), np.where(seen, 1 / np.where(seen, window, 1), 0.0)
+    short = np.asarray(resize(jnp.asarray(alm), lmax))
+    rows = np.where(ell >= lmin, short * inverse[:, None, ell], 0.0)
+    if not np.isfinite(rows).all():
+        bad = int(np.sum(~np.isfinite(alm)))
+        raise ValueError(f"Argument `alm` has {bad} of {alm.size} values that are not finite.")
+    return Multipoles(lmin, ell, rows, weights)
 
 
-def _compressed(rows: np.ndarray, multipoles: Multipoles, layout: Layout) -> Pixels:
+def _compressed(multipoles: Multipoles, layout: Layout) -> Pixels:
     """Return vectors with the same covariance of bands as the coefficients of each multipole.
 
     They are the triangular factor of the coefficients (QR), so squares are not formed: signals 1e8
-    above the noise leave no trace in chi^2. `rows` are beam-deconvolved coefficients.
+    above the noise leave no trace in chi^2.
     """
     lmin = multipoles.lmin
     weights = np.moveaxis(layout.rows(multipoles.weights[..., lmin:]), -1, 0)[..., None]
@@ -213,7 +200,7 @@ def _compressed(rows: np.ndarray, multipoles: Multipoles, layout: Layout) -> Pix
     root = np.zeros((*weights.shape[:3], size))
     order, ends = np.argsort(multipoles.ell, kind="stable"), np.arange(lmin, lmin + len(root) + 1)
     for i, own in enumerate(np.split(order, ends**2)[1:-1]):
-        x = layout.rows(rows[..., own])
+        x = layout.rows(multipoles.alm[..., own])
         x = np.concatenate(list(x), axis=1)[None] if alike else x
         triangle = np.asarray(np.linalg.qr(x.swapaxes(1, 2), mode="r"))
         root[i, ..., : triangle.shape[1]] = triangle.swapaxes(1, 2)
@@ -271,8 +258,7 @@ def harmonic_likelihood(
     like = spectral_likelihood(sky, bands, nothing, one, start, unit=unit, compress=False)
     components = len(sky.components)
     multipoles = multipoles_of(alm, noise, beams, components, lmin, lmax)
-    rows = multipoles.without_beams(alm)
-    pixels = tuple(_compressed(rows, multipoles, layout) for layout in like.layout)
+    pixels = tuple(_compressed(multipoles, layout) for layout in like.layout)
     bands_used = (multipoles.weights > 0).sum(axis=0)[..., multipoles.ell]
     values = bands_used - components * (multipoles.ell >= lmin)
     cells, number = jnp.zeros(len(pixels[0].data), int), int(values.sum())

@@ -298,9 +298,11 @@ def harmonic_component_maps(
             f"`like`, but has {alm.shape[1]}."
         )
     multipoles = multipoles_of(alm, noise, beams, len(names), lmin, lmax)
-    ell, sigma = multipoles.ell, multipoles.sigma
+    ell = multipoles.ell
+    with np.errstate(divide="ignore"):  # infinite where a band is left out
+        sigma = 1 / np.sqrt(multipoles.weights)
     of_alm = Noise(sigma[..., ell])
-    found = component_maps(like, params, multipoles.without_beams(alm), of_alm, covariance=False)
+    found = component_maps(like, params, multipoles.alm, of_alm, covariance=False)
     of_noise = found
     if covariance:
         of_noise = component_maps(like, params, np.zeros(sigma.shape), Noise(sigma))

@@ -60,11 +60,8 @@ def covariance_terms(
         blocks = _narrow_products(spectra, given)
     else:
         last = min(spectra.lmax, EXACT_LMAX + MARGIN)
-        factors = None if spectra.derivatives is None else pure_factors(last)
         mask = profile[: 2 * last + 1]  # its higher multipoles couple none up to the last
-        blocks = zonal_products(
-            mask * derivative_factors(len(mask)), given[..., : last + 1], factors
-        )
+        blocks = zonal_products(mask, given[..., : last + 1], spectra.derivatives is not None)
         if last < spectra.lmax:
             low, exact = slice(EXACT_LMAX + 1), blocks
             blocks = _narrow_products(spectra, given)
@@ -124,23 +121,22 @@ def ring_functions(
 
 
 def zonal_products(
-    mask: Float[np.ndarray, "3 reach"],
-    fields: Float[np.ndarray, "field 2 ell"],
-    factors: Float[np.ndarray, "3 ell"] | None = None,
+    mask: Float[np.ndarray, " reach"], fields: Float[np.ndarray, "field 2 ell"], pure: bool
 ) -> Float[np.ndarray, "field field 2 ell 2 ell"]:
     """Return half the covariance of pseudo-spectra EE, BB in a symmetric mask, per pair of fields.
 
     Such a mask does not mix orders m. If K_m turns the E and B of the sky into those of the masked
     map, their covariance at one order is G = K C K^T, and that of pseudo-spectra is sum_m 2 G^2 /
     ((2 l + 1) (2 l' + 1)). Only power beyond the last multipole is neglected. `mask` has a_l0 of
-    the mask and of its derivatives, as maps of spin 0, 1, 2; `fields` are the spectra EE, BB of
-    each field; `factors` are those of the three terms of purified B, None without purification.
+    the mask, `fields` are the spectra EE, BB of each field, and `pure` says if B is purified.
     """
-    lmax, reach = fields.shape[-1] - 1, mask.shape[1] - 1
+    lmax, reach = fields.shape[-1] - 1, mask.size - 1
     nodes = (2 * lmax + reach) // 2 + 1
     theta, weight = ducc0.misc.GL_thetas(nodes), ducc0.misc.GL_weights(nodes, 1)
     zero = np.zeros(1, int)
-    rings = [row @ ring_functions(n, reach, theta, zero)[0, 0] for n, row in enumerate(mask)]
+    # The mask and its derivatives, which are maps of spin 0, 1, 2.
+    alms = enumerate(mask * derivative_factors(mask.size))
+    rings = [row @ ring_functions(n, reach, theta, zero)[0, 0] for n, row in alms]
     size = sum(np.abs(row) / float(lmax) ** n for n, row in enumerate(rings))
     kept = size > NOTHING * size.max()
     theta, weight = theta[kept], weight[kept]
@@ -151,8 +147,8 @@ def zonal_products(
         spin2 = ring_functions(2, lmax, theta, orders)
         sky = np.stack([spin2, spin2[::-1]])
         seen = sky * value
-        if factors is not None:
-            _, once, twice = factors[:, :, None]
+        if pure:
+            _, once, twice = pure_factors(lmax)[:, :, None]
             seen[1] -= once * first * ring_functions(1, lmax, theta, orders)[::-1]
             seen[1, 1] += twice * second * ring_functions(0, lmax, theta, orders)[0]
         low = max(int(orders[0]), 2)

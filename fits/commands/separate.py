@@ -32,7 +32,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
     fit, ratio, spectra = found.fit, found.tensors, found.spectra
     bands, truth, simulated = list(found.data.bands), found.data.truth or {}, found.simulated
     small = None
-    if found.data.by_pixel:
+    if settings.separate.domain == "pixel":
         values = np.asarray(found.found.probability)
         values = values[np.isfinite(values)]
         small = {f"below_{p:g}": float(np.mean(values < p)) for p in (0.05, 0.01, 0.001)}
@@ -171,23 +171,23 @@ def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
     return sentences
 
 
-def _of_components(found: Separation) -> tuple[list[tuple[str, str]], Callable]:
+def _of_components(found: Separation, by_pixel: bool) -> tuple[list[tuple[str, str]], Callable]:
     """Return names and units of the columns of components, and their values in some pixels."""
-    columns, by_pixel = list[tuple[str, str]](), found.data.by_pixel
-    for name in found.components:
-        unit, head = "uK_CMB" if name == "cmb" else "uK_RJ", name.upper()
-        heads = (head, f"{head}_SIGMA") if by_pixel else (head,)
-        columns += [(f"{each}_{s}", unit) for each in heads for s in "QU"]
+    columns = [
+        (f"{name.upper()}{end}_{s}", "uK_CMB" if name == "cmb" else "uK_RJ")
+        for name in found.found.components
+        for end in (("", "_SIGMA") if by_pixel else ("",))
+        for s in "QU"
+    ]
+    if not by_pixel:
+        return columns, lambda part: np.concatenate(found.maps[..., part])
 
     def values(part: slice) -> list[np.ndarray]:
-        rows, maps = list[np.ndarray](), found.maps[..., part]
-        errors = found.found.sigmas(part) if by_pixel else []
-        for i in range(len(found.components)):
-            rows += list(maps[i, -2:])
-            rows += list(errors[i][-2:]) if by_pixel else []
-        return [*rows, found.found.chi2[part], found.found.probability[part]] if by_pixel else rows
+        both = zip(found.maps[..., part], found.found.sigmas(part), strict=True)
+        rows = [row for maps, errors in both for row in (*maps, *errors)]
+        return [*rows, found.found.chi2[part], found.found.probability[part]]
 
-    return [*columns, ("CHI2", ""), ("PROBABILITY", "")] if by_pixel else columns, values
+    return [*columns, ("CHI2", ""), ("PROBABILITY", "")], values
 
 
 def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path]:
@@ -198,19 +198,18 @@ def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path
         if np.ndim(found.fit.best_fit[name])
         for end, values in (("", found.fit.best_fit), ("_SIGMA", found.sigma))
     ]
-    bands, unit = found.data.bands, settings.separate.unit
+    unit, npix, written = settings.separate.unit, found.maps.shape[-1], list[Path]()
     files: tuple[tuple[list[tuple[str, str]], Callable], ...] = (
-        _of_components(found),
+        _of_components(found, settings.separate.domain == "pixel"),
         (
-            [(f"{band}_{s}", unit) for band in bands for s in "QU"],
-            lambda part: found.residuals[..., part][:, -2:].reshape(2 * len(bands), -1),
+            [(f"{band}_{s}", unit) for band in found.data.bands for s in "QU"],
+            lambda part: np.concatenate(found.residuals[..., part]),
         ),
         (
             [(name, unit) for name, unit, *_ in parameters],
             lambda part: [found.of_pixel(n, values, part) for *_, n, values in parameters],
         ),
     )
-    npix, written = found.maps.shape[-1], list[Path]()
     beam = {"FWHM": (settings.common.fwhm, "[arcmin]")}
     mask = np.empty(npix, bool)
     for part in ranges(npix):
@@ -219,8 +218,7 @@ def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path
         if columns:
 
             def read(part, values=values):
-                rows = values(part)
-                return np.stack([np.broadcast_to(row, mask[part].shape) for row in rows])
+                return np.stack([np.broadcast_to(row, mask[part].shape) for row in values(part)])
 
             names, units = map(list, zip(*columns, strict=True))
             written.append(out / file)

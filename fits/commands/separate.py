@@ -154,19 +154,17 @@ def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
             "deviations of BB in a bin. It is part of the model, but a larger "
             "separate.apodization makes it and the errors smaller."
         )
-    if settings.separate.sampler != "none" and len(fit.labels) > SAMPLED:
-        sentences.append(
-            f"The posterior was not sampled: {len(fit.labels)} parameters are more than {SAMPLED}."
+    if settings.separate.sampler != "none" and found.chain is None:
+        reason = (
+            f"{len(fit.labels)} parameters are more than {SAMPLED}."
+            if len(fit.labels) > SAMPLED
+            else "the maps are too large for memory, and their noise differs from pixel to pixel "
+            "and from band to band."
         )
-    elif settings.separate.sampler != "none" and found.chain is None:
-        sentences.append(
-            "The posterior was not sampled: the maps are too large for memory, and their noise "
-            "differs from pixel to pixel and from band to band."
-        )
-    if found.chain is not None and not found.chain.converged:
+        sentences.append(f"The posterior was not sampled: {reason}")
+    elif found.chain is not None and not found.chain.converged:
         sentences.append(f"posterior: {found.chain.message}")
-    if settings.cmb.A_lens != 1:
-        A_lens = settings.cmb.A_lens
+    if (A_lens := settings.cmb.A_lens) != 1:
         sentences.append(f"The lensing B modes are taken as known, A_lens = {A_lens:g}.")
     return sentences
 

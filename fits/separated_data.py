@@ -37,10 +37,11 @@ class _Data:
     `foregrounds` are data with nothing else in them, and `truth` the parameters that are numbers,
     including "r"; both are None for real maps.
 
-    All kinds have the same methods, so that a separation works on any of them: `likelihood` of
-    data, `noise_realisation` like that of the data, `components`, their amplitudes with errors and
-    their maps, `emission` of amplitudes in the bands, zero in masked pixels, and `residuals`, maps
-    (band, stokes, pix) of the data minus that, NaN where masked.
+    All kinds have the same methods, so that a separation works on any of them: `distributed`, the
+    data as a process of a job takes them, its own pixels of maps, or all; `likelihood` of data;
+    `noise_realisation` like that of the data; `components`, their amplitudes with errors and their
+    maps; `emission` of amplitudes in the bands; and `residuals`, maps (band, stokes, pix) of the
+    data minus that. The last two are NaN where amplitudes are, in masked pixels.
     """
 
     sky: Sky
@@ -56,14 +57,11 @@ class _Data:
     truth: dict[str, float] | None
     description: str
 
-    #: Whether data are multipoles of the full sky, for which the likelihood is exact, and whether
-    #: they are maps that are separated pixel by pixel.
+    #: Whether data are multipoles of the full sky, for which the likelihood is exact.
     exact: ClassVar[bool] = False
-    by_pixel: ClassVar[bool] = True
 
-    def distributed(self) -> Self:
-        """Return the data as a process of a job takes them: its own pixels of maps, or all."""
-        return self
+    def emission(self, like: SpectralLikelihood, params: Mapping, amplitude: Maps) -> Maps:
+        return emission_maps(like, params, amplitude)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +81,7 @@ class PixelData(_Data):
     def distributed(self) -> Self:
         # Distributed pixels do not take laws with maps of parameters.
         maps = any(np.ndim(leaf) == 1 for leaf in jax.tree.leaves(self.sky))
-        if job.number() == 1 or not self.by_pixel or maps:
+        if job.number() == 1 or maps:
             return self
         npix = self.observed.shape[-1]
 
@@ -109,15 +107,9 @@ class PixelData(_Data):
         return found, found.amplitude
 
     def residuals(self, like: SpectralLikelihood, params: Mapping, amplitude):
-        emission = emission_maps(like, params, amplitude)
+        emission = self.emission(like, params, amplitude)
         shape = self.observed.shape
         return computed(shape, lambda part: self.observed[..., part] - emission[..., part])
-
-    def emission(self, like: SpectralLikelihood, params: Mapping, amplitude):
-        inside = computed(
-            amplitude.shape, lambda part: np.where(self.used[part], amplitude[..., part], 0.0)
-        )
-        return emission_maps(like, params, inside)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,9 +119,11 @@ class _Multipoles(_Data):
     `spectra` is N_l of the noise in the data [unit^2 sr], and `fwhms` are their beams [arcmin].
     """
 
-    by_pixel: ClassVar[bool] = False
     spectra: Float[np.ndarray, "band stokes ell"]
     fwhms: Float[np.ndarray, " band"]
+
+    def distributed(self) -> Self:
+        return self
 
     def alm(self, data: Numeric) -> Float[np.ndarray, "_ stokes alm"]:
         """Return the coefficients of data."""
@@ -188,7 +182,7 @@ class FullSkyData(_Multipoles):
 
     def emission(self, like: SpectralLikelihood, params: Mapping, amplitude):
         windows = jnp.stack([gaussian_beam(f, lmax_of(amplitude)) for f in self.fwhms])
-        return emission_maps(like, params, amplitude) * np.asarray(expand(windows))[:, None]
+        return super().emission(like, params, amplitude) * np.asarray(expand(windows))[:, None]
 
 
 def separation_data(settings: Experiment) -> PixelData | FullSkyData:

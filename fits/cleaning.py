@@ -135,16 +135,6 @@ class Separation(NamedTuple):
     left: Float[np.ndarray, " bin"] | None
     chain: FitResult | None
 
-    @property
-    def components(self) -> tuple[str, ...]:
-        """Names of the components, in order."""
-        return tuple(self.like.mixing.sky)
-
-    @property
-    def degradation(self) -> float:
-        """Mean noise of the CMB relative to that of a sky without foregrounds."""
-        return self.found.mean_degradation("cmb")
-
     def of_pixel(
         self, name: str, values: Mapping[str, Any], part: slice = slice(None)
     ) -> Float[np.ndarray, " pix"]:

@@ -104,7 +104,7 @@ def test_pulls_of_laws_and_r(domain, region, r):
         fit = best_fit(like, found.fit.best_fit, priors=prior)
         pulls.append([(fit.best_fit[n] - given.truth[n]) / found.sigma[n] for n in fit.free])
         _, maps = given.components(like, fit.best_fit, data, covariance=False)
-        powers = band_powers(found.spectra, maps[found.components.index("cmb")])[1]
+        powers = band_powers(found.spectra, maps[found.found.components.index("cmb")])[1]
         ratios.append(fit_tensors(model, powers))
     every = np.column_stack([pulls, [(ratio.r - r) / sigma for ratio in ratios]])
     print(f"r = {r}: sigma {sigma:.2g}, mean {every.mean(axis=0)}, scatter {every.std(axis=0)}")

@@ -154,7 +154,7 @@ def separated(settings):
         "sigma": list(found.sigma.values()),
         "chi2": found.fit.chi2,
         "r": [found.tensors.r, found.tensors.sigma],
-        "degradation": found.degradation,
+        "degradation": found.found.mean_degradation("cmb"),
         "powers": found.tensors.powers,
         "maps": found.maps,
         "errors": found.found.sigma("dust"),

@@ -38,7 +38,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
         small = {f"below_{p:g}": float(np.mean(values < p)) for p in (0.05, 0.01, 0.001)}
     results: dict[str, Any] = {
         "domain": settings.separate.domain,
-        "components": found.components,
+        "components": found.found.components,
         "bands": bands,
         "parameters": {
             name: {
@@ -54,7 +54,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
         **{key: fit.to_dict()[key] for key in ("chi2", "dof", "converged", "message")},
         "solver": {key: fit.details[key] for key in ("solver", "steps", "distance")},
         "pixels_with_small_probability": small,
-        "cmb_noise_degradation": found.degradation,
+        "cmb_noise_degradation": found.found.mean_degradation("cmb"),
         "residual_rms": dict(zip(bands, _rms(found.residuals), strict=True)),
         "r": {
             "best_fit": ratio.r,
@@ -119,8 +119,8 @@ def _table(found: Separation) -> ResultTable:
     ]
     if found.left is not None:
         rows.append(("r, shift by foregrounds left", f"{ratio.shift(found.left):+.1e}", ""))
-    degradation = f"{found.degradation:.2f}"
-    rows.append(("noise of CMB, times that without foregrounds", degradation, ""))
+    degradation = found.found.mean_degradation("cmb")
+    rows.append(("noise of CMB, times that without foregrounds", f"{degradation:.2f}", ""))
     header, columns = ("parameter", "best fit", "truth"), 3 if truth else 2
     caption = f"standard deviations; chi2/dof {fit.chi2 / fit.dof:.4f}"
     return ResultTable(header[:columns], [row[:columns] for row in rows], caption)
@@ -235,9 +235,8 @@ def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path
 
 def plot_components(path: Path, found: Separation, settings: Experiment) -> None:
     """Draw Q and U of the components, one row per component."""
-    rows = []
-    drawn = plots.thinned(found.maps, range(len(found.components)))[:, -2:]
-    for name, maps in zip(found.components, drawn, strict=True):
+    names, rows = found.found.components, []
+    for name, maps in zip(names, plots.thinned(found.maps, range(len(names))), strict=True):
         component = found.like.mixing.sky[name]
         nu_ref = getattr(component, "nu_ref", None)
         title = "CMB" if name == "cmb" else name
@@ -250,7 +249,7 @@ def plot_residuals(path: Path, found: Separation, settings: Experiment) -> None:
     """Draw data minus components in a few bands, Q next to U."""
     names, rows, unit = list(found.data.bands), [], settings.separate.unit
     shown = plots.spread(names, SHOWN)
-    drawn = plots.thinned(found.residuals, [names.index(name) for name in shown])[:, -2:]
+    drawn = plots.thinned(found.residuals, [names.index(name) for name in shown])
     for name, maps in zip(shown, drawn, strict=True):
         limit = 3 * float(np.nanstd(maps))
         rows.append(plots.stokes_panels(f"{name}, data less components", maps, limit, unit, 0.0))

@@ -21,18 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fits import pseudo_cl
 from fits.kept import KeptChain, fingerprint, kept_realisations
 from fits.optimize import best_fit
 from fits.posterior import Gaussian, Likelihood, Posterior, Prior, priors_of, value_and_gradient
 from fits.profile_likelihood import SpectralLikelihood
-from fits.pseudo_cl import (
-    LEAST_WINDOW,
-    MaskedSpectra,
-    band_powers,
-    bin_edges,
-    masked_spectra,
-    mean_spectrum,
-)
 from fits.results import Convergence, FitResult, widened
 from fits.sampling import sample
 from fits.separated_data import FullSkyData, PixelData
@@ -43,7 +36,7 @@ from jaxsky.checks import Numeric, check_double
 from jaxsky.cmb import realisation, tensor_spectra
 from jaxsky.experiment import cmb_spectra
 from jaxsky.harmonics import expand, gaussian_beam, needed_lmax, resize, synthesis
-from jaxsky.io.stacks import Maps, Stack, computed, stored
+from jaxsky.io.stacks import Stack, computed, stored
 from jaxsky.mesh import spread
 from jaxsky.noise import stream
 from jaxsky.programs import QUIET, Progress
@@ -130,7 +123,7 @@ class Separation(NamedTuple):
     maps: Float[np.ndarray, "component stokes pix"]
     residuals: Float[np.ndarray, "band stokes pix"]
     simulated: SimulatedNoise
-    spectra: MaskedSpectra
+    spectra: pseudo_cl.MaskedSpectra
     tensors: TensorFit
     left: Float[np.ndarray, " bin"] | None
     chain: FitResult | None
@@ -208,11 +201,11 @@ def separate_data(
     )
     left = None
     if data.foregrounds is not None:
-        alone = cleaned_cmb(data, whole, best, data.foregrounds)
-        left = band_powers(spectra, alone)[1]
+        alone = _cleaned_cmb(data, whole, best, data.foregrounds)
+        left = pseudo_cl.band_powers(spectra, alone)[1]
     sigma, covariance = _errors(data, like, fit, simulated)
     chain = None
-    ratio = fit_tensors(model, band_powers(spectra, maps[row])[1])
+    ratio = fit_tensors(model, pseudo_cl.band_powers(spectra, maps[row])[1])
     if spec.sampler != "none" and len(fit.labels) <= SAMPLED and like.source is None:
         progress.step("posterior")
         chain = _chain(settings, data, like, fit, simulated, out, progress)
@@ -233,19 +226,14 @@ def separate_data(
     )
 
 
-def cleaned_cmb(
-    data: PixelData | FullSkyData,
-    like: SpectralLikelihood,
-    params: Mapping[str, Array],
-    observed: np.ndarray,
-) -> Float[np.ndarray, "stokes pix"] | Maps:
+def _cleaned_cmb(data, like, params, observed):
     """Return the map of the CMB in `observed`, separated with these parameters."""
     found, maps = data.components(like, params, observed, covariance=False)
     return stored(maps[found.components.index("cmb")])
 
 
 def _simulation(data, like, response, emission, spectra, window, lensed, key):
-    """Return the fields of `SimulatedNoise` of one realisation of noise, on foregrounds.
+    """Return `SimulatedNoise` of one realisation of noise, on foregrounds.
 
     `response` is that of the best fit to noise, `emission` the foregrounds in the bands, `window`
     the beam of the maps, and `lensed` C_l of a CMB without tensors up to its end [uK_CMB^2].
@@ -255,32 +243,35 @@ def _simulation(data, like, response, emission, spectra, window, lensed, key):
         noise = data.noise_realisation(key)
         observed = computed(noise.shape, lambda at: emission[..., at] + noise[..., at])
         theta = response.moved(data.likelihood(observed), stream(key, "priors"))
-        alone = cleaned_cmb(data, like, like.named(jnp.asarray(response.theta)), noise)
-        both = cleaned_cmb(data, like, like.named(jnp.asarray(theta)), observed)
+        alone = _cleaned_cmb(data, like, like.named(jnp.asarray(response.theta)), noise)
+        both = _cleaned_cmb(data, like, like.named(jnp.asarray(theta)), observed)
         nside = healpy.npix2nside(both.shape[-1])
         alm = realisation(stream(key, "cmb"), lensed) * expand(jnp.asarray(window))
         alm = resize(alm, max(2, needed_lmax(window)))
-        # Made one by one, since they may be large.
-        every = (
-            lambda: alone,
-            lambda: both[...] - alone[...],
-            lambda: both,
-            lambda: both[...] + synthesis(alm, nside),
-            lambda: synthesis(alm.at[1].set(0.0), nside),
+
+        def BB(maps):
+            return pseudo_cl.band_powers(spectra, maps)[1]
+
+        # Maps are made one by one, since they may be large.
+        return SimulatedNoise(
+            theta=theta - response.theta,
+            noise=BB(alone),
+            residual=BB(both[...] - alone[...]),
+            both=BB(both),
+            total=BB(both[...] + synthesis(alm, nside)),
+            leaked=BB(synthesis(alm.at[1].set(0.0), nside)),
+            spectrum=pseudo_cl.mean_spectrum(spectra.mask, both, spectra.lmax),
         )
-        powers = [band_powers(spectra, maps())[1] for maps in every]
-        mean = mean_spectrum(spectra.mask, both, spectra.lmax)
-        return [theta - response.theta, *powers, mean]
 
 
 def _spectra(
     settings: Experiment, mask: np.ndarray
-) -> tuple[Float[np.ndarray, " ell"], MaskedSpectra]:
+) -> tuple[Float[np.ndarray, " ell"], pseudo_cl.MaskedSpectra]:
     """Return the beam of the maps, and the operator that takes their spectra."""
     how, nside, fwhm = settings.separate, settings.common.nside, settings.common.fwhm
     highest = 2 * nside
     window = np.asarray(gaussian_beam(fwhm, highest))
-    reach = int(np.flatnonzero(window > LEAST_WINDOW).max())
+    reach = int(np.flatnonzero(window > pseudo_cl.LEAST_WINDOW).max())
     # Bins beyond lmax are needed for power that the mask mixes into those below.
     lmax = min(reach, highest - how.width) if how.lmax is None else how.lmax
     if lmax > min(reach, highest - 1):
@@ -293,8 +284,8 @@ def _spectra(
             f"separate: no bin of {how.width} multipoles fits between lmin, {how.lmin}, and {lmax}."
         )
     pure = how.purify and not np.all(mask == 1)
-    edges = bin_edges(how.lmin, lmax, how.width)
-    return window, masked_spectra(mask, edges, window=window, pure=pure)
+    edges = pseudo_cl.bin_edges(how.lmin, lmax, how.width)
+    return window, pseudo_cl.masked_spectra(mask, edges, window=window, pure=pure)
 
 
 def _mark(settings: Experiment, data: PixelData | FullSkyData) -> str:

@@ -180,9 +180,7 @@ def multipoles_of(
     ell, inverse = alm_ell(lmax), np.where(seen, 1 / np.where(seen, window, 1), 0.0)
     short = np.asarray(resize(jnp.asarray(alm), lmax))
     rows = np.where(ell >= lmin, short * inverse[:, None, ell], 0.0)
-    if not np.isfinite(rows).all():
-        bad = int(np.sum(~np.isfinite(alm)))
-        raise ValueError(f"Argument `alm` has {bad} of {alm.size} values that are not finite.")
+    check_finite("alm", rows)
     return Multipoles(lmin, ell, rows, weights)
 
 

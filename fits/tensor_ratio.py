@@ -20,7 +20,7 @@ import scipy.special
 from jaxtyping import Float, Int
 
 from fits.pseudo_cl import MaskedSpectra, derivative_factors, pure_factors
-from jaxsky.checks import check_shape
+from jaxsky.checks import check_finite, check_shape
 from jaxsky.harmonics import alm_to_healpy, analysis, lmax_of
 
 #: Most iterations for r, and the change in standard deviations at which they end.
@@ -289,11 +289,9 @@ def fit_tensors(model: PowerModel, powers: Float[np.ndarray, " bin"]) -> TensorF
     powers : band powers D_b of BB, including noise and residuals [uK_CMB^2]
     """
     powers = np.asarray(powers, float)
-    if powers.shape != model.tensors.shape or not np.isfinite(powers).all():
-        raise ValueError(
-            f"Argument `powers` must be {model.tensors.size} finite numbers, but has shape "
-            f"{powers.shape} and {int(np.sum(~np.isfinite(powers)))} that are not finite."
-        )
+    good, form = powers.shape == model.tensors.shape, f"be {model.tensors.size} finite numbers"
+    check_shape("powers", powers, good, form)
+    check_finite("powers", powers)
     r, before = 0.0, np.inf
     for _ in range(STEPS):
         covariance = model.covariance(r)

@@ -142,4 +142,6 @@ def test_bad_input_is_refused(changes, words):
 def test_powers_that_are_none_are_refused():
     with pytest.raises(ValueError, match=r"`powers` must be 18 finite numbers, .* shape \(2,\)"):
         fit_tensors(model(), np.ones(2))
-    raises(ValueError, "18 that are not finite", fit_tensors, model(), np.full(18, np.nan))
+    raises(
+        ValueError, "18 of 18 values that are not finite", fit_tensors, model(), np.full(18, np.nan)
+    )

@@ -308,12 +308,11 @@ def _full_sky_data(settings, inputs, inside, factors, shared) -> FullSkyData:
         noises[name] = MapNoise(as_observed, noise, correlated)
 
     def coefficients(maps):
-        maps = list(maps)
+        def of_band(pair):
+            own, factor = pair
+            return harmonic_coefficients([np.asarray(own) * factor], lmax)[0]
 
-        def one(i):
-            return harmonic_coefficients([np.asarray(maps[i]) * factors[i]], lmax)[0]
-
-        return np.stack(list(by_turns(one, range(len(maps)))))
+        return np.stack(list(by_turns(of_band, list(zip(maps, factors, strict=True)))))
 
     alone = inputs.foregrounds
     return FullSkyData(

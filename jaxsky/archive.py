@@ -34,10 +34,6 @@ _FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used
 Report = Callable[..., None]
 
 
-class CutError(Exception):
-    """A transfer that ended early; its argument is the number of bytes received."""
-
-
 class RefusedError(Exception):
     """A response that is not the file; its argument says what it is instead."""
 
@@ -46,7 +42,7 @@ class _State(NamedTuple):
     """The origin of a partial file, stored next to it."""
 
     address: str
-    #: The file's strong ETag or modification date, from the server.
+    #: The file's strong ETag or modification date, from the server; "" if it gave neither.
     version: str
     #: Size of the complete file in bytes, None if the server did not say.
     total: int | None
@@ -77,8 +73,7 @@ def _transfer(address: str, part: Path, size: int | None, report: Report) -> Non
             return
         with _get(address, {"Range": f"bytes={have}-", "If-Range": state.version}) as answer:
             if rest := _rest(answer, state, have):
-                _check(answer, part, have, rest.total, size)
-                _receive(answer, part, have, rest.total, report)
+                _receive(answer, part, rest, have, size, report)
                 return
     with _get(address, {}) as answer:
         answer.raise_for_status()
@@ -86,13 +81,8 @@ def _transfer(address: str, part: Path, size: int | None, report: Report) -> Non
             raise RefusedError(f"answers {answer.status_code}")
         text = answer.headers.get("Content-Length", "")
         plain = text.isdecimal() and "Transfer-Encoding" not in answer.headers
-        total = int(text) if plain else None
-        _check(answer, part, 0, total, size)
-        discard(part)
-        if version := _version(answer):
-            state = _State(address, version, total)
-            part.with_name(f"{part.name}.json").write_text(json.dumps(state._asdict()))
-        _receive(answer, part, 0, total, report)
+        state = _State(address, _version(answer), int(text) if plain else None)
+        _receive(answer, part, state, 0, size, report)
 
 
 def _rest(answer: requests.Response, state: _State, have: int) -> _State | None:
@@ -105,7 +95,7 @@ def _rest(answer: requests.Response, state: _State, have: int) -> _State | None:
         return None
     total = state.total if found[2] == "*" else int(found[2])
     dated = not state.version.startswith('"')  # a date need not be repeated, an ETag must
-    same = _version(answer) in (None if dated else state.version, state.version)
+    same = _version(answer) in ("" if dated else state.version, state.version)
     fits = int(found[1]) == have and state.total in (None, total)
     return state._replace(total=total) if same and fits else None
 
@@ -131,17 +121,22 @@ def _stay_safe(answer: requests.Response, **_: object) -> None:
             raise RefusedError(f"sends on to {there}, which is not https")
 
 
-def _version(answer: requests.Response) -> str | None:
-    """Return what identifies this version of the file: a strong ETag, else the date."""
+def _version(answer: requests.Response) -> str:
+    """Return what identifies this version of the file: a strong ETag, else the date, or ""."""
     tag = answer.headers.get("ETag", "")
-    return tag if tag.startswith('"') else answer.headers.get("Last-Modified")
+    return tag if tag.startswith('"') else answer.headers.get("Last-Modified", "")
 
 
-def _check(
-    answer: requests.Response, part: Path, have: int, total: int | None, size: int | None
+def _receive(
+    answer: requests.Response,
+    part: Path,
+    state: _State,
+    have: int,
+    size: int | None,
+    report: Report,
 ) -> None:
-    """Refuse, before the transfer, a file that is compressed, of the wrong size, or too large."""
-    encoding = answer.headers.get("Content-Encoding", "identity")
+    """Receive a file, or the rest of one after `have` bytes, unless it cannot be the right one."""
+    total, encoding = state.total, answer.headers.get("Content-Encoding", "identity")
     if encoding not in ("", "identity"):
         raise RefusedError(f"sends the file compressed ({encoding}), unasked")
     if size is not None and total not in (None, size):
@@ -150,28 +145,29 @@ def _check(
     if total is not None and total - have > free:
         more = f"{in_words(free)} are free, but {part.stem} takes {in_words(total - have)} more"
         raise DownloadError(f"{part.parent}: {more}; make room, or give another --dir.")
-
-
-def _receive(
-    answer: requests.Response, part: Path, have: int, total: int | None, report: Report
-) -> None:
+    if not have:
+        discard(part)
+        if state.version:
+            part.with_name(f"{part.name}.json").write_text(json.dumps(state._asdict()))
     report(completed=have, total=total)
     # Keep the bytes received before a connection breaks.
     answer.raw.enforce_content_length = False
+    ended = False
     with part.open("ab" if have else "wb") as file:
-        while True:
+        while not ended:
             try:
                 chunk = answer.raw.read1(CHUNK, decode_content=False)
             except (urllib3.exceptions.HTTPError, OSError):
-                raise CutError(have) from None
-            if not chunk:
                 break
             file.write(chunk)
             file.flush()
-            have += len(chunk)
+            have, ended = have + len(chunk), not chunk
             report(completed=have, total=total)
-    if total is not None and have != total:
-        raise CutError(have)
+    if not ended or total not in (None, have):
+        raise DownloadError(
+            f"{part.stem}: the transfer from {state.address} ended early, after {have} bytes; "
+            "fetch it again to resume."
+        )
 
 
 def _reason(error: requests.RequestException) -> str:
@@ -294,11 +290,6 @@ def _download(product: Product, part: Path, report: Report) -> None:
             discard(part)
             said = str(error).replace(str(part), product.name).rstrip(".")
             failures.append(f"{address} sent another file ({said})")
-        except CutError as cut:
-            raise DownloadError(
-                f"{product.name}: the transfer from {address} ended early, after {cut} bytes; "
-                "fetch it again to resume."
-            ) from None
         except requests.RequestException as error:
             failures.append(f"{address} {_reason(error)}")
         except (RefusedError, urllib3.exceptions.HTTPError) as error:

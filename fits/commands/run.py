@@ -297,45 +297,14 @@ def print_error(error: Exception) -> None:
     console.print(message, soft_wrap=True)
 
 
-class _Interrupts:
-    """State of Ctrl-C: whether it was pressed, whether that was said, and in which words."""
-
-    def __init__(self) -> None:
-        self.pressed, self.seen, self.words = threading.Event(), threading.Event(), "Stopped."
-
-    def watch(self, reader: socket.socket) -> None:
-        """Wait for Ctrl-C, then make sure that the process ends."""
-        while signal.SIGINT not in (received := reader.recv(64)):
-            if not received:  # the command has ended
-                return
-        self.pressed.set()
-        for _ in range(REPETITIONS):
-            if not self.seen.wait(PATIENCE):
-                _thread.interrupt_main()
-        threading.Event().wait(PATIENCE)  # time for the interpreter to exit
-        self.say()
-        console.show_cursor()
-        os._exit(130)
-
-    def say(self) -> None:
-        """Print that the command was stopped, once."""
-        if not self.seen.is_set():
-            self.seen.set()
-            console.print(self.words)
-
-    def caused(self, error: BaseException) -> bool:
-        """Return True if an error is Ctrl-C, or what typer or another library turned it into."""
-        if not isinstance(error, Exception):
-            return isinstance(error, KeyboardInterrupt) or getattr(error, "code", 0) == 130
-        return self.pressed.wait(MOMENT)  # the thread may hear of it only now
-
-
-_current = _Interrupts()
+#: What Ctrl-C prints.
+_words = ""
 
 
 def if_stopped(words: str) -> None:
     """Set the words that Ctrl-C prints after "Stopped" from now on."""
-    _current.words = f"Stopped{words}."
+    global _words
+    _words = f"Stopped{words}."
 
 
 def _unraisable(error: "sys.UnraisableHookArgs") -> None:
@@ -353,24 +322,48 @@ def interruptible() -> Iterator[None]:
     are printed or turned into others. So a second thread also watches for the signal.
     Files on disk are complete at any moment, so that a run stopped in this way can be resumed.
     """
-    global _current
-    _current = interrupts = _Interrupts()
+    if_stopped("")
+    pressed, said = threading.Event(), threading.Event()
     reader, writer = socket.socketpair()
     writer.setblocking(False)
+
+    def say() -> None:
+        if not said.is_set():
+            said.set()
+            console.print(_words)
+
+    def watch() -> None:
+        """Wait for Ctrl-C, then make sure that the process ends."""
+        while signal.SIGINT not in (received := reader.recv(64)):
+            if not received:  # the command has ended
+                return
+        pressed.set()
+        for _ in range(REPETITIONS):
+            if not said.wait(PATIENCE):
+                _thread.interrupt_main()
+        threading.Event().wait(PATIENCE)  # time for the interpreter to exit
+        say()
+        console.show_cursor()
+        os._exit(130)
+
     before, sys.unraisablehook = sys.unraisablehook, _unraisable
     descriptor = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-    threading.Thread(target=interrupts.watch, args=(reader,), daemon=True).start()
+    threading.Thread(target=watch, daemon=True).start()
     try:
         yield
     except BaseException as error:
-        if not interrupts.caused(error):
+        if isinstance(error, Exception):  # a library made it of Ctrl-C, if one comes by now
+            stopped = pressed.wait(MOMENT)
+        else:  # typer makes an exit of it
+            stopped = isinstance(error, KeyboardInterrupt) or getattr(error, "code", 0) == 130
+        if not stopped:
             raise
-        interrupts.say()
+        say()
         sys.exit(130)
     finally:
         # While the interpreter exits, nothing is left to stop and nobody catches an exception.
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
-        if not interrupts.pressed.is_set():
+        if not pressed.is_set():
             signal.set_wakeup_fd(descriptor)
             sys.unraisablehook = before
             writer.close()

@@ -3,6 +3,7 @@
 import html.parser
 import json
 from pathlib import Path
+from unittest import mock
 
 import healpy
 import jax
@@ -56,7 +57,8 @@ def make_figures(settings, out, only=(), *, overwrite=False, steps=STEPS) -> lis
     """As the command does in its folder."""
     out.mkdir(parents=True, exist_ok=True)
     command = Run(settings, out, True, overwrite, (), Folder(out, ALL), Quiet(), ALL, None)
-    return paper.make_figures(settings, command, only, steps)
+    with mock.patch.object(paper, "STEPS", steps):
+        return paper.make_figures(settings, command, only)
 
 
 @pytest.fixture(scope="module")

@@ -50,9 +50,9 @@ STEPS: dict[str, Make] = {
 }
 
 
-def labels_of(words: Iterable[str], known: Iterable[str] = STEPS) -> list[str]:
+def labels_of(words: Iterable[str]) -> list[str]:
     """Return labels of figures, in order, from numbers or labels; all if none are given."""
-    labels, wanted = {label.lower(): label for label in known}, set()
+    labels, wanted = {label.lower(): label for label in STEPS}, set()
     for word in words:
         name = " ".join(word.lower().split())
         name = f"figure {name}" if name.isdigit() else name
@@ -64,17 +64,14 @@ def labels_of(words: Iterable[str], known: Iterable[str] = STEPS) -> list[str]:
     return [label for label in labels.values() if not wanted or label in wanted]
 
 
-def make_figures(
-    settings: Experiment, command: Run, only: Iterable[str], steps: Mapping[str, Make] = STEPS
-) -> list[PaperFigure]:
+def make_figures(settings: Experiment, command: Run, only: Iterable[str]) -> list[PaperFigure]:
     """Make the missing figures and tables, and `index.html`, which shows all that exist.
 
-    `only` lists numbers or labels of figures; `steps` has the function that makes each. With
-    --overwrite, the wanted figures are made again; others in the folder are kept if they were made
-    with these settings, and otherwise removed once the first new figure is there. Returns all
-    figures of the page, new and old.
+    `only` lists numbers or labels of figures. With --overwrite, the wanted figures are made again;
+    others in the folder are kept if they were made with these settings, and otherwise removed once
+    the first new figure is there. Returns all figures of the page, new and old.
     """
-    out, overwrite, wanted = command.out, command.overwrite, labels_of(only, steps)
+    out, overwrite, wanted = command.out, command.overwrite, labels_of(only)
     mark = settings.model_dump(mode="json", exclude_none=True)
     figures, other = _kept(out, mark, overwrite)
     command.steps.keep(command.log)  # not `begin`: old figures are replaced one by one
@@ -90,7 +87,7 @@ def make_figures(
         command.steps.advance(done, len(todo))
         start = time.perf_counter()
         try:
-            figure = steps[label](paper, out / picture_of(label))
+            figure = STEPS[label](paper, out / picture_of(label))
         except Impossible as reason:
             figure = PaperFigure(label, Section(f"{label}: not made", note=f"Not made: {reason}"))
         for name in other - {figure.section.picture}:
@@ -98,12 +95,12 @@ def make_figures(
         other = set()
         figures[label] = figure._replace(seconds=round(time.perf_counter() - start, 1))
         write_text(out / KEPT, FILE.dump_json((mark, list(figures.values())), indent=2).decode())
-        _write_page(paper, out, figures, steps)
+        _write_page(paper, out, figures)
         if OBSERVED.isdisjoint(todo[done + 1 :]):
             paper.forget_bands()
         # Figures have no compiled programs in common, and the memory of these adds up.
         forget_programs()
-    shown = _write_page(paper, out, figures, steps)
+    shown = _write_page(paper, out, figures)
     write_log(out / CIRCUMSTANCES, settings, command.steps.seconds)
     return shown
 
@@ -131,10 +128,10 @@ def _kept(
 
 
 def _write_page(
-    paper: PaperSky, out: Path, figures: Mapping[str, PaperFigure], order: Iterable[str]
+    paper: PaperSky, out: Path, figures: Mapping[str, PaperFigure]
 ) -> list[PaperFigure]:
     """Write the page of all figures in order and the table of their numbers; return these."""
-    shown = [figures[label] for label in order if label in figures]
+    shown = [figures[label] for label in STEPS if label in figures]
     rows: list[Row] = [(n.what, n.paper, n.ours, n.note, f.label) for f in shown for n in f.numbers]
     if rows:
         table = ResultTable(("quantity", "paper", "here", "about it", "see"), rows)

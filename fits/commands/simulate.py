@@ -56,8 +56,6 @@ def make_realisations(settings: Experiment, command: Run, *, only: str | None) -
             now = time.perf_counter()
             seconds.append(now - before)
             before = now
-    if command.executor is not None:
-        command.folder.clean()  # of files that workers which died have not finished
     if settings.simulate.sheet:
         steps.step("drawing")
         shown = montecarlo.paths(out, names, indices.start)

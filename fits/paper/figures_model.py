@@ -44,14 +44,12 @@ UNIT = plots.UNITS["uK_RJ"]
 
 def figure_templates(paper: PaperSky, picture: Path) -> PaperFigure:
     """Figure 1: Q of both templates."""
-    rows, beams = [], {}
-    for name in ("dust", "synchrotron"):
-        layer = paper.template(name)
-        beams[name] = layer.fwhm
+    rows, layers = [], {name: paper.template(name) for name in ("dust", "synchrotron")}
+    for name, layer in layers.items():
         title = f"{name}, $Q$, {float(layer.component.nu_ref):g} GHz"
         rows.append([plots.MapPanel(title, np.asarray(layer.maps[0]), UNIT)])
     plots.plot_maps(picture, rows)
-    return paper.described("Figure 1", beams=beams)
+    return paper.described("Figure 1", layers=layers)
 
 
 def figure_indices(paper: PaperSky, picture: Path) -> PaperFigure:

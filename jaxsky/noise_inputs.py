@@ -12,7 +12,6 @@ from jaxsky.inputs import narrow, read
 from jaxsky.io import Maps, unit_factor
 from jaxsky.io.columns import stokes_of
 from jaxsky.noise import (
-    COVARIANCE_COLUMNS,
     check_covariance,
     covariance_from_columns,
     hits_covariance,
@@ -21,12 +20,6 @@ from jaxsky.noise import (
 )
 from jaxsky.settings import MapFile, MapKeys, NoiseColumns, NoiseTable, SettingsError, at_key
 
-#: Stokes parameters of the columns of a kind of noise, by their number; hits have none.
-COLUMNS: dict[str, dict[int, tuple[str, ...]]] = {
-    "rms": {2: ("QQ", "UU"), 3: ("II", "QQ", "UU")},
-    "covariance": COVARIANCE_COLUMNS,
-    "weights": COVARIANCE_COLUMNS,
-}
 #: Noise outside this range, relative to the rms of its map, is refused unless confirmed.
 PLAUSIBLE = (1e-6, 10.0)
 
@@ -148,7 +141,7 @@ def _read_columns(
     number = max(tables, len(fields))
     if kind == "rms" and not fields and tables == 1:
         number = len(read(folder, columns).names)
-    wanted = COLUMNS.get(kind, {}).get(number, ())
+    wanted = NoiseTable.COLUMNS.get(kind, {}).get(number, ())
     named = [stokes_of(name) if isinstance(name, str) else None for name in fields]
     if any(s is not None and w not in (s, s * 2) for s, w in zip(named, wanted, strict=False)):
         expected = ", ".join(w[0] if kind == "rms" else w for w in wanted)

@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from jaxsky.bandpass import UNITS
 from jaxsky.checks import listed
 from jaxsky.io.columns import parse_stokes
+from jaxsky.noise import COVARIANCE_COLUMNS
 from jaxsky.settings.types import FileName, MistakeAt, Positive, SettingsTable, Several, valid
 
 Files = FileName | Annotated[list[FileName], Field(min_length=1)]
@@ -130,11 +131,11 @@ class NoiseTable(SettingsTable):
     KINDS: ClassVar[tuple[str, ...]] = (
         "level", "rms", "covariance", "hits", "weights", "estimate_above"
     )  # fmt: skip
-    #: The columns that have to be named for each kind.
-    COLUMNS: ClassVar[dict[str, str]] = {
-        "covariance": "QQ, QU, UU or II, IQ, IU, QQ, QU, UU",
-        "hits": "N_OBS",
-        "weights": "QQ, QU, UU",
+    #: Stokes parameters of the columns of a kind, by their number; hits have none.
+    COLUMNS: ClassVar[dict[str, dict[int, tuple[str, ...]]]] = {
+        "rms": {2: ("QQ", "UU"), 3: ("II", "QQ", "UU")},
+        "covariance": COVARIANCE_COLUMNS,
+        "weights": {3: COVARIANCE_COLUMNS[3]},
     }
 
     level: float | None = Field(None, ge=0)
@@ -153,7 +154,7 @@ class NoiseTable(SettingsTable):
         self.one_of("noise", self.KINDS)
         if self.correlated and self.estimate_above is None:
             raise ValueError("correlated goes with estimate_above only")
-        for kind in ("rms", *self.COLUMNS):
+        for kind in self.KINDS:
             if isinstance(spec := getattr(self, kind), NoiseColumns):
                 self._check_columns(kind, spec)
         return self
@@ -167,10 +168,11 @@ class NoiseTable(SettingsTable):
             if spec.file is None and not spec.fields:
                 raise MistakeAt("rms.file", "is missing, or fields of the map's own file")
             return
-        choices = self.COLUMNS[kind].split(" or ")
-        if len(spec.fields or []) not in [len(choice.split(", ")) for choice in choices]:
+        choices = self.COLUMNS.get(kind, {1: ("N_OBS",)})
+        if len(spec.fields or []) not in choices:
+            wanted = " or ".join(map(", ".join, choices.values()))
             named = ", ".join(map(str, spec.fields or [])) or "none"
-            raise MistakeAt(f"{kind}.fields", f"name the columns {self.COLUMNS[kind]}, not {named}")
+            raise MistakeAt(f"{kind}.fields", f"name the columns {wanted}, not {named}")
 
 
 class SeenKeys(BeamedKeys):

@@ -184,16 +184,9 @@ def read_template_noise(
         level = noise.level * reading.uK_RJ_per(noise.unit or template.unit, spec.nu_ref, where)
         spectrum = level_spectrum(level, template.fwhm, 4 * nside)
         return TemplateNoise(correlated=spectrum, shared=noise.shared)
+    maps = template.component.amplitude
     found, _ = read_noise(
-        folder,
-        noise,
-        spec.nu_ref,
-        nside,
-        where,
-        template.unit,
-        own=spec,
-        maps=template.component.amplitude,
-        used=template.used,
+        folder, spec, spec.nu_ref, nside, where, template.unit, maps=maps, used=template.used
     )
     return TemplateNoise(found, shared=noise.shared)
 
@@ -323,9 +316,7 @@ def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -
         with at_key(f"{where}.estimate_above"):
             noise, correlated = _estimated_noise(spec.noise, maps, used)
     else:
-        noise, known = read_noise(
-            folder, spec.noise, bandpass, nside, where, unit, own=spec, maps=maps, used=used
-        )
+        noise, known = read_noise(folder, spec, bandpass, nside, where, unit, maps=maps, used=used)
         maps, used = maps if known.all() else jnp.where(known, maps, 0), used & known
     return Band(maps, used, bandpass, beam, noise, correlated, leakage)
 

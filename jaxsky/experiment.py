@@ -200,16 +200,16 @@ def read_channel(
         raise SettingsError(f"{where}: give the beam either as fwhm or as a window, beam.")
     noise: Array | float | None = None
     if given is not None and noisy:
-        where, own = f"{where}.noise", None if spec.file is None else spec
+        where = f"{where}.noise"
         if given.estimate_above is not None:
             raise SettingsError(f"{where}.estimate_above: is of a map, but here none is read.")
-        with_unit = isinstance(given.rms, NoiseColumns) or given.covariance or own is None
+        with_unit = isinstance(given.rms, NoiseColumns) or given.covariance or spec.file is None
         unit = given.unit or spec.unit or ("uK_CMB" if with_unit else None)
         if unit is None:
             raise SettingsError(
                 f"{where}.unit: is missing; it is that of the map, which is not read here."
             )
-        noise, known = read_noise(folder, given, band, nside, where, unit, stokes, own=own)
+        noise, known = read_noise(folder, spec, band, nside, where, unit, stokes)
         if missing := int(np.sum(~known)):
             raise SettingsError(
                 f"{where}: {missing} pixels have no noise; a simulation takes maps of the full sky."

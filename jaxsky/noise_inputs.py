@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsky.bandpass import Bandpass
 from jaxsky.inputs import narrow, read
-from jaxsky.io import Maps, unit_factor
+from jaxsky.io import unit_factor
 from jaxsky.io.columns import stokes_of
 from jaxsky.noise import (
     check_covariance,
@@ -18,7 +18,7 @@ from jaxsky.noise import (
     rms_covariance,
     weights_covariance,
 )
-from jaxsky.settings import MapFile, MapKeys, NoiseColumns, NoiseTable, SettingsError, at_key
+from jaxsky.settings import MapFile, NoiseTable, SeenKeys, SettingsError, at_key
 
 #: Noise outside this range, relative to the rms of its map, is refused unless confirmed.
 PLAUSIBLE = (1e-6, 10.0)
@@ -26,34 +26,35 @@ PLAUSIBLE = (1e-6, 10.0)
 
 def read_noise(
     folder: Path,
-    noise: NoiseTable,
+    own: SeenKeys,
     at: Bandpass | float | None,
     nside: int,
     where: str,
     unit: str,
     stokes: str = "QU",
     *,
-    own: MapKeys | None = None,
     maps: Float[Array, "stokes pix"] | None = None,
     used: Bool[np.ndarray, " pix"] | None = None,
 ) -> tuple[Array | float, Bool[np.ndarray, " pix"]]:
-    """Return the noise of a map, and where it is known (not in pixels without hits).
+    """Return the noise in the table of a map, and where it is known (not in pixels without hits).
 
     The noise is a level [uK_RJ arcmin] if the settings give a number, else the covariance of each
     pixel [uK_RJ^2], 0 where it is unknown.
 
     `at` is the frequency [GHz] or band of the map. Level, rms and sigma0 are in the map's `unit`
-    unless the noise has its own; `own` is the map's file, which may contain columns of noise. The
+    unless the noise has its own; the map's `own` table may name a file with columns of noise. The
     noise is checked against the rms of `maps` [uK_RJ] in `used` pixels. `where` is the settings
     key.
     """
+    noise = own.noise
+    assert noise is not None  # callers have checked
     unit = noise.unit or unit
     found: Array | float
     with at_key(where):
         factor, pixel = unit_factor(unit, "uK_RJ", at), healpy.nside2resol(nside, arcmin=True)
         level = noise.rms * pixel if isinstance(noise.rms, float) else noise.level
         if level is None:
-            pixels, known = _covariance(folder, noise, at, nside, stokes, where, factor, own)
+            pixels, known = _covariance(folder, own, at, nside, stokes, where, factor)
             check_covariance("noise", pixels if known.all() else pixels[..., known])
             found = pixels if known.all() else jnp.where(known, pixels, 0.0)
         else:
@@ -86,11 +87,11 @@ def _check_plausible(where, noise, maps, inside, factor, unit):
             )
 
 
-def _covariance(folder, noise, at, nside, stokes, where, factor, own):
+def _covariance(folder, own, at, nside, stokes, where, factor):
     """Return a covariance as in `read_noise`, with arbitrary values where it is not known."""
-    n, (kind,) = len(stokes), noise.changed(noise.KINDS)
-    spec, where = getattr(noise, kind), f"{where}.{kind}"
-    found = _read_columns(folder, spec, own, kind, noise.unit, where)
+    n, (kind,) = len(stokes), own.noise.changed(own.noise.KINDS)
+    spec, where = getattr(own.noise, kind), f"{where}.{kind}"
+    found = _read_columns(folder, own, spec, kind, where)
     if found.nside != nside:
         raise SettingsError(f"{where}: nside is {found.nside}, but that of the map is {nside}.")
     given, known = found.unit, np.asarray(found.mask)
@@ -119,17 +120,16 @@ def _covariance(folder, noise, at, nside, stokes, where, factor, own):
     return hits_covariance(sigma0, jnp.where(known, maps[0], 1.0), n), known
 
 
-def _read_columns(
-    folder: Path, spec: NoiseColumns, own: MapKeys | None, kind: str, unit: str | None, where: str
-) -> Maps:
+def _read_columns(folder, own, spec, kind, where):
     """Read the columns of a kind of noise, from the map's file if they have none of their own."""
     said = spec.model_dump(exclude={"sigma0"}, exclude_none=True)
+    unit = own.noise.unit
     # Hits and weights are numbers, whatever the header calls them.
     implied = {"rms": unit, "covariance": unit and f"{unit}^2"}.get(kind, "")
     if implied is not None:
         said.setdefault("unit", implied)
     if spec.file is None:
-        if own is None:
+        if own.file is None:
             raise SettingsError(f"{where}: file is missing.")
         if len(own.files) > 1 or (isinstance(own.hdu, list) and spec.hdu is None):
             raise SettingsError(f"{where}: the map has several files or HDUs; give file and hdu.")

@@ -10,7 +10,15 @@ from jaxsky.bandpass import Bandpass
 from jaxsky.inputs import bandpass_of, read, read_sky, set_parameters_of
 from jaxsky.io import InputError
 from jaxsky.noise_inputs import read_noise
-from jaxsky.settings import BandTable, Experiment, MapFile, NoiseTable, SettingsError, load
+from jaxsky.settings import (
+    BandTable,
+    Experiment,
+    MapFile,
+    NoiseTable,
+    SeenKeys,
+    SettingsError,
+    load,
+)
 from mapfiles import table, write
 from refusals import cases, raises
 
@@ -77,8 +85,9 @@ WMAP = MapFile(
 
 
 def noise_of(folder, spec, stokes="QU", unit="K_CMB", own=None):
-    noise = NoiseTable.model_validate(spec)
-    return read_noise(folder, noise, BAND, NSIDE, "noise", unit, stokes, own=own)
+    file = {} if own is None else own.model_dump(exclude_none=True)
+    table = SeenKeys(**file, noise=NoiseTable.model_validate(spec))
+    return read_noise(folder, table, BAND, NSIDE, "noise", unit, stokes)
 
 
 def others():

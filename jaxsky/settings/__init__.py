@@ -1,7 +1,7 @@
 """The experiment file: its tables, error messages, and the files that it names."""
 
 from jaxsky.settings.experiment import CommonTable, Experiment, RadioIndexMap, parse_region
-from jaxsky.settings.files import BeamedMap, MapFile, MapKeys, NoiseColumns, NoiseTable
+from jaxsky.settings.files import BeamedMap, MapFile, MapKeys, NoiseColumns, NoiseTable, SeenKeys
 from jaxsky.settings.tables import BandTable, ComponentTable, RegionsTable, SmallScalesTable
 from jaxsky.settings.toml import (
     at_key,

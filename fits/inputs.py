@@ -131,14 +131,10 @@ def inputs_of(
         names = settings.modelled()
         sky, description = reading.read_sky(settings, names=names, galaxy=galaxy, number=many)
 
-    def read(spec: BandTable) -> tuple[str, Band, Mapping[str, float] | None]:
-        band, truth = _from_file(settings, spec)
-        return str(spec.name), band.of_many(many), truth
-
     filed = [s for s in settings.bands if s.file is not None or settings.common.maps is not None]
-    found = list(by_turns(read, filed))
-    bands = {name: band for name, band, _ in found}
-    truths, alone = [truth for *_, truth in found], None
+    found = list(by_turns(partial(_from_file, settings), filed))
+    bands = {str(spec.name): band for spec, (band, _) in zip(filed, found, strict=True)}
+    truths, alone = [truth for _, truth in found], None
     if missing := [str(spec.name) for spec in settings.bands if str(spec.name) not in bands]:
         if "noise" not in settings.included():
             raise SettingsError("simulate.include: leaves out the noise, which errors are made of.")
@@ -255,25 +251,26 @@ def _leakage_of(observed: Observed | None, used: Bool[np.ndarray, " pix"]) -> Le
 
 def _from_file(settings: Experiment, spec: BandTable) -> tuple[Band, Mapping[str, float] | None]:
     """Read a band from its file, or from simulated maps, and the true parameters of its sky."""
-    folder, where = Path(settings.data_dir), f"bands.{spec.name}"
+    folder = Path(settings.data_dir)
     if spec.file is not None:
         observed = read_observed(find_file(folder, spec.files[0]))
         if observed is not None:
-            _check_beam(folder, spec, observed, where)
-        return read_band(folder, spec, observed), None if observed is None else observed.truth
-    name = f"{settings.common.maps}/{spec.name}.fits"
-    try:
-        observed = read_observed(find_file(folder, name))
-    except MissingFileError as error:
-        raise SettingsError(f"common.maps: {error}") from None
-    if observed is None:
-        raise SettingsError(f"common.maps: {name} was not written by jaxsky simulate.")
-    # The file describes its map, which may have another beam than the band.
-    plain = BandTable(name=spec.name, file=name, fields=["Q", "U"])
-    return read_band(folder, plain, observed), observed.truth
+            _check_beam(folder, spec, observed)
+    else:
+        name = f"{settings.common.maps}/{spec.name}.fits"
+        try:
+            observed = read_observed(find_file(folder, name))
+        except MissingFileError as error:
+            raise SettingsError(f"common.maps: {error}") from None
+        if observed is None:
+            raise SettingsError(f"common.maps: {name} was not written by jaxsky simulate.")
+        # The file describes its map, which may have another beam than the band.
+        spec = BandTable(name=spec.name, file=name, fields=["Q", "U"])
+    band = read_band(folder, spec, observed).of_many(len(settings.bands))
+    return band, None if observed is None else observed.truth
 
 
-def _check_beam(folder: Path, spec: BandTable, observed: Observed, where: str) -> None:
+def _check_beam(folder: Path, spec: BandTable, observed: Observed) -> None:
     """Refuse a beam that differs from that of the simulated map."""
     own = np.asarray(observed.beam)
     given = reading.beam_of(folder, spec, own.size - 1)
@@ -281,7 +278,7 @@ def _check_beam(folder: Path, spec: BandTable, observed: Observed, where: str) -
         return
     said = f"fwhm: {spec.fwhm:g} arcmin" if spec.beam is None else f"beam: {spec.beam}"
     raise SettingsError(
-        f"{where}.{said}, but the map {spec.label} says that its beam is "
+        f"bands.{spec.name}.{said}, but the map {spec.label} says that its beam is "
         f"{'another table' if own.ndim else f'{own:g} arcmin'}."
     )
 

@@ -292,12 +292,11 @@ class Experiment(SettingsTable):
     def left_out(self, command: str) -> list[str]:
         """Return warnings about settings of free parameters that a command ignores."""
         here = self.free_in(command)
+        others = [n for n in self.free if n not in here]
         regions = [n for n, one in here.items() if one.regions and command != "separate"]
         uniform = [n for n, one in here.items() if one.uniform and command == "forecast"]
         parts = {
-            "Not free here, as jaxsky {} does not have them": [
-                n for n in self.free if n not in here
-            ],
+            "Not free here, as jaxsky {} does not have them": others,
             "One value for all, as jaxsky {} does not have regions of parameters": regions,
             "Without a prior, as jaxsky {} does not have uniform ones": uniform,
         }

@@ -324,7 +324,6 @@ class FreeParameter(SettingsTable):
             self.start = self.gaussian[0] if self.gaussian else sum(self.uniform or ()) / 2
         return self
 
-    def numbers(self) -> list[float]:
-        """Return all values that it contains, to check their sign."""
-        said = (self.start, self.gaussian and self.gaussian[0], self.uniform and self.uniform[1])
-        return [number for number in said if number is not None]
+    def numbers(self) -> list[float | None]:
+        """Return the values that it contains, or None, to check their sign."""
+        return [self.start, self.gaussian and self.gaussian[0], self.uniform and self.uniform[1]]

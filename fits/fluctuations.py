@@ -66,9 +66,7 @@ class MapNoise(NamedTuple):
             before = empty((count, 2, npix), covariance.dtype)
         for own, row in enumerate(rows):
             if before is not None:
-                before[own] = np.asarray(
-                    self.preparation.transpose(loaded(row)).block_until_ready()
-                )
+                before[own] = np.asarray(self.preparation.transpose(loaded(row)))
             if modes is not None:
                 modes[own] = np.asarray(_modes(row, spectra))
         if before is not None:

@@ -344,8 +344,7 @@ def modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
     """Return laws, on one pixel, or on all if parameters are maps; and where these are known."""
     folder, nside = Path(settings.data_dir), settings.common.nside
     laws = {name: settings.sky.components[name] for name in settings.modelled()}
-    given = laws.values()
-    maps = any(isinstance(value, MapFile) for c in given for value in c.parameters.values())
+    maps = any(isinstance(value, MapFile) for c in laws.values() for value in c.parameters.values())
     amplitude = jnp.ones((2, 12 * nside**2 if maps else 1))
     components: dict[str, Component] = {"cmb": component_class("cmb")(amplitude)}
     known = np.ones(12 * nside**2, bool)

@@ -147,7 +147,7 @@ def read_sky(
     *,
     names: Collection[str] | None = None,
     galaxy: EmbeddedSky | None = None,
-    number: int | None = None,
+    number: int = 0,
 ) -> tuple[dict[str, Template], str]:
     """Read the components named `names` (default: all) as templates [uK_RJ], in order.
 
@@ -174,8 +174,7 @@ def read_sky(
         spec = tables[name]
         if spec.file is not None:
             known[name] = _read_template(folder, name, spec, known, stokes, dtype)
-        if number is not None:
-            known[name] = of_many(known[name], number)
+        known[name] = of_many(known[name], number)
     found = {name: known[name] for name in wanted}
     with at_key("fixed"):
         return set_parameters_of(found, settings.fixed, tables), description

@@ -19,6 +19,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from jaxsky.arrays import Alm, Covariance, Map, Spectrum, StokesMaps
 from jaxsky.checks import Numeric, as_array, check_finite, check_seed, check_shape, is_concrete
 from jaxsky.harmonics import analysis, children, expand, power_spectrum
+from jaxsky.io.stacks import ranges
 
 #: Pixels checked at once.
 PIECE = 1 << 20
@@ -150,8 +151,7 @@ def draw_in_pieces(key: Array, covariance: Any) -> StokesMaps:
     _, stokes, npix = covariance.shape
     white = stokes_noise(key, stokes, npix, float)
     found = np.empty(white.shape)
-    for start in range(0, npix, PIECE):
-        part = slice(start, start + PIECE)
+    for part in ranges(npix, PIECE):
         piece = jnp.asarray(covariance[..., part], float)
         found[:, part] = _correlated(piece, white[:, part], False)
     return jnp.asarray(found)
@@ -288,6 +288,6 @@ def check_covariance(name: str, covariance: Covariance) -> None:
     if not is_concrete(covariance):
         return
     npix = covariance.shape[-1]
-    pieces = (covariance[..., start : start + PIECE] for start in range(0, npix, PIECE))
+    pieces = (covariance[..., part] for part in ranges(npix, PIECE))
     if bad := sum(int(_number_indefinite(piece)) for piece in pieces):
         raise ValueError(f"Argument `{name}` is not positive definite in {bad} of {npix} pixels.")

@@ -67,16 +67,7 @@ class Stack:
 
     def __init__(self, shape: tuple[int, ...], dtype: Any = float) -> None:
         self.shape, self.dtype = tuple(shape), np.dtype(dtype)
-
-    @property
-    def ndim(self) -> int:
-        """Number of axes."""
-        return len(self.shape)
-
-    @property
-    def size(self) -> int:
-        """Number of values."""
-        return int(np.prod(self.shape))
+        self.ndim, self.size = len(self.shape), int(np.prod(self.shape))
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -92,10 +83,19 @@ class Stack:
 
 
 class Stored(Stack):
-    """An array in a scratch file; what is read of it does not stay in memory."""
+    """An array in a scratch file; what is read of it does not stay in memory.
 
-    def __init__(self, shape: tuple[int, ...], dtype: Any = float) -> None:
+    With `path`, the file is that of another process, which removes it.
+    """
+
+    def __init__(
+        self, shape: tuple[int, ...], dtype: Any = float, path: Path | None = None
+    ) -> None:
         super().__init__(shape, dtype)
+        if path is not None:
+            self.path = path
+            self._open(os.O_RDWR)
+            return
         check_guards()
         place = _place[-1] if _place else Path(tempfile.gettempdir())
         self.path = (place / partial(f"{next(_number)}.maps")).absolute()
@@ -120,7 +120,7 @@ class Stored(Stack):
         weakref.finalize(self, os.close, self._file)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _attached, (self.path, self.shape, self.dtype)
+        return Stored, (self.shape, self.dtype, self.path)
 
     def _block(self, index: Any) -> tuple[int, tuple[int, ...]] | None:
         """Return the place and shape of what numbers choose on the first axes, else None."""
@@ -128,9 +128,8 @@ class Stored(Stack):
         if len(rows) >= self.ndim or not all(isinstance(row, int | np.integer) for row in rows):
             return None
         sizes, shape = self.shape[: len(rows)], self.shape[len(rows) :]
-        if not all(0 <= row < size for row, size in zip(rows, sizes, strict=True)):
-            return None
-        first = int(np.ravel_multi_index(rows, sizes))
+        places = [range(size)[row] for row, size in zip(rows, sizes, strict=True)]
+        first = int(np.ravel_multi_index(places, sizes))
         return first * int(np.prod(shape)) * self.dtype.itemsize, shape
 
     def _pieces(self, values: np.ndarray, place: int) -> Iterator[tuple[np.ndarray, int]]:
@@ -177,15 +176,6 @@ class Stored(Stack):
         with self._mapped(mmap.ACCESS_WRITE) as values:
             values[index] = value
             del values
-
-
-def _attached(path: Path, shape: tuple[int, ...], dtype: Any) -> Stored:
-    """Return an array in the file of another process, which removes it."""
-    found = Stored.__new__(Stored)
-    Stack.__init__(found, shape, dtype)
-    found.path = path
-    found._open(os.O_RDWR)
-    return found
 
 
 class Computed(Stack):

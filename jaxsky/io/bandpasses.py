@@ -204,8 +204,7 @@ def _columns(table: TextTable, fields: Sequence[int | str] | None) -> list[int]:
         return [0, 1]
     if isinstance(fields, str) or len(fields) != 2:
         raise UnfitError(f"argument `fields` must name two columns, not {fields!r}.")
-    listed = ", ".join(names) or f"0 to {width - 1}"
-    columns = [index_of(field, names or [""] * width, listed) for field in fields]
+    columns = [index_of(field, names or [""] * width) for field in fields]
     if columns[0] == columns[1]:
         raise UnfitError(f"argument `fields` names column {fields[0]!r} twice.")
     return columns

@@ -109,8 +109,11 @@ def equals(
     return (values >= number - apart) & (values <= number + apart)
 
 
-def index_of(field: int | str, names: Sequence[str], listed: str) -> int:
-    """Return the number of a column given by name (in any case, if unambiguous) or number."""
+def index_of(field: int | str, names: Sequence[str]) -> int:
+    """Return the number of a column given by name (in any case, if unambiguous) or number.
+
+    All names are empty if the columns have none.
+    """
     if isinstance(field, str):
         same = [i for i, name in enumerate(names) if name == field]
         same = same or [i for i, name in enumerate(names) if name.upper() == field.upper()]
@@ -120,6 +123,7 @@ def index_of(field: int | str, names: Sequence[str], listed: str) -> int:
             return same[0]
     elif not isinstance(field, bool) and field in range(len(names)):
         return int(field)
+    listed = ", ".join(filter(None, names)) or f"0 to {len(names) - 1}"
     raise UnfitError(f"no column {field!r}; it has {listed}.")
 
 
@@ -172,14 +176,6 @@ def _nestable(nside: int) -> int:
     if not healpy.isnsideok(nside, nest=True):
         raise UnfitError(f"ordering is NESTED, but nside is {nside}, no power of 2.")
     return nside
-
-
-def _taken(column: np.ndarray, places: np.ndarray | None) -> np.ndarray:
-    """Return places of a column (row,) or (row, width), counted along its rows; None for all."""
-    if places is None:
-        return column
-    width = column.shape[1] if column.ndim == 2 else 1
-    return column[np.divmod(places, width)] if width > 1 else column.reshape(-1)[places]
 
 
 class HealpixTable:
@@ -262,7 +258,7 @@ class HealpixTable:
 
     def index(self, field: int | str) -> int:
         """Return the number of a column; see `index_of`."""
-        return index_of(field, self.names, ", ".join(self.names))
+        return index_of(field, self.names)
 
     def unit(self, index: int) -> str | None:
         """Return TUNIT of a column; None if it is missing or blank."""
@@ -311,24 +307,24 @@ class HealpixTable:
         and 0. Of `own` RING pixels only, these are read of the mapped file, and returned.
         """
         npix, pixels = healpy.nside2npix(self.nside), self._pixels
-        size, expected = self._field(index, logical).size, npix if pixels is None else pixels.size
-        if size != expected:
+        field, expected = self._field(index, logical), npix if pixels is None else pixels.size
+        if field.size != expected:
             name = self.names[index]
-            raise UnfitError(f"column {name} has {size} values for {expected} pixels.")
-        if own is not None:
-            places = self._places(own, ordering)
-            return np.where(places < 0, np.nan, self._real(index, places))
-        column = self._real(index, logical=logical)
+            raise UnfitError(f"column {name} has {field.size} values for {expected} pixels.")
+        places = None if own is None else self._places(own, ordering)
+        column = np.array(field if places is None else field.flat[places], np.float64).ravel()
+        column[self._missing(index, column, places)] = np.nan
+        if places is not None:
+            return np.where(places < 0, np.nan, column)
         if pixels is not None:
             listed, column = column, np.full(npix, np.nan)
             column[pixels] = listed
         return in_ring(column, ordering)
 
-    def _real(
-        self, index: int, places: np.ndarray | None = None, logical: bool = False
-    ) -> Float[np.ndarray, " row"]:
-        """Return a column, or some places of it, NaN where it has no value."""
-        column = np.array(_taken(self._field(index, logical), places), np.float64).ravel()
+    def _missing(
+        self, index: int, column: Float[np.ndarray, " row"], places: np.ndarray | None
+    ) -> Bool[np.ndarray, " row"]:
+        """Return where a column, or what some places of it hold, has no value."""
         bad = ~np.isfinite(column) | equals(column, healpy.UNSEEN, 1e-5)
         text = self.keyword("BAD_DATA") or "UNSEEN"
         if text not in ("UNSEEN", "NAN"):
@@ -342,11 +338,11 @@ class HealpixTable:
             if (null := to_number(text)) is None or not null.is_integer():
                 raise UnfitError(f"{key} is {text}, which is not a whole number.")
             raw = self._table.data.view(np.ndarray)
-            stored = _taken(raw[raw.dtype.names[index]], places).ravel()
+            stored = raw[raw.dtype.names[index]]
+            stored = stored.ravel() if places is None else stored.flat[places]
             exact = stored.dtype.kind in "iu"
             bad |= stored == int(null) if exact else equals(column, null, 1e-5)
-        column[bad] = np.nan
-        return column
+        return bad
 
     def state(self, argument: str, given: str | None, default: str | None = None) -> str:
         """Return a property from the header or the argument, which must agree, or the default."""

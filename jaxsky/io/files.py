@@ -263,40 +263,13 @@ class Folder:
         self._owner = Owner(me, now, part.start, part.stop, host)
 
     @property
-    def _place(self) -> Path:
+    def place(self) -> Path:
+        """File that this process keeps locked as long as it works in the folder."""
         return self.path / self._owner.name
-
-    @contextmanager
-    def owned(self) -> Iterator["Folder"]:
-        """Work in the folder, unless another process works on the same part."""
-        me, lock = self._owner, _lock(self._place)
-        with alone(self.path) as locked:
-            for other in _owners(self.path) if locked else ():
-                if other.first < me.stop and me.first < other.stop:
-                    raise ValueError(
-                        f"{self.path}: is being written to by another command ({other}); wait "
-                        "for its end, or choose another --out."
-                    )
-            self.locked = locked and _acquire(lock)
-            self._place.touch()
-        guards.append(self.check)
-        try:
-            yield self
-        except (OSError, ValueError):
-            self.check()  # if the folder was removed, that is the reason for the error
-            raise
-        finally:
-            guards.remove(self.check)
-            with suppress(OSError):
-                self.check()
-                self.clean()  # what workers have left that were stopped
-                with alone(self.path):
-                    self._place.unlink()
-            lock.release()
 
     def check(self) -> None:
         """Raise FileNotFoundError if the folder was removed or replaced."""
-        if not self._place.exists():
+        if not self.place.exists():
             raise FileNotFoundError(
                 f"{self.path}: was removed while the command worked in it; the rest of its "
                 "results is not written."
@@ -305,9 +278,9 @@ class Folder:
     def narrow(self, part: range) -> None:
         """Reduce the part that this process works on."""
         with alone(self.path):
-            before = self._place
+            before = self.place
             self._owner = self._owner._replace(first=part.start, stop=part.stop)
-            before.rename(self._place)
+            before.rename(self.place)
 
     def remove(self, patterns: Sequence[str]) -> None:
         """Remove the files whose names match any of the patterns."""
@@ -338,9 +311,32 @@ def occupied(out: Path, part: range = ALL) -> Iterator[Folder]:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OSError(f"{out}: cannot be made ({error.strerror}); choose another --out.") from error
+    folder = Folder(out, part)
+    lock = _lock(folder.place)
     try:
-        with Folder(out, part).owned() as folder:
+        with alone(out) as locks:
+            for other in _owners(out) if locks else ():
+                if other.first < part.stop and part.start < other.stop:
+                    raise ValueError(
+                        f"{out}: is being written to by another command ({other}); wait for its "
+                        "end, or choose another --out."
+                    )
+            folder.locked = locks and _acquire(lock)
+            folder.place.touch()
+        guards.append(folder.check)
+        try:
             yield folder
+        except (OSError, ValueError):
+            folder.check()  # if the folder was removed, that is the reason for the error
+            raise
+        finally:
+            guards.remove(folder.check)
+            with suppress(OSError):
+                folder.check()
+                folder.clean()  # what workers have left that were stopped
+                with alone(out):
+                    folder.place.unlink()
+            lock.release()
     finally:
         for made in missing:
             with suppress(OSError):

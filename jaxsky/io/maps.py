@@ -73,27 +73,6 @@ def _interpolated(block: np.ndarray, rotator: healpy.Rotator) -> np.ndarray:
     return np.array([(ss - ee) / 2, np.einsum(project, s, tensor, e)])
 
 
-def _to_galactic(
-    maps: Float[np.ndarray, "field pix"],
-    mask: Bool[np.ndarray, " pix"],
-    blocks: Sequence[list[int]],
-    coordinates: str,
-) -> tuple[Float[np.ndarray, "field pix"], Bool[np.ndarray, " pix"]]:
-    """Rotate maps and mask to Galactic coordinates, with Q and U as a spin-2 field.
-
-    Complete maps are rotated in harmonic space, which is exact for a sky without structure above
-    l = 2.5 nside and cuts what is above. Incomplete maps are interpolated between the four
-    nearest pixels, and pixels next to missing ones are lost.
-    """
-    rotator = healpy.Rotator(coord=[coordinates, "G"])
-    turn = _turned if mask.all() else _interpolated
-    turned = np.concatenate([turn(maps[rows], rotator) for rows in blocks])
-    if not mask.all():
-        mask = _interpolated(mask[None].astype(float), rotator)[0] > 1 - 1e-9
-        turned[:, ~mask] = 0
-    return turned, mask
-
-
 @dataclass(frozen=True, eq=False)
 class Maps:
     """Maps in the package's conventions: RING, Galactic, COSMO sign of U, float64.
@@ -202,7 +181,15 @@ def read_maps(
     if pixels is None and not mask.any():
         raise InputError(f"{where}: no pixel has values in {', '.join(names)}.")
     if blocks is not None:
-        maps, mask = _to_galactic(maps, mask, blocks, first.coordinates)
+        # Complete maps are rotated in harmonic space, which is exact for a sky without structure
+        # above l = 2.5 nside and cuts what is above. Incomplete maps are interpolated between the
+        # four nearest pixels, and pixels next to missing ones are lost.
+        rotator = healpy.Rotator(coord=[first.coordinates, "G"])
+        turn = _turned if mask.all() else _interpolated
+        maps = np.concatenate([turn(maps[rows], rotator) for rows in blocks])
+        if not mask.all():
+            mask = _interpolated(mask[None].astype(float), rotator)[0] > 1 - 1e-9
+            maps[:, ~mask] = 0
     return Maps(maps, mask, first.unit, names, kinds, first.nside)
 
 

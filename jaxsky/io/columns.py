@@ -118,25 +118,23 @@ def sentinels(
     usual |= {0.0} if zero else set()
     found: list[tuple[float, int]] = []
     while rest.size:
-        for extreme in (float(rest.min()), float(rest.max())):
-            count = int(np.count_nonzero(rest == extreme))
-            others = _marks(rest, extreme, count, extreme in usual) if zero or extreme else None
-            if others is not None:
-                found.append((extreme, count))
-                rest = others
-                break
-        else:
+        extremes = float(rest.min()), float(rest.max())
+        marks = [x for x in extremes if (zero or x) and _is_mark(rest, x, x in usual)]
+        if not marks:
             break
+        found.append((marks[0], int(np.count_nonzero(rest == marks[0]))))
+        rest = rest[rest != marks[0]]
     return found
 
 
-def _marks(rest: np.ndarray, extreme: float, count: int, usual: bool) -> np.ndarray | None:
-    """Return the other values if an extreme value marks missing pixels, else None."""
+def _is_mark(rest: np.ndarray, extreme: float, usual: bool) -> bool:
+    """Return whether an extreme value of an array marks missing pixels."""
+    count = int(np.count_nonzero(rest == extreme))
     if count < 2 and not usual and abs(extreme) < HUGE:
-        return None
+        return False
     others = rest[rest != extreme]
     if not others.size:
-        return None
+        return False
     near = others.min() if extreme < others.min() else others.max()
     far = abs(near - extreme) > abs(np.median(others) - near)
     often = max(REPEATED, 1 + MORE_OFTEN * int(np.count_nonzero(others == near)))
@@ -146,7 +144,7 @@ def _marks(rest: np.ndarray, extreme: float, count: int, usual: bool) -> np.ndar
     is_mark = far and (usual or abs(extreme) >= HUGE or repeated)
     if usual and count > 1 and not is_mark:
         is_mark = not np.array_equal(others, np.round(others))
-    return others if is_mark else None
+    return bool(is_mark)
 
 
 class Column(NamedTuple):

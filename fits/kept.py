@@ -148,14 +148,13 @@ def kept_realisations(
         """Yield realisations in order, made by one thread per processor, or by the executor."""
         if executor is not None:
             yield from realised(one, numbers, executor, path.parent if path else cache_folder())
-            return
-        if (step := job.number()) > 1:
+        elif (step := job.number()) > 1:
             for start in range(0, len(numbers), step):
                 yield from job.by_turns(one, numbers[start : start + step])
-            return
-        yield from map(one, numbers[:1])  # alone, so that each program is compiled once
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            yield from pool.map(one, numbers[1:])
+        else:
+            yield from map(one, numbers[:1])  # alone, so that each program is compiled once
+            with ThreadPoolExecutor(os.cpu_count()) as pool:
+                yield from pool.map(one, numbers[1:])
 
     def stacked() -> dict[str, np.ndarray]:
         return dict(zip(names, map(np.stack, zip(*done, strict=True)), strict=True))

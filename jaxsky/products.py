@@ -13,7 +13,7 @@ import pooch
 from rich.filesize import decimal
 
 from jaxsky.io import InputError, read_spectra
-from jaxsky.io.files import UnfitError, locked
+from jaxsky.io.files import UnfitError, is_fits, locked
 from jaxsky.io.quantities import unit_name
 from jaxsky.io.tables import HealpixTable, is_cut, open_fits, open_table
 from jaxsky.public import packaged
@@ -182,7 +182,7 @@ def _check_structure(product: Product, path: Path) -> list[str]:
     if not start:
         raise InputError(f"{path}: is empty.")
     if product.name.endswith(".fits"):
-        if not start.startswith((b"SIMPLE", b"\x1f\x8b")):
+        if not is_fits(path):
             raise InputError(f"{path}: is no FITS file, it begins with {shown!r}.")
         with open_fits(path) as hdus:
             if is_cut(path, hdus):

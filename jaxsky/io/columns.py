@@ -59,8 +59,6 @@ def _known() -> dict[str, str]:
 
 
 _KNOWN = _known()
-#: Values of `stokes` for one column.
-_CHOICES = ("", "I", "Q", "U", "II", "IQ", "IU", "QQ", "QU", "UU")
 
 
 def stokes_of(name: str) -> str | None:
@@ -84,7 +82,7 @@ def parse_stokes(given: str | Sequence[str]) -> list[str]:
     words = given.replace(",", " ").split() if isinstance(given, str) else given
     entries = list(words[0]) if isinstance(given, str) and len(words) == 1 else words
     found = [_ordered(str(entry).upper()) for entry in entries]
-    if not set(found).issubset(_CHOICES):
+    if not set(found).issubset(_KNOWN.values()):
         raise InputError(
             "Argument `stokes` must name I, Q, U or pairs of them in the order of the columns, "
             f'such as "QU" or "QQ QU UU", but is {given!r}.'

@@ -130,7 +130,7 @@ def _check_commas(rows: list[TextRow]) -> None:
 
 SPECTRA = ("TT", "EE", "BB", "TE")
 #: First columns of the files that CAMB calls so.
-_CAMB_NAMES = ["L", "TT", "EE", "BB", "TE"]
+_CAMB_NAMES = ["L", *SPECTRA]
 #: Column names in upper case -> the package's: HEALPix (IDL, Fortran, healpy), HEALPix C++.
 _NAMES = {
     **dict.fromkeys(("ELL", "INDEX", "MULTIPOLE"), "L"),

@@ -153,13 +153,12 @@ def _rimo_names(
     averages, single = {}, {}
     for name in names:
         key, _, detector = name.upper().removeprefix("BANDPASS_").partition("-")
-        key = key.lstrip("F0")
-        if detector and wanted in (None, key):
+        if not detector:
+            averages[key.lstrip("F0")] = name
+        elif wanted in (None, key.lstrip("F0")):
             single[detector] = name
-        elif not detector:
-            averages[key] = name
     if detectors is None:
-        if wanted is None or wanted not in averages:
+        if wanted not in averages:
             asked = "give `band`" if wanted is None else f"no band {band!r}"
             raise UnfitError(f"{asked}; it has {', '.join(averages)}.")
         return [averages[wanted]]

@@ -8,6 +8,5 @@ Everything else is converted and checked here, once. A file that cannot be used 
 from jaxsky.io.bandpasses import read_bandpass
 from jaxsky.io.curves import read_beam, read_spectra
 from jaxsky.io.files import InputError, MissingFileError, check_file, whole, write_text
-from jaxsky.io.maps import Maps, degrade_mask, read_maps, read_mask
+from jaxsky.io.maps import Maps, degrade_mask, read_maps, read_mask, write_maps
 from jaxsky.io.quantities import from_quantity, unit_factor, unit_name
-from jaxsky.io.written import write_maps

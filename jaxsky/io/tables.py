@@ -178,6 +178,11 @@ def _nestable(nside: int) -> int:
     return nside
 
 
+def _flat(column: np.ndarray) -> Any:
+    """Return what takes the values of a column by their number, without a copy of the column."""
+    return column if column.ndim == 1 else column.flat  # the second is slower
+
+
 class HealpixTable:
     """The columns and the header of a HEALPix table in an open FITS file."""
 
@@ -312,7 +317,7 @@ class HealpixTable:
             name = self.names[index]
             raise UnfitError(f"column {name} has {field.size} values for {expected} pixels.")
         places = None if own is None else self._places(own, ordering)
-        column = np.array(field if places is None else field.flat[places], np.float64).ravel()
+        column = np.array(field if places is None else _flat(field)[places], np.float64).ravel()
         column[self._missing(index, column, places)] = np.nan
         if places is not None:
             return np.where(places < 0, np.nan, column)
@@ -339,7 +344,7 @@ class HealpixTable:
                 raise UnfitError(f"{key} is {text}, which is not a whole number.")
             raw = self._table.data.view(np.ndarray)
             stored = raw[raw.dtype.names[index]]
-            stored = stored.ravel() if places is None else stored.flat[places]
+            stored = stored.ravel() if places is None else _flat(stored)[places]
             exact = stored.dtype.kind in "iu"
             bad |= stored == int(null) if exact else equals(column, null, 1e-5)
         return bad

@@ -111,8 +111,8 @@ def main() -> None:
     console.print(rich_table(rows))
     console.print("\n".join(lines), highlight=False)
     if arguments.write:
-        text = markdown(rows, lines)
-        RESULTS.write_text(renewed(RESULTS.read_text(), text) if arguments.only else text)
+        old = RESULTS.read_text() if arguments.only else ""
+        RESULTS.write_text(renewed(old, rows, lines) if old else markdown(rows, lines))
 
 
 if __name__ == "__main__":

@@ -373,11 +373,7 @@ class Posterior:
         if self.priors:
             diagonal = np.asarray(prior_terms(theta, self.priors)[2])
         matrix = assembled(np.asarray(local), self.index, len(theta), diagonal)
-        if keep is None:
-            return matrix
-        return (
-            matrix[np.ix_(keep, keep)] if isinstance(matrix, np.ndarray) else matrix[keep][:, keep]
-        )
+        return matrix if keep is None else matrix[np.ix_(keep, keep)]
 
     def convex(self, theta: np.ndarray) -> np.ndarray:
         """Return second derivatives of each cell, or its Fisher matrix if not positive."""

@@ -23,13 +23,14 @@ def components(stokes: int = 2) -> dict[str, Component]:
     """One component of each kind, every parameter at a value at which it matters."""
     maps = random_maps(1, stokes)
     dust = random_maps(2, stokes)
+    ame = AME.from_dust_angles(jnp.abs(maps[0]), dust, 0.01, nu_ref=22.8) if stokes > 1 else None
     return {
         "synchrotron": Synchrotron(maps, 3.1, curvature=-0.2, nu_piv=23.0, nu_ref=30.0),
         "dust": Dust(maps, 1.53, 21.0, nu_ref=353.0),
         "two_body_dust": Dust(
             maps, (1.67, 2.70), (9.4, 16.2), (0.49, 1.0), nu_ref=353.0, nu_pivot=3000.0
         ),
-        "ame": AME.from_dust_angles(jnp.abs(maps[0]), dust, 0.01, nu_ref=22.8),
+        "ame": ame or AME(maps, nu_ref=22.8),
         "cmb": CMB(maps),
     }
 

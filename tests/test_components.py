@@ -10,6 +10,7 @@ import systems
 from jaxsky import (
     AME,
     CMB,
+    Bandpass,
     Component,
     Dust,
     Sky,
@@ -92,12 +93,33 @@ def test_constant_maps_of_all_parameters_are_their_numbers(sky):
     )
 
 
-@pytest.mark.parametrize("stokes", [2, 3])
+@pytest.mark.parametrize("stokes", [1, 2, 3])
 def test_stokes_rows_share_the_law(stokes):
     for name, component in systems.components(stokes).items():
         seen = observe(Sky({name: component}), systems.bands())
         ratio = seen / component.template
         np.testing.assert_allclose(ratio, ratio[:, :1, :1] * jnp.ones_like(ratio), rtol=1e-12)
+
+
+@pytest.mark.parametrize("law", [Dust, Synchrotron, AME])
+@pytest.mark.parametrize("varying", [False, True])
+def test_intensity_and_polarization_have_their_own_reference(law, varying):
+    maps, own = systems.random_maps(7, 3), law(systems.random_maps(7, 3))
+    name = {Dust: "T_dust", Synchrotron: "beta_syn", AME: "m60"}[law]
+    value = getattr(own, name) * (jnp.linspace(0.9, 1.1, systems.NPIX) if varying else 1.0)
+    component = law(maps, nu_ref_I=31.0, **{name: value})
+    at_I, at_P = observe(Sky({"x": component}), [Bandpass.delta(31.0), Bandpass.delta(own.nu_ref)])
+    np.testing.assert_allclose(at_I[0], maps[0], rtol=1e-9)
+    np.testing.assert_allclose(at_P[1:], maps[1:], rtol=1e-9)
+    scaled = component.sed(31.0)  # the same law for both
+    np.testing.assert_allclose(at_I[1:], maps[1:] * scaled, rtol=1e-9)
+
+    def seen(x, nu):
+        moved = law(maps, nu_ref_I=nu, **{name: value * x})
+        return observe(Sky({"x": moved}), systems.bands())[..., :3]
+
+    one, at = jnp.asarray(1.0), jnp.asarray(31.0)
+    check_grads(seen, (one, at), order=1, modes=["fwd", "rev"], rtol=1e-5, atol=1e-4)
 
 
 def test_single_precision_in_single_precision_out(sky):
@@ -157,8 +179,13 @@ MAPS = np.ones((2, 12))
         (lambda: Synchrotron(MAPS, 3j), TypeError, "`beta_syn` must be real"),
         (lambda: Synchrotron(MAPS, np.inf), ValueError, "`beta_syn` has 1 of 1 values"),
         (lambda: CMB(MAPS, T_cmb=-1.0), ValueError, "`T_cmb` must be positive"),
+        (lambda: Dust(MAPS, nu_ref_I=545.0), ValueError, "`nu_ref_I` of Dust is for .* with I"),
+        (lambda: CMB(np.ones((3, 12)), nu_ref_I=1.0), ValueError, "is for a law with nu_ref"),
+        (lambda: Dust(np.ones((3, 12)), nu_ref_I=0.5), ValueError, "`nu_ref_I` .* from 1 to"),
         (lambda: AME.from_dust_angles(np.ones(3), MAPS), ValueError,
          r"`intensity` must have shape"),
+        (lambda: AME.from_dust_angles(np.ones(12), np.ones((1, 12))), ValueError,
+         r"`dust` must have shape \(stokes, pix\) with Stokes Q, U or I, Q, U"),
     ],
 )  # fmt: skip
 def test_bad_arguments_are_refused(make, error, words):

@@ -108,7 +108,12 @@ def test_jit_and_gradients():
 
 
 def test_maps_of_Q_and_U_are_refused():
-    raises(ValueError, "not polarized: it takes part in I, Q, U only", FreeFree, jnp.ones((2, 12)))
+    raises(
+        ValueError,
+        "not polarized: it takes part in I, or I, Q, U only",
+        FreeFree,
+        jnp.ones((2, 12)),
+    )
     raises(ValueError, "Q and U must be zero", FreeFree, jnp.ones((3, 12)))
 
 

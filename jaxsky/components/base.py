@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike
 
 from jaxsky.arrays import Map, Scalar, StokesMaps
 from jaxsky.checks import (
+    Parameter,
     Printed,
     as_array,
     check_finite,
@@ -25,6 +26,8 @@ from jaxsky.checks import (
 )
 from jaxsky.mesh import spread
 
+#: Stokes parameters of maps by the number of their rows.
+STOKES = {1: "I", 2: "QU", 3: "IQU"}
 #: Components by the name of their law, or "module:Class"; filled as classes are defined.
 _LAWS: dict[str, type["Component"]] = {}
 
@@ -43,6 +46,7 @@ def parameter(
     symbol: str = "",
     unit: str = "",
     zero: bool = True,
+    kw_only: bool = False,
 ) -> Any:
     """Declare the field of a component for a spectral parameter: a number, or a map (pix,).
 
@@ -53,10 +57,11 @@ def parameter(
     within, hint : refuse a number, or the median of a map, outside this range, with a hint
     symbol, unit : for figures and tables; by default the name (in TeX), and "" for a pure number
     zero : whether exact zeros in a map are data; if not, they are taken to mark missing values
+    kw_only : whether it can be given by name only
     """
     refused = {"positive": positive, "within": within, "hint": hint}
     metadata = refused | {"symbol": symbol, "unit": unit, "zero": zero}
-    return eqx.field(converter=_converted, metadata=metadata, default=default)
+    return eqx.field(converter=_converted, metadata=metadata, default=default, kw_only=kw_only)
 
 
 def reference(default: float, within: tuple[float, float]) -> Any:
@@ -76,10 +81,10 @@ def _converted(value: Any) -> Any:
 
 
 class Component(Printed, eqx.Module):
-    """Base class of sky components: `amplitude` (stokes, pix) times `sed(nu)`.
+    """Base class of sky components: `template` (stokes, pix) times `sed(nu)`.
 
-    Stokes parameters are I, Q, U (3 rows) or Q, U (2 rows), in uK_RJ at the component's
-    reference frequency, HEALPix RING order, Galactic coordinates, COSMO sign of U.
+    Stokes parameters of the amplitude are I (1 row), Q, U (2 rows) or I, Q, U (3 rows), in uK_RJ at
+    the component's reference frequency, HEALPix RING order, Galactic coordinates, COSMO sign of U.
 
     A subclass declares its fields with `template` and `parameter`, and defines `sed`. By the name
     of its law, or as `law = "module:Class"`, it can be used in the settings of every command.
@@ -87,8 +92,9 @@ class Component(Printed, eqx.Module):
     Attributes
     ----------
     law : name of the law in settings, given in the class statement; by default "module:Class"
-    polarized : whether there is anything in Q and U; if not, an amplitude has to be I, Q, U
+    polarized : whether there is anything in Q and U; if not, an amplitude has to be I, or I, Q, U
     unit : unit of the amplitude
+    nu_ref_I : reference frequency [GHz] of the amplitude of I, if it is not `nu_ref`
 
     Raises
     ------
@@ -116,6 +122,9 @@ class Component(Printed, eqx.Module):
     unit: ClassVar[str] = "uK_RJ"
 
     amplitude: eqx.AbstractVar[StokesMaps]
+    nu_ref_I: Parameter | None = parameter(
+        None, positive=True, symbol=r"\nu_{{\rm ref}, I}", unit="GHz", kw_only=True
+    )
 
     def __init_subclass__(cls, law: str = "", **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -131,12 +140,15 @@ class Component(Printed, eqx.Module):
 
     @property
     def template(self) -> StokesMaps:
-        """The maps that the law multiplies: the amplitude, unless a class scales it first."""
-        return self.amplitude
+        """The maps that the law multiplies: the amplitude, with I brought to `nu_ref`."""
+        if self.nu_ref_I is None:
+            return self.amplitude
+        intensity = self.amplitude[:1] / self.sed(self.nu_ref_I)
+        return jnp.concatenate([intensity, self.amplitude[1:]])
 
     def summary(self):
         stokes, npix = self.amplitude.shape
-        maps = f"{'I, Q, U' if stokes == 3 else 'Q, U'} in {npix} pixels"
+        maps = f"{', '.join(STOKES[stokes])} in {npix} pixels"
         if is_concrete(self.amplitude) and not spread(self.amplitude):
             rms = np.sqrt(np.mean(np.square(self.amplitude[-2:])))
             maps = f"{maps}, rms {rms:.4g} {self.unit}"
@@ -149,13 +161,21 @@ class Component(Printed, eqx.Module):
 
     def __check_init__(self) -> None:
         amplitude = as_array("amplitude", self.amplitude)
-        good = amplitude.ndim == 2 and len(amplitude) in (2, 3)
-        form = "have shape (stokes, pix) with Stokes Q, U or I, Q, U"
+        good = amplitude.ndim == 2 and len(amplitude) in STOKES
+        form = "have shape (stokes, pix) with Stokes I, or Q, U, or I, Q, U"
         check_shape("amplitude", amplitude, good, form)
+        if self.nu_ref_I is not None:
+            known = declared(type(self), "nu_ref")
+            if len(amplitude) == 2 or not known:
+                raise ValueError(
+                    f"Argument `nu_ref_I` of {type(self).__name__} is for a law with nu_ref and an "
+                    "amplitude with I."
+                )
+            check_value("nu_ref_I", as_array("nu_ref_I", self.nu_ref_I), known)
         if len(amplitude) == 2 and not self.polarized:
             raise ValueError(
-                f"{type(self).__name__} is not polarized: it takes part in I, Q, U only, and has "
-                "no maps of Q and U."
+                f"{type(self).__name__} is not polarized: it takes part in I, or I, Q, U only, and "
+                "has no maps of Q and U."
             )
         check_finite("amplitude", amplitude)
         if not self.polarized and is_concrete(amplitude) and bool((amplitude[1:] != 0).any()):

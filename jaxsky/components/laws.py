@@ -146,6 +146,8 @@ class AME(Component, law="ame"):
         that is unpolarized, so is the AME. Further parameters are those of the class.
         """
         intensity, dust = as_array("intensity", intensity), as_array("dust", dust)
+        good = dust.ndim == 2 and len(dust) in (2, 3)
+        check_shape("dust", dust, good, "have shape (stokes, pix) with Stokes Q, U or I, Q, U")
         form = f"have shape {dust.shape[1:]} like a map of `dust`"
         check_shape("intensity", intensity, intensity.shape == dust.shape[1:], form)
         Q, U = dust[-2:]
@@ -156,8 +158,10 @@ class AME(Component, law="ame"):
 
     @property
     def template(self):
-        polarized = self.amplitude[-2:] * self.polarization_fraction
-        return jnp.concatenate([self.amplitude[:-2], polarized])
+        maps = super().template
+        if len(maps) == 1:
+            return maps
+        return jnp.concatenate([maps[:-2], maps[-2:] * self.polarization_fraction])
 
     def sed(self, nu):
         return sed.ame_log_parabola(nu, self.m60, self.nu_max, self.nu_ref)
@@ -188,7 +192,7 @@ class FreeFree(Component, law="free_free"):
 
     Parameters
     ----------
-    amplitude : template at nu_ref [uK_RJ], I, Q, U with zeros in Q and U, shape (3, pix);
+    amplitude : template at nu_ref [uK_RJ], I, shape (1, pix), or I, Q, U with zeros in Q and U;
         `amplitude_from_emission_measure` gives the map of I
     T_e : electron temperature [K]
     nu_ref : reference frequency [GHz]

@@ -17,6 +17,7 @@ from fits.mixing import TemplateErrors, template_errors
 from fits.regions import common_holes
 from fits.template_likelihood import CovarianceOf, SkyLikelihood, likelihood
 from jaxsky import Bandpass, Component, Sky, job, observe
+from jaxsky.arrays import stokes_rows
 from jaxsky.checks import Numeric, check_choice
 from jaxsky.harmonics import Preparation, beam_ratio, gaussian_beam, pixel_window, shortened
 from jaxsky.io.stacks import Computed, Maps, Stack, computed, is_large, ranges, stored
@@ -60,7 +61,7 @@ class CommonMaps(NamedTuple):
         self,
         start: Mapping[str, Numeric],
         *,
-        stokes: str = "QU",
+        stokes: str | None = None,
         region: Bool[np.ndarray, " pix"] | None = None,
         kind: str = "exact",
     ) -> SkyLikelihood:
@@ -70,7 +71,8 @@ class CommonMaps(NamedTuple):
         ----------
         start : free parameters by name; errors from noise of the templates are those at these
             values
-        stokes : "Q", "U" or "QU"
+        stokes : some of the Stokes parameters of the maps, "Q", "U", "QU", "I" or "IQU"; all by
+            default
         region : pixels to use, among those usable; default all
         kind : "exact", or "diagonal" for the paper's sum over pixels
         """
@@ -154,8 +156,8 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         for what, (_, own) in given.items()
     }
     holes = common_holes([used for used, _ in given.values()]) if fwhm else {}
-    many, npix = len(inputs.bands), healpy.nside2npix(nside)
-    if is_large((many, 2, npix)) or any(isinstance(b.maps, Stack) for b in bands.values()):
+    many, npix, stokes = len(inputs.bands), healpy.nside2npix(nside), len(inputs.stokes)
+    if is_large((many, stokes, npix)) or any(isinstance(b.maps, Stack) for b in bands.values()):
         return_memory()
     kept = {what: holes.get(own) for what, own in nsides.items()}
 
@@ -191,7 +193,7 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         return maps - leakage[name] if name in leakage else maps
 
     # Band by band: JAX would otherwise prepare the input of all transforms at once.
-    data = filled((many, 2, npix), observed)
+    data = filled((many, stokes, npix), observed)
     # Averaged pixels contain multipoles beyond those they resolve.
     reach = lmax if fwhm else 4 * nside
 
@@ -199,13 +201,13 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
         """Return noise of the pixels that are kept, and C_l of its correlated part."""
         operator, own = operators[what], kept[what]
         if own is not None:
-            whole = pixel_covariance(noise, operator.nside_in)
+            whole = pixel_covariance(noise, operator.nside_in, stokes)
             shape, dtype = whole.shape, whole.dtype
             noise = computed(shape, lambda at: whole[..., at] * own[at], dtype, many)
         if spectrum is not None:
             last = reach if operator.window is None else operator.window.size - 1
             spectrum = spectrum[: last + 1] * window_of(operator, last) ** 2
-        return MapNoise(operator, noise, spectrum)
+        return MapNoise(operator, noise, spectrum, inputs.stokes)
 
     noises = {
         name: noise_of(f"band {name!r}", band.noise, band.correlated)
@@ -268,7 +270,10 @@ def _cmb(
     windows = jnp.stack([beam_ratio(fwhm or band.beam, 0.0, lmax) for band in bands])
     if not fwhm:
         windows = windows * pixel_window(nside, lmax)
-    return jnp.asarray(inputs.cmb(lmax)[1:3]), windows, factors
+    spectra = inputs.cmb(lmax)
+    if inputs.stokes != "IQU":
+        spectra = spectra[stokes_rows(inputs.stokes)]
+    return jnp.asarray(spectra), windows, factors
 
 
 def window_of(preparation: Preparation, lmax: int) -> Float[Array, " ell"]:

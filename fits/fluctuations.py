@@ -18,8 +18,9 @@ import scipy.linalg
 from jaxtyping import Array, Float
 
 from jaxsky import job
+from jaxsky.arrays import Alm, stokes_rows
 from jaxsky.checks import Numeric
-from jaxsky.cmb import realisation
+from jaxsky.cmb import field_spectra, realisation
 from jaxsky.harmonics import (
     Preparation,
     adjoint_synthesis,
@@ -31,23 +32,31 @@ from jaxsky.harmonics import (
 )
 from jaxsky.io.stacks import Maps, empty, is_large, loaded, ranges
 from jaxsky.job import filled
-from jaxsky.noise import draw, pixel_covariance, stream, white_alm
+from jaxsky.noise import cholesky, draw, pixel_covariance, stream, white_alm
 
 #: Pixels whose products are summed at once; few enough to stay in cache.
 CHUNK = 1 << 16
 
 
 class MapNoise(NamedTuple):
-    """Noise of Q and U of a map, with the preparation for the common resolution.
+    """Noise of a map, with the preparation for the common resolution.
 
-    `noise` is that of its own pixels, a level [uK_RJ arcmin] or the covariance of Q and U in each
-    [uK_RJ^2]; `correlated` C_l of noise that is correlated between pixels, the same for E and B, in
-    the prepared map [uK_RJ^2], None where there is none.
+    `noise` is that of its own pixels, a level [uK_RJ arcmin] or the covariance of the Stokes
+    parameters in each [uK_RJ^2]; `correlated` C_l of noise that is correlated between pixels, the
+    same for I, E and B, in the prepared map [uK_RJ^2], None where there is none.
     """
 
     preparation: Preparation
     noise: Numeric
     correlated: Float[Array, " ell"] | None
+    stokes: str = "QU"
+
+    def _spectra(self) -> Float[np.ndarray, "stokes ell"]:
+        """Return `correlated` of each Stokes parameter; polarization has no modes at l < 2."""
+        spectra = np.stack([np.asarray(self.correlated)] * len(self.stokes))
+        if "QU" in self.stokes:
+            spectra[-2:, :2] = 0.0
+        return spectra
 
     def covariance(
         self, rows: Iterable[Float[Array, "stokes pix"]], count: int
@@ -58,17 +67,17 @@ class MapNoise(NamedTuple):
         """
         block, modes, before = np.zeros((count, count)), None, None
         if self.correlated is not None:
-            spectra = np.stack([self.correlated] * 2)
-            modes = empty((count, 2 * spectra.shape[-1] ** 2))
-        covariance = pixel_covariance(self.noise, self.preparation.nside_in)
+            root = np.sqrt(self._spectra())
+            modes = empty((count, len(root) * root.shape[-1] ** 2))
+        covariance = self._pixels()
         npix = covariance.shape[-1]
         if np.ndim(self.noise) or self.noise:
-            before = empty((count, 2, npix), covariance.dtype)
+            before = empty((count, len(self.stokes), npix), covariance.dtype)
         for own, row in enumerate(rows):
             if before is not None:
                 before[own] = np.asarray(self.preparation.transpose(loaded(row)))
             if modes is not None:
-                modes[own] = np.asarray(_modes(row, spectra))
+                modes[own] = np.asarray(_modes(row, root))
         if before is not None:
             for cut in ranges(npix, CHUNK):
                 maps = before[..., cut].astype(float)
@@ -78,24 +87,30 @@ class MapNoise(NamedTuple):
             block = (block + block.T) / 2
         return block if modes is None else block + _products(modes)
 
-    def alm(self, key: Array, name: str) -> Float[Array, "2 alm"]:
-        """Return E and B of a realisation of smoothed noise; the map's name is in its key."""
+    def _pixels(self) -> Any:
+        """Return the covariance of each pixel before the preparation."""
+        return pixel_covariance(self.noise, self.preparation.nside_in, len(self.stokes))
+
+    def alm(self, key: Array, name: str) -> Alm:
+        """Return coefficients of a realisation of smoothed noise; the map's name is in its key."""
         window = self.preparation.window
         assert window is not None  # there is a common beam
-        white = white_alm(stream(key, "noise", name), self.noise, window.size - 1) * expand(window)
+        own, lmax = stream(key, "noise", name), window.size - 1
+        white = white_alm(own, self.noise, lmax, len(self.stokes)) * expand(window)
         return white if self.correlated is None else white + self._correlated_alm(key, name)
 
-    def _correlated_alm(self, key: Array, name: str) -> Float[Array, "2 alm"]:
-        spectrum = jnp.asarray(self.correlated)
-        white = jax.random.normal(stream(key, "correlated", name), (2, spectrum.size**2))
-        return white * expand(jnp.sqrt(spectrum))
+    def _correlated_alm(self, key: Array, name: str) -> Alm:
+        spectra = jnp.asarray(self._spectra())
+        shape = len(spectra), spectra.shape[-1] ** 2
+        white = jax.random.normal(stream(key, "correlated", name), shape)
+        return white * expand(jnp.sqrt(spectra))
 
     def realisation(self, key: Array, name: str) -> Float[Array, "stokes pix"]:
         """Return noise at the common resolution [uK_RJ], with random numbers by name."""
         nside = self.preparation.nside
         if self.preparation.window is not None:
             return synthesis(self.alm(key, name), nside)
-        pixels = jnp.asarray(pixel_covariance(self.noise, self.preparation.nside_in), float)
+        pixels = jnp.asarray(self._pixels(), float)
         total = average_pixels(draw(stream(key, "noise", name), pixels), nside)
         if self.correlated is None:
             return total
@@ -105,26 +120,33 @@ class MapNoise(NamedTuple):
         """Return the variance in each prepared pixel [uK_RJ^2]; see `Fluctuations.sigma`."""
         if np.ndim(self.noise):
             pixels: Any = self.noise
-            total = np.asarray(self.preparation.variance([pixels[s, s] for s in range(2)]))
+            each = [pixels[s, s] for s in range(len(self.stokes))]
+            total = np.asarray(self.preparation.variance(each))
         else:
-            shape = (2, healpy.nside2npix(self.preparation.nside))
+            shape = (len(self.stokes), healpy.nside2npix(self.preparation.nside))
             total = np.broadcast_to(self.preparation.uniform_variance(float(self.noise)), shape)
         return total if self.correlated is None else total + map_variance(self.correlated)
 
 
 class Fluctuations(eqx.Module):
-    """Noise and CMB: what Q, U maps in several bands contain besides the model.
+    """Noise and CMB: what maps in several bands contain besides the model.
 
     Bands have `noises`, `cmb_windows` with the beam and pixel window of their prepared maps,
     `cmb_factors` in uK_RJ per uK_CMB, and `names`, from which the random numbers of each are
-    derived. `cmb_spectra` are C_l of EE and BB [uK_CMB^2], None without CMB.
+    derived. `cmb_spectra` are C_l [uK_CMB^2] of TT for I, of EE and BB for Q and U, or of TT, EE,
+    BB and TE for all three; None without CMB.
     """
 
     noises: tuple[MapNoise, ...]
-    cmb_spectra: Float[Array, "stokes ell"] | None
+    cmb_spectra: Float[Array, "spectrum ell"] | None
     cmb_windows: Float[Array, "band ell"] | None
     cmb_factors: Float[Array, " band"]
     names: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def stokes(self) -> str:
+        """Stokes parameters of the maps."""
+        return self.noises[0].stokes
 
     @property
     def nside(self) -> int:
@@ -142,8 +164,8 @@ class Fluctuations(eqx.Module):
         if self.cmb_spectra is not None and self.cmb_windows is not None:
             # As far as the beams leave some.
             last = max(len(shortened(window)) for window in self.cmb_windows)
-            spectra = self.cmb_power()[..., :last]
-            modes = empty((*rows.shape[:2], 2 * last**2))
+            roots = self._cmb_roots()[..., :last]
+            modes = empty((*rows.shape[:2], len(self.stokes) * last**2))
         for start in range(0, len(noises), job.number()):
             # As many bands at a time as there are processes, which take turns.
             bands = range(len(noises))[start : start + job.number()]
@@ -154,7 +176,7 @@ class Fluctuations(eqx.Module):
                 block = noises[i].covariance(own, len(maps[i]))
                 if modes is None:
                     return block, []
-                return block, [np.asarray(_modes(row[..., :npix], spectra[i])) for row in maps[i]]
+                return block, [np.asarray(_modes(row[..., :npix], roots[i])) for row in maps[i]]
 
             for i, (block, projected) in zip(bands, job.by_turns(of_band, bands), strict=True):
                 blocks.append(block)
@@ -166,7 +188,7 @@ class Fluctuations(eqx.Module):
     # Not one program: there XLA would draw the normals anew for each row.
     def noise_realisation(self, key: Array) -> Maps:
         """Return noise of all bands at the common resolution [uK_RJ]."""
-        shape = len(self.names), 2, healpy.nside2npix(self.nside)
+        shape = len(self.names), len(self.stokes), healpy.nside2npix(self.nside)
         named = zip(self.noises, self.names, strict=True)
         each = (noise.realisation(key, name) for noise, name in named)
         if not is_large(shape):
@@ -180,19 +202,32 @@ class Fluctuations(eqx.Module):
     def cmb_realisation(self, key: Array) -> Float[Array, "band stokes pix"]:
         """Return the CMB in all bands at the common resolution [uK_RJ]; zero without CMB."""
         if self.cmb_spectra is None or self.cmb_windows is None:
-            return jnp.zeros((len(self.names), 2, healpy.nside2npix(self.nside)))
-        EE, BB = self.cmb_spectra
-        zero = jnp.zeros_like(EE)
-        alm = realisation(stream(key, "cmb"), jnp.stack([zero, EE, BB, zero]))
+            npix = healpy.nside2npix(self.nside)
+            return jnp.zeros((len(self.names), len(self.stokes), npix))
+        spectra = self.cmb_spectra
+        if len(spectra) < 4:  # what is not seen does not matter
+            whole = jnp.zeros((4, spectra.shape[-1]))
+            spectra = whole.at[stokes_rows(self.stokes)].set(spectra)
+        alm = realisation(stream(key, "cmb"), spectra, self.stokes)
         seen = self.cmb_factors[:, None] * self.cmb_windows
         return jnp.stack([synthesis(alm * expand(window), self.nside) for window in seen])
 
-    def cmb_power(self) -> Float[np.ndarray, "band 2 ell"]:
-        """Return mean spectra EE and BB of the CMB in the maps of each band [uK_RJ^2]."""
+    def cmb_power(self) -> Float[np.ndarray, "band stokes ell"]:
+        """Return mean spectra TT, EE and BB, as far as seen, of the CMB in each band [uK_RJ^2]."""
         if self.cmb_spectra is None or self.cmb_windows is None:
-            return np.zeros((len(self.names), 2, 1))
+            return np.zeros((len(self.names), len(self.stokes), 1))
         seen = np.asarray(self.cmb_factors)[:, None] * np.asarray(self.cmb_windows)
-        return seen[:, None] ** 2 * np.asarray(self.cmb_spectra)
+        return seen[:, None] ** 2 * np.asarray(self.cmb_spectra)[: len(self.stokes)]
+
+    def _cmb_roots(self) -> Float[np.ndarray, "band *stokes stokes ell"]:
+        """Return square roots of the spectra of the CMB, of their matrix if T and E are both seen.
+
+        They are the lower Cholesky factor of the matrix.
+        """
+        if self.stokes != "IQU" or self.cmb_spectra is None:
+            return np.sqrt(self.cmb_power())
+        seen = np.asarray(self.cmb_factors)[:, None] * np.asarray(self.cmb_windows)
+        return seen[:, None, None] * np.asarray(cholesky(field_spectra(self.cmb_spectra)))
 
     def sigma(self) -> Maps:
         """Return the standard deviation of the noise in each prepared pixel [uK_RJ].
@@ -200,7 +235,7 @@ class Fluctuations(eqx.Module):
         NaN where it is unknown: next to steps of the noise by more than a factor of about 100,
         where the smoothed map of variances rings below zero.
         """
-        shape = len(self.names), 2, healpy.nside2npix(self.nside)
+        shape = len(self.names), len(self.stokes), healpy.nside2npix(self.nside)
         uniform = not any(np.ndim(one.noise) for one in self.noises)
         size = 1 if uniform else shape[-1]
 
@@ -221,7 +256,12 @@ def _products(modes: Maps) -> Float[np.ndarray, "row row"]:
 
 @jax.jit
 def _modes(
-    row: Float[Array, "stokes pix"], spectra: Float[Array, "stokes ell"]
+    row: Float[Array, "stokes pix"], root: Float[Array, "*stokes stokes ell"]
 ) -> Float[Array, " mode"]:
-    """Project a row on independent modes of unit variance, with the spectra of E and B."""
-    return (expand(jnp.sqrt(spectra)) * adjoint_synthesis(row, spectra.shape[-1] - 1)).ravel()
+    """Project a row on independent modes of unit variance, given the root of their spectra."""
+    alm = adjoint_synthesis(row, root.shape[-1] - 1)
+    if root.ndim == 2:
+        return (expand(root) * alm).ravel()
+    size = len(root)
+    modes = [sum(expand(root[i, j]) * alm[i] for i in range(j, size)) for j in range(size)]
+    return jnp.concatenate(modes)

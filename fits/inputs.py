@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import healpy
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from fits.regions import absolute_latitude
 from jaxsky import Bandpass, Component, Sky, job, set_parameters
 from jaxsky import inputs as reading
+from jaxsky.arrays import STOKES, stokes_rows
 from jaxsky.checks import Numeric, listed
 from jaxsky.components import component_class
 from jaxsky.experiment import SimulationInputs, cmb_spectra, simulation_inputs
@@ -46,13 +47,26 @@ class Leakage(NamedTuple):
     used: Bool[np.ndarray, " pix"]
     beam: float | Float[Array, " ell"]
 
+    @classmethod
+    def of(
+        cls,
+        maps: Float[Array, "2 pix"],
+        used: Bool[np.ndarray, " pix"],
+        beam: float | Float[Array, " ell"],
+        stokes: str,
+    ) -> "Leakage | None":
+        """Return what leaks into maps of some Stokes parameters: into I, nothing."""
+        if stokes == "I":
+            return None
+        return cls(jnp.pad(maps, ((len(stokes) - 2, 0), (0, 0))), used, beam)
+
 
 class Band(NamedTuple):
-    """Observed Q and U [uK_RJ] of a band at the resolution of the map.
+    """Observed maps [uK_RJ] of a band at their own resolution.
 
     `beam` is the FWHM of a Gaussian [arcmin] or a table b_l. `noise` is a level [uK_RJ arcmin] or
-    the covariance of Q and U in each pixel; `correlated` is the spectrum of additional noise, if
-    any [uK_RJ^2].
+    the covariance of the Stokes parameters in each pixel; `correlated` is the spectrum of
+    additional noise, if any [uK_RJ^2].
     `leakage` is in the maps, and is subtracted when they are brought to a common resolution.
     Large maps of many bands lie on disk (`jaxsky.io.stacks`).
     """
@@ -72,11 +86,12 @@ class Band(NamedTuple):
 
 
 class TemplateNoise(NamedTuple):
-    """Noise of Q and U of a template; without any of these it has none.
+    """Noise of a template; without any of these it has none.
 
-    `noise` is that of the pixels of its map, a level [uK_RJ arcmin] or the covariance of Q and U in
-    each [uK_RJ^2]; `correlated` the spectrum C_l of noise that is correlated between pixels
-    [uK_RJ^2]. `shared` are factors by which the noise of bands, by name, is in the template, too.
+    `noise` is that of the pixels of its map, a level [uK_RJ arcmin] or the covariance of the Stokes
+    parameters in each [uK_RJ^2]; `correlated` the spectrum C_l of noise that is correlated between
+    pixels [uK_RJ^2]. `shared` are factors by which the noise of bands, by name, is in the template,
+    too.
     """
 
     noise: Numeric = 0.0
@@ -96,7 +111,7 @@ class Inputs(NamedTuple):
     `truth` are the parameters of a simulated sky that are numbers, including "r"; None where maps
     are not simulated. `description` says what the maps are. Templates whose noise is not known are
     missing from `template_noise`. `foregrounds` are maps of simulated bands with nothing else. What
-    all bands have of large maps lies on disk.
+    all bands have of large maps lies on disk. `stokes` are the rows of all maps.
     """
 
     templates: dict[str, reading.Template]
@@ -106,6 +121,7 @@ class Inputs(NamedTuple):
     description: str
     template_noise: Mapping[str, TemplateNoise] = MappingProxyType({})
     foregrounds: dict[str, Float[Array, "stokes pix"] | Maps] | None = None
+    stokes: str = "QU"
 
 
 def inputs_of(
@@ -127,9 +143,10 @@ def inputs_of(
     if galaxy is None and any(components[name].file is None for name in own):
         galaxy = reading.embedded_galaxy(settings)
     sky, description, many = dict[str, reading.Template](), settings.title, len(settings.bands)
+    stokes = settings.common.stokes
     if templates:
-        names = settings.modelled()
-        sky, description = reading.read_sky(settings, names=names, galaxy=galaxy, number=many)
+        given: Any = {"names": settings.modelled(), "galaxy": galaxy, "number": many}
+        sky, description = reading.read_sky(settings, stokes, **given)
 
     filed = [s for s in settings.bands if s.file is not None or settings.common.maps is not None]
     found = list(by_turns(partial(_from_file, settings), filed))
@@ -143,7 +160,9 @@ def inputs_of(
         bands = {str(s.name): (bands | made)[str(s.name)] for s in settings.bands}
         truths.append(setup.truth)
         description = setup.description
-    noises = {n: read_template_noise(folder, n, components[n], one) for n, one in sky.items()}
+    noises = {
+        n: read_template_noise(folder, n, components[n], one, stokes) for n, one in sky.items()
+    }
     return Inputs(
         sky,
         bands,
@@ -152,17 +171,20 @@ def inputs_of(
         description,
         {name: noise for name, noise in noises.items() if noise is not None},
         alone,
+        stokes,
     )
 
 
-def level_spectrum(level: float, fwhm: float, lmax: int) -> Float[Array, " ell"]:
+def level_spectrum(
+    level: float, fwhm: float, lmax: int, stokes: str = "QU"
+) -> Float[Array, " ell"]:
     """Return the spectrum of white noise [uK_RJ arcmin] seen through a beam of fwhm [arcmin]."""
     white = (level * np.radians(1 / 60)) ** 2 * jnp.asarray(gaussian_beam(fwhm, lmax)) ** 2
-    return white.at[:2].set(0.0)
+    return white.at[:2].set(0.0) if stokes == "QU" else white
 
 
 def read_template_noise(
-    folder: Path, name: str, spec: ComponentTable, template: reading.Template
+    folder: Path, name: str, spec: ComponentTable, template: reading.Template, stokes: str = "QU"
 ) -> TemplateNoise | None:
     """Read the noise of a template from the settings; None if they do not state it."""
     noise, where = spec.noise, f"sky.{name}.noise"
@@ -175,14 +197,20 @@ def read_template_noise(
             f"{where}: is not known for a template with the angles of another; write "
             "{ rms = 0.0 } to take it as exact."
         )
-    nside = healpy.npix2nside(template.used.size)
+    nside, unit = healpy.npix2nside(template.used.size), noise.unit or template.unit
+    at = None if spec.nu_ref is None else spec.reference(stokes[-1])
+    if at is not None and spec.reference(stokes[0]) != at:
+        raise SettingsError(
+            f"{where}: is not known for a template with a reference frequency of its own for I; "
+            'choose "I" or "QU" as common.stokes, or write { rms = 0.0 } to take it as exact.'
+        )
     if noise.level is not None:
-        level = noise.level * reading.uK_RJ_per(noise.unit or template.unit, spec.nu_ref, where)
-        spectrum = level_spectrum(level, template.fwhm, 4 * nside)
+        level = noise.level * reading.uK_RJ_per(unit, at, where)
+        spectrum = level_spectrum(level, template.fwhm, 4 * nside, stokes)
         return TemplateNoise(correlated=spectrum, shared=noise.shared)
     maps = template.component.amplitude
     found, _ = read_noise(
-        folder, spec, spec.nu_ref, nside, where, template.unit, maps=maps, used=template.used
+        folder, spec, at, nside, where, template.unit, stokes, maps=maps, used=template.used
     )
     return TemplateNoise(found, shared=noise.shared)
 
@@ -214,7 +242,7 @@ def _simulated(
     def band_of(name: str) -> Band:
         observed, total = observed_band(setup, name), next(made)[1]["total"]
         noise, correlated = _noise_of(observed, observation.nside, f"bands.{name}.noise")
-        if (leakage := _leakage_of(observed, used)) is not None:
+        if (leakage := _leakage_of(observed, used, observation.stokes)) is not None:
             total = total + leakage.maps
         own = Band(total, used, observed.bandpass, observed.beam, noise, correlated, leakage)
         return own.of_many(many)
@@ -223,7 +251,7 @@ def _simulated(
     if not foregrounds or not sky:
         return bands, None
     quiet = {n: ObservedBand(c.band, c.beam, c.target) for n, c in observation.channels.items()}
-    alone = Observation(quiet, observation.nside, lmax=observation.lmax)
+    alone = Observation(quiet, observation.nside, observation.stokes, lmax=observation.lmax)
     seen = observe_bands(key, sky, alone, names=own)
     each = by_turns(lambda _: stored(next(seen)[1]["total"], many), names)
     return bands, dict(zip(names, each, strict=True))
@@ -243,10 +271,12 @@ def _noise_of(
     return 0.0, jnp.asarray(np.pad(observed.spectrum, (0, beyond)))
 
 
-def _leakage_of(observed: Observed | None, used: Bool[np.ndarray, " pix"]) -> Leakage | None:
+def _leakage_of(
+    observed: Observed | None, used: Bool[np.ndarray, " pix"], stokes: str
+) -> Leakage | None:
     if observed is None or observed.leakage is None:
         return None
-    return Leakage(jnp.asarray(observed.leakage), used, observed.beam)
+    return Leakage.of(jnp.asarray(observed.leakage), used, observed.beam, stokes)
 
 
 def _from_file(settings: Experiment, spec: BandTable) -> tuple[Band, Mapping[str, float] | None]:
@@ -265,8 +295,9 @@ def _from_file(settings: Experiment, spec: BandTable) -> tuple[Band, Mapping[str
         if observed is None:
             raise SettingsError(f"common.maps: {name} was not written by jaxsky simulate.")
         # The file describes its map, which may have another beam than the band.
-        spec = BandTable(name=spec.name, file=name, fields=["Q", "U"])
-    band = read_band(folder, spec, observed).of_many(len(settings.bands))
+        spec = BandTable(name=spec.name, file=name, fields=list(settings.common.stokes))
+    stokes = settings.common.stokes
+    band = read_band(folder, spec, observed, stokes).of_many(len(settings.bands))
     return band, None if observed is None else observed.truth
 
 
@@ -283,7 +314,9 @@ def _check_beam(folder: Path, spec: BandTable, observed: Observed) -> None:
     )
 
 
-def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -> Band:
+def read_band(
+    folder: Path, spec: BandTable, observed: Observed | None = None, stokes: str = "QU"
+) -> Band:
     """Read map, bandpass and noise of a band from the files named in its settings.
 
     By default they are those of the simulation that made the map, `observed`.
@@ -293,15 +326,15 @@ def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -
         bandpass = observed.bandpass
     else:
         bandpass = reading.bandpass_of(folder, spec)
-    maps, used, unit = _polarization(folder, spec, bandpass, where)
+    maps, used, unit = _read_maps(folder, spec, bandpass, where, stokes)
     nside = healpy.npix2nside(used.size)
     if (beam := reading.beam_of(folder, spec, 2 * nside)) is None:
         beam = 0.0 if observed is None else observed.beam
-    leakage = _leakage_of(observed, used)
+    leakage = _leakage_of(observed, used, stokes)
     if isinstance(given := spec.leakage, MapKeys):
-        own = _polarization(folder, given, bandpass, f"{where}.leakage", True)
-        leakage = Leakage(*own[:2], given.fwhm or 0.0)
-    elif given and leakage is None:
+        own, known, _ = _read_maps(folder, given, bandpass, f"{where}.leakage", "QU", True)
+        leakage = Leakage.of(own, known, given.fwhm or 0.0, stokes)
+    elif given and (observed is None or observed.leakage is None):
         words = f"{given:g} is of a simulation, but {spec.label} holds none"
         raise SettingsError(f"{where}.leakage: {words}; give the map that is subtracted.")
     where, correlated = f"{where}.noise", None
@@ -309,22 +342,32 @@ def read_band(folder: Path, spec: BandTable, observed: Observed | None = None) -
         if observed is None:
             raise SettingsError(f"{where}: is missing.")
         noise, correlated = _noise_of(observed, nside, where)
+        if np.ndim(noise):
+            pixels = np.asarray(noise)
+            rows = stokes_rows(stokes, STOKES[len(pixels)])
+            noise = pixels[rows, rows]
     elif spec.noise.estimate_above is not None:
         with at_key(f"{where}.estimate_above"):
             noise, correlated = _estimated_noise(spec.noise, maps, used)
     else:
-        noise, known = read_noise(folder, spec, bandpass, nside, where, unit, maps=maps, used=used)
+        given_maps: Any = {"maps": maps, "used": used}
+        noise, known = read_noise(folder, spec, bandpass, nside, where, unit, stokes, **given_maps)
         maps, used = maps if known.all() else jnp.where(known, maps, 0), used & known
     return Band(maps, used, bandpass, beam, noise, correlated, leakage)
 
 
-def _polarization(
-    folder: Path, spec: MapKeys, bandpass: Bandpass, where: str, zeros_are_data: bool = False
+def _read_maps(
+    folder: Path,
+    spec: MapKeys,
+    bandpass: Bandpass,
+    where: str,
+    stokes: str,
+    zeros_are_data: bool = False,
 ) -> tuple[Array, Bool[np.ndarray, " pix"], str]:
-    """Read Q and U of a map [uK_RJ], where they are known, and the unit of its file."""
+    """Read maps of Stokes parameters [uK_RJ], where they are known, and the unit of the file."""
     found = reading.read(folder, spec, zeros_are_data=zeros_are_data)
-    reading.check_stokes(where, found, "QU")
-    maps = reading.narrow(found.maps[-2:] * reading.uK_RJ_per(found.unit, bandpass, where))
+    rows = reading.check_stokes(where, found, stokes)
+    maps = reading.narrow(found.maps[rows] * reading.uK_RJ_per(found.unit, bandpass, where))
     return maps, np.asarray(found.mask), found.unit
 
 
@@ -334,7 +377,7 @@ def _estimated_noise(noise, maps, used):
     quiet = used & (absolute_latitude(nside) >= noise.estimate_above)
     if not noise.correlated:
         variance = estimate_variance(maps, quiet)
-        return jnp.eye(2)[..., None] * variance[:, None, None] * jnp.ones(used.size), None
+        return jnp.eye(len(maps))[..., None] * variance[:, None, None] * jnp.ones(used.size), None
     white, knee, slope = fit_knee(maps, quiet, 2 * nside)
     excess = knee_spectrum(white, knee, slope, 4 * nside) - white
     return float(np.degrees(np.sqrt(white)) * 60), excess.at[:2].set(0.0)

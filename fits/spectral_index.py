@@ -170,7 +170,8 @@ def _look(
     """
     errors, sky = prepared.template_errors, prepared.sky
     assert sky is not None  # there are templates
-    bands, keep = list(prepared.bands.values()), np.array(["QU".index(s) for s in stokes])
+    bands, labels = list(prepared.bands.values()), prepared.fluctuations.stokes
+    keep = np.array([labels.index(s) for s in stokes])
     known = parameter_names(sky)
     moved = set_parameters(sky, {name: v for name, v in params.items() if name in known})
 
@@ -202,7 +203,7 @@ def _look(
     weightless = tuple(n for n, some in zip(prepared.bands, heavy, strict=True) if not some)
     cmb = prepared.fluctuations.cmb_power().sum(axis=1)
     # Q and U each have half the variance of E and B.
-    variance = cmb @ (2 * np.arange(cmb.shape[-1]) + 1) / (8 * np.pi)
+    variance = cmb @ (2 * np.arange(cmb.shape[-1]) + 1) / (4 * np.pi * len(labels))
     ratio = variance[:, None] * weight / used.sum()
     shares = (squares[1] / squares[0]).tolist() if squares else []
     return weightless, 1.0 + float(ratio[heavy].mean()), dict(zip(sky, shares, strict=False))
@@ -230,5 +231,5 @@ def fit_regions(
     return [
         _fit_pixels(settings, prepared, pixels, region, stokes, out, mark, progress)
         for region, pixels in used.items()
-        for stokes in settings.fit.stokes
+        for stokes in settings.fitted()
     ]

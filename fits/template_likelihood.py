@@ -35,6 +35,7 @@ from fits.mixing import Mixing, TemplateErrors, check_signal, named_bands, unit_
 from fits.posterior import Likelihood
 from fits.systems import square_root
 from jaxsky import Bandpass, Sky, observe_components, parameter_names
+from jaxsky.arrays import STOKES
 from jaxsky.checks import Numeric, as_array, check_double, check_shape
 from jaxsky.interpolation import NodeCounts, Nodes
 from jaxsky.io.stacks import Stack
@@ -175,7 +176,7 @@ def likelihood(
     start : free parameters by name, with values at which the sky is otherwise expanded; a free
         parameter that is a map in `sky` is replaced by a constant, or shifted if ".offset" is
         appended to its name
-    stokes : which rows to use, e.g. "Q"; default all, "QU" or "IQU" by their number
+    stokes : which rows to use, e.g. "Q"; default all, "I", "QU" or "IQU" by their number
     covariance_of : covariance of inner products with the data, for the exact likelihood;
         None for the paper's diagonal one
     pixelwise : evaluate pixel by pixel even where inner products would do
@@ -203,7 +204,7 @@ def likelihood(
     if isinstance(data, Stack) and not isinstance(sigma, Stack):
         sigma = np.broadcast_to(sigma, shape)
     weights, counts = products.checked_weights(data, sigma)
-    labels = "QU" if shape[1] == 2 else "IQU"
+    labels = STOKES[shape[1]]
     stokes = labels if stokes is None else stokes
     if not stokes or set(stokes) - set(labels):
         raise ValueError(f"Argument `stokes` must be among {labels!r}, not {stokes!r}.")

@@ -3,9 +3,19 @@
 Maps are in HEALPix RING order. Coefficients are packed, see `jaxsky.harmonics`.
 """
 
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from jaxtyping import Array, Float
+
+#: Stokes parameters of maps by the number of their rows.
+STOKES: Final = {1: "I", 2: "QU", 3: "IQU"}
+
+
+def stokes_rows(wanted: str, given: str = "IQU") -> slice:
+    """Return the rows of some Stokes parameters, one of `STOKES`, in maps of those `given`."""
+    start = given.index(wanted)
+    return slice(start, start + len(wanted))
+
 
 #: A number that may be differentiated.
 Scalar: TypeAlias = Float[Array, ""]

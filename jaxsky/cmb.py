@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsky.arrays import Alm
+from jaxsky.arrays import STOKES, Alm, stokes_rows
 from jaxsky.checks import check_choice
 from jaxsky.harmonics import expand
 from jaxsky.noise import cholesky, normal
@@ -113,12 +113,16 @@ def _spectra(which: str, end: int, **arguments: Any) -> Float[np.ndarray, "4 ell
 
 @partial(jax.jit, static_argnames="stokes")
 def realisation(key: Array, spectra: Float[Array | np.ndarray, "4 ell"], stokes: str = "QU") -> Alm:
-    """Draw coefficients E, B ("QU") or I, E, B ("IQU") from C_l of TT, EE, BB, TE in any unit."""
-    check_choice("stokes", stokes, ("QU", "IQU"))
+    """Draw coefficients E, B ("QU"), I ("I") or I, E, B ("IQU") from C_l of TT, EE, BB, TE."""
+    check_choice("stokes", stokes, STOKES.values())
+    return gaussian_fields(key, field_spectra(spectra))[stokes_rows(stokes)]
+
+
+def field_spectra(spectra: Float[Array | np.ndarray, "4 ell"]) -> Float[Array, "3 3 ell"]:
+    """Return the matrix of the spectra of I, E and B, given TT, EE, BB, TE."""
     TT, EE, BB, TE = spectra
     zero = jnp.zeros_like(TT)
-    fields = jnp.array([[TT, TE, zero], [TE, EE, zero], [zero, zero, BB]])
-    return gaussian_fields(key, fields)[3 - len(stokes) :]
+    return jnp.array([[TT, TE, zero], [TE, EE, zero], [zero, zero, BB]])
 
 
 # Mutually correlated fields, after Brown & Battye (2011).

@@ -59,18 +59,21 @@ def simulation_inputs(
 ) -> SimulationInputs:
     """Read the sky and the bands called `names` (default: all), and check that they fit.
 
-    If `written`, maps have the Stokes parameters and the precision of the settings, and pixels that
-    resolve all beams; otherwise they are Q and U in double precision, to be smoothed later. The map
+    If `written`, maps have the Stokes parameters and the precision of `simulate`, and pixels that
+    resolve all beams; otherwise they are those of `common` in double precision, to be smoothed
+    later. The map
     of a band does not depend on which other bands are simulated. `galaxy` is the embedded model, if
     it has been made already.
     """
     spec = settings.simulate
-    stokes, precision = (spec.stokes, spec.precision) if written else ("QU", "double")
+    stokes, precision = spec.stokes, spec.precision
+    if not written:
+        stokes, precision = settings.common.stokes, "double"
     target = spec.fwhm or None
     included = settings.included()
     tables = settings.sky.components
     foregrounds = [name for name in tables if name in included]
-    seen_here = [name for name in foregrounds if written or tables[name].polarized]
+    seen_here = [n for n in foregrounds if written or stokes != "QU" or tables[n].polarized]
     sky, description = read_sky(settings, stokes, DTYPES[precision], names=seen_here, galaxy=galaxy)
     with at_key("truth"):
         templates = set_parameters_of(sky, settings.truth, tables)
@@ -244,7 +247,7 @@ def _leakage(
         for band in settings.bands
         if band.name in observation.names and isinstance(band.leakage, float)
     }
-    if not names or not any(fractions.values()):
+    if observation.stokes == "I" or not names or not any(fractions.values()):
         return {}
     with at_key("bands.leakage"):
         whole, _ = read_sky(settings, "IQU", names=names, galaxy=galaxy)

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxsky.arrays import STOKES, stokes_rows
 from jaxsky.checks import (
     Parameter,
     as_number,
@@ -116,9 +117,9 @@ class EmbeddedSky(eqx.Module):
         return healpy.npix2nside(self.dust.shape[-1])
 
     def sky(self, stokes: str = "QU") -> Sky:
-        """Return a sky ("QU" or "IQU") with the paper's baseline spectral parameters."""
-        check_choice("stokes", stokes, ("QU", "IQU"))
-        rows = slice(3 - len(stokes), 3)
+        """Return a sky ("QU", "I" or "IQU") with the paper's baseline spectral parameters."""
+        check_choice("stokes", stokes, STOKES.values())
+        rows = stokes_rows(stokes)
         dust = Dust(self.dust[rows], nu_ref=self.nu_dust)
         synchrotron = Synchrotron(self.synchrotron[rows], nu_ref=self.nu_synchrotron)
         return Sky({"dust": dust, "synchrotron": synchrotron})

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxsky import galaxy as model_galaxy
+from jaxsky.arrays import stokes_rows
 from jaxsky.bandpass import Bandpass
 from jaxsky.checks import listed
 from jaxsky.components import AME, Component, check_law, component_class, parameter_declaration
@@ -117,10 +118,19 @@ def read(
 
 
 def read_parameters(
-    folder: Path, name: str, spec: ComponentTable, nside: int, of: str = "that of the template"
+    folder: Path,
+    name: str,
+    spec: ComponentTable,
+    nside: int,
+    of: str = "that of the template",
+    stokes: str = "QU",
 ) -> tuple[dict[str, Any], Bool[np.ndarray, " pix"]]:
     """Read the parameters of a component's law, numbers or maps, and where they are known."""
-    parameters: dict[str, Any] = {} if spec.nu_ref is None else {"nu_ref": spec.nu_ref}
+    parameters: dict[str, Any] = {}
+    if spec.nu_ref is not None:
+        parameters["nu_ref"] = spec.reference(stokes[-1])
+        if spec.reference(stokes[0]) != parameters["nu_ref"]:
+            parameters["nu_ref_I"] = spec.reference(stokes[0])
     used = np.ones(healpy.nside2npix(nside), bool)
     for key, value in spec.parameters.items():
         if isinstance(value, MapFile):
@@ -151,10 +161,10 @@ def read_sky(
 ) -> tuple[dict[str, Template], str]:
     """Read the components named `names` (default: all) as templates [uK_RJ], in order.
 
-    Also returns a sentence that describes them. Templates from files are the last two or three
-    columns, in precision `dtype`; parameters that are maps are always in double precision.
-    `galaxy` is the embedded model, if it has been made already. With a `number`, maps lie on disk
-    that would be large if there were so many.
+    Also returns a sentence that describes them. Maps from files are in precision `dtype`;
+    parameters that are maps are always in double precision. `galaxy` is the embedded model, if it
+    has been made already. With a `number`, maps lie on disk that would be large if there were so
+    many.
     """
     tables, folder = settings.sky.components, Path(settings.data_dir)
     wanted = [name for name in tables if names is None or name in names]
@@ -229,23 +239,26 @@ def _read_template(
     if not law.polarized and stokes == "QU":
         raise SettingsError(
             f"sky.{name}: {law.__name__} is not polarized, and these are maps of Q and U; leave it "
-            'out of common.components, or of simulations unless simulate.stokes is "IQU".'
+            'out of common.components, or choose "I" or "IQU" as common.stokes, or simulate.stokes '
+            "for simulations."
         )
-    check_stokes(f"sky.{name}", found, "I" if spec.angles or not law.polarized else stokes)
-    parameters, known = read_parameters(folder, name, spec, found.nside)
-    factor = uK_RJ_per(found.unit, spec.nu_ref, f"sky.{name}")
-    own = found.maps  # as large as everything else
-    maps = jnp.asarray(np.multiply(own, factor, out=own), dtype)
+    own_stokes = "I" if spec.angles or not law.polarized else stokes
+    rows = check_stokes(f"sky.{name}", found, own_stokes)
+    parameters, known = read_parameters(folder, name, spec, found.nside, stokes=own_stokes)
+    where = f"sky.{name}"
+    factors = [uK_RJ_per(found.unit, spec.reference(s), where) for s in own_stokes]
+    own = found.maps[rows]  # as large as everything else
+    maps = jnp.asarray(np.multiply(own, np.array(factors)[:, None], out=own), dtype)
     used = np.asarray(found.mask) & known
     with at_key(f"sky.{name}"):
-        if spec.angles:
+        if spec.angles and stokes != "I":
             component: Component = AME.from_dust_angles(
                 maps[0], jnp.asarray(others[spec.angles].component.amplitude), **parameters
             )
         else:
             if not law.polarized:
-                maps = jnp.pad(maps[:1], ((0, 2), (0, 0)))
-            component = law(maps[-len(stokes) :], **parameters)
+                maps = jnp.pad(maps, ((0, len(stokes) - 1), (0, 0)))
+            component = law(maps, **parameters)
         if ":" in component.law:  # a class of the user's
             check_law(component)
     return Template(component, spec.fwhm or 0.0, used, found.unit)
@@ -277,13 +290,17 @@ def uK_RJ_per(unit: str, at: Bandpass | float | None, where: str) -> float:
         return float(unit_factor(unit, "uK_RJ", at))
 
 
-def check_stokes(where: str, found: Maps, wanted: str) -> None:
-    """Refuse columns that are not the Stokes parameters wanted; I, Q, U will do for Q, U."""
+def check_stokes(where: str, found: Maps, wanted: str) -> slice:
+    """Return the rows of the Stokes parameters wanted, of these alone or of I, Q, U.
+
+    Refuses other columns.
+    """
     names, expected = ", ".join(found.names), "IQU" if len(found.names) == 3 else wanted
-    if len(found.names) != len(expected) or not expected.endswith(wanted):
+    if len(found.names) != len(expected):
         raise SettingsError(f"{where}: fields must name {listed(wanted)}, not {names}.")
     if any(s not in (None, w) for s, w in zip(found.stokes, expected, strict=True)):
         raise SettingsError(f"{where}.fields: {names} are not {listed(wanted)} by their names.")
+    return stokes_rows(wanted, expected)
 
 
 def bandpass_of(folder: Path, spec: BandTable) -> Bandpass:

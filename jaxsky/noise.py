@@ -25,6 +25,7 @@ from jaxsky.io.stacks import ranges
 PIECE = 1 << 20
 #: Columns of a covariance by their number, in the order of Planck's maps.
 COVARIANCE_COLUMNS: dict[int, tuple[str, ...]] = {
+    1: ("II",),
     3: ("QQ", "QU", "UU"),
     6: ("II", "IQ", "IU", "QQ", "QU", "UU"),
 }
@@ -50,9 +51,10 @@ def normal(key: Array, shape: tuple[int, ...], dtype: Any) -> Float[Array, "..."
 
 @partial(jax.jit, static_argnames=("stokes", "size", "dtype"))
 def stokes_noise(key: Array, stokes: int, size: int, dtype: Any) -> Float[Array, "stokes size"]:
-    """Draw white noise of I, or Q, U, or I, Q, U; Q and U are the same with and without I."""
-    white = normal(key, (stokes, size), dtype)
-    return jnp.roll(white, 1, axis=0) if stokes == 3 else white
+    """Draw white noise of I, or Q, U, or I, Q, U; each is the same with and without the others."""
+    if stokes == 2:
+        return normal(key, (2, size), dtype)
+    return jnp.roll(normal(key, (3, size), dtype), 1, axis=0)[:stokes]
 
 
 @partial(jax.jit, static_argnames=("nside", "stokes", "pixels"))
@@ -64,12 +66,12 @@ def uniform_covariance(
     return jnp.eye(stokes)[..., None] * jnp.full(npix, (noise / pixel) ** 2)
 
 
-def pixel_covariance(noise: Any, nside: int) -> Any:
-    """Return the covariance of Q and U in each pixel; that of a level takes no memory."""
+def pixel_covariance(noise: Any, nside: int, stokes: int = 2) -> Any:
+    """Return the covariance of Stokes parameters in each pixel; that of a level takes no memory."""
     if np.ndim(noise):
         return noise
-    one = np.asarray(uniform_covariance(noise, nside, pixels=1))
-    return np.broadcast_to(one, (2, 2, healpy.nside2npix(nside)))
+    one = np.asarray(uniform_covariance(noise, nside, stokes, pixels=1))
+    return np.broadcast_to(one, (stokes, stokes, healpy.nside2npix(nside)))
 
 
 def uniform_map(key: Array, noise: ArrayLike, nside: int, stokes: int = 2) -> StokesMaps:
@@ -93,10 +95,10 @@ def uniform_alm(key: Array, noise: ArrayLike, lmax: int, stokes: int = 2) -> Alm
     return stokes_noise(key, stokes, (lmax + 1) ** 2, noise.dtype) * expand(levels)
 
 
-def white_alm(key: Array, noise: Any, lmax: int) -> Float[Array, "2 alm"]:
-    """Draw coefficients E and B of noise given as a level or as a covariance of each pixel."""
+def white_alm(key: Array, noise: Any, lmax: int, stokes: int = 2) -> Alm:
+    """Draw coefficients of noise given as a level or as a covariance of each pixel."""
     if not jnp.ndim(noise):
-        return uniform_alm(key, noise, lmax)
+        return uniform_alm(key, noise, lmax, stokes)
     # Without iterations or multipoles beyond lmax, ten times faster than usual, the mean spectrum
     # is right to 1e-4.
     in_memory = isinstance(noise, jax.Array)
@@ -263,13 +265,13 @@ def _diagonal(variance: StokesMaps) -> Covariance:
     return jnp.eye(len(variance), dtype=variance.dtype)[..., None] * variance
 
 
-def covariance_from_columns(columns: Float[Array, "column pix"]) -> Covariance:
+def covariance_from_columns(columns: Float[Array | np.ndarray, "column pix"]) -> Covariance:
     """Return the covariance of each pixel from its elements, in order of `COVARIANCE_COLUMNS`."""
     columns = as_array("columns", columns)
     good = columns.ndim == 2 and len(columns) in COVARIANCE_COLUMNS
-    check_shape("columns", columns, good, "have shape (3, pix) or (6, pix)")
+    check_shape("columns", columns, good, "have shape (1, pix), (3, pix) or (6, pix)")
     rows = dict(zip(COVARIANCE_COLUMNS[len(columns)], columns, strict=True))
-    stokes = "QU" if len(columns) == 3 else "IQU"
+    stokes = {1: "I", 3: "QU", 6: "IQU"}[len(columns)]
     return jnp.array([[rows[min(a + b, b + a)] for b in stokes] for a in stokes])
 
 

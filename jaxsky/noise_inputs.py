@@ -7,11 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxsky.arrays import stokes_rows
 from jaxsky.bandpass import Bandpass
+from jaxsky.checks import listed
 from jaxsky.inputs import narrow, read
 from jaxsky.io import unit_factor
 from jaxsky.io.columns import stokes_of
 from jaxsky.noise import (
+    COVARIANCE_COLUMNS,
     check_covariance,
     covariance_from_columns,
     hits_covariance,
@@ -90,6 +93,11 @@ def _check_plausible(where, noise, maps, inside, factor, unit):
 def _covariance(folder, own, at, nside, stokes, where, factor):
     """Return a covariance as in `read_noise`, with arbitrary values where it is not known."""
     n, (kind,) = len(stokes), own.noise.changed(own.noise.KINDS)
+
+    def rows(number: int) -> slice:
+        """Return those of the Stokes parameters among one for all, one each, or I, Q, U."""
+        return stokes_rows(stokes) if number == 3 else slice(number)
+
     spec, where = getattr(own.noise, kind), f"{where}.{kind}"
     found = _read_columns(folder, own, spec, kind, where)
     if found.nside != nside:
@@ -99,17 +107,19 @@ def _covariance(folder, own, at, nside, stokes, where, factor):
     del found  # as large as everything else
     if kind == "rms":
         _check_number(f"{where}.fields", len(maps), stokes)
-        rms = maps[-n:] * unit_factor(given, "uK_RJ", at)
+        rms = maps[rows(len(maps))] * unit_factor(given, "uK_RJ", at)
         return rms_covariance(jnp.broadcast_to(rms, (n, rms.shape[-1]))), known
     if kind == "covariance":
-        if len(maps) == 3 and n == 3:
-            raise SettingsError(f"{where}: I, Q and U need six columns, II, IQ, IU, QQ, QU, UU.")
-        columns = maps * unit_factor(given, "uK_RJ^2", at)
-        return covariance_from_columns(columns)[-n:, -n:], known
+        needed = COVARIANCE_COLUMNS[n * (n + 1) // 2]
+        if len(maps) not in (len(needed), 6):
+            raise SettingsError(f"{where}: {listed(stokes)} need columns {', '.join(needed)}.")
+        found = covariance_from_columns(maps * unit_factor(given, "uK_RJ^2", at))
+        return found[rows(len(found)), rows(len(found))], known
     if given:
         raise SettingsError(f"{where}.unit: {kind} are pure numbers, but are said to be {given}.")
     _check_number(f"{where}.sigma0", len(spec.sigma0), stokes)
-    sigma0 = jnp.broadcast_to(jnp.array(spec.sigma0, maps.dtype)[-n:] * factor, (n,))
+    sigma0 = jnp.array(spec.sigma0, maps.dtype)[rows(len(spec.sigma0))] * factor
+    sigma0 = jnp.broadcast_to(sigma0, (n,))
     if kind == "weights":
         if n != 2:
             raise SettingsError(f"{where}: weights are those of Q and U, not of {stokes}.")

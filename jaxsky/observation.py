@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxsky.arrays import Beam, Covariance, Scalar
+from jaxsky.arrays import STOKES, Beam, Covariance, Scalar
 from jaxsky.bandpass import Bandpass
 from jaxsky.checks import (
     Printed,
@@ -34,7 +34,7 @@ class Source(eqx.Module):
 
     Parameters
     ----------
-    component : template and law; Q, U, or I, Q, U
+    component : template and law; I, or Q, U, or I, Q, U
     fwhm : beam of the template [arcmin]
     small_scales : how the template is continued to small scales; None leaves it unchanged
     correlated_with : name of a source with which the small scales are correlated
@@ -100,7 +100,7 @@ class Observation(eqx.Module):
     ----------
     channels : by name, in order
     nside : resolution of the maps, a power of 2
-    stokes : "QU" or "IQU"
+    stokes : "QU", "I" or "IQU"
     finest : beam to which small scales are made [arcmin], at most the finest one observed
     lmax : largest multipole of the sky in the maps, by default 2 nside
     precision : "double" or "single", in which the maps are computed; single takes half the memory
@@ -128,7 +128,7 @@ class Observation(eqx.Module):
             self.lmax = 2 * self.nside
         if not self.channels:
             raise ValueError("Argument `channels` must have at least one channel.")
-        check_choice("stokes", self.stokes, ("QU", "IQU"))
+        check_choice("stokes", self.stokes, STOKES.values())
         check_choice("precision", self.precision, DTYPES)
 
     @property

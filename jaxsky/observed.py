@@ -14,15 +14,16 @@ from jaxsky.experiment import SimulationInputs
 from jaxsky.harmonics import beam_ratio
 from jaxsky.io import InputError
 from jaxsky.io.tables import open_fits
+from jaxsky.noise import COVARIANCE_COLUMNS, covariance_from_columns
 
 #: Marks the tables written by this module.
 CREATOR = "jaxsky"
-#: Numeric columns of each table.
+#: Numeric columns of each table; those of the noise depend on the Stokes parameters.
 TABLES = {
     "BANDPASS": ("NU", "WEIGHT"),
     "BEAM": ("BEAM",),
     "NOISE_SPECTRUM": ("N_L",),
-    "NOISE": ("QQ", "QU", "UU"),
+    "NOISE": (),
     "LEAKAGE": ("Q", "U"),
     "TRUTH": ("VALUE",),
 }
@@ -32,14 +33,15 @@ class Observed(NamedTuple):
     """How a map was observed.
 
     `beam` is the FWHM of a Gaussian [arcmin], or a table b_l. `noise` is a level [uK_RJ arcmin]
-    or the covariance of Q and U in each pixel [uK_RJ^2]. If it was smoothed with the map, `noise`
-    is None and `spectrum` is N_l [uK_RJ^2], where known. `leakage` is Q and U leaked from the
-    intensity [uK_RJ], with the beam of the map; `truth` has spectral parameters by dotted name.
+    or the covariance of the Stokes parameters in each pixel [uK_RJ^2]. If it was smoothed with the
+    map, `noise` is None and `spectrum` is N_l [uK_RJ^2], where known. `leakage` is Q and U leaked
+    from the intensity [uK_RJ], with the beam of the map; `truth` has spectral parameters by dotted
+    name.
     """
 
     bandpass: Bandpass
     beam: float | Float[Array, " ell"]
-    noise: float | Float[Array | np.ndarray, "2 2 pix"] | None = None
+    noise: float | Float[Array | np.ndarray, "stokes stokes pix"] | None = None
     spectrum: Float[np.ndarray, " ell"] | None = None
     leakage: Float[np.ndarray, "2 pix"] | None = None
     truth: Mapping[str, float] = {}
@@ -55,7 +57,8 @@ def observed_band(setup: SimulationInputs, name: str) -> Observed:
             lmax = setup.observation.lmax
             window = np.asarray(beam_ratio(beam, channel.beam, lmax, f"band {name!r}"))
             spectrum = (float(noise) * np.radians(1 / 60) * window) ** 2
-            spectrum[:2] = 0.0
+            if setup.observation.stokes == "QU":
+                spectrum[:2] = 0.0  # where polarization has no modes
         noise = None
     return Observed(
         channel.band,
@@ -76,15 +79,16 @@ def observed_tables(observed: Observed) -> list[pyfits.BinTableHDU]:
     if observed.spectrum is not None:
         rows["NOISE_SPECTRUM"] = [observed.spectrum]
     if not (observed.noise is None or isinstance(observed.noise, float)):
-        (QQ, QU), (_, UU) = np.asarray(observed.noise)[-2:, -2:]
-        rows["NOISE"] = [QQ, QU, UU]
+        upper = np.triu_indices(len(observed.noise))
+        rows["NOISE"] = list(np.asarray(observed.noise)[upper])
     if observed.leakage is not None:
         rows["LEAKAGE"] = list(observed.leakage)
     if observed.truth:
         rows["TRUTH"] = [list(observed.truth.values())]
     tables = []
     for name, values in rows.items():
-        named = zip(TABLES[name], map(np.asarray, values), strict=True)
+        names = TABLES[name] or COVARIANCE_COLUMNS[len(values)]
+        named = zip(names, map(np.asarray, values), strict=True)
         columns = [pyfits.Column(n, "D", array=array) for n, array in named]
         if name == "TRUTH":
             length = max(map(len, observed.truth))
@@ -111,7 +115,8 @@ def read_observed(path: Path) -> Observed | None:
         for table, names in TABLES.items():
             if table not in tables:
                 continue
-            values = found[table] = np.array([tables[table].data[n] for n in names], float)
+            data = tables[table].data
+            values = found[table] = np.array([data[n] for n in names or data.names], float)
             if not np.isfinite(values).all():
                 raise InputError(f"{path}: its table {table} has values that are not finite.")
             if table in ("NOISE", "LEAKAGE") and values.shape[1] != npix:
@@ -133,7 +138,7 @@ def read_observed(path: Path) -> Observed | None:
         return Observed(
             Bandpass(nu, weights, header["CONVENT"]),
             stated["FWHM"] if "FWHM" in stated else jnp.asarray(found["BEAM"][0]),
-            stated.get("NOISE") if noise is None else np.array([noise[:2], noise[1:]]),
+            stated.get("NOISE") if noise is None else np.asarray(covariance_from_columns(noise)),
             None if spectrum is None else spectrum[0],
             found.get("LEAKAGE"),
             truth,

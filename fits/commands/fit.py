@@ -21,7 +21,13 @@ from jaxsky.settings import WORDS, Experiment
 UNLIKELY = 0.01
 #: Files of the chains, from which a stopped run resumes.
 CHAINS = "chain_*.npz"
-STOKES_COLORS = {"Q": COLORS[0], "U": COLORS[1], "QU": COLORS[6]}
+STOKES_COLORS = {
+    "Q": COLORS[0],
+    "U": COLORS[1],
+    "QU": COLORS[6],
+    "I": COLORS[2],
+    "IQU": COLORS[5],
+}
 
 
 def _result(fit: RegionFit, method: str) -> dict[str, Any]:

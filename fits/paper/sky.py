@@ -306,7 +306,7 @@ class PaperSky:
             parameters |= {key: value for (component, _, key), value in fixed if component == name}
             if any(map(np.ndim, parameters.values())):
                 raise Impossible("It takes parameters of AME that are numbers, not maps.")
-            factor = inputs.uK_RJ_per(found.unit, spec.nu_ref, where)
+            factor = inputs.uK_RJ_per(found.unit, spec.reference("I"), where)
             intensity = jnp.asarray(found.maps[0] * factor)
             origin = f"The intensity of AME is {spec.label}"
             if spec.nu_ref != NU_AME:

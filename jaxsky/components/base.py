@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from jaxsky.arrays import Map, Scalar, StokesMaps
+from jaxsky.arrays import STOKES, Map, Scalar, StokesMaps
 from jaxsky.checks import (
     Parameter,
     Printed,
@@ -26,8 +26,6 @@ from jaxsky.checks import (
 )
 from jaxsky.mesh import spread
 
-#: Stokes parameters of maps by the number of their rows.
-STOKES = {1: "I", 2: "QU", 3: "IQU"}
 #: Components by the name of their law, or "module:Class"; filled as classes are defined.
 _LAWS: dict[str, type["Component"]] = {}
 

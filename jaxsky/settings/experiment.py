@@ -62,10 +62,11 @@ Multipole = Annotated[int, Field(ge=2)]
 
 
 class ResolutionTable(SettingsTable):
-    """Pixels and the beam [arcmin] of maps; 0 smooths none."""
+    """Pixels, the beam [arcmin] and Stokes parameters of maps; a beam of 0 smooths none."""
 
     nside: Nside | None = None
     fwhm: float = Field(0.0, ge=0)
+    stokes: Literal["QU", "I", "IQU"] = "QU"
 
 
 class CommonTable(ResolutionTable):
@@ -81,7 +82,6 @@ class CommonTable(ResolutionTable):
 class SimulateTable(ResolutionTable):
     """How bands without a map are simulated, and what `jaxsky simulate` writes."""
 
-    stokes: Literal["QU", "IQU"] = "QU"
     unit: Literal["uK_RJ", "uK_CMB"] = "uK_RJ"
     components: bool = False
     precision: Literal["single", "double"] = "single"
@@ -108,7 +108,7 @@ class FitTable(ByRegionTable, ChainsTable):
 
     nsteps: int | None = Field(3000, ge=1)
     regions: Several[str] = Field(["strip", "full"])
-    stokes: Several[Literal["Q", "U", "QU"]] = Field(["Q", "U", "QU"])
+    stokes: Several[Literal["Q", "U", "QU", "I", "IQU"]] | None = None
     methods: Several[Literal["grid", "gradient", "mcmc"]] = Field(["grid", "gradient", "mcmc"])
     likelihood: Literal["exact", "diagonal"] = "exact"
     points: int = Field(200, ge=20, le=2000)
@@ -241,10 +241,12 @@ class Experiment(SettingsTable):
         if "cmb" in (self.simulate.include or ()) and not self.cmb.include:
             raise MistakeAt("simulate.include", "has 'cmb', but cmb.include is false")
         components = self.sky.components
+        choices = [s for s in ("I", "Q", "U", "QU", "IQU") if set(s) <= set(self.common.stokes)]
         known: list[tuple[str, Iterable[str] | None, Collection[str]]] = [
             ("common.components", self.common.components, components),
             ("simulate.include", self.simulate.include, [*components, "cmb", "noise"]),
             ("compare.patches", self.compare.patches, names),
+            ("fit.stokes", self.fit.stokes, choices),
             ("fit.regions", self.fit.regions, self.regions),
             ("compare.regions", self.compare.regions, self.regions),
             ("separate.region", self.separate.region, self.regions),
@@ -264,6 +266,11 @@ class Experiment(SettingsTable):
     def modelled(self) -> list[str]:
         """Return the names of the components in the model."""
         return [n for n in self.sky.components if n in (self.common.components or [n])]
+
+    def fitted(self) -> list[str]:
+        """Return the choices of Stokes parameters that are fitted."""
+        defaults = {"QU": ["Q", "U", "QU"], "I": ["I"], "IQU": ["I", "QU", "IQU"]}
+        return list(self.fit.stokes or defaults[self.common.stokes])
 
     def included(self) -> list[str]:
         """Return the names of everything that is simulated, with "cmb" and "noise"."""

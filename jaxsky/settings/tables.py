@@ -92,12 +92,13 @@ class SmallScalesTable(SettingsTable):
 class ComponentTable(SeenKeys):
     """A component: its law, parameters that differ from the defaults, its map at `nu_ref` [GHz].
 
+    Two values of `nu_ref` are those of I and of polarization.
     A component without a map belongs to the embedded model, or is found by a separation from its
     law alone. `angles` names the component along which an intensity is polarized.
     """
 
     law: Annotated[str, valid(component_class)] | None = None
-    nu_ref: Positive | None = None
+    nu_ref: Positive | Pair[Positive] | None = None
     angles: str | None = None
     parameters: dict[str, float | list[float] | MapFile] = Field(default={})
     small_scales: SmallScalesTable | None = None
@@ -116,17 +117,23 @@ class ComponentTable(SeenKeys):
             if not reference:
                 raise ValueError(f"the law {self.law!r} has no nu_ref")
             least, most = reference["within"] or (0, math.inf)
-            if not least <= self.nu_ref <= most:
-                raise ValueError(
-                    f"nu_ref is in GHz, for the law {self.law!r} from {least:g} to {most:g}, "
-                    f"not {self.nu_ref:g}"
-                )
+            for nu in (self.reference("I"), self.reference("Q")):
+                if not least <= nu <= most:
+                    raise ValueError(
+                        f"nu_ref is in GHz, for the law {self.law!r} from {least:g} to {most:g}, "
+                        f"not {nu:g}"
+                    )
         self.check_file(("fwhm", "angles", "noise"))
         if self.file is not None and self.law is None:
             raise ValueError("law is missing")
         if self.file is not None and reference and self.nu_ref is None:
             raise ValueError("nu_ref is missing")
         return self
+
+    def reference(self, stokes: str) -> float:
+        """Return the frequency of the map of a Stokes parameter [GHz], which must be given."""
+        assert self.nu_ref is not None
+        return self.nu_ref if isinstance(self.nu_ref, float) else self.nu_ref[stokes != "I"]
 
     @property
     def polarized(self) -> bool:

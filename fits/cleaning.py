@@ -85,12 +85,24 @@ class Response:
         return np.clip(theta, self._low, self._high)
 
 
+class BModes(NamedTuple):
+    """What spectra of polarization take: masked spectra, the beam of the maps, and C_l to its end.
+
+    `lensed` are the spectra of a CMB without tensors [uK_CMB^2].
+    """
+
+    spectra: pseudo_cl.MaskedSpectra
+    window: Float[np.ndarray, " ell"]
+    lensed: Float[np.ndarray, "4 ell"]
+
+
 class SimulatedNoise(NamedTuple):
     """Parameters minus the best fit, and band powers D_b of BB [uK_CMB^2], per simulation.
 
-    The powers are of the noise in the cleaned CMB, the foregrounds left with these parameters, both
-    together, the sum with a CMB without tensors, and that CMB without its B modes: E that pixels
-    and mask turn into B. `spectrum` is C_l of noise and foregrounds in the masked map.
+    Without polarization there are no powers. They are of the noise in the cleaned CMB, the
+    foregrounds left with these parameters, both together, the sum with a CMB without tensors, and
+    that CMB without its B modes: E that pixels and mask turn into B. `spectrum` is C_l of noise and
+    foregrounds in the masked map.
     """
 
     theta: Float[np.ndarray, "sim par"]
@@ -111,7 +123,7 @@ class Separation(NamedTuple):
     too many parameters, come from simulations, except for multipoles of the full sky. `found`
     are the components with their errors, and `maps` their maps at one beam. `residuals` are maps of
     the data minus the components, and `left` the band powers of foregrounds left in the CMB, None
-    where these are not known.
+    where these are not known. Without polarization there are no spectra and no tensors.
     """
 
     data: PixelData | FullSkyData
@@ -123,8 +135,8 @@ class Separation(NamedTuple):
     maps: Float[np.ndarray, "component stokes pix"]
     residuals: Float[np.ndarray, "band stokes pix"]
     simulated: SimulatedNoise
-    spectra: pseudo_cl.MaskedSpectra
-    tensors: TensorFit
+    spectra: pseudo_cl.MaskedSpectra | None
+    tensors: TensorFit | None
     left: Float[np.ndarray, " bin"] | None
     chain: FitResult | None
 
@@ -144,7 +156,7 @@ def separate_data(
     progress: Progress = QUIET,
     executor: Executor | None = None,
 ) -> Separation:
-    """Fit the laws, separate the components, and measure r.
+    """Fit the laws, separate the components, and measure r if they are polarized.
 
     `data` are from `fits.separated_data.separation_data`, and `out` is the folder for simulations
     and chains; what it contains is not made again. `executor` makes the simulations, by default
@@ -172,40 +184,23 @@ def separate_data(
     row = found.components.index("cmb")
 
     progress.step("simulations")
-    window, spectra = _spectra(settings, data.mask)
-    highest = window.size - 1
-    with at_key("cmb.cosmology"):
-        tensors = tensor_spectra(highest, **settings.cmb.cosmology)
-    # Lensing is that of the settings, in simulations and in the model.
-    lensed = cmb_spectra(settings, highest, r=0.0)
+    modes = None if settings.common.stokes == "I" else _b_modes(settings, data.mask)
     others = (np.arange(len(found.components)) != row)[:, None, None]
     foregrounds = computed(amplitude.shape, lambda part: amplitude[..., part] * others)
     emission = data.emission(whole, best, foregrounds)
     bare = dataclasses.replace(whole, source=None)  # the noise of other data takes its place
-    make = partial(_simulation, data, bare, response, emission, spectra, window, lensed)
+    make = partial(_simulation, data, bare, response, emission, modes)
     path = None if out is None else out / "simulations.npz"
     kept = spec.nsims, settings.seed, path, _mark(settings, data), progress.advance, executor
     simulated = kept_realisations(make, SimulatedNoise, *kept)
-    progress.step("tensor-to-scalar ratio")
-    # The model has the mean E in B that the windows know of; only the rest is added.
-    EE = lensed[1, : spectra.lmax + 1]
-    leaked = simulated.leaked.mean(axis=0) - spectra.windows[1, :, 0] @ EE
-    model = power_model(
-        spectra,
-        window,
-        lensed,
-        tensors,
-        additive=simulated.both.mean(axis=0) + leaked,
-        noise=simulated.spectrum.mean(axis=0),
-        simulated=simulated.total,
-    )
-    left = None
-    if data.foregrounds is not None:
-        alone = _cleaned_cmb(data, whole, best, data.foregrounds)
-        left = pseudo_cl.band_powers(spectra, alone)[1]
+    ratio = left = None
+    if modes is not None:
+        progress.step("tensor-to-scalar ratio")
+        ratio = _tensors(settings, modes, simulated, maps[row])
+        if data.foregrounds is not None:
+            left = _BB(modes.spectra, _cleaned_cmb(data, whole, best, data.foregrounds))
     sigma, covariance = _errors(data, like, fit, simulated)
     chain = None
-    ratio = fit_tensors(model, pseudo_cl.band_powers(spectra, maps[row])[1])
     if spec.sampler != "none" and len(fit.labels) <= SAMPLED and like.source is None:
         progress.step("posterior")
         chain = _chain(settings, data, like, fit, simulated, out, progress)
@@ -219,7 +214,7 @@ def separate_data(
         maps=maps,
         residuals=data.residuals(whole, best, amplitude),
         simulated=simulated,
-        spectra=spectra,
+        spectra=None if modes is None else modes.spectra,
         tensors=ratio,
         left=left,
         chain=chain,
@@ -232,42 +227,65 @@ def _cleaned_cmb(data, like, params, observed):
     return stored(maps[found.components.index("cmb")])
 
 
-def _simulation(data, like, response, emission, spectra, window, lensed, key):
+def _BB(spectra, maps):
+    """Return the band powers of BB of maps Q, U or I, Q, U."""
+    return pseudo_cl.band_powers(spectra, maps[-2:])[1]
+
+
+def _tensors(settings, modes, simulated, cleaned):
+    """Fit r to BB of the cleaned CMB, given `BModes` and `SimulatedNoise`."""
+    spectra, window, lensed = modes
+    with at_key("cmb.cosmology"):
+        tensors = tensor_spectra(window.size - 1, **settings.cmb.cosmology)
+    # The model has the mean E in B that the windows know of; only the rest is added.
+    EE = lensed[1, : spectra.lmax + 1]
+    leaked = simulated.leaked.mean(axis=0) - spectra.windows[1, :, 0] @ EE
+    model = power_model(
+        spectra,
+        window,
+        lensed,
+        tensors,
+        additive=simulated.both.mean(axis=0) + leaked,
+        noise=simulated.spectrum.mean(axis=0),
+        simulated=simulated.total,
+    )
+    return fit_tensors(model, _BB(spectra, cleaned))
+
+
+def _simulation(data, like, response, emission, modes, key):
     """Return `SimulatedNoise` of one realisation of noise, on foregrounds.
 
-    `response` is that of the best fit to noise, `emission` the foregrounds in the bands, `window`
-    the beam of the maps, and `lensed` C_l of a CMB without tensors up to its end [uK_CMB^2].
+    `response` is that of the best fit to noise, `emission` the foregrounds in the bands, and
+    `modes` the `BModes`, None without polarization.
     """
     # Transforms of large maps use all processors, and much memory: one after the other.
     with ONE if isinstance(emission, Stack) else nullcontext():
         noise = data.noise_realisation(key)
         observed = computed(noise.shape, lambda at: emission[..., at] + noise[..., at])
         theta = response.moved(data.likelihood(observed), stream(key, "priors"))
+        if modes is None:
+            return SimulatedNoise(theta - response.theta, *6 * (np.zeros(0),))
+        spectra, window, lensed = modes
         alone = _cleaned_cmb(data, like, like.named(jnp.asarray(response.theta)), noise)
         both = _cleaned_cmb(data, like, like.named(jnp.asarray(theta)), observed)
         nside = healpy.npix2nside(both.shape[-1])
         alm = realisation(stream(key, "cmb"), lensed) * expand(jnp.asarray(window))
         alm = resize(alm, max(2, needed_lmax(window)))
-
-        def BB(maps):
-            return pseudo_cl.band_powers(spectra, maps)[1]
-
+        BB = partial(_BB, spectra)
         # Maps are made one by one, since they may be large.
         return SimulatedNoise(
             theta=theta - response.theta,
             noise=BB(alone),
             residual=BB(both[...] - alone[...]),
             both=BB(both),
-            total=BB(both[...] + synthesis(alm, nside)),
+            total=BB(both[-2:] + synthesis(alm, nside)),
             leaked=BB(synthesis(alm.at[1].set(0.0), nside)),
-            spectrum=pseudo_cl.mean_spectrum(spectra.mask, both, spectra.lmax),
+            spectrum=pseudo_cl.mean_spectrum(spectra.mask, both[-2:], spectra.lmax),
         )
 
 
-def _spectra(
-    settings: Experiment, mask: np.ndarray
-) -> tuple[Float[np.ndarray, " ell"], pseudo_cl.MaskedSpectra]:
-    """Return the beam of the maps, and the operator that takes their spectra."""
+def _b_modes(settings: Experiment, mask: np.ndarray) -> BModes:
+    """Return what spectra of the maps take."""
     how, nside, fwhm = settings.separate, settings.common.nside, settings.common.fwhm
     highest = 2 * nside
     window = np.asarray(gaussian_beam(fwhm, highest))
@@ -285,7 +303,9 @@ def _spectra(
         )
     pure = how.purify and not np.all(mask == 1)
     edges = pseudo_cl.bin_edges(how.lmin, lmax, how.width)
-    return window, pseudo_cl.masked_spectra(mask, edges, window=window, pure=pure)
+    spectra = pseudo_cl.masked_spectra(mask, edges, window=window, pure=pure)
+    # Lensing is that of the settings, in simulations and in the model.
+    return BModes(spectra, window, cmb_spectra(settings, highest, r=0.0))
 
 
 def _mark(settings: Experiment, data: PixelData | FullSkyData) -> str:

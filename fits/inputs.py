@@ -47,18 +47,11 @@ class Leakage(NamedTuple):
     used: Bool[np.ndarray, " pix"]
     beam: float | Float[Array, " ell"]
 
-    @classmethod
-    def of(
-        cls,
-        maps: Float[Array, "2 pix"],
-        used: Bool[np.ndarray, " pix"],
-        beam: float | Float[Array, " ell"],
-        stokes: str,
-    ) -> "Leakage | None":
+    def into(self, stokes: str) -> "Leakage | None":
         """Return what leaks into maps of some Stokes parameters: into I, nothing."""
         if stokes == "I":
             return None
-        return cls(jnp.pad(maps, ((len(stokes) - 2, 0), (0, 0))), used, beam)
+        return self._replace(maps=jnp.pad(self.maps, ((len(stokes) - 2, 0), (0, 0))))
 
 
 class Band(NamedTuple):
@@ -276,7 +269,7 @@ def _leakage_of(
 ) -> Leakage | None:
     if observed is None or observed.leakage is None:
         return None
-    return Leakage.of(jnp.asarray(observed.leakage), used, observed.beam, stokes)
+    return Leakage(jnp.asarray(observed.leakage), used, observed.beam).into(stokes)
 
 
 def _from_file(settings: Experiment, spec: BandTable) -> tuple[Band, Mapping[str, float] | None]:
@@ -333,7 +326,7 @@ def read_band(
     leakage = _leakage_of(observed, used, stokes)
     if isinstance(given := spec.leakage, MapKeys):
         own, known, _ = _read_maps(folder, given, bandpass, f"{where}.leakage", "QU", True)
-        leakage = Leakage.of(own, known, given.fwhm or 0.0, stokes)
+        leakage = Leakage(own, known, given.fwhm or 0.0).into(stokes)
     elif given and (observed is None or observed.leakage is None):
         words = f"{given:g} is of a simulation, but {spec.label} holds none"
         raise SettingsError(f"{where}.leakage: {words}; give the map that is subtracted.")
@@ -388,7 +381,8 @@ def modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
     folder, nside = Path(settings.data_dir), settings.common.nside
     laws = {name: settings.sky.components[name] for name in settings.modelled()}
     maps = any(isinstance(value, MapFile) for c in laws.values() for value in c.parameters.values())
-    amplitude = jnp.ones((2, 12 * nside**2 if maps else 1))
+    stokes = settings.common.stokes
+    amplitude = jnp.ones((len(stokes), 12 * nside**2 if maps else 1))
     components: dict[str, Component] = {"cmb": component_class("cmb")(amplitude)}
     known = np.ones(12 * nside**2, bool)
     for name, spec in laws.items():
@@ -396,6 +390,8 @@ def modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
         known &= has
         with at_key(f"sky.{name}"):
             assert spec.law is not None  # the settings ensure this
+            if stokes == "IQU" and not spec.polarized:
+                raise ValueError("is not polarized; to separate it, choose I as common.stokes")
             components[name] = component_class(spec.law)(amplitude, **numbers)
     others = set(settings.sky.components) - set(laws)
     fixed = {name: v for name, v in settings.fixed.items() if name.split(".")[0] not in others}

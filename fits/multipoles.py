@@ -26,6 +26,7 @@ from fits.mixing import named_bands, spectral_names
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
+from jaxsky.arrays import STOKES
 from jaxsky.checks import UNSEEN, Numeric, check_double, check_finite, check_shape
 from jaxsky.harmonics import alm_ell, gaussian_beam, lmax_of, low_multipoles, map_variance, resize
 
@@ -60,8 +61,8 @@ def harmonic_coefficients(
 
     Parameters
     ----------
-    maps : full-sky maps (band, stokes, pix), RING, with Stokes Q, U or I, Q, U; or a list of maps
-        (stokes, pix), which may differ in nside
+    maps : full-sky maps (band, stokes, pix), RING, with Stokes I, or Q, U, or I, Q, U; or a list of
+        maps (stokes, pix), which may differ in nside
     lmax : largest multipole; by default 2 nside of the coarsest map, and not above
 
     Raises
@@ -74,10 +75,10 @@ def harmonic_coefficients(
     shapes = {each.shape for each in rows}
     alike = len({shape[:-1] for shape in shapes}) == 1
     sizes = {12 * 4**k for k in range(30)}  # of maps whose nside is a power of 2
-    if not (alike and all(len(s) == 2 and s[0] in (2, 3) and s[1] in sizes for s in shapes)):
+    if not (alike and all(len(s) == 2 and s[0] in STOKES and s[1] in sizes for s in shapes)):
         raise ValueError(
-            "Argument `maps` must have shape (band, stokes, pix) with Stokes Q, U or I, Q, U, "
-            f"but has {len(rows)} bands of shape {', '.join(map(str, sorted(shapes)))}."
+            "Argument `maps` must have shape (band, stokes, pix) with Stokes I, Q, U or all, but "
+            f"has {len(rows)} bands of shape {', '.join(map(str, sorted(shapes)))}."
         )
     nside = min(healpy.npix2nside(shape[1]) for shape in shapes)
     lmax = 2 * nside if lmax is None else lmax
@@ -114,9 +115,9 @@ class Multipoles(NamedTuple):
 def check_alm(alm: Numeric, bands: int) -> np.ndarray:
     """Return packed coefficients (band, stokes, alm) unchanged, after checking their shape."""
     array = bare("alm", alm)
-    good = array.ndim == 3 and len(array) == bands and array.shape[1] in (2, 3)
+    good = array.ndim == 3 and len(array) == bands and array.shape[1] in STOKES
     good = good and (lmax_of(array) + 1) ** 2 == array.shape[2]
-    form = f"shape (band, stokes, (lmax + 1)^2) with {bands} bands and rows E, B or I, E, B"
+    form = f"shape (band, stokes, (lmax + 1)^2) with {bands} bands and rows I, or E, B, or I, E, B"
     check_shape("alm", array, good, f"have {form}, as from `harmonic_coefficients`")
     return array
 

@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 
 from fits.results import FitResult
+from jaxsky.arrays import STOKES
 from jaxsky.components import parameter_declaration
 from jaxsky.io import whole
 from jaxsky.io.stacks import Maps, ranges
@@ -194,10 +195,10 @@ class MapPanel(NamedTuple):
 def stokes_panels(
     name: str, maps: Sequence[Map], limit: float, unit: str, middle: float | None = None
 ) -> list[MapPanel]:
-    """Return panels of Q and U."""
+    """Return panels of the Stokes parameters."""
     return [
         MapPanel(plain(f"{name}: {stokes}"), values, f"{stokes} [{UNITS[unit]}]", middle, limit)
-        for values, stokes in zip(maps, "QU", strict=True)
+        for values, stokes in zip(maps, STOKES[len(maps)], strict=True)
     ]
 
 

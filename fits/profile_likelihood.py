@@ -29,6 +29,7 @@ from fits.posterior import Likelihood
 from fits.regions import check_labels
 from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
+from jaxsky.arrays import STOKES
 from jaxsky.bandpass import parse_unit
 from jaxsky.checks import Numeric, as_array, check_double, check_finite, check_shape
 from jaxsky.io.stacks import Stack
@@ -233,7 +234,7 @@ def spectral_likelihood(
     sky : components by name. Their laws count, not their amplitudes; parameters that are not
         free keep their values, maps of the data's pixels among them.
     bands : the bands by name, or as a list
-    data : observed maps, shape (band, stokes, pix) with Stokes Q, U or I, Q, U
+    data : observed maps, shape (band, stokes, pix) with Stokes I, or Q, U, or I, Q, U
     noise : standard deviations or covariances in the unit of the data; see
         `fits.compress.as_noise`
     start : start values of the free parameters by name: of the laws ("dust.beta_dust"), or of
@@ -263,8 +264,8 @@ def spectral_likelihood(
     components = len(sky.components)
     if parse_unit(unit)[1] not in ("K_RJ", "K_CMB"):
         raise ValueError(f"Argument `unit` must be one of K_RJ or K_CMB, not {unit!r}.")
-    good = data.ndim == 3 and len(data) == len(bands) and data.shape[1] in (2, 3)
-    form = f"(band, stokes, pix) with {len(bands)} bands and Stokes Q, U or I, Q, U"
+    good = data.ndim == 3 and len(data) == len(bands) and data.shape[1] in STOKES
+    form = f"(band, stokes, pix) with {len(bands)} bands and Stokes I, or Q, U, or I, Q, U"
     check_shape("data", data, good, f"have shape {form}")
     if len(bands) < components + bool(start):
         raise ValueError(
@@ -307,7 +308,7 @@ def spectral_likelihood(
         block_cell=None,
         of_pixel=None if cells.of_pixel is None else jnp.asarray(cells.of_pixel),
         layout=Layout.of(data.shape[1], angles or noise.covariance is not None),
-        stokes="QU" if data.shape[1] == 2 else "IQU",
+        stokes=STOKES[data.shape[1]],
         weightless=(),
     )
     matrix = _check_matrices(like)[:, : len(data), :components]

@@ -290,13 +290,16 @@ def _full_sky_data(settings, inputs, inside, factors, shared) -> FullSkyData:
                 "only; choose the domain 'pixel'."
             )
     nsides = [healpy.npix2nside(band.used.size) for band in bands.values()]
-    lmax = 2 * min(nside, *nsides)
-    spectra, noises = np.zeros((len(nsides), 2, lmax + 1)), {}
+    lmax, stokes = 2 * min(nside, *nsides), inputs.stokes
+    spectra, noises = np.zeros((len(nsides), len(stokes), lmax + 1)), {}
     for i, (name, band) in enumerate(bands.items()):
         size, noise, correlated = factors[i], band.noise, None
         if np.ndim(noise):
             noise = jnp.asarray(noise) * size**2
-            level = jnp.diagonal(noise).mean() * healpy.nside2pixarea(nsides[i])
+            each = np.diagonal(noise).mean(axis=0)
+            if "QU" in stokes:  # E and B have the mean of both
+                each[-2:] = each[-2:].mean()
+            level = each[:, None] * healpy.nside2pixarea(nsides[i])
         else:
             noise = noise * size
             level = (noise * np.radians(1 / 60)) ** 2
@@ -305,7 +308,7 @@ def _full_sky_data(settings, inputs, inside, factors, shared) -> FullSkyData:
             correlated = band.correlated[: lmax + 1] * size**2
             spectra[i] += correlated
         as_observed = Preparation(jnp.ones(lmax + 1), nsides[i], nside)
-        noises[name] = MapNoise(as_observed, noise, correlated)
+        noises[name] = MapNoise(as_observed, noise, correlated, stokes)
 
     def coefficients(maps):
         def of_band(pair):

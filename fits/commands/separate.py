@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from fits import plots
-from fits.cleaning import SAMPLED, Separation, separate_data
+from fits.cleaning import SAMPLED, Separation, SimulatedNoise, separate_data
 from fits.commands.report import ResultTable, Row
 from fits.commands.run import Command, Report, Run
 from fits.results import FitError, probability, two_digits, with_error
 from fits.separated_data import separation_data
+from fits.tensor_ratio import TensorFit
 from jaxsky.components import parameter_declaration
 from jaxsky.io import write_maps
 from jaxsky.io.stacks import Maps, Stack, computed, ranges
@@ -29,8 +30,7 @@ CLEANED, NOISE, RESIDUAL, LEFT, LENSING, TRUTH = (*plots.COLORS[:4], "0.5", plot
 
 def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
     """Return all numbers; band powers are D_l of BB in uK_CMB^2."""
-    fit, ratio, spectra = found.fit, found.tensors, found.spectra
-    bands, truth, simulated = list(found.data.bands), found.data.truth or {}, found.simulated
+    fit, bands, truth = found.fit, list(found.data.bands), found.data.truth or {}
     small = None
     if settings.separate.domain == "pixel":
         values = np.asarray(found.found.probability)
@@ -56,11 +56,30 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
         "pixels_with_small_probability": small,
         "cmb_noise_degradation": found.found.mean_degradation("cmb"),
         "residual_rms": dict(zip(bands, _rms(found.residuals), strict=True)),
+        **_of_BB(found),
+        "simulations": len(found.simulated.theta),
+    }
+    if (chain := found.chain) is not None:
+        results["posterior"] = {
+            "sampler": chain.method,
+            "interval_68": {n: chain.of_row(chain.interval_68, n) for n in chain.labels},
+            "converged": bool(chain.converged),
+            "message": chain.message,
+        }
+    return results
+
+
+def _of_BB(found: Separation) -> dict[str, Any]:
+    """Return the numbers of the spectrum BB and of r; none without polarization."""
+    ratio, spectra, simulated = found.tensors, found.spectra, found.simulated
+    if ratio is None or spectra is None:
+        return {}
+    return {
         "r": {
             "best_fit": ratio.r,
             "sigma": ratio.sigma,
             "upper_95": ratio.upper_95,
-            "truth": truth.get("r"),
+            "truth": (found.data.truth or {}).get("r"),
             "shift_by_foregrounds_left": None if found.left is None else ratio.shift(found.left),
             "shift_by_errors_of_laws": ratio.shift(simulated.residual.mean(axis=0)),
             "chi2": ratio.chi2,
@@ -78,16 +97,7 @@ def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
             "lensing": ratio.model.lensing,
             "tensors_r_1": ratio.model.tensors,
         },
-        "simulations": len(simulated.theta),
     }
-    if (chain := found.chain) is not None:
-        results["posterior"] = {
-            "sampler": chain.method,
-            "interval_68": {n: chain.of_row(chain.interval_68, n) for n in chain.labels},
-            "converged": bool(chain.converged),
-            "message": chain.message,
-        }
-    return results
 
 
 def _rms(maps: Maps) -> np.ndarray:
@@ -112,18 +122,35 @@ def _table(found: Separation) -> ResultTable:
         shown = with_error(float(np.nanmedian(value)), float(np.nanmedian(sigma)))
         regions = f", median of {int(np.isfinite(value).sum())} regions" if value.ndim else ""
         rows.append((name + regions, shown, f"{truth[name]:g}" if name in truth else ""))
-    rows += [
-        (),
-        ("r", with_error(ratio.r, ratio.sigma), f"{truth.get('r', 0.0):g}"),
-        ("r, 95 % below", f"{ratio.upper_95:.2g}", ""),
-    ]
-    if found.left is not None:
+    rows.append(())
+    if ratio is not None:
+        rows.append(("r", with_error(ratio.r, ratio.sigma), f"{truth.get('r', 0.0):g}"))
+        rows.append(("r, 95 % below", f"{ratio.upper_95:.2g}", ""))
+    if ratio is not None and found.left is not None:
         rows.append(("r, shift by foregrounds left", f"{ratio.shift(found.left):+.1e}", ""))
     degradation = found.found.mean_degradation("cmb")
     rows.append(("noise of CMB, times that without foregrounds", f"{degradation:.2f}", ""))
     header, columns = ("parameter", "best fit", "truth"), 3 if truth else 2
     caption = f"standard deviations; chi2/dof {fit.chi2 / fit.dof:.4f}"
     return ResultTable(header[:columns], [row[:columns] for row in rows], caption)
+
+
+def _warnings_of_BB(ratio: TensorFit, simulated: SimulatedNoise) -> list[str]:
+    """Return warnings to users of the spectrum BB and of r."""
+    sentences = list[str]()
+    if ratio.probability < UNLIKELY:
+        sentences.append(
+            f"BB of the cleaned CMB is not that of tensors, lensing, noise and errors of laws "
+            f"(probability {probability(ratio.probability)}); foregrounds may be left in it."
+        )
+    share = simulated.leaked.mean(axis=0) / simulated.total.std(axis=0, ddof=1)
+    if (share > LEAKED).any():
+        sentences.append(
+            f"E that leaks into B at the edge of the mask is up to {share.max():.1f} standard "
+            "deviations of BB in a bin. It is part of the model, but a larger "
+            "separate.apodization makes it and the errors smaller."
+        )
+    return sentences
 
 
 def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
@@ -142,18 +169,8 @@ def separation_warnings(found: Separation, settings: Experiment) -> list[str]:
             f"chi2 / dof is {fit.chi2 / fit.dof:.3g}: the laws do not describe the maps, or the "
             "noise is not what it is said to be."
         )
-    if ratio.probability < UNLIKELY:
-        sentences.append(
-            f"BB of the cleaned CMB is not that of tensors, lensing, noise and errors of laws "
-            f"(probability {probability(ratio.probability)}); foregrounds may be left in it."
-        )
-    share = simulated.leaked.mean(axis=0) / simulated.total.std(axis=0, ddof=1)
-    if (share > LEAKED).any():
-        sentences.append(
-            f"E that leaks into B at the edge of the mask is up to {share.max():.1f} standard "
-            "deviations of BB in a bin. It is part of the model, but a larger "
-            "separate.apodization makes it and the errors smaller."
-        )
+    if ratio is not None:
+        sentences += _warnings_of_BB(ratio, simulated)
     if settings.separate.sampler != "none" and found.chain is None:
         reason = (
             f"{len(fit.labels)} parameters are more than {SAMPLED}."
@@ -175,7 +192,7 @@ def _of_components(found: Separation, by_pixel: bool) -> tuple[list[tuple[str, s
         (f"{name.upper()}{end}_{s}", "uK_CMB" if name == "cmb" else "uK_RJ")
         for name in found.found.components
         for end in (("", "_SIGMA") if by_pixel else ("",))
-        for s in "QU"
+        for s in found.like.stokes
     ]
     if not by_pixel:
         return columns, lambda part: np.concatenate(found.maps[..., part])
@@ -200,7 +217,7 @@ def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path
     files: tuple[tuple[list[tuple[str, str]], Callable], ...] = (
         _of_components(found, settings.separate.domain == "pixel"),
         (
-            [(f"{band}_{s}", unit) for band in found.data.bands for s in "QU"],
+            [(f"{band}_{s}", unit) for band in found.data.bands for s in found.like.stokes],
             lambda part: np.concatenate(found.residuals[..., part]),
         ),
         (
@@ -234,7 +251,7 @@ def _write_maps(out: Path, found: Separation, settings: Experiment) -> list[Path
 
 
 def plot_components(path: Path, found: Separation, settings: Experiment) -> None:
-    """Draw Q and U of the components, one row per component."""
+    """Draw the Stokes parameters of the components, one row per component."""
     names, rows = found.found.components, []
     for name, maps in zip(names, plots.thinned(found.maps, range(len(names))), strict=True):
         component = found.like.mixing.sky[name]
@@ -246,7 +263,7 @@ def plot_components(path: Path, found: Separation, settings: Experiment) -> None
 
 
 def plot_residuals(path: Path, found: Separation, settings: Experiment) -> None:
-    """Draw data minus components in a few bands, Q next to U."""
+    """Draw data minus components in a few bands, Stokes parameters next to each other."""
     names, rows, unit = list(found.data.bands), [], settings.separate.unit
     shown = plots.spread(names, SHOWN)
     drawn = plots.thinned(found.residuals, [names.index(name) for name in shown])
@@ -274,8 +291,10 @@ def plot_parameters(path: Path, found: Separation, settings: Experiment) -> bool
     return bool(rows)
 
 
-def plot_spectra(path: Path, found: Separation, settings: Experiment) -> None:
+def plot_spectra(path: Path, found: Separation, settings: Experiment) -> bool:
     """Draw BB of the cleaned CMB, its noise and residual foregrounds, against the model."""
+    if found.tensors is None or found.spectra is None:
+        return False
     model, edges, ell = found.tensors.model, np.array(found.spectra.edges), found.spectra.centers
     signal = found.tensors.powers - model.additive
     error = np.sqrt(np.diagonal(found.tensors.covariance))
@@ -304,11 +323,13 @@ def plot_spectra(path: Path, found: Separation, settings: Experiment) -> None:
         plots.label_b_modes(axes, edges[0], edges[-1] - 1, 2)
         lowest = min(x[x > 0].min(initial=np.inf) for x in (residual, found.left) if x is not None)
         axes.set_ylim(bottom=max(lowest / 3, np.nanmax(model.lensing) * 1e-8))
+    return True
 
 
-def plot_ratio(path: Path, found: Separation, settings: Experiment) -> None:
+def plot_ratio(path: Path, found: Separation, settings: Experiment) -> bool:
     """Draw the posterior of the tensor-to-scalar ratio, the estimate with its error above it."""
-    ratio = found.tensors
+    if (ratio := found.tensors) is None:
+        return False
     r, sigma, grid, posterior = ratio.r, ratio.sigma, ratio.grid, ratio.posterior
     with plots.draw_panels(path, settings.title, (plots.COLUMN, 3.2), fontsize=8) as panels:
         axes, below = panels[0, 0], grid <= ratio.upper_95
@@ -330,6 +351,7 @@ def plot_ratio(path: Path, found: Separation, settings: Experiment) -> None:
         )
         axes.ticklabel_format(axis="x", style="sci", scilimits=(-2, 3), useMathText=True)
         plots.legend_below(axes, 2, fontsize=7)
+    return True
 
 
 def plot_posterior(path: Path, found: Separation, settings: Experiment) -> bool:

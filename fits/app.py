@@ -171,7 +171,7 @@ def _paper(
     """Make the figures and tables of the paper again, and a page that shows them."""
     from fits.commands.paper import KEPT, report_figures
 
-    command = Command("paper", partial(report_figures, only=only or ()), (KEPT,))
+    command = Command("paper", partial(report_figures, only=only or ()), (KEPT,), stokes=("QU",))
     run_command(command, file, out, values, resume=resume, overwrite=overwrite, workers=workers)
 
 

@@ -30,27 +30,35 @@ from fits.pseudo_cl import (
     polarization_alms,
 )
 from fits.results import probability
+from jaxsky.arrays import STOKES
 from jaxsky.harmonics import power_spectrum
 from jaxsky.programs import QUIET
 from jaxsky.settings import Experiment, SettingsError
 
-#: Combinations of Stokes parameters, and the weights of Q and U in each.
-STOKES, COUNTED = ("Q", "U", "QU"), np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+#: What is compared of maps of some Stokes parameters.
+COMPARED = {"I": ("I",), "QU": ("Q", "U", "QU"), "IQU": ("I", "Q", "U", "QU")}
 #: Fewest pixels for a slope and a correlation.
 LEAST_PIXELS = 10
+
+
+def _counted(maps: Array) -> Float[np.ndarray, "choice stokes"]:
+    """Return the weight of each Stokes parameter of maps (..., stokes, pix) in what is compared."""
+    stokes = STOKES[maps.shape[-2]]
+    return np.array([[float(s in choice) for s in stokes] for choice in COMPARED[stokes]])
 
 
 class ComparisonRealisations(NamedTuple):
     """Statistics of each realisation, for comparison with those of the data.
 
-    `chi2` of noise and CMB, and the sum of their squares [uK_RJ^2], for Q, U and both; C_l of EE
-    and BB [uK_RJ^2], `spectra` of foregrounds, CMB and noise together, and those of noise alone.
+    `chi2` of noise and CMB, and the sum of their squares [uK_RJ^2], for each entry of `COMPARED`;
+    C_l of TT, EE and BB [uK_RJ^2], as far as seen, `spectra` of foregrounds, CMB and noise
+    together, and those of noise alone.
     """
 
-    chi2: Float[np.ndarray, "sim band region 3"]
-    squares: Float[np.ndarray, "sim band region 3"]
-    spectra: Float[np.ndarray, "sim band 2 ell"]
-    noise: Float[np.ndarray, "sim band 2 ell"]
+    chi2: Float[np.ndarray, "sim band region choice"]
+    squares: Float[np.ndarray, "sim band region choice"]
+    spectra: Float[np.ndarray, "sim band stokes ell"]
+    noise: Float[np.ndarray, "sim band stokes ell"]
 
 
 class Scatter(NamedTuple):
@@ -97,21 +105,21 @@ class BandSpectra(NamedTuple):
     """
 
     band: str
-    observed: Float[np.ndarray, "2 ell"]
-    uncorrected: Float[np.ndarray, "2 ell"] | None
-    foregrounds: Float[np.ndarray, "2 ell"]
-    complete: Float[np.ndarray, "2 ell"]
-    noise: Float[np.ndarray, "2 ell"]
-    cmb: Float[np.ndarray, "2 ell"]
-    error: Float[np.ndarray, "2 ell"]
+    observed: Float[np.ndarray, "stokes ell"]
+    uncorrected: Float[np.ndarray, "stokes ell"] | None
+    foregrounds: Float[np.ndarray, "stokes ell"]
+    complete: Float[np.ndarray, "stokes ell"]
+    noise: Float[np.ndarray, "stokes ell"]
+    cmb: Float[np.ndarray, "stokes ell"]
+    error: Float[np.ndarray, "stokes ell"]
     edges: tuple[int, ...]
-    binned: Float[np.ndarray, "2 bin"]
-    binned_uncorrected: Float[np.ndarray, "2 bin"] | None
-    mean: Float[np.ndarray, "2 bin"]
-    std: Float[np.ndarray, "2 bin"]
-    chi2: Float[np.ndarray, " 2"]
-    pte: Float[np.ndarray, " 2"]
-    pte_uncorrected: Float[np.ndarray, " 2"] | None
+    binned: Float[np.ndarray, "stokes bin"]
+    binned_uncorrected: Float[np.ndarray, "stokes bin"] | None
+    mean: Float[np.ndarray, "stokes bin"]
+    std: Float[np.ndarray, "stokes bin"]
+    chi2: Float[np.ndarray, " stokes"]
+    pte: Float[np.ndarray, " stokes"]
+    pte_uncorrected: Float[np.ndarray, " stokes"] | None
 
     @property
     def centers(self) -> Float[np.ndarray, " bin"]:
@@ -119,17 +127,17 @@ class BandSpectra(NamedTuple):
         return bin_centers(self.edges)
 
     @property
-    def chi2_bins(self) -> Float[np.ndarray, "2 bin"]:
+    def chi2_bins(self) -> Float[np.ndarray, "stokes bin"]:
         """((observed - mean) / std)^2 in each bin."""
         return ((self.binned - self.mean) / self.std) ** 2
 
     @property
-    def largest_error(self) -> Float[np.ndarray, " 2"]:
+    def largest_error(self) -> Float[np.ndarray, " stokes"]:
         """Largest of the paper's errors as a fraction of the observed spectrum."""
         return (self.error[:, LMIN:] / self.observed[:, LMIN:]).max(axis=-1)
 
 
-#: By band, region and Stokes parameters: "Q", "U" or "QU".
+#: By band, region and Stokes parameters: "Q", "U", "QU" or "I".
 Scatters: TypeAlias = dict[tuple[str, str, str], Scatter]
 
 
@@ -144,6 +152,11 @@ class Comparison(NamedTuple):
     regions: dict[str, Bool[np.ndarray, " pix"]]
     scatters: Scatters
     spectra: list[BandSpectra]
+
+    @property
+    def stokes(self) -> str:
+        """Stokes parameters of the maps."""
+        return self.prepared.fluctuations.stokes
 
 
 def check_comparison(
@@ -251,22 +264,22 @@ def simulated_fluctuations(
 @jax.jit
 def _sums_of_squares(
     maps: Float[Array, "band stokes pix"], regions: Bool[Array, "region pix"]
-) -> Float[Array, "band region 3"]:
-    """Return the sums over the pixels of each region of the squares of Q, U and both."""
-    return jnp.einsum("bsp,rp,ts->brt", maps**2, regions.astype(maps.dtype), COUNTED)
+) -> Float[Array, "band region choice"]:
+    """Return the sums over the pixels of each region of the squares of Q, U and both, or of I."""
+    return jnp.einsum("bsp,rp,ts->brt", maps**2, regions.astype(maps.dtype), _counted(maps))
 
 
 def _slopes(
     prepared: CommonMaps, model: Float[Array, "band stokes pix"], inside: Bool[Array, "region pix"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return slopes and their errors, shape (band, region, 3).
+    """Return slopes and their errors, shape (band, region, choice).
 
     The slope of the maps d on the model m is m^T W d / m^T W m; with C the covariance of noise and
     CMB in the maps, its variance is m^T W C W m / (m^T W m)^2.
     """
     weighted = jnp.where(jnp.isfinite(prepared.sigma), model / prepared.sigma**2, 0.0)
-    # One row per region for each of Q, U and both.
-    rows = jnp.einsum("bsp,rp,ts->brtsp", weighted, inside.astype(model.dtype), COUNTED)
+    # One row per region for each choice of Stokes parameters.
+    rows = jnp.einsum("bsp,rp,ts->brtsp", weighted, inside.astype(model.dtype), _counted(model))
     shape = rows.shape[:3]
     total = prepared.fluctuations.covariance(rows.reshape(shape[0], -1, *rows.shape[3:]))
     variance = np.einsum("brtbrt->brt", total.reshape(*shape, *shape))
@@ -280,7 +293,7 @@ def compare_pixels(
     regions: Mapping[str, Bool[np.ndarray, " pix"]],
     simulated: ComparisonRealisations,
 ) -> Scatters:
-    """Compare the observed maps with the model in each region, for Q, U and both."""
+    """Compare the observed maps with the model in each region, for Q, U and both, and for I."""
     inside = jnp.asarray(np.stack(list(regions.values())))
     slopes, errors = _slopes(prepared, model, inside)
     residual = prepared.data - model
@@ -288,12 +301,13 @@ def compare_pixels(
     floor = 1 / (1 + len(simulated.chi2))
     pte = floor * (1 + (simulated.chi2 >= found).sum(axis=0))
     squares = simulated.squares.mean(axis=0)
-    names = itertools.product(prepared.bands, regions, STOKES)
+    letters = prepared.fluctuations.stokes
+    names = itertools.product(prepared.bands, regions, COMPARED[letters])
     scatters = {}
     for name, at in zip(names, np.ndindex(slopes.shape), strict=True):
         _, region, stokes = name
         both = (np.asarray(maps[at[0]])[:, regions[region]] for maps in (model, prepared.data))
-        x, y = (maps[["QU".index(s) for s in stokes]].ravel() for maps in both)
+        x, y = (maps[[letters.index(s) for s in stokes]].ravel() for maps in both)
         scatters[name] = Scatter(
             pixels=x.size,
             slope=float(slopes[at]),
@@ -374,7 +388,7 @@ def _binned(spectra: Float[np.ndarray, "... ell"], edges: tuple[int, ...]) -> np
 
 
 def _tested(
-    binned: Float[np.ndarray, "2 bin"], simulated: Float[np.ndarray, "sim 2 bin"]
-) -> Float[np.ndarray, "2 2"]:
-    """Return chi^2 of EE and BB against simulations, and the probabilities to exceed them."""
-    return np.array([hotelling(binned[i], simulated[:, i]) for i in (0, 1)]).T
+    binned: Float[np.ndarray, "stokes bin"], simulated: Float[np.ndarray, "sim stokes bin"]
+) -> Float[np.ndarray, "2 stokes"]:
+    """Return chi^2 of each spectrum against simulations, and the probabilities to exceed them."""
+    return np.array([hotelling(binned[i], simulated[:, i]) for i in range(len(binned))]).T

@@ -32,6 +32,8 @@ LEAST_MODES = 4.0
 #: Lowest multipole of polarization.
 LMIN = 2
 FIELDS = ("EE", "BB")
+#: Names of the spectra of maps of some Stokes parameters.
+SPECTRA = {"I": ("TT",), "QU": FIELDS, "IQU": ("TT", *FIELDS)}
 
 
 class MaskedSpectra(NamedTuple):
@@ -317,8 +319,8 @@ def mean_spectrum(
 
 def polarization_alms(
     maps: Float[Array, "band stokes pix"], lmax: int
-) -> Float[Array, "band 2 alm"]:
-    """Return E and B of each band; at l = 1.5 nside their spectra are good to 1e-3."""
+) -> Float[Array, "band stokes alm"]:
+    """Return I, E and B of each band, as far as seen; to l = 1.5 nside C_l are good to 1e-3."""
     return jnp.stack([analysis(band, lmax) for band in maps])
 
 

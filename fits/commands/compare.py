@@ -18,9 +18,11 @@ from fits.comparison import BandSpectra, Comparison, Scatter, check_comparison, 
 from fits.discs import PatchComparison, compare_patches
 from fits.inputs import inputs_of
 from fits.patches import PatchFits
-from fits.pseudo_cl import FIELDS
+from fits.pseudo_cl import FIELDS, SPECTRA
 from fits.regions import region_masks
 from fits.results import probability, with_error
+from jaxsky.arrays import STOKES
+from jaxsky.checks import listed
 from jaxsky.harmonics import average_pixels
 from jaxsky.settings import Experiment
 
@@ -34,7 +36,7 @@ MULTIPOLE = r"multipole $\ell$"
 NSIDE = 32
 #: Panels per row.
 COLUMNS = 3
-#: Label, C_l of EE and BB, and style.
+#: Label, C_l of all spectra, and style.
 Curve = tuple[str, np.ndarray, dict[str, Any]]
 #: Patches in a picture: name, which are shown, and x and y, each a fit and EE (0) or BB (1).
 Series = tuple[str, np.ndarray, tuple[PatchFits, int], tuple[PatchFits, int]]
@@ -65,23 +67,24 @@ def _patch_numbers(patches: PatchComparison) -> dict[str, Any]:
 
 def _table(comparison: Comparison) -> ResultTable:
     """Return the table of slopes, correlations and probabilities."""
-    header = ("band", "region", "", "slope", "r", "rms", "exp.", "PTE", "EE", "BB")
-    spectra = {s.band: s for s in comparison.spectra}
+    names = SPECTRA[comparison.stokes]
+    header = ("band", "region", "", "slope", "r", "rms", "exp.", "PTE", *names)
+    spectra, nothing = {s.band: s for s in comparison.spectra}, [""] * len(names)
     rows: list[Row] = []
     for band in comparison.prepared.bands:
-        powers = [probability(p) for p in spectra[band].pte] if band in spectra else ["", ""]
+        powers = [probability(p) for p in spectra[band].pte] if band in spectra else nothing
         first, last = band, powers  # in the first row of a band only
         for (name, region, stokes), s in comparison.scatters.items():
             if name == band:
                 slope = with_error(s.slope, s.error).replace(" ", "")
                 numbers = (f"{s.correlation:.2f}", f"{s.rms:.2f}", f"{s.expected:.2f}", s.pte_text)
                 rows.append((first, region, stokes, slope, *numbers, *last))
-                first, last = "", ["", ""]
+                first, last = "", nothing
         rows.append(())
     caption = (
         "Slope of observed on model with the error of noise and CMB; rms of their difference, and "
         "that expected of noise and CMB, in uK_RJ; PTE: probability that noise and CMB alone give "
-        "a larger chi2, in pixels, EE and BB."
+        f"a larger chi2, in pixels, {listed(names)}."
     )
     return ResultTable(header, rows, caption, words=3)
 
@@ -96,18 +99,20 @@ def comparison_warnings(comparison: Comparison, settings: Experiment) -> list[st
             f"{comparison.prepared.used.size} pixels have no value."
         )
     for (band, region, stokes), s in comparison.scatters.items():
-        if stokes == "QU" and s.slope_pte < UNLIKELY:
+        if stokes in ("I", "QU") and s.slope_pte < UNLIKELY:
             sentences.append(
                 f"{band}, {region}: the slope is {with_error(s.slope, s.error)}, further from "
                 f"1 than noise and CMB explain (PTE {probability(s.slope_pte)})."
             )
-        if stokes == "QU" and s.pte <= s.floor:
+        if stokes in ("I", "QU") and s.pte <= s.floor:
             sentences.append(
                 f"{band}, {region}: the maps differ from the model by {s.rms:.3g} uK_RJ, more "
                 f"than in any of {round(1 / s.floor) - 1} realisations of noise and CMB."
             )
     for one in comparison.spectra:
-        if unlikely := [n for n, p in zip(FIELDS, one.pte, strict=True) if p < UNLIKELY]:
+        if unlikely := [
+            n for n, p in zip(SPECTRA[comparison.stokes], one.pte, strict=True) if p < UNLIKELY
+        ]:
             sentences.append(
                 f"{one.band}: {' and '.join(unlikely)} differ from the model by more than noise "
                 f"and CMB do (PTE below {UNLIKELY:g})."
@@ -120,17 +125,18 @@ def plot_scatter(
 ) -> None:
     """Draw observed against modelled pixels of a region, Q above U (the paper's fig. 5)."""
     names, pixels = list(comparison.prepared.bands), comparison.regions[region]
-    rows, columns = 2 * -(-len(bands) // COLUMNS), min(len(bands), COLUMNS)
+    many = len(comparison.stokes)
+    rows, columns = many * -(-len(bands) // COLUMNS), min(len(bands), COLUMNS)
     size = 2.4 * columns, 2.35 * rows + 0.6
     with plots.draw_panels(path, title, size, rows, columns) as grid:
         for i, band in enumerate(bands):
-            for s, stokes in enumerate("QU"):
-                axes = grid[2 * (i // COLUMNS) + s, i % COLUMNS]
+            for s, stokes in enumerate(comparison.stokes):
+                axes = grid[many * (i // COLUMNS) + s, i % COLUMNS]
                 both = (comparison.model, comparison.prepared.data)
                 x, y = (np.asarray(maps[names.index(band), s])[pixels] for maps in both)
                 axes.set_title(plots.plain(f"{band}: {stokes}"))
                 _draw_scatter(axes, comparison.scatters[band, region, stokes], x, y)
-        for axes in grid[-2:, (len(bands) - 1) % COLUMNS + 1 :].flat:
+        for axes in grid[-many:, (len(bands) - 1) % COLUMNS + 1 :].flat:
             axes.set_visible(False)
         for axes in grid[:, 0]:
             axes.set_ylabel(f"observed [{UNIT}]")
@@ -156,7 +162,7 @@ def plot_model_maps(
 ) -> None:
     """Draw observed maps next to the model, on the same colour scale (the paper's fig. 6).
 
-    One row per band, two columns per letter of `stokes`, "Q", "U" or "QU"; in pixels of nside 32.
+    One row per band, two columns per letter of `stokes`, such as "QU"; in pixels of nside 32.
     """
     nside = min(NSIDE, healpy.npix2nside(comparison.prepared.used.size))
     names, rows = list(comparison.prepared.bands), []
@@ -172,7 +178,7 @@ def plot_model_maps(
         )
         row: list[plots.MapPanel] = []
         for kind in stokes:
-            s, scatter = "QU".index(kind), comparison.scatters[band, region, kind]
+            s, scatter = comparison.stokes.index(kind), comparison.scatters[band, region, kind]
             limit, slope = plots.color_limit(model[s]), with_error(scatter.slope, scatter.error)
             head = f"model; slope {slope}, r = {scatter.correlation:.2f} ({region})"
             row += [
@@ -184,7 +190,7 @@ def plot_model_maps(
 
 
 def _draw_curves(axes: Axes, curves: Sequence[Curve], field: int, width: float) -> None:
-    """Draw spectra of EE (0) or BB (1) as D_l, on logarithmic axes."""
+    """Draw one of the spectra, BB being the last, as D_l, on logarithmic axes."""
     for name, spectra, style in curves:
         axes.plot(*plots.with_powers(spectra[field]), label=name, **{"lw": width, **style})
     axes.set(xscale="log", yscale="log")
@@ -192,9 +198,10 @@ def _draw_curves(axes: Axes, curves: Sequence[Curve], field: int, width: float) 
 
 
 def plot_full_sky(path: Path, spectra: Sequence[BandSpectra], title: str) -> None:
-    """Draw EE and BB per band, observed and of the complete model (the paper's figs. 7 and 8)."""
-    size = 7.2, 2.3 * len(spectra) + 0.8
-    with plots.draw_panels(path, title, size, len(spectra), 2, sharex=True) as grid:
+    """Draw spectra per band, observed and of the complete model (the paper's figs. 7 and 8)."""
+    columns = len(spectra[0].pte)
+    size = (max(4.0, 3.6 * columns), 2.3 * len(spectra) + 0.8)
+    with plots.draw_panels(path, title, size, len(spectra), columns, sharex=True) as grid:
         for row, one in zip(grid, spectra, strict=True):
             for index, axes in enumerate(row):
                 _draw_spectrum(axes, one, index)
@@ -221,7 +228,8 @@ def _draw_spectrum(axes: Axes, spectra: BandSpectra, index: int) -> None:
     axes.set_ylim(bottom=0.3 * min(observed.min(), foregrounds.min()))
     chi2, pte = f"{spectra.chi2[index]:.1f}", probability(spectra.pte[index])
     tested = rf"$\chi^2$ = {chi2} / {spectra.binned.shape[-1]} bins, PTE {pte}"
-    axes.set_title(f"{plots.plain(spectra.band)}: {FIELDS[index]}, {tested}")
+    name = SPECTRA[STOKES[len(spectra.pte)]][index]
+    axes.set_title(f"{plots.plain(spectra.band)}: {name}, {tested}")
 
 
 def plot_leakage(path: Path, spectra: Sequence[BandSpectra], title: str) -> None:
@@ -230,14 +238,14 @@ def plot_leakage(path: Path, spectra: Sequence[BandSpectra], title: str) -> None
         for axes, one in zip(grid[0], spectra, strict=True):
             assert one.uncorrected is not None  # as chosen by the caller
             assert one.pte_uncorrected is not None
-            before, after = (probability(p[1]) for p in (one.pte_uncorrected, one.pte))
+            before, after = (probability(p[-1]) for p in (one.pte_uncorrected, one.pte))
             curves: list[Curve] = [
                 (f"before correction, PTE {before}", one.uncorrected, {"color": plots.COLORS[1]}),
                 (f"after correction, PTE {after}", one.observed, {"color": plots.COLORS[0]}),
                 ("foregrounds", one.foregrounds, {"color": "k", "lw": 0.9, "ls": "--"}),
                 ("noise", one.noise, {"color": plots.COLORS[2], "ls": ":"}),
             ]
-            _draw_curves(axes, curves, 1, 1.2)
+            _draw_curves(axes, curves, -1, 1.2)
             axes.set(xlabel=MULTIPOLE, title=plots.plain(f"{one.band}: BB"))
             axes.legend(frameon=False)
         grid[0, 0].set_ylabel(POWER)
@@ -320,7 +328,7 @@ def _work(settings: Experiment, command: Run) -> Report:
         f"scatter_{region}.png": (plot_scatter, found, region, bands, f"{title}\n{region}")
         for region in regions
     }
-    pictures |= {f"maps_{s}.png": (plot_model_maps, found, s, bands, title) for s in "QU"}
+    pictures |= {f"maps_{s}.png": (plot_model_maps, found, s, bands, title) for s in found.stokes}
     if found.spectra:
         pictures["spectra.png"] = plot_full_sky, found.spectra, title
     if leaky := [s for s in found.spectra if s.uncorrected is not None]:
@@ -335,5 +343,5 @@ def _work(settings: Experiment, command: Run) -> Report:
     return Report(inputs.description, [_table(found)], warnings, numbers, pictures)
 
 
-PICTURES = ("scatter_*.png", "maps_[QU].png", "spectra.png", "leakage.png", "patches.png")
+PICTURES = ("scatter_*.png", "maps_[IQU].png", "spectra.png", "leakage.png", "patches.png")
 COMMAND = Command("compare", _work, ("comparison.json", "simulations.npz", *PICTURES))

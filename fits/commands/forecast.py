@@ -346,4 +346,5 @@ def _work(settings: Experiment, command: Run) -> Report:
     )
 
 
-COMMAND = Command("forecast", _work, ("forecast.json", "bb.png", "fisher.png"))
+RESULTS = ("forecast.json", "bb.png", "fisher.png")
+COMMAND = Command("forecast", _work, RESULTS, stokes=("QU", "IQU"))

@@ -33,9 +33,10 @@ from fits.commands.report import (
 )
 from fits.results import FitError, write_json, write_log
 from jaxsky import job
+from jaxsky.arrays import STOKES
 from jaxsky.io import files
 from jaxsky.io.stacks import scratch
-from jaxsky.settings import Experiment, check_log, load, of_file
+from jaxsky.settings import Experiment, SettingsError, check_log, load, of_file
 from jaxsky.workers import raised_in, workers_of
 
 #: Files in every results folder: the steps with their times, and the page of results.
@@ -116,13 +117,15 @@ class Command(NamedTuple):
     """A command; its name is also that of its default experiment file.
 
     `work` calls `Run.begin` before it writes; `results` are patterns of all files but the logs.
-    If `shared`, the processes of a job share out the work.
+    If `shared`, the processes of a job share out the work. `stokes` are the choices of
+    `common.stokes` that it takes.
     """
 
     name: str
     work: Callable[[Experiment, Run], Report]
     results: tuple[str, ...] = ()
     shared: bool = False
+    stokes: tuple[str, ...] = tuple(STOKES.values())
 
 
 def run_command(
@@ -158,6 +161,12 @@ def run_command(
         import matplotlib as mpl
 
         from jaxsky.montecarlo import other_sky
+
+        if settings.common.stokes not in command.stokes:
+            raise SettingsError(
+                f"common.stokes: jaxsky {command.name} takes {' or '.join(command.stokes)}, not "
+                f"{settings.common.stokes}."
+            )
 
         mpl.use("Agg")  # pictures go to files
         guard = results_folder(out, command.results, resume=resume, overwrite=overwrite, part=part)

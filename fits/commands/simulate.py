@@ -11,6 +11,7 @@ import numpy as np
 
 from fits.commands.run import Report, Run
 from fits.plots import UNITS, color_limit, draw_map, draw_panels, draw_spectra, plain, spread
+from fits.pseudo_cl import SPECTRA
 from jaxsky import experiment, montecarlo
 from jaxsky.harmonics import analysis, power_spectrum
 from jaxsky.io import read_maps
@@ -72,21 +73,24 @@ def make_realisations(settings: Experiment, command: Run, *, only: str | None) -
 
 
 def _draw_sheet(path: Path, files: Mapping[str, Path], lmax: int, settings: Experiment) -> None:
-    """Draw Q and U of some bands, read from their files, and the spectra of their totals."""
+    """Draw maps of some bands, read from their files, and the spectra of their totals."""
     names, unit, spectra = spread(list(files), SHOWN), settings.simulate.unit, {}
-    size, heights = (7.2, 1.75 * len(names) + 3.2), [1.0] * len(names) + [1.6]
+    stokes = settings.simulate.stokes
+    size, heights = (max(4.5, 3.6 * len(stokes)), 1.75 * len(names) + 3.2), [1.0] * len(names)
+    shape, heights = (len(names) + 1, len(stokes)), [*heights, 1.6]
     with draw_panels(
-        path, settings.title, size, len(names) + 1, 2, fontsize=10, height_ratios=heights
+        path, settings.title, size, *shape, fontsize=10, height_ratios=heights
     ) as panels:
         for row, name in zip(panels, names, strict=False):
-            maps = np.asarray(read_maps(files[name], fields=["Q", "U"], missing=[]).maps)
+            maps = np.asarray(read_maps(files[name], fields=list(stokes), missing=[]).maps)
             # Without refinement this is good to 1e-3, which no eye can see.
             largest = min(lmax, LMAX_SHOWN, 2 * healpy.npix2nside(maps.shape[-1]))
             spectra[name] = np.asarray(power_spectrum(analysis(jnp.asarray(maps), largest, 0)))
-            for axes, values, which in zip(row, maps, "QU", strict=True):
-                draw_map(axes, values, color_limit(maps), UNITS[unit])
+            for axes, values, which in zip(row, maps, stokes, strict=True):
+                limit = color_limit(maps[:1] if which == "I" else maps[-2:])
+                draw_map(axes, values, limit, UNITS[unit])
                 axes.set_title(plain(f"{name}: {which}"))
-        for index, (axes, which) in enumerate(zip(panels[-1], ("EE", "BB"), strict=True)):
+        for index, (axes, which) in enumerate(zip(panels[-1], SPECTRA[stokes], strict=True)):
             draw_spectra(axes, {n: s[index] for n, s in spectra.items()}, unit)
             axes.set_title(which)
             low, high = axes.get_ylim()

@@ -238,6 +238,8 @@ class Experiment(SettingsTable):
                 raise MistakeAt(f"fixed.{name}.nu_ref", f"belongs next to law in sky.{name}")
         if not self.forecast.free and not self.free_in("forecast"):
             raise MistakeAt("forecast.free", "is empty, and so is the table free")
+        if self.compare.patches and self.common.stokes != "QU":
+            raise MistakeAt("compare.patches", "takes Q and U alone; choose QU as common.stokes")
         if "cmb" in (self.simulate.include or ()) and not self.cmb.include:
             raise MistakeAt("simulate.include", "has 'cmb', but cmb.include is false")
         components = self.sky.components

@@ -106,24 +106,29 @@ def _load(path: Path) -> Any:
 
 def _instrument(table: Any) -> dict[str, Any]:
     """Return title, fraction of the sky and bands of a table in memory."""
-    title = fraction = None
-    if isinstance(table, Mapping):
-        table = dict(table)
-        meta = table.pop("meta", None)
-        about = dict(meta) if isinstance(meta, Mapping) else {}
-        for key in ("title", "sky_fraction", "f_sky"):
-            if key in table and np.ndim(table[key]) == 0:
-                about[key] = table.pop(key)
-        title, fraction = about.get("title"), about.get("sky_fraction", about.get("f_sky"))
-        if set(table) == {"bands"}:
-            table = table["bands"]
-            rows = table if isinstance(table, list) else []
-            if any(isinstance(row, Mapping) and not _is_flat(row) for row in rows):
-                return _checked(title, fraction, [dict(row) for row in rows])
+    table, about = _heading(table)
+    title, fraction = about.get("title"), about.get("sky_fraction", about.get("f_sky"))
+    rows = table if about.get("bands") and isinstance(table, list) else [None]
+    tables = all(isinstance(row, Mapping) for row in rows)
+    if tables and not (rows and all(map(_is_flat, rows))):  # of an experiment file
+        return _checked(title, fraction, [dict(row) for row in rows])
     found = _numbers_of(_named(_columns(table)))
     if fraction is None and len(set(found.get("sky_fraction", ()))) == 1:
         fraction = found["sky_fraction"][0]
     return _checked(title, fraction, _bands(found))
+
+
+def _heading(table: Any) -> tuple[Any, dict[str, Any]]:
+    """Return columns or rows without what is said of all, and that; "bands" if these held rows."""
+    if not isinstance(table, Mapping):
+        return table, {}
+    columns, meta = dict(table), table.get("meta")
+    about = dict(meta) if isinstance(meta, Mapping) else {}
+    columns.pop("meta", None)
+    for key in ("title", "sky_fraction", "f_sky"):
+        if key in columns and _is_one(columns[key]):
+            about[key] = columns.pop(key)
+    return columns.get("bands", columns), about | {"bands": "bands" in columns}
 
 
 def _is_flat(row: Mapping[str, Any]) -> bool:
@@ -135,9 +140,9 @@ def _checked(title: Any, fraction: Any, bands: list[dict[str, Any]]) -> dict[str
     """Return an instrument, after checking that its bands have names, all different."""
     names = [str(band.get("name", "")) for band in bands]
     if not bands or "" in names:
-        raise UnfitError("has no bands." if not bands else f"band {names.index('') + 1}: no name.")
+        raise UnfitError(f"band {names.index('') + 1}: no name." if bands else "there are none.")
     if twice := next((name for name in names if names.count(name) > 1), None):
-        raise UnfitError(f"{names.count(twice)} bands are called {twice!r}; give them names.")
+        raise UnfitError(f"{names.count(twice)} of bands {', '.join(names)} are called {twice}.")
     if fraction is not None:
         fraction = _number("sky_fraction", "sky_fraction", 1, fraction, None)
     return {"title": title and str(title), "sky_fraction": fraction, "bands": bands}
@@ -186,6 +191,11 @@ def _split(key: Any) -> tuple[str, str | None]:
     return (match["name"], match["unit"]) if match else (str(key).strip(), None)
 
 
+def _is_one(column: Any) -> bool:
+    """Return whether what stands for a column is a single value."""
+    return not isinstance(column, list | tuple) and np.ndim(column) == 0
+
+
 def _named(columns: Mapping[str, Any]) -> dict[str, _Column]:
     """Return the columns by what they hold."""
     found: dict[str, _Column] = {}
@@ -200,7 +210,7 @@ def _named(columns: Mapping[str, Any]) -> dict[str, _Column]:
         if kind in found:
             raise UnfitError(f"{label} and {found[kind].label} are both columns of the {kind}.")
         unit = str(own) if (own := getattr(column, "unit", None)) is not None else unit
-        values = [column] if isinstance(column, str) or np.ndim(column) == 0 else list(column)
+        values = [column] if _is_one(column) else list(column)
         found[kind] = _Column(label, values, unit)
     for kind in ("center", "fwhm", "noise"):
         if kind not in found:

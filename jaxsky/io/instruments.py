@@ -108,10 +108,8 @@ def _instrument(table: Any) -> dict[str, Any]:
     """Return title, fraction of the sky and bands of a table in memory."""
     table, about = _heading(table)
     title, fraction = about.get("title"), about.get("sky_fraction", about.get("f_sky"))
-    rows = table if about.get("bands") and isinstance(table, list) else [None]
-    tables = all(isinstance(row, Mapping) for row in rows)
-    if tables and not (rows and all(map(_is_flat, rows))):  # of an experiment file
-        return _checked(title, fraction, [dict(row) for row in rows])
+    if about.get("bands") and _are_of_experiment(table):
+        return _checked(title, fraction, [dict(row) for row in table])
     found = _numbers_of(_named(_columns(table)))
     if fraction is None and len(set(found.get("sky_fraction", ()))) == 1:
         fraction = found["sky_fraction"][0]
@@ -131,9 +129,12 @@ def _heading(table: Any) -> tuple[Any, dict[str, Any]]:
     return columns.get("bands", columns), about | {"bands": "bands" in columns}
 
 
-def _is_flat(row: Mapping[str, Any]) -> bool:
-    """Return whether a row has a frequency of its own, as bands of an experiment file have not."""
-    return any(KINDS.get(_split(key)[0].lower()) == "center" for key in row)
+def _are_of_experiment(rows: Any) -> bool:
+    """Return whether rows are bands of an experiment file, which have no frequency of their own."""
+    if not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows):
+        return False
+    kinds = [{KINDS.get(_split(key)[0].lower()) for key in row} for row in rows]
+    return not rows or any("center" not in row for row in kinds)
 
 
 def _checked(title: Any, fraction: Any, bands: list[dict[str, Any]]) -> dict[str, Any]:

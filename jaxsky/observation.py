@@ -275,7 +275,7 @@ def load_instrument(
     ----------
     name : "planck", "wmap", "core", "litebird", "litebird-arrays" (its 22 arrays), "so-sat",
         "so-sat-goal", "so-lat", "so-lat-goal" (Simons Observatory), "pico", "cmb-s4-sat",
-        "cmb-s4-lat", "bicep-keck", "spt-3g" or "s-pass"
+        "cmb-s4-lat", "bicep-keck", "advact", "spt-3g" or "s-pass"
     channels : names of the channels wanted, in this order; by default all
     target : common beam of the maps [arcmin]; None keeps the beam of each
     samples : number of samples per band; see `Bandpass.top_hat`

@@ -40,9 +40,12 @@ MAPS = np.random.default_rng(3).normal(size=(2, NPIX))
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets_load_print_and_simulate(name):
+def test_presets_load_print_and_simulate(tmp_path, name):
+    file = tmp_path / "x.toml"
+    file.write_text(f'[sky]\nembedded = {{ nside = 8 }}\n[[bands]]\ninstrument = "{name}"\n')
     instrument, tables = load_instrument(name, samples=3), band_tables(name)
     assert list(instrument) == [table["name"] for table in tables]
+    assert [band.name for band in load(file).bands] == list(instrument)
     lines = str(instrument).splitlines()
     assert lines[0].startswith(f"Instrument {instrument.title}")
     assert len(lines) == 2 + len(instrument)
@@ -87,6 +90,7 @@ PUBLISHED = {
     "cmb-s4-sat": {"95": (95, 22.7, 0.78, None), "270": (270, 13, 6.0, None)},
     "cmb-s4-lat": {"93": (93, 2.2, 2.9, 2.0), "278": (278, 0.9, 23.6, 16.7)},
     "spt-3g": {"95": (93.8, 1.57, 8.4, 5.4), "220": (219.9, 1.04, 25.8, 16.2)},
+    "advact": {"90": (95.9, 2.2, 7.8 * 2**0.5, 7.8), "220": (221.7, 0.9, 25 * 2**0.5, 25)},
     "bicep-keck": {"95": (95.5, 43.1, 5.2, None), "150": (148.9, 29.7, 2.9, None)},
     "planck": {"100": (101.3, 9.68, 1.96 * 60, 1.29 * 60),
                "353": (361.3, 4.94, 7.31 * 60, 2.56 * 60)},

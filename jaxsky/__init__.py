@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from jaxsky.galaxy import embedded_sky
     from jaxsky.harmonics import smooth
     from jaxsky.io import read_bandpass, read_beam, read_maps, read_mask, read_spectra, write_maps
-    from jaxsky.observation import Observation, ObservedBand, Source, load_instrument
+    from jaxsky.observation import Instrument, Observation, ObservedBand, Source, load_instrument
     from jaxsky.simulation import simulate
     from jaxsky.sky import (
         Sky,

@@ -1,6 +1,6 @@
 """The inputs of a simulation: components, bands with beams and noise, pixels, and instruments."""
 
-import tomllib
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from jaxsky.checks import (
     shown,
 )
 from jaxsky.components import Component
-from jaxsky.public import packaged
+from jaxsky.public import packaged, takes_quantities
 from jaxsky.small_scales import SmallScales
 
 #: Floating-point types by the name of their precision.
@@ -173,20 +173,89 @@ def check_sources(sources: Mapping[str, Source], observation: Observation) -> No
 
 
 class Instrument(Printed, dict[str, ObservedBand]):
-    """The channels of an instrument by name, which print as a table."""
+    """The channels of an instrument by name, which print as a table.
 
-    def __init__(self, title: str, channels: Mapping[str, ObservedBand]) -> None:
+    A channel is found by its name, or, where that is a whole number, by the number.
+
+    Parameters
+    ----------
+    title : name of the instrument
+    channels : by name, in order
+    noise_I : uniform level of the noise of I [uK_RJ arcmin] of the channels where it is known; that
+        of a channel, `ObservedBand.noise`, is of Q and U
+    sky_fraction : of the survey, or None
+    """
+
+    def __init__(
+        self,
+        title: str,
+        channels: Mapping[str, ObservedBand],
+        *,
+        noise_I: Mapping[str, Scalar | float] | None = None,
+        sky_fraction: float | None = None,
+    ) -> None:
         super().__init__(channels)
-        self.title = title
+        self.title, self.noise_I, self.sky_fraction = title, dict(noise_I or {}), sky_fraction
 
-    def bands(self) -> dict[str, Bandpass]:
-        """Return the bandpasses by name."""
-        return {name: channel.band for name, channel in self.items()}
+    def __missing__(self, name: object) -> ObservedBand:
+        if isinstance(name, int | np.integer) and str(name) in self:
+            return self[str(name)]
+        raise KeyError(f"{self.title} has no channel {name!r}; it has {', '.join(self)}.")
+
+    @classmethod
+    @takes_quantities
+    def from_table(
+        cls,
+        table: Any,
+        title: str | None = None,
+        *,
+        target: Array | float | None = None,
+        samples: int = 51,
+    ) -> "Instrument":
+        """Return the instrument that a table describes, as `load_instrument` does.
+
+        Parameters
+        ----------
+        table : columns by name, rows, or the name of a file; `jaxsky.io.instruments` says which
+            columns, among them those of FGBuster and of litebird_sim
+        title : by default that of the table, or the name of its file
+        target, samples : see `load_instrument`
+
+        Raises
+        ------
+        InputError, TypeError, ValueError
+            One sentence with the column and the value that cannot be used.
+
+        Examples
+        --------
+        >>> table = {"frequency": [30.0, 150.0], "width": [9.0, 40.0], "fwhm": [70.0, 15.0]}
+        >>> mine = Instrument.from_table(table | {"depth_p": [20.0, 3.0]}, "Mine")
+        >>> list(mine), f"{mine[150].band.center:.1f}"
+        (['30', '150'], '150.0')
+        """
+        from jaxsky.io.instruments import read_instrument  # astropy, which takes its time
+
+        found = read_instrument(table)
+        for band in found["bands"]:
+            _check_simple(band)
+        about = found | {"title": title or found["title"] or "from a table"}
+        return _built(about, found["bands"], target, samples)
+
+    def bands(self) -> OrderedDict[str, Bandpass]:
+        """Return the bandpasses by name; JAX keeps the order of this kind of dictionary."""
+        return OrderedDict((name, channel.band) for name, channel in self.items())
 
     def summary(self):
         table = [dict(channel.summary()[1]) for channel in self.values()]
         rows = [(name, *row.values()) for name, row in zip(self, table, strict=True)]
-        return f"Instrument {self.title}", [("channel", *table[0]), *rows]
+        head: tuple[str, ...] = ("channel", *table[0])
+        if self.noise_I:
+            levels = {name: shown(level, "uK_RJ arcmin") for name, level in self.noise_I.items()}
+            head = (*head, "noise of I")
+            rows = [(*row, levels.get(row[0], "unknown")) for row in rows]
+        part = self.sky_fraction
+        sky = "" if part in (None, 1) else f", {100 * part:.3g} % of the sky"
+        return f"Instrument {self.title}{sky}", [head, *rows]
 
 
 def load_instrument(
@@ -199,11 +268,14 @@ def load_instrument(
     """Return the channels of an instrument by name, as `Observation` takes them.
 
     Each has a top-hat band, a Gaussian beam and white noise of Q and U [uK_RJ arcmin]. The numbers
-    are from `instruments.toml`, which gives the source of each.
+    are from `instruments.toml`, which gives the source of each. For an instrument of one's own see
+    `Instrument.from_table`.
 
     Parameters
     ----------
-    name : "planck", "wmap", "core" or "litebird"
+    name : "planck", "wmap", "core", "litebird", "litebird-arrays" (its 22 arrays), "so-sat",
+        "so-sat-goal", "so-lat", "so-lat-goal" (Simons Observatory), "pico", "cmb-s4-sat",
+        "cmb-s4-lat", "bicep-keck", "advact", "spt-3g" or "s-pass"
     channels : names of the channels wanted, in this order; by default all
     target : common beam of the maps [arcmin]; None keeps the beam of each
     samples : number of samples per band; see `Bandpass.top_hat`
@@ -225,36 +297,74 @@ def load_instrument(
     if name not in presets:
         raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(presets)}.")
     check_names("channels", channels)
-    found = {}
-    for table in band_tables(name, channels):
-        band = Bandpass.top_hat(**table["bandpass"], samples=samples)
-        noise = table["noise"]
-        level = noise["level"] * band.conversion(noise.get("unit", "uK_CMB"), "uK_RJ")
-        found[table["name"]] = ObservedBand(band, jnp.asarray(table["fwhm"]), target, level)
-    return Instrument(presets[name]["title"], found)
+    preset = presets[name]
+    return _built(preset, _chosen(name, preset["bands"], channels), target, samples)
 
 
-def band_tables(
-    name: str, channels: Sequence[str] | None = None, folder: Path = Path()
+def _built(
+    about: Mapping[str, Any],
+    tables: Sequence[Mapping[str, Any]],
+    target: Array | float | None,
+    samples: int,
+) -> Instrument:
+    """Return an instrument with these bands, tables as in `instruments.toml`."""
+    found, intensity = {}, {}
+    for table in tables:
+        name, noise = str(table["name"]), table["noise"]
+        band = _bandpass(samples, **table["bandpass"])
+        factor = band.conversion(noise.get("unit", "uK_CMB"), "uK_RJ")
+        beam = jnp.asarray(table["fwhm"])
+        found[name] = ObservedBand(band, beam, target, noise["level"] * factor)
+        if "noise_I" in table:
+            intensity[name] = table["noise_I"] * factor
+    sky = about.get("sky_fraction")
+    return Instrument(about["title"], found, noise_I=intensity, sky_fraction=sky)
+
+
+def _check_simple(band: Mapping[str, Any]) -> None:
+    """Raise ValueError unless a band says its top-hat, Gaussian beam and level of noise itself."""
+    keys = {key: set(band[key]) for key in ("bandpass", "noise") if isinstance(band.get(key), dict)}
+    good = set(band) - {"noise_I"} == {"name", "bandpass", "fwhm", "noise"} and len(keys) == 2
+    if not good or keys["bandpass"] != {"center", "width"} or keys["noise"] - {"unit"} != {"level"}:
+        raise ValueError(
+            f"Band {band['name']!r} must have bandpass = {{ center, width }}, fwhm and noise = "
+            "{ level, unit }, and nothing else; other bands are for experiment files."
+        )
+
+
+def _bandpass(samples: int, center: float, width: float = 0.0) -> Bandpass:
+    return Bandpass.top_hat(center, width, samples=samples) if width else Bandpass.delta(center)
+
+
+def _chosen(
+    name: str, bands: Sequence[dict[str, Any]], channels: Sequence[str] | None
 ) -> list[dict[str, Any]]:
-    """Return bands of a preset, or of a file in a folder, as tables of an experiment file."""
-    presets, path = packaged("instruments.toml"), folder / name
-    if name in presets:
-        bands = presets[name]["bands"]
-    elif path.is_file():
-        try:
-            bands = tomllib.loads(path.read_text())["bands"]
-            names = [str(band["name"]) for band in bands]
-            if not names or len(set(names)) < len(names):
-                raise ValueError(", ".join(names) or "there are none")
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            raise ValueError(
-                f"{path}: is no TOML file with a list of bands that have different names ({error})"
-            ) from None
-    else:
-        raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(presets)}, or a file.")
+    """Return the tables of some bands of an instrument, by default of all."""
     known = {str(band["name"]): band for band in bands}
     for channel in channels or ():
         if channel not in known:
             raise KeyError(f"{name} has no channel {channel!r}; it has {', '.join(known)}.")
     return [known[channel] for channel in channels or known]
+
+
+def band_tables(
+    name: str, channels: Sequence[str] | None = None, folder: Path = Path()
+) -> list[dict[str, Any]]:
+    """Return bands of a preset, or of a file in a folder, as tables of an experiment file.
+
+    The file is one that `Instrument.from_table` reads, or has bands of an experiment file.
+    """
+    presets, path = packaged("instruments.toml"), folder / name
+    if name in presets:
+        bands = presets[name]["bands"]
+    elif path.is_file():
+        from jaxsky.io.instruments import read_instrument  # astropy, which takes its time
+
+        bands = read_instrument(path)["bands"]
+    else:
+        raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(presets)}, or a file.")
+    # Commands do not ask for the noise of I, which a band of an experiment file does not have.
+    return [
+        {key: value for key, value in band.items() if key != "noise_I"}
+        for band in _chosen(name, bands, channels)
+    ]

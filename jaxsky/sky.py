@@ -1,8 +1,9 @@
 """The sky as a sum of components: observe it in bands, get and set its parameters by name."""
 
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -15,6 +16,9 @@ from jaxsky.checks import Printed, as_array, check_names, check_type
 from jaxsky.components import Component, check_value, declared
 from jaxsky.interpolation import Nodes, Plan, band_sed, choose_nodes
 from jaxsky.mesh import maps_of, over_pixels, typed
+
+#: Bands in order: a list, or what `Instrument.bands` gives.
+Bands: TypeAlias = Sequence[Bandpass] | OrderedDict[str, Bandpass]
 
 
 class Sky(Printed, eqx.Module):
@@ -70,14 +74,18 @@ class Sky(Printed, eqx.Module):
         return stokes, npix
 
 
-def interpolation_nodes(sky: Sky, bands: Sequence[Bandpass], tolerance: float) -> Plan:
+def interpolation_nodes(sky: Sky, bands: Bands, tolerance: float) -> Plan:
     """Choose node counts for each component as `observe` does, for its argument `nodes`."""
-    return tuple(choose_nodes(c, tuple(bands), tolerance) for c in sky.components.values())
+    bands = _check_bands(sky, bands)
+    return tuple(choose_nodes(c, bands, tolerance) for c in sky.components.values())
 
 
 def _check_bands(sky: object, bands: Any) -> tuple[Bandpass, ...]:
     check_type("Argument `sky`", sky, Sky, "a Sky")
-    # A dictionary would lose its order under jit, and with it the order of the result.
+    # JAX keeps the order of this kind of dictionary; another would lose it under jit, and with it
+    # the order of the result.
+    if isinstance(bands, OrderedDict):
+        bands = tuple(bands.values())
     if isinstance(bands, Bandpass) or not isinstance(bands, Sequence):
         raise TypeError(
             "Argument `bands` must be a list of Bandpass; for one, use observe_band, "
@@ -114,13 +122,13 @@ def _observe(sky, bands, *, plan, apart):
 
 
 def observe(
-    sky: Sky, bands: Sequence[Bandpass], *, tolerance: float = 1e-10, nodes: Plan | None = None
+    sky: Sky, bands: Bands, *, tolerance: float = 1e-10, nodes: Plan | None = None
 ) -> BandMaps:
     """Observe the sky through a list of bands, the paper's eq. 8: (band, stokes, pix) [uK_RJ].
 
     Parameters
     ----------
-    sky, bands : the sky, and a list of bands
+    sky, bands : the sky, and a list of bands, or those of an instrument, `instrument.bands()`
     tolerance : relative error of the band-averaged laws where parameters are maps; 0 sums
         directly over the bands in every pixel. Inside jit, where the range of the maps is not
         known beforehand, a fixed number of nodes is used; if they do not reach the tolerance as
@@ -130,7 +138,7 @@ def observe(
     Raises
     ------
     TypeError, ValueError
-        If `sky` is no Sky, or `bands` is not a list of at least one Bandpass.
+        If `sky` is no Sky, or `bands` is not at least one Bandpass in order.
     """
     sky, bands = typed(sky), _check_bands(sky, bands)
     plan = nodes or interpolation_nodes(sky, bands, tolerance)
@@ -143,7 +151,7 @@ def observe_band(sky: Sky, band: Bandpass, *, tolerance: float = 1e-10) -> Stoke
 
 
 def observe_components(
-    sky: Sky, bands: Sequence[Bandpass], *, tolerance: float = 1e-10, nodes: Plan | None = None
+    sky: Sky, bands: Bands, *, tolerance: float = 1e-10, nodes: Plan | None = None
 ) -> dict[str, BandMaps]:
     """Observe each component separately [uK_RJ]; see `observe`."""
     sky, bands = typed(sky), _check_bands(sky, bands)

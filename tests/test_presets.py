@@ -128,7 +128,7 @@ def test_names_and_maps():
         raises(getattr(builtins, error), words, preset, arguments.pop("name"), MAPS, **arguments)
 
 
-@pytest.mark.parametrize("name", ["planck", "wmap", "core", "litebird"])
+@pytest.mark.parametrize("name", ["planck", "wmap", "core", "litebird", "pico", "so-lat", "spt-3g"])
 def test_presets_are_sound(name):
     tables, instrument = band_tables(name), load_instrument(name, samples=7)
     assert list(instrument) == [table["name"] for table in tables]

@@ -34,7 +34,7 @@ NUMERIC = re.compile(
 )
 #: They convert quantities, or refuse them under a name that they are given.
 BY_THEMSELVES = {"from_quantity", "unit_factor", "Maps.to", "refuse_unit", "compress.bare"}
-BY_THEMSELVES |= {"as_array", "as_number"}
+BY_THEMSELVES |= {"as_array", "as_number", "read_instrument", "Instrument.from_table"}
 
 
 def modules():

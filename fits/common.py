@@ -197,7 +197,9 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
     # Averaged pixels contain multipoles beyond those they resolve.
     reach = lmax if fwhm else 4 * nside
 
-    def noise_of(what: str, noise: Numeric, spectrum: Float[Array, " ell"] | None) -> MapNoise:
+    def noise_of(
+        what: str, noise: Numeric, spectrum: Float[Array, "*stokes ell"] | None
+    ) -> MapNoise:
         """Return noise of the pixels that are kept, and C_l of its correlated part."""
         operator, own = operators[what], kept[what]
         if own is not None:
@@ -206,7 +208,7 @@ def common_maps(inputs: Inputs, nside: int, fwhm: float) -> CommonMaps:
             noise = computed(shape, lambda at: whole[..., at] * own[at], dtype, many)
         if spectrum is not None:
             last = reach if operator.window is None else operator.window.size - 1
-            spectrum = spectrum[: last + 1] * window_of(operator, last) ** 2
+            spectrum = spectrum[..., : last + 1] * window_of(operator, last) ** 2
         return MapNoise(operator, noise, spectrum, inputs.stokes)
 
     noises = {

@@ -43,17 +43,18 @@ class MapNoise(NamedTuple):
 
     `noise` is that of its own pixels, a level [uK_RJ arcmin] or the covariance of the Stokes
     parameters in each [uK_RJ^2]; `correlated` C_l of noise that is correlated between pixels, the
-    same for I, E and B, in the prepared map [uK_RJ^2], None where there is none.
+    same for I, E and B, or one for each, in the prepared map [uK_RJ^2], None where there is none.
     """
 
     preparation: Preparation
     noise: Numeric
-    correlated: Float[Array, " ell"] | None
+    correlated: Float[Array, "*stokes ell"] | None
     stokes: str = "QU"
 
     def _spectra(self) -> Float[np.ndarray, "stokes ell"]:
         """Return `correlated` of each Stokes parameter; polarization has no modes at l < 2."""
-        spectra = np.stack([np.asarray(self.correlated)] * len(self.stokes))
+        given = np.asarray(self.correlated)
+        spectra = np.array(np.broadcast_to(given, (len(self.stokes), given.shape[-1])))
         if "QU" in self.stokes:
             spectra[-2:, :2] = 0.0
         return spectra
@@ -125,7 +126,9 @@ class MapNoise(NamedTuple):
         else:
             shape = (len(self.stokes), healpy.nside2npix(self.preparation.nside))
             total = np.broadcast_to(self.preparation.uniform_variance(float(self.noise)), shape)
-        return total if self.correlated is None else total + map_variance(self.correlated)
+        if self.correlated is None:
+            return total
+        return total + np.array([[map_variance(s)] for s in np.atleast_2d(self.correlated)])
 
 
 class Fluctuations(eqx.Module):

@@ -12,18 +12,23 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fits.regions import absolute_latitude
-from jaxsky import Bandpass, Component, Sky, job, set_parameters
+from jaxsky import Bandpass, job
 from jaxsky import inputs as reading
 from jaxsky.arrays import STOKES, stokes_rows
 from jaxsky.checks import Numeric, listed
-from jaxsky.components import component_class
 from jaxsky.experiment import SimulationInputs, cmb_spectra, simulation_inputs
 from jaxsky.galaxy import EmbeddedSky
 from jaxsky.harmonics import gaussian_beam
 from jaxsky.io import MissingFileError
 from jaxsky.io.stacks import Maps, stored
 from jaxsky.job import by_turns
-from jaxsky.noise import estimate_variance, fit_knee, knee_spectrum, realisation_key
+from jaxsky.noise import (
+    estimate_variance,
+    fit_knee,
+    knee_spectrum,
+    pixel_covariance,
+    realisation_key,
+)
 from jaxsky.noise_inputs import read_noise
 from jaxsky.observation import Observation, ObservedBand
 from jaxsky.observed import Observed, observed_band, read_observed
@@ -31,7 +36,6 @@ from jaxsky.settings import (
     BandTable,
     ComponentTable,
     Experiment,
-    MapFile,
     MapKeys,
     SettingsError,
     at_key,
@@ -69,7 +73,7 @@ class Band(NamedTuple):
     bandpass: Bandpass
     beam: float | Float[Array, " ell"]
     noise: Numeric | Maps
-    correlated: Float[Array, " ell"] | None = None
+    correlated: Float[Array, "*stokes ell"] | None = None
     leakage: Leakage | None = None
 
     def of_many(self, number: int) -> "Band":
@@ -192,13 +196,14 @@ def read_template_noise(
         )
     nside, unit = healpy.npix2nside(template.used.size), noise.unit or template.unit
     at = None if spec.nu_ref is None else spec.reference(stokes[-1])
-    if at is not None and spec.reference(stokes[0]) != at:
+    level, apart = noise.level_of(stokes[-1]), at is not None and spec.reference(stokes[0]) != at
+    if apart or noise.level_of(stokes[0]) != level:
         raise SettingsError(
-            f"{where}: is not known for a template with a reference frequency of its own for I; "
-            'choose "I" or "QU" as common.stokes, or write { rms = 0.0 } to take it as exact.'
+            f"{where}: is not known where I has a frequency or level of its own; choose I or QU "
+            "as common.stokes, or write { rms = 0.0 } to take the template as exact."
         )
-    if noise.level is not None:
-        level = noise.level * reading.uK_RJ_per(unit, at, where)
+    if level is not None:
+        level = level * reading.uK_RJ_per(unit, at, where)
         spectrum = level_spectrum(level, template.fwhm, 4 * nside, stokes)
         return TemplateNoise(correlated=spectrum, shared=noise.shared)
     maps = template.component.amplitude
@@ -234,7 +239,8 @@ def _simulated(
 
     def band_of(name: str) -> Band:
         observed, total = observed_band(setup, name), next(made)[1]["total"]
-        noise, correlated = _noise_of(observed, observation.nside, f"bands.{name}.noise")
+        where = f"bands.{name}.noise"
+        noise, correlated = _noise_of(observed, observation.nside, where, observation.stokes)
         if (leakage := _leakage_of(observed, used, observation.stokes)) is not None:
             total = total + leakage.maps
         own = Band(total, used, observed.bandpass, observed.beam, noise, correlated, leakage)
@@ -251,17 +257,24 @@ def _simulated(
 
 
 def _noise_of(
-    observed: Observed, nside: int, where: str
-) -> tuple[Numeric, Float[Array, " ell"] | None]:
+    observed: Observed, nside: int, where: str, stokes: str
+) -> tuple[Numeric, Float[Array, "*stokes ell"] | None]:
     """Return the white noise of a simulation, or the spectrum of noise that was smoothed."""
+    spectrum = observed.spectrum
     if observed.noise is not None:
-        return observed.noise, None
-    if observed.spectrum is None:
+        noise: Any = np.asarray(observed.noise)
+        if not noise.ndim:
+            return observed.noise, None
+        rows = stokes_rows(stokes, STOKES[len(noise)])
+        return pixel_covariance(noise, nside, len(noise))[rows, rows], None
+    if spectrum is None:
         raise SettingsError(
             f"{where}: is missing, or is of pixels that were smoothed with the map."
         )
-    beyond = max(0, 4 * nside + 1 - observed.spectrum.size)
-    return 0.0, jnp.asarray(np.pad(observed.spectrum, (0, beyond)))
+    if spectrum.ndim > 1 and stokes != "IQU":
+        spectrum = spectrum["IQU".index(stokes)]  # Q and U have the same
+    beyond = max(0, 4 * nside + 1 - spectrum.shape[-1])
+    return 0.0, jnp.asarray(np.pad(spectrum, [(0, 0)] * (spectrum.ndim - 1) + [(0, beyond)]))
 
 
 def _leakage_of(
@@ -334,11 +347,7 @@ def read_band(
     if spec.noise is None:
         if observed is None:
             raise SettingsError(f"{where}: is missing.")
-        noise, correlated = _noise_of(observed, nside, where)
-        if np.ndim(noise):
-            pixels = np.asarray(noise)
-            rows = stokes_rows(stokes, STOKES[len(pixels)])
-            noise = pixels[rows, rows]
+        noise, correlated = _noise_of(observed, nside, where, stokes)
     elif spec.noise.estimate_above is not None:
         with at_key(f"{where}.estimate_above"):
             noise, correlated = _estimated_noise(spec.noise, maps, used)
@@ -374,26 +383,3 @@ def _estimated_noise(noise, maps, used):
     white, knee, slope = fit_knee(maps, quiet, 2 * nside)
     excess = knee_spectrum(white, knee, slope, 4 * nside) - white
     return float(np.degrees(np.sqrt(white)) * 60), excess.at[:2].set(0.0)
-
-
-def modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
-    """Return laws, on one pixel, or on all if parameters are maps; and where these are known."""
-    folder, nside = Path(settings.data_dir), settings.common.nside
-    laws = {name: settings.sky.components[name] for name in settings.modelled()}
-    maps = any(isinstance(value, MapFile) for c in laws.values() for value in c.parameters.values())
-    stokes = settings.common.stokes
-    amplitude = jnp.ones((len(stokes), 12 * nside**2 if maps else 1))
-    components: dict[str, Component] = {"cmb": component_class("cmb")(amplitude)}
-    known = np.ones(12 * nside**2, bool)
-    for name, spec in laws.items():
-        numbers, has = reading.read_parameters(folder, name, spec, nside, "common.nside")
-        known &= has
-        with at_key(f"sky.{name}"):
-            assert spec.law is not None  # the settings ensure this
-            if stokes == "IQU" and not spec.polarized:
-                raise ValueError("is not polarized; to separate it, choose I as common.stokes")
-            components[name] = component_class(spec.law)(amplitude, **numbers)
-    others = set(settings.sky.components) - set(laws)
-    fixed = {name: v for name, v in settings.fixed.items() if name.split(".")[0] not in others}
-    with at_key("fixed"):
-        return set_parameters(Sky(components), fixed), known

@@ -266,19 +266,24 @@ def harmonic_likelihood(
 
 def masked_noise(
     prepared: CommonMaps, mask: Float[np.ndarray, " pix"], factors: Float[np.ndarray, " band"]
-) -> Float[np.ndarray, "band 2 ell"]:
+) -> Float[np.ndarray, "band stokes ell"]:
     """Return N_l of masked maps: smoothed white noise plus correlated noise.
 
     They are in a unit of which uK_RJ is `factors`.
     """
     noises = prepared.fluctuations.noises
     lmax = 2 * min(healpy.npix2nside(mask.size), *(n.preparation.nside_in for n in noises))
-    area, spectra = np.mean(mask**2), np.zeros((len(noises), 2, lmax + 1))
+    stokes = prepared.fluctuations.stokes
+    area, spectra = np.mean(mask**2), np.zeros((len(noises), len(stokes), lmax + 1))
     sigma = np.where(mask > 0, prepared.sigma, 0.0) * factors[:, None, None] * mask
     for i, noise in enumerate(noises):
         shape, correlated = np.asarray(window_of(noise.preparation, lmax)) ** 2, np.zeros(lmax + 1)
         if noise.correlated is not None:
-            correlated = np.asarray(noise.correlated[: lmax + 1]) * factors[i] ** 2
-        white = np.mean(sigma[i] ** 2) - map_variance(correlated) * area
-        spectra[i] = white / map_variance(shape) * shape + correlated * area
+            correlated = np.asarray(noise.correlated)[..., : lmax + 1] * factors[i] ** 2
+        total = np.mean(sigma[i] ** 2, axis=-1)
+        if "QU" in stokes:  # E and B have the mean of both
+            total[-2:] = total[-2:].mean()
+        of_rows = np.broadcast_to(correlated, spectra[i].shape)
+        white = total - area * np.array([map_variance(row) for row in of_rows])
+        spectra[i] = white[:, None] / map_variance(shape) * shape + correlated * area
     return spectra

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar, Self
 
 import healpy
@@ -13,19 +14,21 @@ from jaxtyping import Array, Bool, Float
 
 from fits.common import Fluctuations, MapNoise, prepared_maps
 from fits.compress import Noise
-from fits.inputs import inputs_of, modelled_laws
+from fits.inputs import inputs_of
 from fits.mixing import nominal
 from fits.multipoles import harmonic_coefficients, harmonic_likelihood, masked_noise
 from fits.profile_likelihood import SpectralLikelihood, spectral_likelihood
 from fits.regions import apodize, parameter_labels, region_mask
 from fits.separated_maps import component_maps, emission_maps, harmonic_component_maps, synthesised
-from jaxsky import Bandpass, Sky, job
+from jaxsky import Bandpass, Component, Sky, job, set_parameters
+from jaxsky import inputs as reading
 from jaxsky.checks import Numeric
+from jaxsky.components import component_class
 from jaxsky.harmonics import Preparation, expand, gaussian_beam, lmax_of, low_multipoles
 from jaxsky.io.stacks import Maps, computed
 from jaxsky.job import by_turns, filled
 from jaxsky.mesh import distribute
-from jaxsky.settings import Experiment, SettingsError
+from jaxsky.settings import Experiment, MapFile, SettingsError, at_key
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,6 +188,29 @@ class FullSkyData(_Multipoles):
         return super().emission(like, params, amplitude) * np.asarray(expand(windows))[:, None]
 
 
+def _modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
+    """Return laws, on one pixel, or on all if parameters are maps; and where these are known."""
+    folder, nside = Path(settings.data_dir), settings.common.nside
+    laws = {name: settings.sky.components[name] for name in settings.modelled()}
+    maps = any(isinstance(value, MapFile) for c in laws.values() for value in c.parameters.values())
+    stokes = settings.common.stokes
+    amplitude = jnp.ones((len(stokes), 12 * nside**2 if maps else 1))
+    components: dict[str, Component] = {"cmb": component_class("cmb")(amplitude)}
+    known = np.ones(12 * nside**2, bool)
+    for name, spec in laws.items():
+        numbers, has = reading.read_parameters(folder, name, spec, nside, "common.nside")
+        known &= has
+        with at_key(f"sky.{name}"):
+            assert spec.law is not None  # the settings ensure this
+            if stokes == "IQU" and not spec.polarized:
+                raise ValueError("is not polarized; to separate it, choose I as common.stokes")
+            components[name] = component_class(spec.law)(amplitude, **numbers)
+    others = set(settings.sky.components) - set(laws)
+    fixed = {name: v for name, v in settings.fixed.items() if name.split(".")[0] not in others}
+    with at_key("fixed"):
+        return set_parameters(Sky(components), fixed), known
+
+
 def separation_data(settings: Experiment) -> PixelData | FullSkyData:
     """Read or simulate the data of a separation, and check that the settings allow it."""
     spec, common = settings.separate, settings.common
@@ -203,7 +229,7 @@ def separation_data(settings: Experiment) -> PixelData | FullSkyData:
         )
     inside = region_mask(settings, spec.region, common.nside)
     _check_some(inside)
-    sky, known = modelled_laws(settings)
+    sky, known = _modelled_laws(settings)
     inside &= known
     _check_some(inside, " in which parameters are known")
     inputs = inputs_of(settings, templates=False, foregrounds=True)
@@ -305,7 +331,7 @@ def _full_sky_data(settings, inputs, inside, factors, shared) -> FullSkyData:
             level = (noise * np.radians(1 / 60)) ** 2
         spectra[i] = level
         if band.correlated is not None:
-            correlated = band.correlated[: lmax + 1] * size**2
+            correlated = band.correlated[..., : lmax + 1] * size**2
             spectra[i] += correlated
         as_observed = Preparation(jnp.ones(lmax + 1), nsides[i], nside)
         noises[name] = MapNoise(as_observed, noise, correlated, stokes)

@@ -63,20 +63,25 @@ def uniform_covariance(
 ) -> Covariance:
     """Return the covariance of all (or so many) pixels for a level, alike for Stokes parameters."""
     npix, pixel = pixels or healpy.nside2npix(nside), healpy.nside2resol(nside, arcmin=True)
-    return jnp.eye(stokes)[..., None] * jnp.full(npix, (noise / pixel) ** 2)
+    variance = jnp.broadcast_to((noise / pixel) ** 2, (stokes,))
+    return jnp.broadcast_to(jnp.diag(variance)[..., None], (stokes, stokes, npix))
 
 
 def pixel_covariance(noise: Any, nside: int, stokes: int = 2) -> Any:
     """Return the covariance of Stokes parameters in each pixel; that of a level takes no memory."""
-    if np.ndim(noise):
+    if np.ndim(noise) > 1:
         return noise
     one = np.asarray(uniform_covariance(noise, nside, stokes, pixels=1))
     return np.broadcast_to(one, (stokes, stokes, healpy.nside2npix(nside)))
 
 
 def uniform_map(key: Array, noise: ArrayLike, nside: int, stokes: int = 2) -> StokesMaps:
-    """Draw white noise of a level, as from `uniform_covariance` but without that in memory."""
+    """Draw white noise of a level, as from `uniform_covariance` but without that in memory.
+
+    Levels may differ between Stokes parameters, here and in what follows: shape (stokes,).
+    """
     sigma = as_array("noise", noise) / float(healpy.nside2resol(nside, arcmin=True))
+    sigma = sigma[:, None] if sigma.ndim else sigma
     return sigma * stokes_noise(key, stokes, healpy.nside2npix(nside), sigma.dtype)
 
 
@@ -91,6 +96,7 @@ def uniform_alm(key: Array, noise: ArrayLike, lmax: int, stokes: int = 2) -> Alm
     noise = as_array("noise", noise)
     spins = jnp.array({1: [0], 2: [2, 2], 3: [0, 2, 2]}[stokes])
     there = jnp.arange(lmax + 1) >= spins[:, None]
+    noise = noise[:, None] if noise.ndim else noise
     levels = jnp.where(there, noise * (math.pi / 180 / 60), 0)
     return stokes_noise(key, stokes, (lmax + 1) ** 2, noise.dtype) * expand(levels)
 

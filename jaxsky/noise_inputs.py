@@ -41,8 +41,8 @@ def read_noise(
 ) -> tuple[Array | float, Bool[np.ndarray, " pix"]]:
     """Return the noise in the table of a map, and where it is known (not in pixels without hits).
 
-    The noise is a level [uK_RJ arcmin] if the settings give a number, else the covariance of each
-    pixel [uK_RJ^2], 0 where it is unknown.
+    The noise is a level [uK_RJ arcmin] if the settings give numbers, or one for each Stokes
+    parameter where they differ, else the covariance of each pixel [uK_RJ^2], 0 where it is unknown.
 
     `at` is the frequency [GHz] or band of the map. Level, rms and sigma0 are in the map's `unit`
     unless the noise has its own; the map's `own` table may name a file with columns of noise. The
@@ -55,14 +55,18 @@ def read_noise(
     found: Array | float
     with at_key(where):
         factor, pixel = unit_factor(unit, "uK_RJ", at), healpy.nside2resol(nside, arcmin=True)
-        level = noise.rms * pixel if isinstance(noise.rms, float) else noise.level
-        if level is None:
+        if isinstance(noise.rms, float):
+            levels = [noise.rms * pixel]
+        else:
+            levels = [level for s in stokes if (level := noise.level_of(s)) is not None]
+        if not levels:
             pixels, known = _covariance(folder, own, at, nside, stokes, where, factor)
             check_covariance("noise", pixels if known.all() else pixels[..., known])
             found = pixels if known.all() else jnp.where(known, pixels, 0.0)
         else:
-            found = float(level * factor)
             known = np.ones(healpy.nside2npix(nside), bool)
+            alike = len(set(levels)) == 1
+            found = float(levels[0] * factor) if alike else jnp.asarray(levels) * factor
     if maps is not None and not noise.plausible:
         inside = known if used is None else known & used
         _check_plausible(where, found, maps, inside, factor, unit)
@@ -75,12 +79,13 @@ def _check_plausible(where, noise, maps, inside, factor, unit):
         return
     rms = np.sqrt(np.mean(np.square(np.asarray(maps)[:, inside], dtype=float)))
     low, high = (limit * rms for limit in PLAUSIBLE)
-    if np.ndim(noise):
+    if np.ndim(noise) > 1:
         variances = [
             np.mean(np.asarray(row[s])[inside], dtype=float) for s, row in enumerate(noise)
         ]
     else:
-        variances = [(noise / healpy.nside2resol(healpy.npix2nside(inside.size), arcmin=True)) ** 2]
+        pixel = healpy.nside2resol(healpy.npix2nside(inside.size), arcmin=True)
+        variances = np.square(np.atleast_1d(noise) / pixel)
     for own in np.sqrt(variances):
         if rms and not low <= own <= high:
             raise SettingsError(

@@ -54,8 +54,8 @@ class ObservedBand(Printed, eqx.Module):
     band : the bandpass
     beam : FWHM of a Gaussian [arcmin], or a table b_l
     target : beam to which the observed map is smoothed [arcmin]; None leaves it as observed
-    noise : uniform level [uK_RJ arcmin], covariance of each pixel [uK_RJ^2], shape
-        (stokes, stokes, pix), or None
+    noise : uniform level [uK_RJ arcmin], or levels (stokes,); covariance of each pixel [uK_RJ^2],
+        shape (stokes, stokes, pix); or None
     diagonal : draw noise with the diagonal of the Cholesky factor only (`noise.draw`)
 
     Raises
@@ -77,8 +77,9 @@ class ObservedBand(Printed, eqx.Module):
 
     def summary(self):
         beam, noise = self.beam, "none" if self.noise is None else "a covariance"
-        if self.noise is not None and not jnp.ndim(self.noise):
-            noise = shown(self.noise, "uK_RJ arcmin")
+        if self.noise is not None and jnp.ndim(self.noise) < 2:
+            levels = jnp.unique(jnp.atleast_1d(self.noise))
+            noise = ", ".join(shown(level, "uK_RJ arcmin") for level in levels)
         rows = [
             ("center", shown(self.band.center, "GHz")),
             ("width", shown(self.band.nu[-1] - self.band.nu[0], "GHz")),
@@ -363,8 +364,4 @@ def band_tables(
         bands = read_instrument(path)["bands"]
     else:
         raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(presets)}, or a file.")
-    # Commands do not ask for the noise of I, which a band of an experiment file does not have.
-    return [
-        {key: value for key, value in band.items() if key != "noise_I"}
-        for band in _chosen(name, bands, channels)
-    ]
+    return _chosen(name, bands, channels)

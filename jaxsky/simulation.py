@@ -239,7 +239,7 @@ def _noise(
         return None
     noise = jnp.asarray(channel.noise, observation.dtype)
     stokes, nside, lmax = len(observation.stokes), observation.nside, observation.lmax
-    white = draw(key, noise, diagonal=channel.diagonal) if noise.ndim else None
+    white = draw(key, noise, diagonal=channel.diagonal) if noise.ndim > 1 else None
     if channel.target is None:
         return uniform_map(key, noise, nside, stokes) if white is None else white
     window = beam_ratio(channel.target, channel.beam, lmax, "the channel")

@@ -16,9 +16,11 @@ from fits.inputs import inputs_of
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe
 from jaxsky.cmb import camb_spectra, field_spectra
 from jaxsky.components.laws import FreeFree
+from jaxsky.experiment import simulation_inputs
 from jaxsky.harmonics import Preparation, expand, synthesis
 from jaxsky.io import read_maps, write_maps
 from jaxsky.noise import cholesky, stokes_noise
+from jaxsky.observation import load_instrument
 from jaxsky.settings import load
 from settings_fuzz import written
 from systems import random_maps, small_experiment
@@ -36,6 +38,20 @@ def experiment(stokes, channels=("30", "44", "70", "353"), **tables):
     simulate = {"stokes": "IQU", "nside": 32, "fwhm": 300.0, "precision": "double", "sheet": False}
     given = {"common": common, "simulate": simulate, "free": FREE} | tables
     return small_experiment(channels, nside=32, **given)
+
+
+def test_instruments_know_the_noise_of_intensity_and_of_polarization():
+    """Simulated noise has the levels of Planck's table."""
+    settings = load(DEFAULTS / "fit.toml", ["common.stokes=IQU", "sky.embedded.nside=16",
+        'bands.0.channels=["30"]', "simulate.nside=16"])  # fmt: skip
+    level = settings.bands[0].noise.level
+    planck = load_instrument("planck", ["30"])
+    to_RJ = planck["30"].band.conversion("uK_CMB", "uK_RJ")
+    wanted = [float(planck.noise_I["30"]), float(planck["30"].noise)]
+    assert np.array(level) * to_RJ == pytest.approx(wanted)
+    assert level[0] < level[1]
+    noise = simulation_inputs(settings, written=False).observation.channels["30"].noise
+    np.testing.assert_allclose(noise, [wanted[0], wanted[1], wanted[1]], rtol=1e-9)
 
 
 def test_noise_of_each_stokes_parameter_is_the_same_with_and_without_others():

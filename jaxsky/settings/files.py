@@ -10,7 +10,7 @@ from jaxsky.bandpass import UNITS
 from jaxsky.checks import listed
 from jaxsky.io.columns import parse_stokes
 from jaxsky.noise import COVARIANCE_COLUMNS
-from jaxsky.settings.types import FileName, MistakeAt, Positive, SettingsTable, Several, valid
+from jaxsky.settings.types import FileName, MistakeAt, Pair, Positive, SettingsTable, Several, valid
 
 Files = FileName | Annotated[list[FileName], Field(min_length=1)]
 _Hdu = Annotated[int, Field(ge=1)]
@@ -121,11 +121,15 @@ class NoiseColumns(ColumnKeys):
         return {"fields": list(value)} if isinstance(value, list | tuple) else value
 
 
+_Level = Annotated[float, Field(ge=0)]
+
+
 class NoiseTable(SettingsTable):
     """Noise of a band or of a template, as exactly one of its kinds: a level, or of each pixel.
 
-    `unit` is that of level, rms, covariance (squared) and sigma0, by default that of the map, or
-    uK_CMB where there is no map. `weights` are the inverse covariance in units of sigma0.
+    Two levels are those of I and of polarization. `unit` is that of level, rms, covariance
+    (squared) and sigma0, by default that of the map, or uK_CMB where there is no map. `weights` are
+    the inverse covariance in units of sigma0.
     """
 
     KINDS: ClassVar[tuple[str, ...]] = (
@@ -138,8 +142,8 @@ class NoiseTable(SettingsTable):
         "weights": {3: COVARIANCE_COLUMNS[3]},
     }
 
-    level: float | None = Field(None, ge=0)
-    rms: Annotated[float, Field(ge=0)] | NoiseColumns | None = None
+    level: _Level | Pair[_Level] | None = None
+    rms: _Level | NoiseColumns | None = None
     covariance: NoiseColumns | None = None
     hits: NoiseColumns | None = None
     weights: NoiseColumns | None = None
@@ -158,6 +162,10 @@ class NoiseTable(SettingsTable):
             if isinstance(spec := getattr(self, kind), NoiseColumns):
                 self._check_columns(kind, spec)
         return self
+
+    def level_of(self, stokes: str) -> float | None:
+        """Return the level of a Stokes parameter, if levels are given."""
+        return self.level[stokes != "I"] if isinstance(self.level, tuple) else self.level
 
     def _check_columns(self, kind: str, spec: NoiseColumns) -> None:
         numbered = kind in ("hits", "weights")

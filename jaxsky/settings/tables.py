@@ -3,7 +3,7 @@
 import math
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
@@ -236,7 +236,11 @@ class BandTable(SeenKeys):
             raise ValueError("give the beam either as fwhm or as the file of a window, beam")
         if self.changed(["samples"]) and self.bandpass and not self.bandpass.width:
             raise MistakeAt("samples", "is of a top-hat, but the bandpass has no width")
-        if self.noise is not None and 0 in (self.noise.level, self.noise.rms):
+        if self.noise is not None and 0 in (
+            self.noise.level_of("I"),
+            self.noise.level_of("Q"),
+            self.noise.rms,
+        ):
             raise MistakeAt("noise", "must be greater than 0, not 0")
         if self.noise is not None and self.noise.shared:
             raise MistakeAt("noise.shared", "is of templates, which share the noise of bands")
@@ -280,7 +284,9 @@ class BandTable(SeenKeys):
         bands = []
         for channel in band_tables(self.instrument, channels, folder):
             raw = {k: v for k, v in channel.items() if k not in beam}
-            noise = raw.get("noise")
+            noise: Any = raw.get("noise")
+            if (of_I := raw.pop("noise_I", None)) is not None:
+                noise = raw["noise"] = noise | {"level": [of_I, noise["level"]]}
             if "file" not in raw and isinstance(noise, dict) and {"level", "rms"} & set(noise):
                 raw["noise"] = {"unit": "uK_CMB"} | noise
             raw |= own

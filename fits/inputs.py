@@ -195,9 +195,8 @@ def read_template_noise(
             "{ rms = 0.0 } to take it as exact."
         )
     nside, unit = healpy.npix2nside(template.used.size), noise.unit or template.unit
-    at = None if spec.nu_ref is None else spec.reference(stokes[-1])
-    level, apart = noise.level_of(stokes[-1]), at is not None and spec.reference(stokes[0]) != at
-    if apart or noise.level_of(stokes[0]) != level:
+    at, level = spec.reference(stokes[-1]), noise.level_of(stokes[-1])
+    if (spec.reference(stokes[0]), noise.level_of(stokes[0])) != (at, level):
         raise SettingsError(
             f"{where}: is not known where I has a frequency or level of its own; choose I or QU "
             "as common.stokes, or write { rms = 0.0 } to take the template as exact."

@@ -102,7 +102,7 @@ def test_refuses_nonsense():
     for r in (-1, np.nan, np.inf):
         raises(ValueError, f"`r` must be a number from 0 on, but is {r}", cmb.camb_spectra, 10, r=r)
     raises(ValueError, "`lmax` must not be negative, but is -2", cmb.tensor_spectra, -2)
-    with pytest.raises(ValueError, match="`stokes` must be one of QU, IQU, not 'Q'"):
+    with pytest.raises(ValueError, match="`stokes` must be one of I, QU, IQU, not 'Q'"):
         cmb.realisation(jax.random.key(0), jnp.ones((4, 5)), "Q")
 
 

@@ -250,7 +250,7 @@ def test_bad_input_is_named(make, given, error, words):
 
 
 def test_unknown_stokes_are_named(galaxy):
-    raises(ValueError, "`stokes` must be one of QU, IQU, not 'EB'", galaxy.sky, "EB")
+    raises(ValueError, "`stokes` must be one of I, QU, IQU, not 'EB'", galaxy.sky, "EB")
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ def dense_covariance(cmb: bool = True) -> np.ndarray:
     """Covariance of all values (band, stokes, pix) of the prepared maps, mode by mode."""
     model, blocks = fluctuations(cmb), []
     Y, ell = synthesis_matrix(8), alm_ell(8)
-    for preparation, noise, correlated in model.noises:
+    for preparation, noise, correlated, _ in model.noises:
         npix_in = noise.shape[-1]
         basis = jnp.eye(2 * npix_in).reshape(-1, 2, npix_in)
         A = np.asarray(jax.lax.map(preparation, basis, batch_size=256))

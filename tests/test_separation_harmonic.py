@@ -286,7 +286,7 @@ def test_maps_of_a_part_of_the_sky_are_refused(change, lmax, message):
     [
         GOOD[..., :-1],
         GOOD[..., :108],
-        GOOD[:, :1],
+        GOOD[:, :0],
         GOOD[0],
         [GOOD[0], GOOD[0, 0]],
         [GOOD[0], GOOD[0, :, :-1]],
@@ -310,7 +310,7 @@ MAP = {"dust": Dust(np.ones((2, 3)), np.array([1.5, 1.6, 1.7]))}
     [
         ({"alm": GOOD}, r"`alm` must have shape .* as from `harmonic_coefficients`, but .*192\)"),
         ({"alm": ALM[:7]}, r"with 8 bands .* but has shape \(7, 2, 49\)"),
-        ({"alm": ALM[:, :1]}, r"rows E, B or I, E, B"),
+        ({"alm": ALM[:, :0]}, r"rows I, or E, B, or I, E, B"),
         ({"alm": NAN}, r"`alm` has 16 of 784 values that are not finite"),
         ({"noise": np.ones(7)}, r"`noise` must have shape \(8,\), .* but has shape \(7,\)"),
         ({"noise": REST[..., :6]}, r"`noise` must have shape .* l = 0 to 6 or above"),

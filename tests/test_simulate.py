@@ -514,4 +514,4 @@ def test_refusals():
     raises(ValueError, "finer than that of the channel, 1200 arcmin", call, {}, finer)
     raises(ValueError, "end at l = 10, but nside 8 needs 16", call, {}, how, SPECTRA[:, :11])
     raises(ValueError, "at least one channel", Observation, {}, NSIDE)
-    raises(ValueError, "one of QU, IQU, not 'I'", Observation, how.channels, NSIDE, "I")
+    raises(ValueError, "one of I, QU, IQU, not 'Q'", Observation, how.channels, NSIDE, "Q")

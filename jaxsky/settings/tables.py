@@ -118,7 +118,7 @@ class ComponentTable(SeenKeys):
                 raise ValueError(f"the law {self.law!r} has no nu_ref")
             least, most = reference["within"] or (0, math.inf)
             for nu in (self.reference("I"), self.reference("Q")):
-                if not least <= nu <= most:
+                if nu is not None and not least <= nu <= most:
                     raise ValueError(
                         f"nu_ref is in GHz, for the law {self.law!r} from {least:g} to {most:g}, "
                         f"not {nu:g}"
@@ -130,10 +130,9 @@ class ComponentTable(SeenKeys):
             raise ValueError("nu_ref is missing")
         return self
 
-    def reference(self, stokes: str) -> float:
-        """Return the frequency of the map of a Stokes parameter [GHz], which must be given."""
-        assert self.nu_ref is not None
-        return self.nu_ref if isinstance(self.nu_ref, float) else self.nu_ref[stokes != "I"]
+    def reference(self, stokes: str) -> float | None:
+        """Return the frequency of the map of a Stokes parameter [GHz], if it is given."""
+        return self.nu_ref[stokes != "I"] if isinstance(self.nu_ref, tuple) else self.nu_ref
 
     @property
     def polarized(self) -> bool:

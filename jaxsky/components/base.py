@@ -105,6 +105,8 @@ class Component(Printed, eqx.Module):
     ----------
     law : name of the law in settings, given in the class statement; by default "module:Class"
     polarized : whether there is anything in Q and U; if not, an amplitude has to be I, Q, U
+    smooth : whether the law is smooth in its parameters, so that band averages may be interpolated
+        in maps of them (`jaxsky.interpolation`); not so for tables with kinks
     unit : unit of the amplitude
 
     Raises
@@ -130,6 +132,7 @@ class Component(Printed, eqx.Module):
 
     law: ClassVar[str] = ""
     polarized: ClassVar[bool] = True
+    smooth: ClassVar[bool] = True
     unit: ClassVar[str] = "uK_RJ"
 
     amplitude: eqx.AbstractVar[StokesMaps]

@@ -28,7 +28,7 @@ from jaxsky.harmonics import Preparation, expand, gaussian_beam, lmax_of, low_mu
 from jaxsky.io.stacks import Maps, computed
 from jaxsky.job import by_turns, filled
 from jaxsky.mesh import distribute
-from jaxsky.settings import Experiment, MapFile, SettingsError, at_key
+from jaxsky.settings import Experiment, SettingsError, at_key
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,7 +192,7 @@ def _modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]
     """Return laws, on one pixel, or on all if parameters are maps; and where these are known."""
     folder, nside = Path(settings.data_dir), settings.common.nside
     laws = {name: settings.sky.components[name] for name in settings.modelled()}
-    maps = any(isinstance(value, MapFile) for c in laws.values() for value in c.parameters.values())
+    maps = any(spec.maps for spec in laws.values())
     stokes = settings.common.stokes
     amplitude = jnp.ones((len(stokes), 12 * nside**2 if maps else 1))
     components: dict[str, Component] = {"cmb": component_class("cmb")(amplitude)}

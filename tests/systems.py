@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsky import AME, CMB, Bandpass, Component, Dust, Sky, Synchrotron
+from jaxsky.components import HensleyDraine, InterpolatedMap, LineEmission, SpinningDust
 
 NPIX = 48
 
@@ -17,6 +18,19 @@ def random_maps(seed: int, stokes: int = 2, npix: int = NPIX) -> jnp.ndarray:
 def spread(center: float, width: float, npix: int = NPIX) -> jnp.ndarray:
     """A map of a parameter, even over center +- width."""
     return jnp.asarray(center + width * np.random.default_rng(9).uniform(-1, 1, npix))
+
+
+def emissivity() -> np.ndarray:
+    """A table like SPDUST2's: it rises as a power, and falls steeply beyond 30 GHz."""
+    x = np.geomspace(0.02, 15.0, 300)
+    return np.stack([30 * x, 1e-18 * x**2 * np.exp(1 - x**1.2)], axis=1)
+
+
+def grains() -> np.ndarray:
+    """A table like those of Hensley & Draine: intensities by frequency and log10 of the field."""
+    nu, u = np.geomspace(9.0, 1000.0, 60), np.linspace(-2, 2, 17)
+    intensity = nu[:, None] ** 4.6 / np.expm1(np.outer(0.048 * nu, 10 ** (-u / 5.6) / 19))
+    return np.block([[np.zeros((1, 1)), u[None]], [nu[:, None], intensity]])
 
 
 def components(stokes: int = 2) -> dict[str, Component]:
@@ -32,6 +46,10 @@ def components(stokes: int = 2) -> dict[str, Component]:
         ),
         "ame": ame or AME(maps, nu_ref=22.8),
         "cmb": CMB(maps),
+        "interpolated": InterpolatedMap(maps, 40.0, 200.0, 100.0),
+        "line": LineEmission(maps, 70.3),
+        "hd17": HensleyDraine(maps, grains(), 0.3),
+        "spinning_dust": SpinningDust(maps, emissivity(), 33.35, nu_table=30.0),
     }
 
 

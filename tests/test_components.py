@@ -67,7 +67,9 @@ def test_every_parameter_changes_the_observation(sky):
     before = observe(sky, systems.bands())
     for name in parameter_names(sky):
         moved = set_parameters(sky, {name: 1.01 * get_parameters(sky, [name])[name]})
-        assert float(jnp.abs(observe(moved, systems.bands()) / before - 1).max()) > 1e-6, name
+        # A line is not in all bands.
+        change = jnp.abs(observe(moved, systems.bands()) / before - 1)
+        assert float(jnp.nanmax(change)) > 1e-6, name
 
 
 def test_gradients_against_finite_differences(sky):
@@ -85,7 +87,7 @@ def test_gradients_against_finite_differences(sky):
 
 def test_constant_maps_of_all_parameters_are_their_numbers(sky):
     params = get_parameters(sky, spectral(sky))
-    maps = {name: jnp.full(systems.NPIX, value) for name, value in params.items()}
+    maps = {name: jnp.full(systems.NPIX, x) for name, x in params.items() if not x.ndim}
     np.testing.assert_allclose(
         observe(set_parameters(sky, maps), systems.bands()),
         observe(sky, systems.bands()),

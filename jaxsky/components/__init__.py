@@ -18,16 +18,24 @@ from jaxsky.components.base import (
     parameter,
     parameter_declaration,
     reference,
+    table,
     template,
 )
+from jaxsky.components.interpolated import InterpolatedMap, interpolated_maps
 from jaxsky.components.laws import (
     AME,
     CMB,
     Dust,
     FreeFree,
+    KinematicQuadrupole,
+    LineEmission,
     Synchrotron,
+    ThermalSZ,
+    amplitude_from_compton,
     amplitude_from_emission_measure,
+    amplitude_from_line_intensity,
 )
+from jaxsky.components.tabulated import HensleyDraine, SpinningDust
 
 for _module in pkgutil.iter_modules(__path__):
     _found = importlib.import_module(f"{__name__}.{_module.name}")

@@ -10,9 +10,10 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.arrays import STOKES, Map, Scalar, StokesMaps
+from jaxsky.bandpass import Bandpass, Samples, average
 from jaxsky.checks import (
     Parameter,
     Printed,
@@ -68,6 +69,16 @@ def reference(default: float, within: tuple[float, float]) -> Any:
     return parameter(default, positive=True, within=within, hint=hint, symbol=symbol, unit="GHz")
 
 
+def table(columns: str) -> Any:
+    """Declare the field of a component for a table of numbers, (row, column), that its law uses.
+
+    It is kept with a last axis of length 1, (row, column, 1), because maps of parameters have one
+    axis and amplitudes two. Derivatives in its numbers are as for any parameter; fits do not vary
+    it. `columns` says in words what it holds.
+    """
+    return eqx.field(converter=_tabulated, metadata={"table": columns}, default=None)
+
+
 def _converted(value: Any) -> Any:
     """Convert to an array, or a tuple of them; leave anything else for the later check by name."""
     if value is None or isinstance(value, tuple):
@@ -78,19 +89,28 @@ def _converted(value: Any) -> Any:
         return value
 
 
+def _tabulated(value: Any) -> Any:
+    """Convert a table to (row, column, 1); leave anything else for the later check by name."""
+    value = _converted(list(value) if isinstance(value, tuple) else value)
+    return value[..., None] if getattr(value, "ndim", 0) == 2 else value
+
+
 class Component(Printed, eqx.Module):
     """Base class of sky components: `template` (stokes, pix) times `sed(nu)`.
 
     Stokes parameters of the amplitude are I (1 row), Q, U (2 rows) or I, Q, U (3 rows), in uK_RJ at
     the component's reference frequency, HEALPix RING order, Galactic coordinates, COSMO sign of U.
 
-    A subclass declares its fields with `template` and `parameter`, and defines `sed`. By the name
-    of its law, or as `law = "module:Class"`, it can be used in the settings of every command.
+    A subclass declares its fields with `template`, `parameter` and `table` (of numbers), and
+    defines `sed`. By the name of its law, or as `law = "module:Class"`, it can be used in the
+    settings of every command.
 
     Attributes
     ----------
     law : name of the law in settings, given in the class statement; by default "module:Class"
     polarized : whether there is anything in Q and U; if not, an amplitude has to be I, or I, Q, U
+    smooth : whether the law is smooth in its parameters, so that band averages may be interpolated
+        in maps of them (`jaxsky.interpolation`); not so for tables with kinks
     unit : unit of the amplitude
     nu_ref_I : reference frequency [GHz] of the amplitude of I, if it is not `nu_ref`
 
@@ -117,6 +137,7 @@ class Component(Printed, eqx.Module):
 
     law: ClassVar[str] = ""
     polarized: ClassVar[bool] = True
+    smooth: ClassVar[bool] = True
     unit: ClassVar[str] = "uK_RJ"
 
     amplitude: eqx.AbstractVar[StokesMaps]
@@ -136,6 +157,13 @@ class Component(Printed, eqx.Module):
         """Return the spectral law at one frequency [GHz]; a map if any parameter is a map."""
         raise ValueError(f"{type(self).__name__} must define `sed`.")
 
+    def band_average(self, band: Bandpass | Samples) -> Float[Array, "..."]:
+        """Return the law averaged over a band: a number, or a map if any parameter is a map.
+
+        With an axis of bands in front if there are several (`jaxsky.bandpass.stack_bands`).
+        """
+        return average(self.sed, band)
+
     @property
     def template(self) -> StokesMaps:
         """The maps that the law multiplies: the amplitude, with I brought to `nu_ref`."""
@@ -153,7 +181,9 @@ class Component(Printed, eqx.Module):
         rows = [("amplitude", maps)]
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if "positive" in field.metadata and value is not None:
+            if "table" in field.metadata:
+                rows.append((field.name, "table of {} x {} numbers".format(*value.shape)))
+            elif "positive" in field.metadata and value is not None:
                 rows.append((field.name, shown(value, field.metadata["unit"])))
         return f"{type(self).__name__}, law {self.law!r}", rows
 
@@ -182,6 +212,9 @@ class Component(Printed, eqx.Module):
             if field.name == "amplitude" or field.metadata.get("static"):
                 continue
             value = getattr(self, field.name)
+            if "table" in field.metadata:
+                check_table(field.name, value, field.metadata["table"])
+                continue
             for entry in value if isinstance(value, tuple) else (value,):
                 if entry is None:
                     continue
@@ -210,6 +243,16 @@ def check_value(name: str, value: Array, metadata: Mapping[str, Any]) -> None:
             f"Argument `{name}` must be from {low:g} to {high:g}, but {what} {middle:g}; "
             f"{metadata['hint']}."
         )
+
+
+def check_table(name: str, value: Any, columns: str) -> None:
+    """Raise TypeError or ValueError unless a value can be a table as `table` keeps it."""
+    if value is None:
+        raise ValueError(f"Argument `{name}` is missing: a table of {columns}.")
+    array = as_array(name, value)
+    good = array.ndim == 3 and array.shape[-1] == 1
+    check_shape(name, array, good, f"be a table (row, column) of {columns}")
+    check_finite(name, array)
 
 
 def check_law(component: Component, nu: float = 100.0) -> None:

@@ -20,6 +20,7 @@ from jaxsky.components.base import (
     reference,
     template,
 )
+from jaxsky.components.derivatives import Moment, check_parameter_of, moments
 from jaxsky.components.laws import (
     AME,
     CMB,

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from fits.compress import as_noise
     from fits.fisher import fisher_errors
     from fits.grid import grid_fit
+    from fits.moments import moment_prior
     from fits.multipoles import harmonic_coefficients, harmonic_likelihood
     from fits.optimize import Newton, best_fit
     from fits.posterior import Gaussian, Uniform, chi2

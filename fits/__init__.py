@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from fits.compress import as_noise
     from fits.fisher import fisher_errors
     from fits.grid import grid_fit
-    from fits.moments import moment_prior
     from fits.multipoles import harmonic_coefficients, harmonic_likelihood
     from fits.optimize import Newton, best_fit
     from fits.posterior import Gaussian, Uniform, chi2
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from fits.results import Convergence, FitError, FitResult
     from fits.sampling import sample
     from fits.separated_maps import component_maps, harmonic_component_maps, separate
+    from fits.separated_moments import separate_moments
     from fits.template_likelihood import likelihood
     from fits.tensor_ratio import fit_tensors, power_model
 

@@ -97,6 +97,10 @@ class SpectralLikelihood(Likelihood):
     def cells(self):
         return self.index
 
+    def without_data(self) -> "SpectralLikelihood":
+        """Return it without pixels, for the matrices alone."""
+        return dataclasses.replace(self, pixels=(), block_cell=None, source=None)
+
     def matrices(self, local: Float[Array, "cell free"]) -> tuple[Array, ...]:
         """Return mixing matrices (cell, row, unknown), for each of `layout`."""
         values = {name: local[:, k] for k, name in enumerate(self.free)} | self.fixed
@@ -359,7 +363,7 @@ def matrices_at(like: SpectralLikelihood, params: Mapping[str, Numeric]) -> tupl
     """Return mixing matrices (cell, row, unknown) for parameters, for each of `layout`."""
     params = like.check(params) if params and like.start else {}
     # Without data: compiled programs keep what is static, such as the source.
-    return _matrices(dataclasses.replace(like, pixels=(), block_cell=None, source=None), params)
+    return _matrices(like.without_data(), params)
 
 
 @jax.jit

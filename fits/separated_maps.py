@@ -357,7 +357,7 @@ def separate(
         the white noise of the instrument
     unit : unit of the data, "uK_RJ", "uK_CMB" or the like
     prior : standard deviations or covariances of amplitudes by component, as for
-        `spectral_likelihood`; those of moments are found by `fits.moment_prior`
+        `spectral_likelihood`; for moments see `fits.separate_moments`
 
     Raises
     ------

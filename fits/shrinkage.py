@@ -35,14 +35,18 @@ class AmplitudePrior(eqx.Module):
         if isinstance(data, Stack) or spread(data):
             raise ValueError("Priors of amplitudes need maps that are in memory, on one device.")
         array = np.asarray(data)
-        shape = (len(array) + len(self.names), *array.shape[1:])
-        unseen = np.zeros((len(self.names), *array.shape[1:]))
+        bands, stokes, npix = array.shape
+        shape = bands + len(self.names), stokes, npix
+        unseen = np.zeros((len(self.names), stokes, npix))
         return np.concatenate([array, unseen]), _joined(noise, self.covariance, shape)
 
 
-def _joined(noise: Noise, prior: Noise, shape: tuple[int, ...]) -> Noise:
+def _joined(noise: Noise, prior: Noise, shape: tuple[int, int, int]) -> Noise:
     """Return the noise of bands and priors; where all bands are masked, priors are, too."""
-    both, simple = (noise, prior), all(n.separable and n.pixel_sigma is None for n in (noise, prior))
+    both, simple = (
+        (noise, prior),
+        all(n.separable and n.pixel_sigma is None for n in (noise, prior)),
+    )
     if simple:
         return Noise(np.concatenate([np.asarray(one.sigma) for one in both]))
     masked = ~(np.asarray(noise.weights(slice(None))) > 0).any(axis=(0, 1))

@@ -147,12 +147,6 @@ def inverse_gram(
     return jnp.stack([_back_substituted(lower, one * unit) for unit in units], axis=2)
 
 
-def log_determinant(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, ""]:
-    """Return the sum over pixels of ln det M^T W M."""
-    lower = _cholesky(_gram(mixing, pixels))
-    return -2 * sum((jnp.sum(jnp.log(row[-1])) for row in lower), jnp.zeros(()))
-
-
 def residuals(mixing: Float[Array, "row unknown"], pixels: Pixels) -> Float[Array, "group row pix"]:
     """Return whitened residuals: their sum of squares is chi^2."""
     _, rest, _ = fitted(mixing, pixels)

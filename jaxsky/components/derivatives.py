@@ -40,6 +40,11 @@ def check_parameter_of(law: Component, name: str, parameter: str) -> None:
         )
 
 
+def _name(kind: type = str) -> Any:
+    """Declare a field that is part of the structure, and no parameter."""
+    return eqx.field(static=True, converter=kind)
+
+
 class Moment(Component):
     """A derivative of the law of another component of the same sky; see `moments`.
 
@@ -60,8 +65,8 @@ class Moment(Component):
     """
 
     amplitude: StokesMaps = template()
-    of: str = eqx.field(static=True)
-    parameters: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    of: str = _name()
+    parameters: tuple[str, ...] = _name(tuple)
     #: the component, inserted by the sky; nothing else has its parameters
     component: Component | None = eqx.field(default=None, init=False)
 
@@ -73,7 +78,7 @@ class Moment(Component):
     def summary(self):
         heading, rows = super().summary()
         slopes = "".join(f" / d {name}" for name in self.parameters)
-        return heading, [*rows, ("law", f"d^{len(self.parameters)} {self.of}{slopes}")]
+        return heading, [*rows, ("law", f"{self.of}{slopes}")]
 
     def at(self, component: Component | None) -> "Moment":
         """Return it with the component whose law is differentiated, or without any."""

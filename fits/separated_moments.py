@@ -227,6 +227,7 @@ def _fitted(
     (layout,) = like.layout
     pixels = pixel_rows(*like.prior.joined(data, noise), layout, np.flatnonzero(used), None)
     number, at = int(used.sum()), [rows.index(name) for name in moving]
+    weight = np.broadcast_to(pixels.weights, pixels.data.shape)
     bare_like, theta = like.without_data(), np.asarray(like.flat({}))
     scale = np.array([_scale(value) for value in theta])
 
@@ -235,11 +236,9 @@ def _fitted(
         matrix, moved = map(np.asarray, _matrix(theta + scale * x[: theta.size], bare_like))
         factor = np.ones(len(rows))
         factor[at] = np.exp(-2 * x[theta.size :])
-        scaled = Pixels(
-            pixels.data,
-            np.broadcast_to(pixels.weights, pixels.data.shape) * np.tile(factor, 2)[:, None],
-            None if pixels.cross is None else pixels.cross * factor[:, None],
-        )
+        weights: Any = weight * np.tile(factor, 2)[:, None]
+        cross = None if pixels.cross is None else pixels.cross * factor[:, None]
+        scaled = Pixels(pixels.data, weights, cross)
         unseen = scaled._replace(data=0.0 * pixels.data)
         whole, fewer = _integral(matrix, scaled), _integral(matrix[:, apart], unseen)
         slope = whole.slope

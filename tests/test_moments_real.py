@@ -3,6 +3,15 @@
 The maps of PySM 2's d1 and s1 at nside 64 in LiteBIRD's 15 bands, no beams, outside Planck's mask
 GAL060 (60 % of the sky), over 20 realisations of the noise. Laws, pivots and scatter are those
 fitted to the first one; amplitudes, and with them the prior, are those of each.
+
+| | rms error of Q and U of the CMB [uK_CMB] | bias of r |
+|---|---|---|
+| constant laws (beta_dust, T_dust, beta_syn fitted) | 0.0928 | 0.132 |
+| moment of beta_dust, without a prior | 0.1260 | 0.011 |
+| moments of all three, with the prior | 0.0720 | 0.024 |
+| internal linear combination of all pixels | 0.0754 | 0.051 |
+
+The bias is that of BB at l = 2 to 120 with weights for a lensed CMB and 0.06 uK_CMB of white noise.
 """
 
 import healpy
@@ -109,7 +118,7 @@ def found(foregrounds):
 
 
 def test_the_scatter_of_dust_is_that_of_its_maps(found, foregrounds):
-    """Found: 0.0277 of beta_dust, whose map has 0.0286, and 1.52 K of T_dust, 1.57 K."""
+    """Found: 0.0260 of beta_dust, whose map has 0.0286, and 1.60 K of T_dust, 1.57 K."""
     for name in ("dust_beta_dust", "dust_T_dust"):
         assert found[0].scatter[name] == pytest.approx(foregrounds[1][name].std(), rel=0.1)
 
@@ -117,11 +126,11 @@ def test_the_scatter_of_dust_is_that_of_its_maps(found, foregrounds):
 def test_moments_with_a_prior_have_the_least_error(found):
     """Means over 20 seeds, in uK_CMB."""
     mean = {name: values.mean() for name, values in found[1].items()}
-    print(found[0].params, found[0].scatter, mean)
-    assert mean["constant"] == pytest.approx(0.0933, abs=0.001)
-    assert mean["moments"] == pytest.approx(0.124, abs=0.002)
-    assert mean["ilc"] == pytest.approx(0.0750, abs=0.001)
-    assert mean["prior"] < 0.073
+    print({name: f"{value:.4f}" for name, value in mean.items()})
+    assert mean["constant"] == pytest.approx(0.0928, abs=0.001)
+    assert mean["moments"] == pytest.approx(0.126, abs=0.001)
+    assert mean["ilc"] == pytest.approx(0.0754, abs=0.001)
+    assert mean["prior"] == pytest.approx(0.072, abs=0.001)
 
 
 def test_what_is_left_in_r(found, seen):
@@ -140,4 +149,7 @@ def test_what_is_left_in_r(found, seen):
         maps[:, seen] = values
         bias[name] = tensors.shift(band_powers(spectra, maps)[1])
     print({n: f"{b:.4f}" for n, b in bias.items()}, f"sigma {tensors.sigma:.5f}")
-    assert 0 < bias["prior"] < 0.5 * bias["constant"]
+    assert bias["constant"] == pytest.approx(0.132, rel=0.1)
+    assert bias["ilc"] == pytest.approx(0.051, rel=0.1)
+    assert bias["prior"] == pytest.approx(0.024, rel=0.1)
+    assert bias["moments"] < bias["prior"]

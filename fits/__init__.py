@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from fits.results import Convergence, FitError, FitResult
     from fits.sampling import sample
     from fits.separated_maps import component_maps, harmonic_component_maps, separate
+    from fits.separated_moments import separate_moments
     from fits.template_likelihood import likelihood
     from fits.tensor_ratio import fit_tensors, power_model
 

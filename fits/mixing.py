@@ -188,9 +188,14 @@ class Mixing(eqx.Module):
     def rotated(
         self, matrix: Float[Array, "cell band component"], params: Mapping[str, Array]
     ) -> Float[Array, "cell row unknown"]:
-        """Return a matrix for Q and U together: rows Q of all bands, then U; unknowns likewise."""
+        """Return a matrix for Q and U together: rows Q of all bands, then U; unknowns likewise.
+
+        Rows that follow those of the bands are not rotated.
+        """
         angle = 2 * jnp.deg2rad(self.of_bands("angle", params))
         angle = angle.reshape(len(self.names), -1).T[..., None]
+        if others := matrix.shape[1] - len(self.names):
+            angle = jnp.pad(angle, ((0, 0), (0, others), (0, 0)))
         cosine, sine = jnp.cos(angle) * matrix, jnp.sin(angle) * matrix
         return jnp.block([[cosine, -sine], [sine, cosine]])
 

@@ -27,6 +27,7 @@ from fits.compress import Layout, Noise, as_noise, bare, compressed, streamed
 from fits.mixing import Mixing, named_bands, spectral_names, unit_sky
 from fits.posterior import Likelihood
 from fits.regions import check_labels
+from fits.shrinkage import AmplitudePrior, amplitude_prior
 from fits.systems import Pixels
 from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.arrays import STOKES
@@ -61,6 +62,8 @@ class SpectralLikelihood(Likelihood):
     weightless: tuple[str, ...] = eqx.field(static=True)
     #: where `pixels` and `block_cell` are read from, piece by piece, if they are too many
     source: Callable[[], Iterator[tuple[Any, Array]]] | None = eqx.field(static=True, default=None)
+    #: of amplitudes, as further rows of matrices, data and weights
+    prior: AmplitudePrior | None = None
 
     profiled = True
 
@@ -95,10 +98,18 @@ class SpectralLikelihood(Likelihood):
     def cells(self):
         return self.index
 
+    def without_data(self) -> "SpectralLikelihood":
+        """Return it without pixels, for the matrices alone."""
+        return dataclasses.replace(self, pixels=(), block_cell=None, source=None)
+
     def matrices(self, local: Float[Array, "cell free"]) -> tuple[Array, ...]:
         """Return mixing matrices (cell, row, unknown), for each of `layout`."""
         values = {name: local[:, k] for k, name in enumerate(self.free)} | self.fixed
         matrix = self.mixing(values, len(local))
+        if self.prior is not None:
+            rows = self.prior.rows(tuple(self.mixing.sky))
+            rows = jnp.broadcast_to(rows, (len(matrix), *rows.shape))
+            matrix = jnp.concatenate([matrix, rows], axis=1)
         return tuple(
             self.mixing.rotated(matrix, values) if each.joint else matrix for each in self.layout
         )
@@ -226,6 +237,7 @@ def spectral_likelihood(
     labels: Mapping[str, Int[np.ndarray, " pix"]] | None = None,
     unit: str = "uK_RJ",
     compress: bool | None = None,
+    prior: Mapping[str, Numeric] | None = None,
 ) -> SpectralLikelihood:
     """Return the likelihood of the spectral parameters named in `start`, to be fitted or sampled.
 
@@ -245,11 +257,13 @@ def spectral_likelihood(
     unit : unit of the data ("uK_RJ", "K_CMB", ...); amplitudes are uK in any case (CMB: uK_CMB)
     compress : whether vectors replace pixels, which needs separable noise; by default if they are
         fewer
+    prior : standard deviations, or covariances, of amplitudes by name of the component, with mean
+        0; see `fits.shrinkage.amplitude_prior`. chi^2 then includes that of the amplitudes.
 
     Raises
     ------
     RuntimeError : without double precision
-    KeyError : for unknown parameters
+    KeyError : for unknown parameters, and priors of unknown components
     TypeError, ValueError : for shapes that do not match, units, noise that is not positive, data
         that are not finite, too few bands, components that cannot be told apart, invalid labels
     """
@@ -267,13 +281,18 @@ def spectral_likelihood(
     good = data.ndim == 3 and len(data) == len(bands) and data.shape[1] in STOKES
     form = f"(band, stokes, pix) with {len(bands)} bands and Stokes I, or Q, U, or I, Q, U"
     check_shape("data", data, good, f"have shape {form}")
-    if len(bands) < components + bool(start):
+    if len(bands) < (needed := components - len(prior or ())) + bool(start):
         raise ValueError(
-            f"{len(bands)} bands are too few: amplitudes of {components} components take as many, "
+            f"{len(bands)} bands are too few: amplitudes of {needed} components take as many, "
             "and their laws one more."
         )
     mixing = Mixing.of(unit_sky(sky), bands, unit)
     noise = along(data, as_noise(noise, data.shape))
+    shrunk = amplitude_prior(prior or {}, tuple(mixing.sky), data.shape[1:])
+    rows_of_data = tuple(bands)
+    if shrunk is not None:
+        data, noise = shrunk.joined(data, noise)
+        rows_of_data += shrunk.names
     looked, apart = distributed.look(data, noise, components), spread(data)
     used: Any = looked.used
     varying = {n: check_labels(n, v, used) for n, v in (labels or {}).items()}
@@ -310,6 +329,7 @@ def spectral_likelihood(
         layout=Layout.of(data.shape[1], angles or noise.covariance is not None),
         stokes=STOKES[data.shape[1]],
         weightless=(),
+        prior=shrunk,
     )
     matrix = _check_matrices(like)[:, : len(data), :components]
     heavy = distributed.carry_weight(looked.weights[:, None] * np.mean(matrix**2, axis=0))
@@ -336,7 +356,7 @@ def spectral_likelihood(
         block_cell=block_cell,
         source=source,
         values=int(looked.counts[heavy].sum()) - components * data.shape[1] * looked.number,
-        weightless=tuple(name for name, some in zip(bands, heavy, strict=True) if not some),
+        weightless=tuple(n for n, some in zip(rows_of_data, heavy, strict=True) if not some),
     )
 
 
@@ -344,7 +364,7 @@ def matrices_at(like: SpectralLikelihood, params: Mapping[str, Numeric]) -> tupl
     """Return mixing matrices (cell, row, unknown) for parameters, for each of `layout`."""
     params = like.check(params) if params and like.start else {}
     # Without data: compiled programs keep what is static, such as the source.
-    return _matrices(dataclasses.replace(like, pixels=(), block_cell=None, source=None), params)
+    return _matrices(like.without_data(), params)
 
 
 @jax.jit

@@ -180,8 +180,10 @@ def component_maps(
     data, wanted = bare("data", data), (len(like.mixing.names), len(like.stokes))
     good = data.ndim == 3 and data.shape[:2] == wanted
     check_shape("data", data, good, f"have shape (band, stokes, pix) = {(*wanted, 'pix')}")
-    names, (bands, stokes, npix) = tuple(like.mixing.sky), data.shape
     noise, known = along(data, as_noise(noise, data.shape)), matrices_at(like, params)
+    if like.prior is not None:
+        data, noise = like.prior.joined(data, noise)
+    names, (bands, stokes, npix) = tuple(like.mixing.sky), data.shape
     uniform = noise.separable and noise.pixel_sigma is None and like.of_pixel is None
     each, cells = covariance and not uniform, like.of_pixel
     if spread(data):
@@ -212,7 +214,8 @@ def component_maps(
 
 def emission_maps(like: SpectralLikelihood, params: Mapping[str, Numeric], amplitude: Maps) -> Maps:
     """Return the emission in the bands, in the unit of the data, from maps or coefficients."""
-    shape = (len(like.mixing.names), *amplitude.shape[1:])
+    bands = len(like.mixing.names)
+    shape = (bands, *amplitude.shape[1:])
     known, of_pixel = matrices_at(like, params), like.of_pixel
 
     def emission(part):
@@ -223,7 +226,7 @@ def emission_maps(like: SpectralLikelihood, params: Mapping[str, Numeric], ampli
             own = np.asarray(_own(None if of_pixel is None else of_pixel[part], matrix))
             one, sums = len(own) == 1, "ru,kup->krp"
             model = np.einsum(*(sums, own[0]) if one else ("p" + sums, own), rows, optimize=one)
-            result[:, list(layout.stokes)] = layout.maps(model)
+            result[:, list(layout.stokes)] = layout.maps(model)[:bands]
         return result
 
     return computed(shape, emission)
@@ -338,6 +341,7 @@ def separate(
     *,
     noise: Noise | Numeric | None = None,
     unit: str = "uK_CMB",
+    prior: Mapping[str, Numeric] | None = None,
 ) -> Separated:
     """Fit the laws of components to maps in bands, and separate the components.
 
@@ -352,6 +356,8 @@ def separate(
     noise : standard deviations or covariances in the unit of the data (`fits.as_noise`); by default
         the white noise of the instrument
     unit : unit of the data, "uK_RJ", "uK_CMB" or the like
+    prior : standard deviations or covariances of amplitudes by component, as for
+        `spectral_likelihood`; for moments see `fits.separate_moments`
 
     Raises
     ------
@@ -359,24 +365,33 @@ def separate(
         noise, and what `spectral_likelihood` refuses
     """
     data = bare("data", data)
-    check_names("components", components)
     check_names("free", free)
-    if not isinstance(components, Mapping):
-        nothing = jnp.zeros((data.shape[1] if data.ndim == 3 else 2, 1))
-        components = {law: component_class(law)(nothing) for law in components}
-    sky = Sky(components)
+    sky = sky_of(components, data.shape[1] if data.ndim == 3 else 2)
     if free is None:
         free = [name for name in spectral_names(sky) if name.split(".")[1].startswith("beta")]
     start = free if isinstance(free, Mapping) else get_parameters(sky, free)
-    if noise is None:
-        if not isinstance(instrument, Instrument):
-            raise ValueError("Argument `noise` is missing: the bands do not say what they have.")
-        good = data.ndim == 3 and healpy.isnpixok(data.shape[-1])
-        check_shape("data", data, good, "have shape (band, stokes, pix) with 12 nside^2 pixels")
-        pixel = healpy.nside2resol(healpy.npix2nside(data.shape[-1]), arcmin=True)
-        factors = [band.conversion("uK_RJ", unit) for band in instrument.bands().values()]
-        noise = np.array([c.noise for c in instrument.values()]) * np.array(factors) / pixel
+    noise = white_noise(instrument, data, unit) if noise is None else noise
     bands = instrument.bands() if isinstance(instrument, Instrument) else instrument
-    like = spectral_likelihood(sky, bands, data, noise, start, unit=unit)
+    like = spectral_likelihood(sky, bands, data, noise, start, unit=unit, prior=prior)
     fit = best_fit(like)
     return Separated(fit, component_maps(like, fit.best_fit, data, noise))
+
+
+def sky_of(components: Sequence[str] | Mapping[str, Component], stokes: int) -> Sky:
+    """Return a sky of components, or of the laws named, without emission."""
+    check_names("components", components)
+    if not isinstance(components, Mapping):
+        nothing = jnp.zeros((stokes, 1))
+        components = {law: component_class(law)(nothing) for law in components}
+    return Sky(components)
+
+
+def white_noise(instrument: object, data: np.ndarray, unit: str) -> Float[np.ndarray, " band"]:
+    """Return the standard deviation of the noise of an instrument in the pixels of data."""
+    if not isinstance(instrument, Instrument):
+        raise ValueError("Argument `noise` is missing: the bands do not say what they have.")
+    good = data.ndim == 3 and healpy.isnpixok(data.shape[-1])
+    check_shape("data", data, good, "have shape (band, stokes, pix) with 12 nside^2 pixels")
+    pixel = healpy.nside2resol(healpy.npix2nside(data.shape[-1]), arcmin=True)
+    factors = [band.conversion("uK_RJ", unit) for band in instrument.bands().values()]
+    return np.array([c.noise for c in instrument.values()]) * np.array(factors) / pixel

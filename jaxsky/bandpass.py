@@ -137,16 +137,27 @@ class Bandpass(Printed, eqx.Module):
         nu = self.center + factor * (self.nu - self.center)
         return Bandpass(nu, self.weights, self.convention)
 
-    def conversion(self, source: str, target: str, nu_ref: Numeric | None = None) -> Scalar:
+    def conversion(
+        self,
+        source: str,
+        target: str,
+        nu_ref: Numeric | None = None,
+        *,
+        T_cmb: Numeric | None = None,
+        flat: bool = False,
+    ) -> Scalar:
         """Return the factor between brightness units in this band; see `band_conversion`.
 
         MJy/sr requires `nu_ref`, the frequency at which it is quoted [GHz]: published factors
-        are for nominal frequencies, from which the center differs by a few percent.
+        are for nominal frequencies, from which the center differs by a few percent. With `flat`,
+        it is that of a spectrum of constant intensity, the same at any frequency. `T_cmb` [K] is
+        the temperature of the CMB in K_CMB, by default `jaxsky.sed.T_CMB`.
         """
-        if nu_ref is None and "MJy/sr" in (parse_unit(source)[1], parse_unit(target)[1]):
+        kinds = parse_unit(source)[1], parse_unit(target)[1]
+        if nu_ref is None and "MJy/sr" in kinds and not flat:
             raise ValueError("Over a band MJy/sr needs `nu_ref`, the frequency it is quoted at.")
         nu_ref = 1.0 if nu_ref is None else nu_ref
-        return band_conversion(source, target, self.nu, self.quadrature, nu_ref)
+        return band_conversion(source, target, self.nu, self.quadrature, nu_ref, T_cmb, flat=flat)
 
 
 # These pieces are compiled: outside jit every operation is a program of its own, and compiling
@@ -233,29 +244,42 @@ def parse_unit(unit: str) -> tuple[float, str]:
         raise ValueError(f"Unknown unit {unit!r}; known units are {', '.join(UNITS)}.") from None
 
 
-def conversion(source: str, target: str, nu: Numeric) -> Float[Array, "..."]:
-    """Return the factor from one brightness unit to another at a frequency [GHz]."""
+def conversion(
+    source: str, target: str, nu: Numeric, T_cmb: Numeric | None = None
+) -> Float[Array, "..."]:
+    """Return the factor from one brightness unit to another at a frequency [GHz].
+
+    K_CMB are those about the temperature `T_cmb` [K], by default `jaxsky.sed.T_CMB`; PySM has
+    2.7255 K.
+    """
     nu = jnp.asarray(nu)
-    return band_conversion(source, target, nu[..., None], jnp.ones(1, nu.dtype), nu)
+    return band_conversion(source, target, nu[..., None], jnp.ones(1, nu.dtype), nu, T_cmb)
 
 
-@partial(jax.jit, static_argnames=("source", "target"))
+@partial(jax.jit, static_argnames=("source", "target", "flat"))
 def band_conversion(
     source: str,
     target: str,
     nu: Float[Array, "... sample"],
     weights: Float[Array, " sample"],
     nu_ref: Numeric,
+    T_cmb: Numeric | None = None,
+    *,
+    flat: bool = False,
 ) -> Float[Array, "..."]:
     """Return the factor from one brightness unit to another over a band.
 
     A band reports the weighted mean of the antenna temperature, so 1 K_CMB reads sum w g(nu)
-    K_RJ, where g is `cmb_derivative`. A value in MJy/sr is the intensity at `nu_ref` [GHz] of a
-    spectrum I ~ 1/nu (the IRAS convention, which Planck HFI follows: Planck 2013 results IX).
+    K_RJ, where g is `cmb_derivative` at `T_cmb` [K]. A value in MJy/sr is the intensity at `nu_ref`
+    [GHz] of a spectrum I ~ 1/nu (the IRAS convention, which Planck HFI follows: Planck 2013 results
+    IX), or if `flat` that of a spectrum of constant intensity, where `nu_ref` has no effect (PySM's
+    `bandpass_unit_conversion`, with T_cmb = 2.7255 K).
     The weights act on antenna temperature and have sum 1 (`Bandpass.quadrature`).
     """
     (source_size, source_kind), (target_size, target_kind) = parse_unit(source), parse_unit(target)
     scale = source_size / target_size
+    # Left out where it is not given: as a number in the program it rounds otherwise.
+    temperature = () if T_cmb is None else (T_cmb,)
     if source_kind == target_kind:
         return jnp.asarray(scale)
 
@@ -263,8 +287,8 @@ def band_conversion(
         if kind == "K_RJ":
             return 1.0
         if kind == "K_CMB":
-            return jnp.sum(weights * cmb_derivative(nu), axis=-1)
-        falling = jnp.asarray(nu_ref)[..., None] / nu
+            return jnp.sum(weights * cmb_derivative(nu, *temperature), axis=-1)
+        falling = 1.0 if flat else jnp.asarray(nu_ref)[..., None] / nu
         return jnp.sum(weights * falling / (MJYSR_PER_K_RJ_AT_1GHZ * nu**2), axis=-1)
 
     return scale * K_RJ_per(source_kind) / K_RJ_per(target_kind)

@@ -6,11 +6,13 @@ import astropy.units as u
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pysm3
 import pytest
 from jax.test_util import check_grads
 
 from jaxsky import Bandpass, sed
 from jaxsky.bandpass import CONVENTIONS, UNITS, average, conversion, parse_unit, stack_bands
+from jaxsky.io import unit_factor
 from jaxsky.sed import T_CMB
 from refusals import cases, raises
 
@@ -197,6 +199,49 @@ def test_gradients_of_conversions():
     args = tuple(map(jnp.asarray, (143.0, 40.0, 143.0)))
     check_grads(over_band, args, order=1, rtol=1e-6)
     check_grads(jax.tree_util.Partial(conversion, "K_CMB", "uK_RJ"), (jnp.asarray(143.0),), order=1)
+
+
+#: PySM's names of units.
+PYSM_UNITS = {"uK_RJ": pysm3.units.uK_RJ, "mK_CMB": pysm3.units.mK_CMB}
+PYSM_UNITS["MJy/sr"] = pysm3.units.MJy / pysm3.units.sr
+
+
+@pytest.mark.parametrize("pair", list(itertools.permutations(PYSM_UNITS, 2)), ids="-".join)
+def test_pysms_conventions_are_arguments(pair):
+    """Flat spectra in MJy/sr, and 2.7255 K, at a frequency and over a band."""
+    source, target = pair
+    nu = np.linspace(200.0, 320.0, 61)
+    weights = 1e-3 + np.exp(-0.5 * ((nu - 250) / 30) ** 2)
+    units = {"input_unit": PYSM_UNITS[source], "output_unit": PYSM_UNITS[target]}
+    expected = pysm3.bandpass_unit_conversion(nu * u.GHz, weights, **units).value
+    band = Bandpass(nu, weights, "power")
+    for nu_ref in (None, 100.0):
+        found = band.conversion(source, target, nu_ref, T_cmb=2.7255, flat=True)
+        assert float(found) == pytest.approx(expected, rel=1e-9)
+    again = unit_factor(source, target, band, T_cmb=2.7255, flat=True)
+    assert again == pytest.approx(expected, rel=1e-9)
+    expected = pysm3.bandpass_unit_conversion(217 * u.GHz, **units).value
+    assert float(conversion(source, target, 217.0, 2.7255)) == pytest.approx(expected, rel=1e-8)
+    assert unit_factor(source, target, 217.0, T_cmb=2.7255) == pytest.approx(expected, rel=1e-8)
+
+
+def test_the_two_conventions_of_brightness():
+    """nu I_nu or I_nu is constant: int W nu_c/nu over int W, closed for a top-hat in power."""
+    band = Bandpass.top_hat(143.0, 40.0, "power", samples=2001)
+    falling, flat = (band.conversion("K_CMB", "MJy/sr", 143.0, flat=flat) for flat in (False, True))
+    assert float(flat / falling) == pytest.approx(143 / 40 * np.log(163 / 123), rel=1e-6)
+    # At one frequency they are the same.
+    delta = Bandpass.delta(143.0)
+    assert float(delta.conversion("K_CMB", "MJy/sr", flat=True)) == pytest.approx(
+        float(delta.conversion("K_CMB", "MJy/sr", 143.0)), rel=1e-13
+    )
+
+
+def test_gradient_of_a_conversion_in_the_temperature():
+    def over_band(T_cmb):
+        return Bandpass.top_hat(143.0, 40.0).conversion("K_CMB", "MJy/sr", T_cmb=T_cmb, flat=True)
+
+    check_grads(over_band, (jnp.asarray(2.7255),), order=1, rtol=1e-6)
 
 
 def test_unknown_unit_is_named():

@@ -59,6 +59,9 @@ def unit_factor(
     target: str,
     at: Numeric | Bandpass | u.Quantity | None = None,
     nu_ref: float | None = None,
+    *,
+    T_cmb: float | None = None,
+    flat: bool = False,
 ) -> float:
     """Return the factor that converts values from one unit to another.
 
@@ -68,7 +71,11 @@ def unit_factor(
         for covariances) convert with the square of the factor
     at : frequency [GHz] or band, needed between K_RJ, K_CMB and MJy/sr; for a band the factor is
         `Bandpass.conversion`
-    nu_ref : frequency at which a band's MJy/sr is quoted [GHz], needed for that unit
+    nu_ref : frequency at which a band's MJy/sr is quoted [GHz], needed for that unit unless `flat`
+    T_cmb : temperature of the CMB in K_CMB [K], by default `jaxsky.sed.T_CMB`; astropy and
+        PySM have 2.7255
+    flat : whether a band's MJy/sr is that of a spectrum of constant intensity, as in PySM, instead
+        of one that falls as 1/nu, as for IRAS and Planck HFI
 
     Examples
     --------
@@ -96,9 +103,10 @@ def unit_factor(
             "give `at`, a frequency [GHz] or a Bandpass."
         )
     if isinstance(at, Bandpass):
-        return float(at.conversion(first, second, nu_ref)) ** power
+        factor = at.conversion(first, second, nu_ref, T_cmb=T_cmb, flat=flat)
+        return float(factor) ** power
     nu = at.to_value(u.GHz) if isinstance(at, u.Quantity) else at
-    return float(conversion(first, second, nu)) ** power
+    return float(conversion(first, second, nu, T_cmb)) ** power
 
 
 @takes_quantities

@@ -122,8 +122,8 @@ def fiducial(
                 f"matrix has the eigenvalue {least:.2g}); use more of the sky, or a wider range of "
                 "multipoles."
             )
-    names = [name for name in parameter_names(sky) if not name.endswith(".amplitude")]
-    laws = {name: float(value) for name, value in get_parameters(sky, names).items()}
+    values = get_parameters(sky, parameter_names(sky))  # amplitudes and tables have several axes
+    laws = {name: float(value) for name, value in values.items() if value.ndim < 2}
     return {"r": r, "A_lens": A_lens, **laws, **foregrounds}
 
 

@@ -32,6 +32,7 @@ from fits.products import summed, weighted
 from jaxsky import Bandpass, Sky, parameter_names, set_parameters
 from jaxsky.bandpass import Samples, average, parse_unit, stack_bands
 from jaxsky.checks import Numeric
+from jaxsky.components import declared
 from jaxsky.interpolation import band_seds, choose_nodes
 from jaxsky.io.stacks import Maps, computed, stored
 from jaxsky.mesh import distribute, mesh_of
@@ -58,8 +59,12 @@ def nominal(names: Iterable[str]) -> dict[str, float]:
 
 
 def spectral_names(sky: Sky) -> tuple[str, ...]:
-    """Return names of the parameters of the laws: all but those that only scale amplitudes."""
-    return tuple(n for n in parameter_names(sky) if n.split(".")[1] not in NOT_SPECTRAL)
+    """Return names of the parameters of the laws: not tables, nor what only scales amplitudes."""
+
+    def spectral(component: str, field: str) -> bool:
+        return field not in NOT_SPECTRAL and "table" not in declared(type(sky[component]), field)
+
+    return tuple(n for n in parameter_names(sky) if spectral(*n.split(".")[:2]))
 
 
 def named_bands(bands: Mapping[str, Bandpass] | Sequence[Bandpass]) -> dict[str, Bandpass]:
@@ -78,7 +83,8 @@ def unit_sky(sky: Sky, stokes: int = 2, mask: Float[np.ndarray, " pix"] | None =
     def reduced(leaf):
         if leaf.ndim == 2:
             return jnp.asarray(np.ones((stokes, 1)))
-        return jnp.asarray(np.average(leaf, weights=mask)) if leaf.ndim else leaf.astype(float)
+        is_map = leaf.ndim == 1
+        return jnp.asarray(np.average(leaf, weights=mask)) if is_map else leaf.astype(float)
 
     return jax.tree.map(reduced, sky)
 

@@ -178,7 +178,7 @@ def _look(
         """Return sums over some pixels: of weights, and of weighted squares of maps."""
 
         def own(maps: Any) -> Any:
-            return maps[..., part] if np.ndim(maps) else maps
+            return maps if np.shape(maps)[-1:] in ((), (1,)) else maps[..., part]
 
         inside = used[part]
         weights = np.where(inside, 1 / np.asarray(own(prepared.sigma))[:, keep] ** 2, 0.0)

@@ -193,7 +193,8 @@ def check_parameter(sky: Sky, target: str, name: str, value: Array) -> None:
 def set_parameters(sky: Sky, params: Mapping[str, ArrayLike]) -> Sky:
     """Return a sky with some parameters replaced, or shifted for names that end in ".offset".
 
-    Values are numbers, or maps with the sky's pixels; for amplitudes maps of the sky's shape.
+    Values are numbers, or maps with the sky's pixels; for amplitudes maps of the sky's shape, and
+    for tables of numbers those of the same shape, (row, column, 1).
     KeyError lists the known names if one is unknown; ValueError refuses values of another shape,
     that are not finite, or outside the range of the parameter.
 
@@ -213,9 +214,10 @@ def set_parameters(sky: Sky, params: Mapping[str, ArrayLike]) -> Sky:
         if target not in leaves:
             raise unknown_parameter(name, leaves)
         value = as_array(name, value)
-        amplitude = target.endswith(".amplitude")
-        if value.shape not in ((sky.shape,) if amplitude else ((), sky.shape[1:])):
-            wanted = f"shape {sky.shape}" if amplitude else f"a number or of shape {sky.shape[1:]}"
+        own = leaves[target].shape
+        whole = len(own) > 1  # an amplitude or a table
+        if value.shape not in ((own,) if whole else ((), sky.shape[1:])):
+            wanted = f"shape {own}" if whole else f"a number or of shape {sky.shape[1:]}"
             raise ValueError(f"Parameter {name!r} must be {wanted}, but has shape {value.shape}.")
         leaves[target] = leaves[target] + value if name.endswith(OFFSET) else value
         check_parameter(sky, target, name, leaves[target])

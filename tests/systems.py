@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsky import AME, CMB, Bandpass, Component, Dust, Sky, Synchrotron
+from jaxsky.components import SpinningDust
 
 NPIX = 48
 
@@ -17,6 +18,12 @@ def random_maps(seed: int, stokes: int = 2, npix: int = NPIX) -> jnp.ndarray:
 def spread(center: float, width: float, npix: int = NPIX) -> jnp.ndarray:
     """A map of a parameter, even over center +- width."""
     return jnp.asarray(center + width * np.random.default_rng(9).uniform(-1, 1, npix))
+
+
+def emissivity() -> np.ndarray:
+    """A table like SPDUST2's: it rises as a power, and falls steeply beyond 30 GHz."""
+    x = np.geomspace(0.02, 15.0, 300)
+    return np.stack([30 * x, 1e-18 * x**2 * np.exp(1 - x**1.2)], axis=1)
 
 
 def components(stokes: int = 2) -> dict[str, Component]:
@@ -32,6 +39,7 @@ def components(stokes: int = 2) -> dict[str, Component]:
         ),
         "ame": ame or AME(maps, nu_ref=22.8),
         "cmb": CMB(maps),
+        "spinning_dust": SpinningDust(maps, emissivity(), 33.35, nu_table=30.0),
     }
 
 

@@ -18,6 +18,7 @@ from jaxsky.components.base import (
     parameter,
     parameter_declaration,
     reference,
+    table,
     template,
 )
 from jaxsky.components.laws import (
@@ -28,6 +29,7 @@ from jaxsky.components.laws import (
     Synchrotron,
     amplitude_from_emission_measure,
 )
+from jaxsky.components.tabulated import SpinningDust
 
 for _module in pkgutil.iter_modules(__path__):
     _found = importlib.import_module(f"{__name__}.{_module.name}")

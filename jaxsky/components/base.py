@@ -70,6 +70,16 @@ def reference(default: float, within: tuple[float, float]) -> Any:
     return parameter(default, positive=True, within=within, hint=hint, symbol=symbol, unit="GHz")
 
 
+def table(columns: str) -> Any:
+    """Declare the field of a component for a table of numbers, (row, column), that its law uses.
+
+    It is kept with a last axis of length 1, (row, column, 1), because maps of parameters have one
+    axis and amplitudes two. Derivatives in its numbers are as for any parameter; fits do not vary
+    it. `columns` says in words what it holds.
+    """
+    return eqx.field(converter=_tabulated, metadata={"table": columns}, default=None)
+
+
 def _converted(value: Any) -> Any:
     """Convert to an array, or a tuple of them; leave anything else for the later check by name."""
     if value is None or isinstance(value, tuple):
@@ -80,14 +90,21 @@ def _converted(value: Any) -> Any:
         return value
 
 
+def _tabulated(value: Any) -> Any:
+    """Convert a table to (row, column, 1); leave anything else for the later check by name."""
+    value = _converted(list(value) if isinstance(value, tuple) else value)
+    return value[..., None] if getattr(value, "ndim", 0) == 2 else value
+
+
 class Component(Printed, eqx.Module):
     """Base class of sky components: `template` (stokes, pix) times `sed(nu)`.
 
     Stokes parameters of the amplitude are I (1 row), Q, U (2 rows) or I, Q, U (3 rows), in uK_RJ at
     the component's reference frequency, HEALPix RING order, Galactic coordinates, COSMO sign of U.
 
-    A subclass declares its fields with `template` and `parameter`, and defines `sed`. By the name
-    of its law, or as `law = "module:Class"`, it can be used in the settings of every command.
+    A subclass declares its fields with `template`, `parameter` and `table` (of numbers), and
+    defines `sed`. By the name of its law, or as `law = "module:Class"`, it can be used in the
+    settings of every command.
 
     Attributes
     ----------
@@ -155,7 +172,9 @@ class Component(Printed, eqx.Module):
         rows = [("amplitude", maps)]
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if "positive" in field.metadata and value is not None:
+            if "table" in field.metadata:
+                rows.append((field.name, "table of {} x {} numbers".format(*value.shape)))
+            elif "positive" in field.metadata and value is not None:
                 rows.append((field.name, shown(value, field.metadata["unit"])))
         return f"{type(self).__name__}, law {self.law!r}", rows
 
@@ -184,6 +203,9 @@ class Component(Printed, eqx.Module):
             if field.name == "amplitude" or field.metadata.get("static"):
                 continue
             value = getattr(self, field.name)
+            if "table" in field.metadata:
+                check_table(field.name, value, field.metadata["table"])
+                continue
             for entry in value if isinstance(value, tuple) else (value,):
                 if entry is None:
                     continue
@@ -212,6 +234,16 @@ def check_value(name: str, value: Array, metadata: Mapping[str, Any]) -> None:
             f"Argument `{name}` must be from {low:g} to {high:g}, but {what} {middle:g}; "
             f"{metadata['hint']}."
         )
+
+
+def check_table(name: str, value: Any, columns: str) -> None:
+    """Raise TypeError or ValueError unless a value can be a table as `table` keeps it."""
+    if value is None:
+        raise ValueError(f"Argument `{name}` is missing: a table of {columns}.")
+    array = as_array(name, value)
+    good = array.ndim == 3 and array.shape[-1] == 1
+    check_shape(name, array, good, f"be a table (row, column) of {columns}")
+    check_finite(name, array)
 
 
 def check_law(component: Component, nu: float = 100.0) -> None:

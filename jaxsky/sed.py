@@ -1,9 +1,9 @@
 """Spectral laws, one function per equation.
 
-Each law but `cmb_derivative` is the antenna temperature (Rayleigh-Jeans, K_RJ) at `nu` relative to
-that at `nu_ref`, so exactly 1 there. Arguments are floats or arrays, broadcast against each other
-and can be differentiated; no value is treated as a special case. Frequencies are in GHz,
-temperatures in K. "The paper" is Hervias-Caimapo, Bonaldi & Brown (2016, MNRAS 462, 2063).
+Each law but `cmb_derivative` and `thermal_sz` is the antenna temperature (Rayleigh-Jeans, K_RJ) at
+`nu` relative to that at `nu_ref`, so exactly 1 there. Arguments are floats or arrays, broadcast
+against each other and can be differentiated; no value is treated as a special case. Frequencies are
+in GHz, temperatures in K. "The paper" is Hervias-Caimapo, Bonaldi & Brown (2016, MNRAS 462, 2063).
 """
 
 from typing import Final
@@ -105,3 +105,15 @@ def cmb_derivative(nu: Numeric, T_cmb: Numeric = T_CMB) -> Float[Array, "..."]:
     """
     x = H_OVER_K * nu / T_cmb
     return jnp.square(x * jnp.exp(-x / 2) / -jnp.expm1(-x))
+
+
+@jax.jit
+def thermal_sz(nu: Numeric, T_cmb: Numeric = T_CMB) -> Float[Array, "..."]:
+    """Antenna temperature of the thermal SZ effect per Compton y [K_RJ].
+
+    T_cmb (x coth(x/2) - 4) x^2 e^x / (e^x - 1)^2 with x = h nu / k T_cmb (Sunyaev & Zeldovich 1972;
+    Carlstrom et al. 2002, without relativistic corrections): negative below 217 GHz, -2 T_cmb at
+    long wavelengths.
+    """
+    x = H_OVER_K * nu / T_cmb
+    return T_cmb * (x / jnp.tanh(x / 2) - 4) * cmb_derivative(nu, T_cmb)

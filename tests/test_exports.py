@@ -69,11 +69,13 @@ def spectral_laws(sed) -> Calls:
     yield sed.modified_blackbodies, NU, (1.7, 2.7), (9.4, 16.2), (0.5, 1.0), 353.0
     yield sed.ame_log_parabola, NU, 4.0, 20.0, 22.8
     yield sed.cmb_derivative, NU
+    yield sed.thermal_sz, NU
 
 
 @of("jaxsky.components.laws")
 def emission(laws) -> Calls:
     yield laws.amplitude_from_emission_measure, MAPS[0], 8000.0, 30.0
+    yield laws.amplitude_from_compton, MAPS[0], 100.0
 
 
 @of("jaxsky.pysm.emission")

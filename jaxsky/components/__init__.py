@@ -27,6 +27,8 @@ from jaxsky.components.laws import (
     Dust,
     FreeFree,
     Synchrotron,
+    ThermalSZ,
+    amplitude_from_compton,
     amplitude_from_emission_measure,
 )
 from jaxsky.components.tabulated import SpinningDust

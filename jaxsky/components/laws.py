@@ -1,6 +1,6 @@
-"""The components that come with the package: dust, synchrotron, AME, free-free and the CMB."""
+"""The components with closed forms: dust, synchrotron, AME, free-free, the CMB, the SZ effect."""
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,9 @@ from jaxsky.arrays import StokesMaps
 from jaxsky.checks import Numeric, Parameter, as_array, check_shape, is_concrete
 from jaxsky.components.base import Component, parameter, reference, template
 from jaxsky.sed import T_CMB
+
+#: Zero of x coth(x/2) - 4, where the thermal SZ effect vanishes: 217.5 GHz.
+SZ_ZERO: Final = 3.830016096
 
 
 class Dust(Component, law="dust"):
@@ -224,3 +227,48 @@ class CMB(Component, law="cmb"):
 
     def sed(self, nu):
         return sed.cmb_derivative(nu, self.T_cmb)
+
+
+@jax.jit
+def amplitude_from_compton(y: Numeric, nu_ref: Numeric, T_cmb: Numeric = T_CMB) -> Array:
+    """Return the antenna temperature of the thermal SZ effect [uK_RJ] at nu_ref [GHz].
+
+    From Compton y, a number or an array; T_cmb in K. See `sed.thermal_sz`.
+    """
+    return jnp.asarray(1e6 * y * sed.thermal_sz(nu_ref, T_cmb))
+
+
+class ThermalSZ(Component, law="sz"):
+    """Thermal Sunyaev-Zeldovich effect, without relativistic corrections (`sed.thermal_sz`).
+
+    As for other laws the amplitude is in uK_RJ at nu_ref, and the law relative to that, so it is
+    negative on the other side of 217 GHz, and any frequency may be observed, 217 GHz included. A
+    map of Compton y becomes an amplitude by `amplitude_from_compton`. It is not polarized.
+
+    Parameters
+    ----------
+    amplitude : template at nu_ref [uK_RJ], I, Q, U with zeros in Q and U, shape (3, pix); negative
+        where y is positive if nu_ref is below 217 GHz
+    T_cmb : temperature of the monopole [K]
+    nu_ref : reference frequency [GHz]; ValueError within 2 GHz of the zero of the law
+    """
+
+    polarized: ClassVar[bool] = False
+
+    amplitude: StokesMaps = template()
+    T_cmb: Parameter = parameter(T_CMB, positive=True, symbol=r"T_{\rm CMB}", unit="K", zero=False)
+    nu_ref: Parameter = reference(100.0, within=(0.01, 2e3))
+
+    def __check_init__(self) -> None:
+        nu_ref, T_cmb = as_array("nu_ref", self.nu_ref), as_array("T_cmb", self.T_cmb)
+        if not (is_concrete(nu_ref) and is_concrete(T_cmb)):
+            return
+        zero = float(SZ_ZERO * T_cmb.mean() / sed.H_OVER_K)
+        if bool(jnp.any(jnp.abs(nu_ref - zero) < 2)):
+            raise ValueError(
+                f"Argument `nu_ref` must be at least 2 GHz from {zero:.4g} GHz, where the law is "
+                f"zero, but is {float(nu_ref.mean()):g}."
+            )
+
+    def sed(self, nu):
+        return sed.thermal_sz(nu, self.T_cmb) / sed.thermal_sz(self.nu_ref, self.T_cmb)

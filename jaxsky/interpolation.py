@@ -117,7 +117,7 @@ def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
 def choose_nodes(component: Component, bands: tuple[Bandpass, ...], tolerance: float) -> Nodes:
     """Choose node counts for a relative tolerance; None if the direct sum is better, or no map."""
     maps, _ = _split(component)
-    if not maps or len(maps) > MAX_DIMENSIONS or tolerance <= 0:
+    if not maps or len(maps) > MAX_DIMENSIONS or tolerance <= 0 or not component.smooth:
         return None
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((component, bands))):
         return NodeCounts((TRACED_NODES,) * len(maps), tolerance)

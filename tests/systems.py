@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsky import AME, CMB, Bandpass, Component, Dust, Sky, Synchrotron
-from jaxsky.components import SpinningDust
+from jaxsky.components import HensleyDraine, SpinningDust
 
 NPIX = 48
 
@@ -26,6 +26,13 @@ def emissivity() -> np.ndarray:
     return np.stack([30 * x, 1e-18 * x**2 * np.exp(1 - x**1.2)], axis=1)
 
 
+def grains() -> np.ndarray:
+    """A table like those of Hensley & Draine: intensities by frequency and log10 of the field."""
+    nu, u = np.geomspace(9.0, 1000.0, 60), np.linspace(-2, 2, 17)
+    intensity = nu[:, None] ** 4.6 / np.expm1(np.outer(0.048 * nu, 10 ** (-u / 5.6) / 19))
+    return np.block([[np.zeros((1, 1)), u[None]], [nu[:, None], intensity]])
+
+
 def components(stokes: int = 2) -> dict[str, Component]:
     """One component of each kind, every parameter at a value at which it matters."""
     maps = random_maps(1, stokes)
@@ -39,6 +46,7 @@ def components(stokes: int = 2) -> dict[str, Component]:
         ),
         "ame": ame or AME(maps, nu_ref=22.8),
         "cmb": CMB(maps),
+        "hd17": HensleyDraine(maps, grains(), 0.3),
         "spinning_dust": SpinningDust(maps, emissivity(), 33.35, nu_table=30.0),
     }
 

@@ -31,7 +31,7 @@ from jaxsky.components.laws import (
     amplitude_from_compton,
     amplitude_from_emission_measure,
 )
-from jaxsky.components.tabulated import SpinningDust
+from jaxsky.components.tabulated import HensleyDraine, SpinningDust
 
 for _module in pkgutil.iter_modules(__path__):
     _found = importlib.import_module(f"{__name__}.{_module.name}")

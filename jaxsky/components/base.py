@@ -110,6 +110,8 @@ class Component(Printed, eqx.Module):
     ----------
     law : name of the law in settings, given in the class statement; by default "module:Class"
     polarized : whether there is anything in Q and U; if not, an amplitude has to be I, or I, Q, U
+    smooth : whether the law is smooth in its parameters, so that band averages may be interpolated
+        in maps of them (`jaxsky.interpolation`); not so for tables with kinks
     unit : unit of the amplitude
     nu_ref_I : reference frequency [GHz] of the amplitude of I, if it is not `nu_ref`
 
@@ -136,6 +138,7 @@ class Component(Printed, eqx.Module):
 
     law: ClassVar[str] = ""
     polarized: ClassVar[bool] = True
+    smooth: ClassVar[bool] = True
     unit: ClassVar[str] = "uK_RJ"
 
     amplitude: eqx.AbstractVar[StokesMaps]

@@ -30,7 +30,6 @@ from jaxsky.settings import (
     BandTable,
     ComponentTable,
     Experiment,
-    MapFile,
     MapKeys,
     SettingsError,
     at_key,
@@ -344,7 +343,7 @@ def modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
     """Return laws, on one pixel, or on all if parameters are maps; and where these are known."""
     folder, nside = Path(settings.data_dir), settings.common.nside
     laws = {name: settings.sky.components[name] for name in settings.modelled()}
-    maps = any(isinstance(value, MapFile) for c in laws.values() for value in c.parameters.values())
+    maps = any(spec.maps for spec in laws.values())
     amplitude = jnp.ones((2, 12 * nside**2 if maps else 1))
     components: dict[str, Component] = {"cmb": component_class("cmb")(amplitude)}
     known = np.ones(12 * nside**2, bool)

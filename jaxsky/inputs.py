@@ -20,6 +20,7 @@ from jaxsky.components import AME, Component, check_law, component_class, parame
 from jaxsky.galaxy import EmbeddedSky, GalaxyModel, embedded_sky
 from jaxsky.io import Maps, read_bandpass, read_beam, read_maps, unit_factor
 from jaxsky.io.columns import sentinels
+from jaxsky.io.curves import read_text
 from jaxsky.io.files import kept
 from jaxsky.io.stacks import stored
 from jaxsky.settings import (
@@ -119,18 +120,29 @@ def read(
 def read_parameters(
     folder: Path, name: str, spec: ComponentTable, nside: int, of: str = "that of the template"
 ) -> tuple[dict[str, Any], Bool[np.ndarray, " pix"]]:
-    """Read the parameters of a component's law, numbers or maps, and where they are known."""
+    """Read the parameters of a component's law: numbers, maps, tables; and where maps are known."""
     parameters: dict[str, Any] = {} if spec.nu_ref is None else {"nu_ref": spec.nu_ref}
     used = np.ones(healpy.nside2npix(nside), bool)
     for key, value in spec.parameters.items():
-        if isinstance(value, MapFile):
-            place, stated = f"sky.{name}.parameters.{key}", value.missing is not None
-            found = read(folder, value, stokes="", zeros_are_data=True)
-            column, known = parameter_map(found, key, nside, place, of=of, stated=stated)
-            parameters[key], used = jnp.asarray(column), used & known
-        else:
+        if not isinstance(value, MapFile):
             parameters[key] = tuple(value) if isinstance(value, list) else value
+    for key, value in spec.maps.items():
+        place, stated = f"sky.{name}.parameters.{key}", value.missing is not None
+        found = read(folder, value, stokes="", zeros_are_data=True)
+        column, known = parameter_map(found, key, nside, place, of=of, stated=stated)
+        parameters[key], used = jnp.asarray(column), used & known
+    for key, value in spec.tables.items():
+        parameters[key] = read_table(folder, value, f"sky.{name}.parameters.{key}")
     return parameters, used
+
+
+def read_table(folder: Path, spec: MapFile, where: str) -> Float[np.ndarray, "row column"]:
+    """Read the numbers that a law interpolates from the text file that is named at a key."""
+    if others := spec.changed(set(MapFile.model_fields) - {"file"}):
+        raise SettingsError(f"{where}.{others[0]}: is of maps, but this is a table of numbers.")
+    if len(spec.files) > 1:
+        raise SettingsError(f"{where}.file: must be one file, not {spec.label}.")
+    return read_text(find_file(folder, spec.files[0])).numbers()
 
 
 def narrow(values: ArrayLike) -> Array:

@@ -129,6 +129,21 @@ class ComponentTable(SeenKeys):
         return self
 
     @property
+    def maps(self) -> dict[str, MapFile]:
+        """The parameters that are maps."""
+        return self._files(table=False)
+
+    @property
+    def tables(self) -> dict[str, MapFile]:
+        """The parameters that are files of a table of numbers, which the law interpolates."""
+        return self._files(table=True)
+
+    def _files(self, table: bool) -> dict[str, MapFile]:
+        found = {k: v for k, v in self.parameters.items() if isinstance(v, MapFile)}
+        law = component_class(self.law or EMBEDDED[0])
+        return {k: v for k, v in found.items() if table == ("table" in declared(law, k))}
+
+    @property
     def polarized(self) -> bool:
         """Whether the law, which must be given, is polarized."""
         return component_class(str(self.law)).polarized

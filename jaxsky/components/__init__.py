@@ -21,6 +21,7 @@ from jaxsky.components.base import (
     table,
     template,
 )
+from jaxsky.components.interpolated import InterpolatedMap, interpolated_maps
 from jaxsky.components.laws import (
     AME,
     CMB,

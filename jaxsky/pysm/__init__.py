@@ -4,6 +4,8 @@
 templates that the user has, and `.sky()` the `jaxsky.Sky` behind it. PySM itself is not needed.
 """
 
+from jaxsky.pysm.cmb import CMBDipole, CMBMap, SimpleSZ, WebSkyCMB
+from jaxsky.pysm.lines import COLines
 from jaxsky.pysm.models import (
     CurvedPowerLaw,
     Model,
@@ -13,4 +15,5 @@ from jaxsky.pysm.models import (
 )
 from jaxsky.pysm.sky import Sky, get_pysm_emission
 from jaxsky.pysm.smoothing import apply_smoothing_and_coord_transform
+from jaxsky.pysm.tabulated import HensleyDraine2017, SpDust, SpDustPol
 from jaxsky.pysm.units import bandpass_unit_conversion

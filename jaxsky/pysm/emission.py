@@ -24,11 +24,11 @@ class Part:
 
     `ready` has all its maps at one reference frequency, and `ends` is the law at the ends of the
     ranges of its maps, which is enough to choose how it is averaged over a band. `name` tells the
-    parts of a model apart.
+    parts of a model apart; with `cut` it is averaged without samples of no weight (`above_cut`).
     """
 
-    def __init__(self, component: Component, name: str = "") -> None:
-        self.component, self.name = component, name
+    def __init__(self, component: Component, name: str = "", cut: bool = False) -> None:
+        self.component, self.name, self.cut = component, name, cut
 
     @cached_property
     def ready(self) -> Component:
@@ -84,7 +84,21 @@ class _Writable:
 def emission_of(parts: Iterable[Part], band: Bandpass, factor: float) -> np.ndarray:
     """Return the sum of the emission of parts in a band [uK_RJ], times a factor, shape (3, pix)."""
     parts = tuple(parts)
-    plan: Plan = tuple(choose_nodes(part.ends, (band,), TOLERANCE) for part in parts)
-    maps = _summed(tuple(part.ready for part in parts), band, jnp.asarray(factor), plan=plan)
+    cut = above_cut(band) if any(part.cut for part in parts) else band
+    if cut is not band and not all(part.cut for part in parts):
+        own, others = (tuple(p for p in parts if p.cut == which) for which in (True, False))
+        return emission_of(own, band, factor) + emission_of(others, band, factor)
+    plan: Plan = tuple(choose_nodes(part.ends, (cut,), TOLERANCE) for part in parts)
+    maps = _summed(tuple(part.ready for part in parts), cut, jnp.asarray(factor), plan=plan)
     # Nothing else refers to what a program returns, so users may change it in place, as PySM's.
     return np.asarray(_Writable(maps))
+
+
+def above_cut(band: Bandpass, cut: float = 1e-10) -> Bandpass:
+    """Return a band without samples whose weights, once it has the integral 1 [1/GHz], are below.
+
+    As PySM converts units. The band itself is returned where there are none.
+    """
+    nu, response = np.asarray(band.nu), np.asarray(band.weights)
+    kept = response >= cut * np.trapezoid(response, nu)
+    return band if nu.size == 1 or kept.all() else Bandpass(nu[kept], response[kept], "power")

@@ -21,7 +21,7 @@ from jaxsky.pysm.files import given_frequency, given_map, read_map
 from jaxsky.pysm.units import T_CMB, bandpass, unit_of
 
 #: Classes by the names that PySM has for them.
-MODELS: dict[str, type["LawModel"]] = {}
+MODELS: dict[str, type["Model"]] = {}
 
 
 class Model:
@@ -106,6 +106,8 @@ class LawModel(Model):
     words: ClassVar[Mapping[str, str]] = {}
     #: Whether another reference frequency only scales the law, and does not change its shape.
     scales: ClassVar[bool] = True
+    #: Whether samples of no weight are left out, see `Part`.
+    cut: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -117,7 +119,7 @@ class LawModel(Model):
             nside,
             **{k: arguments.pop(k, None) for k in ("max_nside", "available_nside", "map_dist")},
         )
-        self._parts = tuple(Part(one, name) for name, one in self._components(arguments))
+        self._parts = tuple(Part(one, name, self.cut) for name, one in self._components(arguments))
 
     @property
     def parts(self) -> tuple[Part, ...]:
@@ -125,22 +127,7 @@ class LawModel(Model):
 
     def _components(self, arguments: dict[str, Any]) -> Iterable[tuple[str, Component]]:
         """Yield the components by name, "" for a single one; all arguments have to be used."""
-        polarized = arguments.pop("has_polarization", True)
-        nu_I = given_frequency("freq_ref_I", arguments.pop("freq_ref_I", None))
-        stated = arguments.pop("freq_ref_P", None)
-        nu_P = given_frequency("freq_ref_P", stated) if polarized else nu_I
-        together = polarized and arguments.get("map_Q") is None
-        maps = []
-        for row in "IQU" if polarized and not together else "I":
-            unit = arguments.pop(f"unit_{row}", None)
-            values = arguments.pop(f"map_{row}", None)
-            if values is None:
-                raise TypeError(f"{type(self).__name__} needs the argument `map_{row}`.")
-            nu = nu_I if row == "I" else nu_P
-            maps.append(self._amplitude(values, unit, nu, [0, 1, 2] if together else 0))
-        for row in "QU":
-            arguments.pop(f"map_{row}", None), arguments.pop(f"unit_{row}", None)
-        amplitude = np.concatenate([np.atleast_2d(np.asarray(m, np.float64)) for m in maps])
+        amplitude, nu_I, nu_P = self._maps(arguments)
         law = self._law(arguments)
         if nu_I == nu_P:
             yield "", law(amplitude, nu_ref=nu_P)
@@ -149,6 +136,23 @@ class LawModel(Model):
         else:
             yield "I", law(amplitude[:1], nu_ref=nu_I)
             yield "QU", law(amplitude[1:], nu_ref=nu_P)
+
+    def _maps(self, arguments: dict[str, Any]) -> tuple[np.ndarray, float, float]:
+        """Take I, or I, Q, U [uK_RJ] out of the arguments, with their frequencies [GHz]."""
+        polarized = arguments.pop("has_polarization", True)
+        nu_I = given_frequency("freq_ref_I", arguments.pop("freq_ref_I", None))
+        stated = arguments.pop("freq_ref_P", None)
+        nu_P = given_frequency("freq_ref_P", stated) if polarized else nu_I
+        together = polarized and arguments.get("map_Q") is None
+        maps = []
+        for row in "IQU" if polarized and not together else "I":
+            unit, values = arguments.pop(f"unit_{row}", None), self._taken(f"map_{row}", arguments)
+            nu = nu_I if row == "I" else nu_P
+            maps.append(self._amplitude(values, unit, nu, [0, 1, 2] if together else 0))
+        for row in "QU":
+            arguments.pop(f"map_{row}", None), arguments.pop(f"unit_{row}", None)
+        amplitude = np.concatenate([np.atleast_2d(np.asarray(m, np.float64)) for m in maps])
+        return amplitude, nu_I, nu_P
 
     def _amplitude(
         self,
@@ -167,10 +171,20 @@ class LawModel(Model):
     def _law(self, arguments: dict[str, Any]) -> Callable[..., Component]:
         """Return the component as a function of its amplitude, from all arguments that are left."""
         given = {ours: self._parameter(theirs, arguments) for theirs, ours in self.words.items()}
+        self._no_more(arguments)
+        return partial(component_class(self.law), **self._signed(given))
+
+    def _taken(self, name: str, arguments: dict[str, Any]) -> Any:
+        """Take a required argument out of all."""
+        if arguments.get(name) is None:
+            raise TypeError(f"{type(self).__name__} needs the argument `{name}`.")
+        return arguments.pop(name)
+
+    def _no_more(self, arguments: dict[str, Any]) -> None:
+        """Raise TypeError if there are arguments that nothing has taken."""
         if arguments:
             unknown = ", ".join(map(repr, arguments))
             raise TypeError(f"{type(self).__name__} has no argument {unknown}.")
-        return partial(component_class(self.law), **self._signed(given))
 
     def _signed(self, given: dict[str, Any]) -> dict[str, Any]:
         """Return parameters with the signs of jaxsky in place of PySM's."""
@@ -178,9 +192,7 @@ class LawModel(Model):
 
     def _parameter(self, theirs: str, arguments: dict[str, Any]) -> Any:
         """Take a parameter of the law out of the arguments, in jaxsky's unit."""
-        if theirs not in arguments:
-            raise TypeError(f"{type(self).__name__} needs the argument `{theirs}`.")
-        value = arguments.pop(theirs)
+        value = self._taken(theirs, arguments)
         unit = declared(component_class(self.law), self.words[theirs])["unit"]
         if unit == "GHz":
             return given_frequency(theirs, value)
@@ -210,11 +222,10 @@ class ModifiedBlackBodyLayers(ModifiedBlackBody):
         nu = given_frequency("freq_ref", arguments.pop("freq_ref", None))
         factor = arguments.pop("color_correction", 1)
         unit = arguments.pop("unit_layers", None)
-        if "map_layers" not in arguments:
-            raise TypeError(f"{type(self).__name__} needs the argument `map_layers`.")
+        layers = self._taken("map_layers", arguments)
         for layer in range(arguments.pop("num_layers", 1)):
             own = {k: _layer(v, layer) for k, v in arguments.items()}
-            maps = self._amplitude(own.pop("map_layers"), unit, nu, [0, 1, 2], np.float64)
+            maps = self._amplitude(_layer(layers, layer), unit, nu, [0, 1, 2], np.float64)
             yield f"{layer + 1}", self._law(own)(maps * factor, nu_ref=nu)
 
 

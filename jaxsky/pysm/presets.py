@@ -19,24 +19,30 @@ def preset_settings(name: str) -> dict[str, Any]:
     if name not in pysm_presets():
         raise KeyError(f"Unknown preset {name!r}; known are {', '.join(pysm_presets())}.")
     entry = presets[name]
-    if "law" in entry:
+    if _single(entry):
         return _settings(entry)
     return {part: _settings(own) for part, own in entry.items()}
+
+
+def _single(entry: Mapping[str, Any]) -> bool:
+    """Return whether an entry of the table is one model of PySM, not several."""
+    return "model" in entry or "files" in entry
 
 
 def pysm_presets() -> list[str]:
     """Return the names of the presets that there are."""
 
-    def has_files(entry: Mapping[str, Any]) -> bool:
-        return "files" in entry or any(
-            "files" in own for own in entry.values() if type(own) is dict
-        )
+    def made(entry: Mapping[str, Any]) -> bool:
+        parts = [own for own in entry.values() if isinstance(own, dict)]
+        return _single(entry) or (bool(parts) and all(map(_single, parts)))
 
-    return [name for name, entry in packaged("presets.toml").items() if has_files(entry)]
+    return [name for name, entry in packaged("presets.toml").items() if made(entry)]
 
 
 def _settings(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of one component."""
+    """Return the settings of one model."""
+    if "model" in entry:
+        return {"class": entry["model"]} | {k: v for k, v in entry.items() if k != "model"}
     own = {key: value for key, value in entry.items() if key not in ("law", "maps", "files")}
     own |= entry["files"]
     own = {"beta_syn" if key == "pysm_beta" else key: value for key, value in own.items()}
@@ -65,7 +71,6 @@ def _kind(law: str, own: Mapping[str, Any]) -> type[LawModel]:
     """Return the class with a law that takes most of what is given."""
     if "layers" in own:
         return ModifiedBlackBodyLayers
-    fitting = [
-        one for one in MODELS.values() if one.law == law and set(one.words.values()) <= {*own}
-    ]
+    fitting = [one for one in MODELS.values() if issubclass(one, LawModel) and one.law == law]
+    fitting = [one for one in fitting if set(one.words.values()) <= {*own}]
     return max(fitting, key=lambda one: len(one.words))

@@ -13,6 +13,7 @@ from jaxsky.bandpass import UNITS, Bandpass
 from jaxsky.checks import as_array
 from jaxsky.io.quantities import from_quantity, unit_factor, unit_name
 from jaxsky.public import takes_quantities
+from jaxsky.pysm.emission import above_cut
 
 #: CMB temperature of astropy and PySM [K].
 T_CMB: Final = 2.7255
@@ -100,12 +101,8 @@ def bandpass_unit_conversion(
     if output_unit is None:
         raise TypeError("Argument `output_unit` is missing.")
     output_unit, input_unit = unit_of(output_unit), unit_of(input_unit)
-    band = bandpass(freqs, weights)
-    nu, response = np.asarray(band.nu), np.asarray(band.weights)
-    kept = response >= cut * np.trapezoid(response, nu)
-    if nu.size > 1 and not kept.all():
-        band = Bandpass(nu[kept], response[kept], "power")
-    at: Any = band if nu.size > 1 else float(nu[0])
+    band = above_cut(bandpass(freqs, weights), cut)
+    at: Any = band if band.nu.size > 1 else float(band.nu[0])
     factor = unit_factor(str(input_unit), str(output_unit), at, T_cmb=T_CMB, flat=True)
     return factor * (output_unit / input_unit)
 

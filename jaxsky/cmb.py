@@ -1,18 +1,21 @@
-"""CMB power spectra from CAMB, and Gaussian fields with given auto- and cross-spectra."""
+"""CMB power spectra from CAMB, Gaussian fields with given auto- and cross-spectra, the dipole."""
 
 from functools import cache, partial
 from importlib.metadata import version
 from typing import Any, TypeAlias
 
+import healpy
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
-from jaxsky.arrays import Alm
-from jaxsky.checks import check_choice
+from jaxsky.arrays import Alm, Scalar, StokesMaps
+from jaxsky.checks import Numeric, as_number, check_choice, check_nside, is_concrete
+from jaxsky.components import CMB, Component, KinematicQuadrupole
 from jaxsky.harmonics import expand
 from jaxsky.noise import cholesky, normal
+from jaxsky.sed import T_CMB
 
 #: Planck 2018 results VI, TT,TE,EE+lowE+lensing; arguments of `camb.set_params`.
 PLANCK_2018 = {
@@ -184,3 +187,81 @@ def gaussian_fields(key: Array, spectra: Spectra) -> Float[Array, "field alm"]:
     lower = cholesky(spectra)
     white = normal(key, (n, (lmax + 1) ** 2), spectra.dtype)
     return jnp.stack([sum(expand(lower[i, j]) * white[j] for j in range(i + 1)) for i in range(n)])
+
+
+@jax.jit
+def speed_of_dipole(amplitude: Numeric, T_cmb: Numeric = T_CMB) -> Scalar:
+    """Return the observer's v/c from the largest rise of temperature.
+
+    From `amplitude` [uK_CMB], 3366.6 in Planck's last maps (Planck intermediate results LVII), and
+    T_cmb [K]. The temperature towards the velocity is T_cmb sqrt[(1 + beta)/(1 - beta)].
+    """
+    ratio = jnp.square(1 + 1e-6 * amplitude / T_cmb)
+    return (ratio - 1) / (ratio + 1)
+
+
+def dipole(
+    nside: int,
+    beta: ArrayLike,
+    longitude: ArrayLike = 263.986,
+    latitude: ArrayLike = 48.247,
+    *,
+    T_cmb: ArrayLike = T_CMB,
+    quadrupole: bool = False,
+) -> dict[str, Component]:
+    """Return what a moving observer adds to the CMB, as components "dipole", "quadrupole".
+
+    Differentiable in speed, direction and temperature. With mu the cosine of the angle to the
+    velocity, the temperature is T_cmb / [gamma (1 - beta mu)]. To first order in the anisotropy
+    that is one map with the law of the CMB. With `quadrupole` it is, as in PySM's model dip2, to
+    second order in beta: T_cmb beta mu with that law, and T_cmb beta^2 mu^2 with that of
+    `KinematicQuadrupole`.
+
+    Parameters
+    ----------
+    nside : resolution of the maps, RING order, Galactic coordinates
+    beta : speed v/c, between -1 and 1; see `speed_of_dipole`
+    longitude, latitude : Galactic direction of the velocity [deg]; by default the Sun's by Planck
+        (Planck intermediate results LVII)
+    T_cmb : temperature of the monopole [K]
+    quadrupole : whether to return two components
+
+    Raises
+    ------
+    TypeError, ValueError
+        For values that are no numbers, an nside that is no power of 2, or a speed that is not
+        below that of light.
+
+    Examples
+    --------
+    >>> sky = dipole(4, speed_of_dipole(3366.6))
+    >>> round(float(sky["dipole"].amplitude.max() / 3366.6), 2)
+    0.99
+    """
+    check_nside("nside", nside)
+    beta, T_cmb = as_number("beta", beta), as_number("T_cmb", T_cmb, positive=True)
+    if is_concrete(beta) and not abs(float(beta)) < 1:
+        raise ValueError(f"Argument `beta` must be between -1 and 1, but is {float(beta):g}.")
+    direction = as_number("longitude", longitude), as_number("latitude", latitude)
+    pixels = np.stack(healpy.pix2vec(nside, np.arange(12 * nside**2)))
+    first, exact, second = _temperatures(pixels, beta, *direction, T_cmb)
+    if not quadrupole:
+        return {"dipole": CMB(exact, T_cmb)}
+    return {"dipole": CMB(first, T_cmb), "quadrupole": KinematicQuadrupole(second, T_cmb)}
+
+
+@jax.jit
+def _temperatures(
+    pixels: Array, beta: Scalar, longitude: Scalar, latitude: Scalar, T_cmb: Scalar
+) -> tuple[StokesMaps, StokesMaps, StokesMaps]:
+    """Return the first order in the speed, all orders, and the second: I, Q, U [uK_CMB]."""
+    lon, lat = jnp.deg2rad(longitude), jnp.deg2rad(latitude)
+    x, y, z = pixels
+    along = jnp.cos(lat) * (jnp.cos(lon) * x + jnp.sin(lon) * y) + jnp.sin(lat) * z
+    motion = beta * along
+    # sqrt(1 - beta^2)/(1 - beta mu) - 1 without the cancellation of a small speed.
+    root = jnp.sqrt(1 - beta**2)
+    all_orders = (motion - beta**2 / (1 + root)) / (1 - motion)
+    rows = [1e6 * T_cmb * one for one in (motion, all_orders, motion**2)]
+    first, exact, second = (jnp.stack([row, 0 * row, 0 * row]) for row in rows)
+    return first, exact, second

@@ -142,6 +142,8 @@ def transforms(harmonics) -> Calls:
 
 @of("jaxsky.cmb")
 def random_fields(cmb) -> Calls:
+    yield cmb.speed_of_dipole, 3366.6
+    yield partial(cmb.dipole, 2, quadrupole=True), 1e-3
     spectra = np.eye(2)[..., None] * FALLING
     yield cmb.realisation, KEY, np.stack([FALLING] * 4)
     yield cmb.repair, spectra

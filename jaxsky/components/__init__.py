@@ -27,6 +27,7 @@ from jaxsky.components.laws import (
     CMB,
     Dust,
     FreeFree,
+    KinematicQuadrupole,
     Synchrotron,
     ThermalSZ,
     amplitude_from_compton,

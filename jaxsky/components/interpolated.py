@@ -58,10 +58,8 @@ class InterpolatedMap(Component, law="interpolated"):
             )
 
     def sed(self, nu: Any):
-        rising, falling = (
-            jnp.where(nu < self.nu_ref, 0.0, 1.0),
-            jnp.where(nu > self.nu_ref, 0.0, 1.0),
-        )
+        rising = jnp.where(nu < self.nu_ref, 0.0, 1.0)
+        falling = jnp.where(nu > self.nu_ref, 0.0, 1.0)
         if self.nu_below is not None:
             rising = (nu - self.nu_below) / (self.nu_ref - self.nu_below)
         if self.nu_above is not None:

@@ -272,3 +272,27 @@ class ThermalSZ(Component, law="sz"):
 
     def sed(self, nu):
         return sed.thermal_sz(nu, self.T_cmb) / sed.thermal_sz(self.nu_ref, self.T_cmb)
+
+
+class KinematicQuadrupole(Component, law="kinematic_quadrupole"):
+    """Second order in the observer's velocity, with its own law (Kamionkowski & Knox 2003).
+
+    The law is (x/2) coth(x/2) times that of CMB anisotropies, x = h nu / k T_cmb: 1 K_RJ/K_CMB at
+    long wavelengths. It is not polarized.
+
+    Parameters
+    ----------
+    amplitude : T_cmb beta^2 mu^2 [uK_CMB], I, Q, U with zeros in Q and U, shape (3, pix); mu is the
+        cosine of the angle to the velocity (`dipole`)
+    T_cmb : temperature of the monopole [K]
+    """
+
+    polarized: ClassVar[bool] = False
+    unit: ClassVar[str] = "uK_CMB"
+
+    amplitude: StokesMaps = template()
+    T_cmb: Parameter = parameter(T_CMB, positive=True, symbol=r"T_{\rm CMB}", unit="K", zero=False)
+
+    def sed(self, nu):
+        x = sed.H_OVER_K * nu / self.T_cmb
+        return x / 2 / jnp.tanh(x / 2) * sed.cmb_derivative(nu, self.T_cmb)

@@ -158,7 +158,7 @@ class Mixing(eqx.Module):
         """Return the matrix for parameters that are numbers."""
         bands = self.moved(params)
         samples = self._samples(bands)
-        laws = [average(c.sed, samples) for c in self.laws(params).components.values()]
+        laws = [c.band_average(samples) for c in self.laws(params).components.values()]
         return jnp.stack(laws, axis=-1) * self.factors(bands, params)[:, None]
 
     def _interpolated(self, params, cells) -> Float[Array, "cell band component"]:

@@ -175,11 +175,14 @@ def _integrand(
 ) -> Float[Array, " sample"]:
     """Return the weights on antenna temperature times the steps of the trapezoid rule."""
     weights = weights * CONVENTIONS[convention](nu)
-    if nu.size == 1:
-        return weights
+    return weights if nu.size == 1 else weights * _spans(nu) / 2
+
+
+def _spans(nu: Float[Array, " sample"]) -> Float[Array, " sample"]:
+    """Return the distance from the sample before to that behind each one [GHz]."""
     steps = jnp.diff(nu)
     ends = jnp.zeros(1, steps.dtype)
-    return weights * (jnp.concatenate([ends, steps]) + jnp.concatenate([steps, ends])) / 2
+    return jnp.concatenate([ends, steps]) + jnp.concatenate([steps, ends])
 
 
 class Samples(NamedTuple):
@@ -220,6 +223,21 @@ def average(sed: Callable[[Array], Array], band: Bandpass | Samples) -> Float[Ar
 
     first = band.quadrature[0] * sed(band.nu[0])
     return jax.lax.scan(add, first, (band.nu[1:], band.quadrature[1:]))[0]
+
+
+def response_at(nu: Numeric, band: Bandpass | Samples) -> Float[Array, "..."]:
+    """Return the response to antenna temperature per GHz at a frequency, W / int W dnu [1/GHz].
+
+    Linear between the samples of a band, and zero outside; a single sample has no width and gives
+    zero. With an axis of bands in front if there are several (`stack_bands`).
+    """
+    if band.nu.ndim > 1:
+        return jax.vmap(partial(response_at, nu))(band)
+    spans = _spans(band.nu)
+    density = 2 * band.quadrature / jnp.where(spans > 0, spans, jnp.inf)
+    # Samples that fill up a row of several bands lie on the last one, and have its value.
+    density = jnp.where(spans > 0, density, density[jnp.sum(spans > 0) - 1])
+    return jnp.interp(nu, band.nu, density, left=0.0, right=0.0)
 
 
 # Brightness units.

@@ -245,7 +245,8 @@ def _read_template(
         )
     check_stokes(f"sky.{name}", found, "I" if spec.angles or not law.polarized else stokes)
     parameters, known = read_parameters(folder, name, spec, found.nside)
-    factor = uK_RJ_per(found.unit, spec.nu_ref, f"sky.{name}")
+    with at_key(f"sky.{name}.unit"):
+        factor = float(unit_factor(found.unit, law.unit, spec.nu_ref))
     own = found.maps  # as large as everything else
     maps = jnp.asarray(np.multiply(own, factor, out=own), dtype)
     used = np.asarray(found.mask) & known

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.polynomial.chebyshev import chebpts1, chebvander
 
 from jaxsky.arrays import Map, Scalar
-from jaxsky.bandpass import Bandpass, Samples, average, stack_bands
+from jaxsky.bandpass import Bandpass, Samples, stack_bands
 from jaxsky.checks import EXACT, is_concrete
 from jaxsky.components import Component
 from jaxsky.mesh import SUMS, at_once, extremes, over_pixels
@@ -96,7 +96,7 @@ def _tails(component: Component, samples: Samples) -> Float[Array, "maps node"]:
     maps, rebuild = _split(component)
 
     def tail(values, band):
-        line = jax.vmap(lambda *v: average(rebuild(v).sed, band))(*values)
+        line = jax.vmap(lambda *v: rebuild(v).band_average(band))(*values)
         coefs = jnp.abs(_coefficients(line))
         return jnp.cumsum(coefs[::-1])[::-1] / jnp.abs(line).min()
 
@@ -138,14 +138,14 @@ def _series(
     """Return coefficients of the band average and values at the nodes, an axis per map."""
     maps, rebuild = _split(component)
     if not maps:
-        value = average(component.sed, band)
+        value = component.band_average(band)
         return value, value
     axes = [
         mid + half * jnp.asarray(chebpts1(n), mid.dtype)
         for (mid, half), n in zip(map(_range, maps), counts, strict=True)
     ]
     mesh = [axis.ravel() for axis in jnp.meshgrid(*axes, indexing="ij")]
-    values = jax.vmap(lambda *v: average(rebuild(v).sed, band))(*mesh).reshape(counts)
+    values = jax.vmap(lambda *v: rebuild(v).band_average(band))(*mesh).reshape(counts)
     return _coefficients(values), values
 
 
@@ -223,7 +223,7 @@ def term(component: Component, coefs: Float[Array, "..."]) -> Map:
 def band_sed(component: Component, band: Bandpass, nodes: Nodes) -> Scalar | Map:
     """Return the band-averaged law of a component: a number, or a map if a parameter is one."""
     if nodes is None:
-        return average(component.sed, band)
+        return component.band_average(band)
     coefs, values = _series(component, band, nodes.counts)
     points = _points(component)
     if nodes.tolerance is None:
@@ -231,7 +231,7 @@ def band_sed(component: Component, band: Bandpass, nodes: Nodes) -> Scalar | Map
     return jax.lax.cond(
         _resolved(coefs, values, nodes.tolerance),
         lambda: _evaluate(coefs, *points),
-        lambda: average(component.sed, band),
+        lambda: component.band_average(band),
     )
 
 
@@ -252,10 +252,10 @@ def band_seds(
     """Compute `band_sed` in many bands (`stack_bands`) by matrix products: one small program."""
     maps, _ = _split(component)
     if not maps:
-        return average(component.sed, samples)
+        return component.band_average(samples)
 
     def direct():
-        return jax.lax.map(lambda band: average(component.sed, band), samples).T
+        return jax.lax.map(lambda band: component.band_average(band), samples).T
 
     if nodes is None:
         return direct()

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsky.arrays import Alm, BandMaps, Scalar, StokesMaps, Window
-from jaxsky.bandpass import Samples, average, stack_bands
+from jaxsky.bandpass import Samples, stack_bands
 from jaxsky.checks import is_concrete
 from jaxsky.cmb import realisation
 from jaxsky.components import Component
@@ -133,7 +133,7 @@ def _importance(
         # For the total, each law is taken at the mean of its parameters.
         middle = jax.tree.map(lambda x: x.mean() if x.ndim == 1 else x, component)
         rms[name] = jnp.sqrt(jnp.mean(component.template**2))
-        levels[name] = rms[name] * average(middle.sed, samples)
+        levels[name] = rms[name] * middle.band_average(samples)
     total = jnp.sqrt(sum(level**2 for level in levels.values()))
     return {name: value / total for name, value in rms.items()}
 
@@ -316,7 +316,7 @@ def _seen(source: HarmonicSource, channel: ObservedBand, index: int, lmax: int, 
     window = beam_ratio(channel.map_beam, source.fwhm, lmax, f"component {name!r}")
     if source.component is None or source.template is None:
         return _Part(source.alms, source.weights[index], window)
-    law = average(source.component.sed, channel.band)
+    law = source.component.band_average(channel.band)
     seen = source.template * law.astype(source.template.dtype)
     return _Part((analysis(seen, lmax),), (1.0,), window)
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsky import AME, CMB, Bandpass, Component, Dust, Sky, Synchrotron
-from jaxsky.components import HensleyDraine, InterpolatedMap, SpinningDust
+from jaxsky.components import HensleyDraine, InterpolatedMap, LineEmission, SpinningDust
 
 NPIX = 48
 
@@ -47,6 +47,7 @@ def components(stokes: int = 2) -> dict[str, Component]:
         "ame": ame or AME(maps, nu_ref=22.8),
         "cmb": CMB(maps),
         "interpolated": InterpolatedMap(maps, 40.0, 200.0, 100.0),
+        "line": LineEmission(maps, 70.3),
         "hd17": HensleyDraine(maps, grains(), 0.3),
         "spinning_dust": SpinningDust(maps, emissivity(), 33.35, nu_table=30.0),
     }

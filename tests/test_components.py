@@ -67,7 +67,9 @@ def test_every_parameter_changes_the_observation(sky):
     before = observe(sky, systems.bands())
     for name in parameter_names(sky):
         moved = set_parameters(sky, {name: 1.01 * get_parameters(sky, [name])[name]})
-        assert float(jnp.abs(observe(moved, systems.bands()) / before - 1).max()) > 1e-6, name
+        # A line is not in all bands.
+        change = jnp.abs(observe(moved, systems.bands()) / before - 1)
+        assert float(jnp.nanmax(change)) > 1e-6, name
 
 
 def test_gradients_against_finite_differences(sky):

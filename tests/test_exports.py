@@ -76,6 +76,7 @@ def spectral_laws(sed) -> Calls:
 def emission(laws) -> Calls:
     yield laws.amplitude_from_emission_measure, MAPS[0], 8000.0, 30.0
     yield laws.amplitude_from_compton, MAPS[0], 100.0
+    yield laws.amplitude_from_line_intensity, MAPS[0], 115.3
 
 
 @of("jaxsky.pysm.emission")

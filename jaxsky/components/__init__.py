@@ -28,10 +28,12 @@ from jaxsky.components.laws import (
     Dust,
     FreeFree,
     KinematicQuadrupole,
+    LineEmission,
     Synchrotron,
     ThermalSZ,
     amplitude_from_compton,
     amplitude_from_emission_measure,
+    amplitude_from_line_intensity,
 )
 from jaxsky.components.tabulated import HensleyDraine, SpinningDust
 

@@ -10,9 +10,10 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky.arrays import Map, Scalar, StokesMaps
+from jaxsky.bandpass import Bandpass, Samples, average
 from jaxsky.checks import (
     Parameter,
     Printed,
@@ -157,6 +158,13 @@ class Component(Printed, eqx.Module):
     def sed(self, nu: ArrayLike) -> Scalar | Map:
         """Return the spectral law at one frequency [GHz]; a map if any parameter is a map."""
         raise ValueError(f"{type(self).__name__} must define `sed`.")
+
+    def band_average(self, band: Bandpass | Samples) -> Float[Array, "..."]:
+        """Return the law averaged over a band: a number, or a map if any parameter is a map.
+
+        With an axis of bands in front if there are several (`jaxsky.bandpass.stack_bands`).
+        """
+        return average(self.sed, band)
 
     @property
     def template(self) -> StokesMaps:

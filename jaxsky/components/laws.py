@@ -8,6 +8,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxsky import sed
 from jaxsky.arrays import StokesMaps
+from jaxsky.bandpass import response_at
 from jaxsky.checks import Numeric, Parameter, as_array, check_shape, is_concrete
 from jaxsky.components.base import Component, parameter, reference, template
 from jaxsky.sed import T_CMB
@@ -296,3 +297,39 @@ class KinematicQuadrupole(Component, law="kinematic_quadrupole"):
     def sed(self, nu):
         x = sed.H_OVER_K * nu / self.T_cmb
         return x / 2 / jnp.tanh(x / 2) * sed.cmb_derivative(nu, self.T_cmb)
+
+
+@jax.jit
+def amplitude_from_line_intensity(W: Numeric, nu_ref: Numeric) -> Array:
+    """Return the amplitude of `LineEmission` [uK_RJ] from the integral of a line over velocity.
+
+    W is in K_RJ km/s, nu_ref in GHz: int T dnu = nu_ref / c int T dv, divided by 1 GHz.
+    """
+    return jnp.asarray(1e6 * W * nu_ref / 299792.458)
+
+
+class LineEmission(Component, law="line"):
+    """An emission line that is narrow compared with bands, such as those of CO.
+
+    A band sees the response at the line, relative to the integral of the response: W(nu_ref) /
+    int W dnu (`jaxsky.bandpass.response_at`), so it has to have a width; one of a single frequency
+    sees nothing. Rotational lines of CO lie at 115.271, 230.538 and 345.796 GHz.
+
+    Parameters
+    ----------
+    amplitude : antenna temperature in a top-hat of 1 GHz that holds the line [uK_RJ], shape
+        (stokes, pix); see `amplitude_from_line_intensity`. PySM's maps of CO, in K_CMB, are that,
+        converted at the frequency of the line.
+    nu_ref : frequency of the line [GHz]
+    """
+
+    smooth: ClassVar[bool] = False
+
+    amplitude: StokesMaps = template()
+    nu_ref: Parameter = reference(115.271, within=(0.01, 2e4))
+
+    def sed(self, nu):
+        raise ValueError("A line has no law at one frequency; average it over a band with a width.")
+
+    def band_average(self, band):
+        return response_at(self.nu_ref, band)

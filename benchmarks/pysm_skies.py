@@ -12,7 +12,7 @@ import pysm3
 from astropy import units as u
 
 from benchmarks.table import Row, time_text
-from jaxsky import Bandpass, observe, pysm
+from jaxsky import Bandpass, Sky, observe, pysm
 
 #: Samples of a band around 143 GHz, a quarter wide [GHz], and weights per power.
 NU, WEIGHTS = np.linspace(125.0, 161.0, 31), np.hanning(33)[1:-1]
@@ -81,7 +81,9 @@ def _compared(name: str, nside: int, rounds: int) -> Row:
         module.Sky(nside, component_objects=[_model(name, module, nside)], output_unit="uK_CMB")
         for module in (pysm, pysm3)
     )
-    engine, band = ours.sky(), Bandpass(NU, WEIGHTS, "power")
+    # The engine alone has I at the frequency of Q and U; else it would bring it there each time.
+    engine = Sky({str(i): part.ready for i, part in enumerate(ours.parts)})
+    band = Bandpass(NU, WEIGHTS, "power")
     calls: dict[str, Callable[[], Any]] = {
         "ours": lambda: ours.get_emission(NU * u.GHz, WEIGHTS).value,
         "engine": lambda: observe(engine, [band]),
@@ -97,13 +99,13 @@ def _compared(name: str, nside: int, rounds: int) -> Row:
     times = {key: _median(own) for key, own in spent.items()}
     wall, cpu = (a / b for a, b in zip(times["PySM"], times["ours"], strict=True))
     own, own_cpu = (a / b for a, b in zip(times["PySM"], times["engine"], strict=True))
-    kept = max(wall / own, cpu / own_cpu)
+    kept = cpu / own_cpu  # other work on the machine counts less in CPU time
     target = TARGETS[name]
     return Row(
         f"`jaxsky.pysm.Sky` of {name}, I, Q, U, {NU.size} samples, nside {nside}: PySM 3 / jaxsky",
         f"{wall:.0f}x, CPU {cpu:.0f}x",
         f">= {target}x, {KEPT:.0%} of the engine's",
-        max(wall, cpu) >= target and kept >= KEPT,
+        min(wall, cpu) >= target and kept >= KEPT,
         f"{time_text(times['PySM'].wall)} / {time_text(times['ours'].wall)}; CPU "
         f"{time_text(times['PySM'].cpu)} / {time_text(times['ours'].cpu)}; `observe` alone "
         f"{own:.0f}x, CPU {own_cpu:.0f}x; first calls {time_text(first['PySM'][0].wall)} and "

@@ -3,13 +3,13 @@
 from collections.abc import Iterable
 from typing import Any, Final
 
-import healpy
 import jax.numpy as jnp
 import numpy as np
 
 from jaxsky import sed
 from jaxsky.arrays import StokesMaps
 from jaxsky.checks import Parameter, check_choice
+from jaxsky.cmb import dipole, speed_of_dipole
 from jaxsky.components import CMB, Component, parameter, template
 from jaxsky.io.quantities import unit_factor
 from jaxsky.public import takes_quantities
@@ -120,22 +120,16 @@ class CMBDipole(LawModel):
     @takes_quantities
     def _components(self, arguments: dict[str, Any]) -> Iterable[tuple[str, Component]]:
         amplitude, T = (_temperature(self._taken(name, arguments)) for name in ("amp", "T_cmb"))
+        T *= 1e-6
         lon, lat = (_degrees(self._taken(name, arguments)) for name in ("dip_lon", "dip_lat"))
         quadrupole = arguments.pop("quadrupole_correction", False)
         self._no_more(arguments)
-        pixels = np.arange(healpy.nside2npix(self.nside))
-        cosine = jnp.asarray(
-            healpy.ang2vec(lon, lat, lonlat=True) @ healpy.pix2vec(self.nside, pixels)
-        )
-        boost = (1 + amplitude / T) ** 2
-        beta = (boost - 1) / (boost + 1)
-        if not quadrupole:
-            exact = T * (np.sqrt(1 - beta**2) / (1 - beta * cosine) - 1)
-            yield "", CMB(exact[None], T_CMB)
-            return
-        yield "dipole", CMB(T * beta * cosine[None], T_CMB)
-        second = T / 2 * (beta * cosine[None]) ** 2
-        yield "quadrupole", SecondOrder(second, 0.0, 1e-6 * T, T_CMB)
+        beta = speed_of_dipole(amplitude, T)
+        found = dipole(self.nside, beta, lon, lat, T_cmb=T, quadrupole=quadrupole)
+        yield ("dipole" if quadrupole else ""), CMB(found["dipole"].amplitude[:1], T_CMB)
+        if quadrupole:
+            maps = found["quadrupole"].amplitude[:1] / 2
+            yield "quadrupole", SecondOrder(maps, 0.0, T, T_CMB)
 
 
 def _temperature(value: Any) -> float:

@@ -197,6 +197,12 @@ def test_settings_in_pysms_format(tmp_path):
     assert len(one.components) == 1
     parts = [one.components[0], *pysm.get_pysm_emission("s0", NSIDE)]
     parts += [pysm3.sky.get_pysm_emission("f1", NSIDE)[0]]  # anything with PySM's interface
+    by_place, *others = (
+        module.PowerLaw(np.ones(192) * units.uK_RJ, 30 * u.GHz, -3.0, NSIDE, has_polarization=False)
+        for module in (pysm, pysm3)
+    )
+    agrees(by_place.get_emission(*band("few")), others[0].get_emission(*band("few")))
+    raises(TypeError, "takes map_I, .*, others by name", pysm.PowerLaw, 1, 2, 3, 4, 5)
     mixed = pysm.Sky(component_objects=parts)
     agrees(mixed.get_emission(*band("uneven")), theirs)
     raises(ValueError, "PowerLaw is no component of jaxsky", mixed.sky)
@@ -292,7 +298,6 @@ MAPS = healpy.alm2map(ALM[0] + 1j * ALM[1], 16)
     {"beam_window": np.exp(-np.arange(41) / 10) * np.ones((3, 1)), "map2alm_lsq_maxiter": 0},
 ])  # fmt: skip
 def test_smoothing_as_pysm(options):
-    """To what the analysis leaves: PySM has weights, or 3 iterations, where this has 8."""
     options = dict(options)
     if "rot" in options:
         options["rot"] = pysm3.utils.spherical_harmonics.hp.Rotator(coord=options["rot"])
@@ -301,8 +306,7 @@ def test_smoothing_as_pysm(options):
         for module in (pysm, pysm3)
     )
     assert ours.unit == theirs.unit == u.K
-    tolerance = 5e-5 if options.get("output_nside") == 8 else 2e-6
-    np.testing.assert_allclose(ours.value, theirs.value, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(ours.value, theirs.value, rtol=0, atol=1e-9)
 
 
 def test_equivalencies_are_those_of_pysm():

@@ -1,7 +1,7 @@
 """Models of PySM of the CMB: maps of it, its dipole, and the Sunyaev-Zeldovich effects."""
 
 from collections.abc import Iterable
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import jax.numpy as jnp
 import numpy as np
@@ -56,6 +56,7 @@ class CMBMap(LawModel):
 
     law = "cmb"
     cut = True
+    order: ClassVar = ("nside", "max_nside", "map_IQU", "map_I", "map_Q", "map_U")
 
     def _components(self, arguments: dict[str, Any]) -> Iterable[tuple[str, Component]]:
         together = arguments.pop("map_IQU", None)
@@ -96,6 +97,8 @@ class SimpleSZ(LawModel):
     are taken over: `SecondOrder`.
     """
 
+    order: ClassVar = ("nside", "template_name", "sz_type", "max_nside")
+
     def _components(self, arguments: dict[str, Any]) -> Iterable[tuple[str, Component]]:
         kind = self._taken("sz_type", arguments)
         check_choice("sz_type", kind, ("kinetic", "thermal"))
@@ -110,12 +113,14 @@ class SimpleSZ(LawModel):
 
 
 class CMBDipole(LawModel):
-    """The dipole of our motion, of I alone (PySM adds it to Q and U as well).
+    """The dipole of our motion: zero in Q and U, to which PySM's `Sky` adds it as well.
 
     Arguments: `amp` and `T_cmb` (temperatures, such as "3366.6 uK_CMB"), `dip_lon` and `dip_lat`
     (Galactic, such as "264 deg"), and `quadrupole_correction`: to second order in the velocity,
     with the quadrupole's law, instead of the exact temperature at all frequencies.
     """
+
+    order: ClassVar = ("nside", "amp", "T_cmb", "dip_lon", "dip_lat")
 
     @takes_quantities
     def _components(self, arguments: dict[str, Any]) -> Iterable[tuple[str, Component]]:

@@ -104,6 +104,8 @@ class LawModel(Model):
     #: Law of the component, and its parameters by PySM's names.
     law: ClassVar[str] = ""
     words: ClassVar[Mapping[str, str]] = {}
+    #: Arguments that may be given by their place, in PySM's order.
+    order: ClassVar[tuple[str, ...]] = ("nside",)
     #: Whether another reference frequency only scales the law, and does not change its shape.
     scales: ClassVar[bool] = True
     #: Whether samples of no weight are left out, see `Part`.
@@ -114,11 +116,13 @@ class LawModel(Model):
         MODELS[cls.__name__] = cls
 
     @takes_quantities
-    def __init__(self, *, nside: int, **arguments: Any) -> None:
-        super().__init__(
-            nside,
-            **{k: arguments.pop(k, None) for k in ("max_nside", "available_nside", "map_dist")},
-        )
+    def __init__(self, *values: Any, **arguments: Any) -> None:
+        if len(values) > len(self.order):
+            raise TypeError(f"{type(self).__name__} takes {', '.join(self.order)}, others by name.")
+        arguments |= dict(zip(self.order, values, strict=False))
+        words = ("max_nside", "available_nside", "map_dist")
+        nside = self._taken("nside", arguments)
+        super().__init__(nside, **{word: arguments.pop(word, None) for word in words})
         self._parts = tuple(Part(one, name, self.cut) for name, one in self._components(arguments))
 
     @property
@@ -208,6 +212,7 @@ class ModifiedBlackBody(LawModel):
 
     law = "dust"
     words: ClassVar = {"map_mbb_index": "beta_dust", "map_mbb_temperature": "T_dust"}
+    order: ClassVar = ("map_I", "freq_ref_I", "freq_ref_P", *words, "nside")
 
 
 class ModifiedBlackBodyLayers(ModifiedBlackBody):
@@ -217,6 +222,8 @@ class ModifiedBlackBodyLayers(ModifiedBlackBody):
     of files with "{layer}", which is 1, 2, ..., or arrays with a layer in each row; `num_layers`,
     `freq_ref`, `color_correction` (a factor on all maps), `unit_layers`.
     """
+
+    order: ClassVar = ("map_layers", "freq_ref", *ModifiedBlackBody.words, "nside")
 
     def _components(self, arguments):
         nu = given_frequency("freq_ref", arguments.pop("freq_ref", None))
@@ -241,6 +248,7 @@ class PowerLaw(LawModel):
 
     law = "synchrotron"
     words: ClassVar = {"map_pl_index": "beta_syn"}
+    order: ClassVar[tuple[str, ...]] = ("map_I", "freq_ref_I", "map_pl_index", "nside")
 
     def _signed(self, given):
         return given | {"beta_syn": -given["beta_syn"]}
@@ -254,3 +262,4 @@ class CurvedPowerLaw(PowerLaw):
 
     scales = False
     words: ClassVar = PowerLaw.words | {"spectral_curvature": "curvature", "freq_curve": "nu_piv"}
+    order: ClassVar = (*PowerLaw.order, "spectral_curvature", "freq_curve")

@@ -8,8 +8,6 @@ from astropy import units as u
 
 from jaxsky.public import takes_quantities
 
-#: Jacobi iterations where all multipoles are resolved, in place of PySM's weights, a download.
-ITERATIONS = 8
 #: Steps and tolerance of the least-squares analysis, those of PySM.
 STEPS, TOLERANCE = 10, 1e-7
 
@@ -22,7 +20,7 @@ def _multipoles(nside: int, output_nside: int) -> int:
 def _analysis(maps: np.ndarray, lmax: int, steps: int | None) -> np.ndarray:
     nside = healpy.get_nside(maps)
     if lmax <= 1.5 * nside:
-        return np.asarray(healpy.map2alm(maps, lmax=lmax, iter=ITERATIONS))
+        return np.asarray(healpy.map2alm(maps, lmax=lmax, use_pixel_weights=nside > 16))
     if steps == 0:
         return np.asarray(healpy.map2alm(maps, lmax=lmax, iter=0))
     steps = STEPS if steps is None else steps
@@ -69,7 +67,7 @@ def apply_smoothing_and_coord_transform(
     refused: dict[str, Any] = {"output_car_resol": output_car_resol, "map_dist": map_dist}
     refused |= {"return_car": return_car, "return_healpix": not return_healpix}
     for name, value in refused.items():
-        if value:
+        if value is not None and value is not False:
             raise ValueError(f"Argument `{name}` must be as by default: there is HEALPix only.")
     if fwhm is not None and beam_window is not None:
         raise ValueError("Arguments `fwhm` and `beam_window` exclude each other.")
@@ -96,5 +94,6 @@ def _smoothed(alm: np.ndarray, fwhm: Any, beam_window: np.ndarray | None) -> np.
         return np.asarray(healpy.smoothalm(alm, fwhm=u.Quantity(fwhm).to_value(u.rad), pol=True))
     if beam_window is None:
         return alm
-    windows = np.broadcast_to(beam_window, (len(alm), np.shape(beam_window)[-1]))
-    return np.stack([healpy.almxfl(row, own) for row, own in zip(alm, windows, strict=True)])
+    own = beam_window[: len(alm)] if np.ndim(beam_window) > 1 else beam_window
+    windows = np.broadcast_to(own, (len(alm), np.shape(own)[-1]))
+    return np.stack([healpy.almxfl(row, window) for row, window in zip(alm, windows, strict=True)])

@@ -1,7 +1,7 @@
 """Models of PySM whose laws are tables: spinning dust, and dust of Hensley & Draine (2017)."""
 
 from collections.abc import Iterable
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import healpy
 import jax
@@ -35,6 +35,7 @@ class SpDust(LawModel):
     """
 
     law = "spinning_dust"
+    order: ClassVar = ("map_I", "freq_ref_I", "emissivity", "freq_peak", "freq_ref_peak", "nside")
 
     def _components(self, arguments):
         amplitude, nu_ref, _ = self._maps(arguments | {"has_polarization": False})
@@ -84,6 +85,7 @@ class HensleyDraine2017(LawModel):
     """
 
     law = "hd17"
+    order: ClassVar = ("map_I", "map_Q", "map_U", "freq_ref_I", "freq_ref_P", "nside")
 
     def _components(self, arguments: dict[str, Any]) -> Iterable[tuple[str, Component]]:
         amplitude, nu_I, nu_P = self._maps(arguments)

@@ -14,6 +14,7 @@ from benchmarks import (
     large_maps,
     likelihoods,
     pixels,
+    pysm_skies,
     realisations,
     separation,
     simulations,
@@ -30,6 +31,7 @@ BENCHMARKS = {
     "samples": band_averages.samples,
     "nside": band_averages.growth,
     "compile": band_averages.compilation,
+    "pysm": pysm_skies.skies,
     "grid": likelihoods.grid,
     "chain": likelihoods.chain,
     "simulate-beta-maps": simulations.beta_maps,
@@ -59,6 +61,7 @@ BENCHMARKS = {
 #: These take minutes: they are run by name, and when the table is kept.
 LONG = (
     "planck",
+    "pysm",
     "simulate-large",
     "separation-pixels",
     "commands",

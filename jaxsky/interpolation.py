@@ -121,7 +121,8 @@ def choose_nodes(component: Component, bands: tuple[Bandpass, ...], tolerance: f
         return None
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((component, bands))):
         return NodeCounts((TRACED_NODES,) * len(maps), tolerance)
-    tails = np.asarray(_tails(component, stack_bands(bands)))
+    with jax.ensure_compile_time_eval():  # also where other parts of a sky are traced
+        tails = np.asarray(_tails(component, stack_bands(bands)))
     # A series of n terms leaves out the tail from n on; below the floor that is rounding.
     floor = 8 * np.finfo(tails.dtype).eps
     resolved = tails <= max(tolerance / (2 * len(maps)), floor)

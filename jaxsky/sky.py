@@ -120,7 +120,7 @@ def _check_bands(sky: object, bands: Any) -> tuple[Bandpass, ...]:
     return tuple(bands)
 
 
-def _emission(component: Component, bands: tuple[Bandpass, ...], nodes: Nodes) -> list[StokesMaps]:
+def emission(component: Component, bands: tuple[Bandpass, ...], nodes: Nodes) -> list[StokesMaps]:
     """Return the emission of a component in each band."""
     laws = (band_sed(component, band, nodes) for band in bands)
     # Costly laws are evaluated once for all Stokes parameters, ...
@@ -135,7 +135,7 @@ def _emission(component: Component, bands: tuple[Bandpass, ...], nodes: Nodes) -
 def _observe(sky, bands, *, plan, apart):
     """Return the maps of all components together, or of each separately."""
     emissions = {
-        name: _emission(component, bands, nodes)
+        name: emission(component, bands, nodes)
         for (name, component), nodes in zip(sky.components.items(), plan, strict=True)
     }
     if apart:

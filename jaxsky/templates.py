@@ -215,8 +215,8 @@ def preset(name: str, amplitude: ArrayLike, **maps: ArrayLike) -> Component:
 
     Parameters
     ----------
-    name : "baseline_dust" or "baseline_synchrotron" of the paper, or "d0", "d1", "s0", "s1" or
-        "s3" of PySM
+    name : "baseline_dust" or "baseline_synchrotron" of the paper, or a preset of PySM that is one
+        component, such as "d0", "d1", "s0", "s1" or "s3" (`presets.toml`)
     amplitude : template [uK_RJ] at the preset's reference frequency (353 GHz for dust, 23 GHz
         for PySM's synchrotron, 30 GHz for the paper's), shape (stokes, pix); PySM's I templates
         refer to other frequencies and have to be scaled first
@@ -231,10 +231,11 @@ def preset(name: str, amplitude: ArrayLike, **maps: ArrayLike) -> Component:
     >>> float(dust.nu_ref)
     353.0
     """
-    presets = packaged("presets.toml")
+    presets = {key: own for key, own in packaged("presets.toml").items() if "law" in own}
     if name not in presets:
         raise KeyError(f"Unknown preset {name!r}; known are {', '.join(presets)}.")
     constants = dict(presets[name])
+    constants.pop("files", None)
     component: Callable[..., Component] = component_class(constants.pop("law"))
     needed = constants.pop("maps", [])
     for key in needed:

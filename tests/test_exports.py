@@ -79,6 +79,13 @@ def emission(laws) -> Calls:
     yield laws.amplitude_from_line_intensity, MAPS[0], 115.3
 
 
+@of("jaxsky.pysm.emission")
+def pysm_models(emission) -> Calls:
+    own = emission.Part(jaxsky.Dust(random_maps(1, 3, NPIX), 1.53, 20.0, nu_ref_I=545.0))
+    yield emission._at_one_frequency, own.component
+    yield partial(emission._summed, plan=(None,)), (own.ready,), BANDS[0], 1.0
+
+
 @of("jaxsky.bandpass")
 def bandpasses(bandpass) -> Calls:
     yield partial(bandpass._across, samples=9), 100.0, 20.0

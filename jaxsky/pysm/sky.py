@@ -1,0 +1,189 @@
+"""The sky of PySM: presets, models from its settings, and emission in its units."""
+
+import dataclasses
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+
+import jaxsky.sky
+from jaxsky.components import Component
+from jaxsky.io.files import InputError, check_file
+from jaxsky.public import takes_quantities
+from jaxsky.pysm.emission import Part, emission_of, iqu
+from jaxsky.pysm.models import MODELS, Model
+from jaxsky.pysm.presets import preset_settings
+from jaxsky.pysm.units import bandpass, bandpass_unit_conversion, unit_of
+
+
+class Sky(Model):
+    """A drop-in for `pysm3.Sky` with the laws of jaxsky.
+
+    Maps are in double precision as PySM's, which JAX has to be told:
+    `jax.config.update("jax_enable_x64", True)`. Templates come from the user's own files, see
+    `jaxsky.pysm.files`; nothing is downloaded. Where a sample lies exactly at the reference
+    frequency of I of a modified black body, PySM leaves Q and U as they are at their own; here
+    they follow the law.
+
+    Parameters
+    ----------
+    nside : resolution of the maps; that of `component_objects` if it is not given
+    max_nside : for information
+    preset_strings : list of presets of PySM, such as ["d1", "s1"]
+    component_config : models in the format of PySM's presets, a dictionary or a TOML file
+    component_objects : list of models of `jaxsky.pysm`, or anything with PySM's `get_emission`
+    output_unit : a unit of brightness, or its name
+    map_dist : must be None
+
+    Raises
+    ------
+    TypeError, ValueError
+        For settings that are not as said above, and presets that jaxsky does not have.
+    InputError
+        If a template is missing or no such map.
+
+    Attributes
+    ----------
+    components : list of models; those of several components are a `Sky` in turn
+    """
+
+    @takes_quantities
+    def __init__(
+        self,
+        nside: int | None = None,
+        max_nside: int | None = None,
+        preset_strings: list[str] | None = None,
+        component_config: Mapping[str, Any] | str | Path | None = None,
+        component_objects: list[Any] | None = None,
+        output_unit: str | u.UnitBase = "uK_RJ",
+        map_dist: None = None,
+    ) -> None:
+        self.components: list[Any] = [*(component_objects or [])]
+        if nside is None and not self.components:
+            raise TypeError("Argument `nside` is missing.")
+        nside = self.components[0].nside if nside is None else nside
+        for i, model in enumerate(self.components):
+            if model.nside != nside:
+                raise ValueError(
+                    f"Entry {i} of `component_objects` has nside {model.nside}, the sky {nside}."
+                )
+        super().__init__(nside, max_nside, map_dist=map_dist)
+        self.output_unit = unit_of(output_unit)
+        if preset_strings is not None and not isinstance(preset_strings, list):
+            raise TypeError(f"Argument `preset_strings` must be a list, not {preset_strings!r}.")
+        settings = dict(_config(component_config))
+        settings |= {name: preset_settings(name) for name in preset_strings or []}
+        self.components += _models(settings, self.nside)
+
+    def add_component(self, component: Any) -> None:
+        """Add a model, with PySM's `get_emission`."""
+        self.components.append(component)
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        return tuple(part for model in self.components for part in getattr(model, "parts", ()))
+
+    @takes_quantities
+    def get_emission(self, freq: u.Quantity, weights: np.ndarray | None = None) -> u.Quantity:
+        """Return I, Q, U at a frequency, or over a band, in the output unit, shape (3, pix).
+
+        Parameters
+        ----------
+        freq : frequency, or the frequencies of a band, in GHz or another unit
+        weights : response to unit power (Jy/sr) at each, shape (sample,), by default a top-hat
+
+        Raises
+        ------
+        TypeError, ValueError
+            For a frequency without a unit, and bands that `jaxsky.Bandpass` refuses.
+        """
+        factor = bandpass_unit_conversion(freq, weights, self.output_unit, unit_of("uK_RJ")).value
+        total = None
+        if parts := self.parts:
+            total = emission_of(parts, bandpass(freq, weights), factor) << self.output_unit
+        for model in self._others():
+            own = model.get_emission(freq, weights).value * factor << self.output_unit
+            total = own if total is None else total + own
+        if total is None:
+            raise ValueError("The sky has no component.")
+        return total
+
+    def _others(self) -> Iterator[Any]:
+        """Yield the models that are no components of jaxsky."""
+        for model in self.components:
+            if isinstance(model, Sky):
+                yield from model._others()
+            elif not getattr(model, "parts", ()):
+                yield model
+
+    def sky(self) -> jaxsky.sky.Sky:
+        """Return the components as a `jaxsky.Sky` of I, Q, U [uK_RJ], to be differentiated.
+
+        Names are those of the presets or settings, or of the classes of objects, with that of a
+        part after "_" where there are several ("d4_comp1", "d12_3", "s3_I"). ValueError if there
+        is a model that is not of jaxsky.
+        """
+        for model in self._others():
+            raise ValueError(f"{type(model).__name__} is no component of jaxsky.")
+        return jaxsky.sky.Sky(dict(self._named_components()))
+
+    def _named_components(self) -> Iterator[tuple[str, Component]]:
+        names = [model.name or type(model).__name__ for model in self.components]
+        for i, (name, model) in enumerate(zip(names, self.components, strict=True)):
+            name = f"{name}_{i + 1}" if names.count(name) > 1 else name
+            if isinstance(model, Sky):
+                yield from ((f"{name}_{own}", one) for own, one in model._named_components())
+                continue
+            for part in model.parts:
+                one = part.component
+                if len(one.amplitude) < 3:
+                    one = dataclasses.replace(one, amplitude=iqu(one.amplitude))
+                yield f"{name}_{part.name}" if part.name else name, one
+
+
+def _config(given: Mapping[str, Any] | str | Path | None) -> Mapping[str, Any]:
+    """Return models as a dictionary, read from a file where one is named."""
+    if given is None or isinstance(given, Mapping):
+        return given or {}
+    check_file(Path(given))
+    try:
+        return tomllib.loads(Path(given).read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{given}: no TOML file ({error}).") from None
+
+
+def _models(settings: Mapping[str, Any], nside: int) -> Iterator[Any]:
+    """Make the models of settings in PySM's format."""
+    if "class" in settings:
+        settings = {"": settings}
+    for name, own in settings.items():
+        if not isinstance(own, Mapping):
+            raise TypeError(f"Settings of {name!r} must be a table with a class, not {own!r}.")
+        if "class" in own:
+            model = _model(name, own, nside)
+        else:
+            model = Sky(nside, component_objects=[*_models(own, nside)])
+        model.name = name
+        yield model
+
+
+def _model(name: str, own: Mapping[str, Any], nside: int) -> Model:
+    """Make one model of the class that its settings name."""
+    arguments = {key: value for key, value in own.items() if key != "class"}
+    kind = MODELS.get(own["class"])
+    if kind is None:
+        known = ", ".join(sorted(MODELS))
+        raise ValueError(f"Model {name!r}: there is no class {own['class']!r}; known are {known}.")
+    try:
+        return kind(nside=nside, **arguments)
+    except (TypeError, ValueError) as error:
+        error.add_note(f"in the settings of {name!r}")
+        raise
+
+
+def get_pysm_emission(preset_string: str, nside: int) -> list[Any]:
+    """Return the models of one preset, as PySM's function."""
+    return [*_models({preset_string: preset_settings(preset_string)}, nside)]

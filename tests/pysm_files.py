@@ -1,0 +1,99 @@
+"""Made-up templates under the names of PySM's own, in its folders: nothing of the official data."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import healpy
+import numpy as np
+import pysm3
+import pytest
+from pysm3 import models, utils
+
+NSIDE = 4
+#: Ranges of the maps of parameters, by PySM's names; one each, so that programs are compiled once.
+RANGES = {
+    "map_mbb_index": (1.5, 1.6),
+    "map_mbb_temperature": (19.0, 21.0),
+    "map_pl_index": (-3.1, -2.9),
+    "spectral_curvature": (-0.06, -0.04),
+    "freq_peak": (15.0, 35.0),
+}
+#: Units in the headers; PySM's settings have their own for the older files.
+UNITS = {"map_mbb_temperature": "K", "map_layers": "MJy/sr", "map_I": "uK_RJ"}
+COMPILED = ("dust", "dust_layers", "power_law", "spdust", "websky")
+CARBON_MONOXIDE = {"HFI_CompMap_CO-Type1": "_R2.00_ring", "mcmoleCO_HGL": ""}
+PRESETS = pysm3.sky.PRESET_MODELS
+
+
+def _models(settings: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """The models of a preset, one or several."""
+    yield from [settings] if "class" in settings else settings.values()
+
+
+def write_templates(folder: Path, names: list[str], nside: int = NSIDE, dtype: Any = float) -> None:
+    """Write each file that presets name, or that their classes do, with values of its own."""
+    for own in (model for name in names for model in _models(PRESETS[name])):
+        for key, file in own.items():
+            if isinstance(file, str) and file.endswith(".fits"):
+                for layer in range(1, 1 + own.get("num_layers", 1)):
+                    path = folder / file.format(nside=2048, layer=layer)
+                    _write(path, key, own, nside, dtype)
+
+
+def write_others(folder: Path, nside: int = NSIDE, dtype: Any = float) -> None:
+    """Write the files that are named in PySM's code."""
+    rng, npix = np.random.default_rng(7), healpy.nside2npix(nside)
+    columns = {f"co/{name}_512{end}.fits": 3 for name, end in CARBON_MONOXIDE.items()}
+    columns |= {"co/psimap_dust90_512.fits": 1, "co/gmap_dust90_512.fits": 1}
+    websky = "websky/0.4/cmb/map_{}_{}lensed_alm_seed1_nside512.fits"
+    columns |= {websky.format(row, un): 1 for row in "IQU" for un in ("", "un")}
+    for name, number in columns.items():
+        maps = rng.uniform(0.1, 1.0, (number, npix)) * 1e-6
+        save(folder / name, maps, dtype, "K_CMB")
+    # Temperature, its error, index and its error are columns 3, 5, 6 and 8.
+    middle = np.array([0, 0, 0, 20.0, 0, 0.5, 1.55, 0, 0.05])[:, None]
+    commander = middle * rng.uniform(0.9, 1.1, (9, npix))
+    save(folder / "pysm_2/COM_CompMap_dust-commander_0256_R2.00.fits", commander, dtype)
+    nu = np.geomspace(0.05, 3000.0, 300)
+    emissivity = np.exp(-(np.log(nu / 30) ** 2))
+    np.savetxt(folder / "pysm_2/emissivity.txt", np.stack([nu, emissivity], axis=1))
+    wavelengths = np.geomspace(50.0, 4e4, 60)[:, None]
+    for number, name in enumerate(("sil_fe00_2.0", "sil_fe05_2.0", "car_1.0")):
+        log_U = np.arange(-3, 5.01, 0.1)[None]
+        T = (19 + number) * 10 ** (log_U / (5.5 + 0.1 * number))
+        x = 14388 / (wavelengths * T)
+        table = 1e-25 * wavelengths ** -(5.5 + 0.1 * number) / np.expm1(x)
+        rows = np.concatenate([wavelengths, x[:, :2], table, 0.1 * table ** (1.01)], axis=1)
+        np.savetxt(folder / f"pysm_2/{name}.dat", rows, fmt="%.17e")
+
+
+def save(path: Path, maps: Any, dtype: Any, unit: str = "") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    healpy.write_map(path, maps, dtype=dtype, column_units=unit, overwrite=True)
+
+
+def _write(path: Path, key: str, own: Mapping[str, Any], nside: int, dtype: Any) -> None:
+    rng = np.random.default_rng(sum(path.name.encode()))
+    low, high = RANGES.get(key, (1.0, 5.0))
+    maps = rng.uniform(low, high, healpy.nside2npix(nside))
+    maps[:2] = low, high
+    alone = key not in ("map_I", "map_IQU", "map_layers") or "map_Q" in own
+    alone |= own["class"].startswith("SpDust")
+    if not alone and own.get("has_polarization", True):
+        maps = np.stack([maps, *rng.normal(size=(2, maps.size))])
+    save(path, maps * (1e-6 if key == "template_name" else 1), dtype, UNITS.get(key, ""))
+
+
+@pytest.fixture(scope="module")
+def uncompiled() -> Iterator[None]:
+    """PySM's functions as they are before numba compiles them, which takes seconds each.
+
+    Without numba they compute in the precision of the files.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (utils, *(getattr(models, name) for name in COMPILED)):
+            for name, value in list(vars(module).items()):
+                if hasattr(value, "py_func"):
+                    patch.setattr(module, name, value.py_func)
+        yield

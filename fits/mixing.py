@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 #: Parameters of a band, and their values if not given.
 NOMINAL = {"shift": 0.0, "width": 1.0, "gain": 1.0, "angle": 0.0}
 #: Fields that only change amplitudes, which are free in every pixel anyway.
-NOT_SPECTRAL = ("amplitude", "polarization_fraction", "nu_ref")
+NOT_SPECTRAL = ("amplitude", "polarization_fraction", "nu_ref", "nu_ref_I")
 #: Most cells averaged over the bands at a time; for more, laws are interpolated.
 CELLS = 512
 #: Relative error of interpolated laws.

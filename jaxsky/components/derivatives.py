@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 from jaxsky.arrays import StokesMaps
 from jaxsky.checks import check_names, check_type
-from jaxsky.components.base import Component, template
+from jaxsky.components.base import Component, declared, template
 
 
 def _value(law: Component, name: str) -> Any:
@@ -33,7 +33,12 @@ def check_parameter_of(law: Component, name: str, parameter: str) -> None:
     """Raise KeyError unless a law, of the component `name`, has a parameter that is an array."""
     leaves = jax.tree_util.tree_flatten_with_path(law)[0]
     paths = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves]
-    known = [path for path in paths if path.split(".")[0] != "amplitude"]
+    fields = {path: path.split(".")[0] for path in paths}
+    known = [
+        path
+        for path, field in fields.items()
+        if field != "amplitude" and "table" not in declared(type(law), field)
+    ]
     if parameter not in known:
         raise KeyError(
             f"Component {name!r} has no parameter {parameter!r}; it has {', '.join(known)}."
@@ -138,8 +143,9 @@ def moments(
 
     Raises
     ------
-    KeyError : for unknown components and parameters
-    TypeError, ValueError : for a string in place of a list, and orders below 1
+    KeyError : for unknown components and parameters; tables of numbers are no parameters
+    TypeError, ValueError : for a string in place of a list, orders below 1, and components that
+        are averaged over bands by themselves
 
     Examples
     --------
@@ -160,6 +166,8 @@ def moments(
     if name not in (known := list(components)):
         raise KeyError(f"There is no component {name!r}; components are {', '.join(known)}.")
     component = components[name]
+    if type(component).band_average is not Component.band_average:
+        raise ValueError(f"Component {name!r} has no law at one frequency, and so no moments.")
     for parameter in parameters:
         check_parameter_of(component, name, parameter)
     nothing = jnp.zeros_like(component.amplitude)

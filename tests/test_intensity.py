@@ -13,7 +13,9 @@ from fits.commands.run import DEFAULTS
 from fits.common import common_maps
 from fits.fluctuations import Fluctuations, MapNoise
 from fits.inputs import inputs_of
-from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe
+from fits.optimize import best_fit
+from fits.template_likelihood import PixelLikelihood, likelihood
+from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe, set_parameters
 from jaxsky.cmb import camb_spectra, field_spectra
 from jaxsky.components.laws import FreeFree
 from jaxsky.experiment import simulation_inputs
@@ -200,6 +202,26 @@ def test_templates_have_a_reference_for_intensity_of_their_own(tmp_path):
         np.testing.assert_allclose(
             observe(own, [Bandpass.delta(30.0)])[0], seen[: len(stokes)], 1e-6
         )
+
+
+@pytest.mark.parametrize("varying", [False, True])
+@pytest.mark.parametrize("stokes", ["I", "QU", "IQU"])
+def test_fits_find_laws_whose_references_differ(stokes, varying):
+    """In data without noise, on inner products and pixel by pixel."""
+    npix = 192
+    sky = Sky(
+        {
+            "dust": Dust(random_maps(1, 3, npix), nu_ref=353.0, nu_ref_I=545.0,
+                T_dust=jnp.linspace(18.0, 22.0, npix) if varying else 19.0),
+            "synchrotron": Synchrotron(random_maps(2, 3, npix), nu_ref=23.0, nu_ref_I=30.0),
+        }
+    )  # fmt: skip
+    bands = [Bandpass.delta(20.0), Bandpass.top_hat(44.0, 10.0), Bandpass.top_hat(353.0, 60.0)]
+    data = observe(set_parameters(sky, TRUTH), bands)
+    start = {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}
+    like = likelihood(sky, bands, data, 0.01, start, stokes=stokes)
+    assert isinstance(like, PixelLikelihood) == varying
+    assert best_fit(like).best_fit == pytest.approx(TRUTH, abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -188,7 +188,7 @@ class FullSkyData(_Multipoles):
         return super().emission(like, params, amplitude) * np.asarray(expand(windows))[:, None]
 
 
-def _modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
+def modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
     """Return laws, on one pixel, or on all if parameters are maps; and where these are known."""
     folder, nside = Path(settings.data_dir), settings.common.nside
     laws = {name: settings.sky.components[name] for name in settings.modelled()}
@@ -198,7 +198,9 @@ def _modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]
     components: dict[str, Component] = {"cmb": component_class("cmb")(amplitude)}
     known = np.ones(12 * nside**2, bool)
     for name, spec in laws.items():
-        numbers, has = reading.read_parameters(folder, name, spec, nside, "common.nside")
+        # One reference frequency for all amplitudes: that of polarization, if there is any.
+        given = folder, name, spec, nside, "common.nside", stokes[-1]
+        numbers, has = reading.read_parameters(*given)
         known &= has
         with at_key(f"sky.{name}"):
             assert spec.law is not None  # the settings ensure this
@@ -229,7 +231,7 @@ def separation_data(settings: Experiment) -> PixelData | FullSkyData:
         )
     inside = region_mask(settings, spec.region, common.nside)
     _check_some(inside)
-    sky, known = _modelled_laws(settings)
+    sky, known = modelled_laws(settings)
     inside &= known
     _check_some(inside, " in which parameters are known")
     inputs = inputs_of(settings, templates=False, foregrounds=True)

@@ -15,7 +15,7 @@ lint: .venv/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Slow checks, 42 minutes on two slow cores: kills at random moments, and statistics of many skies.
+# Slow checks, 43 minutes on two slow cores: kills at random moments, and statistics of many skies.
 validate: .venv/.dev
 	$(BIN)/pytest validation tests -m slow -n auto --maxprocesses 4 --dist loadfile \
 		--no-loadscope-reorder --durations 40

@@ -14,6 +14,7 @@ from fits.common import common_maps
 from fits.fluctuations import Fluctuations, MapNoise
 from fits.inputs import inputs_of
 from fits.optimize import best_fit
+from fits.separated_data import modelled_laws
 from fits.template_likelihood import PixelLikelihood, likelihood
 from jaxsky import Bandpass, Dust, Sky, Synchrotron, observe, set_parameters
 from jaxsky.cmb import camb_spectra, field_spectra
@@ -202,6 +203,23 @@ def test_templates_have_a_reference_for_intensity_of_their_own(tmp_path):
         np.testing.assert_allclose(
             observe(own, [Bandpass.delta(30.0)])[0], seen[: len(stokes)], 1e-6
         )
+
+
+@pytest.mark.parametrize(("stokes", "expected"), [("I", 545.0), ("QU", 353.0), ("IQU", 353.0)])
+def test_separations_take_the_reference_of_what_they_separate(stokes, expected, tmp_path):
+    sky = {"dust": {"law": "dust", "nu_ref": [545.0, 353.0]}}
+    settings = experiment(stokes) | {"sky": sky, "free": {}}
+    laws, _ = modelled_laws(load(written(tmp_path / "x.toml", settings)))
+    assert float(laws["dust"].nu_ref) == expected
+    assert laws["dust"].nu_ref_I is None
+
+
+@pytest.mark.parametrize("stokes", ["I", "QU", "IQU"])
+def test_leakage_into_polarization_is_no_matter_of_intensity(stokes, tmp_path):
+    name = "LFI_SkyMap_044_1024_R3.00_full.fits"
+    band = {"name": "44", "bandpass": {"center": 44.0}, "fwhm": 27.0, "file": name}
+    settings = experiment(stokes) | {"bands": [band | {"noise": {"level": 240.0}}]}
+    assert bool(load(written(tmp_path / "x.toml", settings)).leaks()) == (stokes != "I")
 
 
 @pytest.mark.parametrize("varying", [False, True])

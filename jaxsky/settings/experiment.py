@@ -294,7 +294,7 @@ class Experiment(SettingsTable):
             f"bands.{band.name}: {file} holds intensity that has leaked into Q and U through the "
             "bandpasses, and nothing is subtracted; indices fitted to it may be wrong by many "
             f"sigma. {advice}."
-            for band in self.bands
+            for band in (self.bands if self.common.stokes != "I" else [])
             for file, advice in band.leaking().items()
         ]
 

@@ -134,27 +134,28 @@ def inputs_of(
     model, if it has been made already.
     """
     folder = Path(settings.data_dir)
-    if not settings.bands:
+    stokes = settings.common.stokes
+    specs = settings.bands_of(stokes)
+    if not specs:
         raise SettingsError("bands: there are none.")
     components, own = settings.sky.components, settings.sky.templates
     if galaxy is None and any(components[name].file is None for name in own):
         galaxy = reading.embedded_galaxy(settings)
-    sky, description, many = dict[str, reading.Template](), settings.title, len(settings.bands)
-    stokes = settings.common.stokes
+    sky, description, many = dict[str, reading.Template](), settings.title, len(specs)
     if templates:
         given: Any = {"names": settings.modelled(), "galaxy": galaxy, "number": many}
         sky, description = reading.read_sky(settings, stokes, **given)
 
-    filed = [s for s in settings.bands if s.file is not None or settings.common.maps is not None]
+    filed = [s for s in specs if s.file is not None or settings.common.maps is not None]
     found = list(by_turns(partial(_from_file, settings), filed))
     bands = {str(spec.name): band for spec, (band, _) in zip(filed, found, strict=True)}
     truths, alone = [truth for _, truth in found], None
-    if missing := [str(spec.name) for spec in settings.bands if str(spec.name) not in bands]:
+    if missing := [str(spec.name) for spec in specs if str(spec.name) not in bands]:
         if "noise" not in settings.included():
             raise SettingsError("simulate.include: leaves out the noise, which errors are made of.")
         setup = simulation_inputs(settings, missing, written=False, galaxy=galaxy)
         made, alone = _simulated(settings, setup, foregrounds and not bands)
-        bands = {str(s.name): (bands | made)[str(s.name)] for s in settings.bands}
+        bands = {str(s.name): (bands | made)[str(s.name)] for s in specs}
         truths.append(setup.truth)
         description = setup.description
     noises = {
@@ -232,7 +233,8 @@ def _simulated(
     observation, key = setup.observation, realisation_key(settings.seed)
     sky = harmonic_sources(setup.small_scales_key(key), setup.sources, observation)
     used = np.ones(healpy.nside2npix(observation.nside), bool)
-    names, many = observation.names, len(settings.bands)
+    names = observation.names
+    many = len(settings.bands_of(observation.stokes))
     own = names[job.index() :: job.number()]
     made = observe_bands(key, sky, observation, setup.cmb, names=own)
 
@@ -302,7 +304,7 @@ def _from_file(settings: Experiment, spec: BandTable) -> tuple[Band, Mapping[str
         # The file describes its map, which may have another beam than the band.
         spec = BandTable(name=spec.name, file=name, fields=list(settings.common.stokes))
     stokes = settings.common.stokes
-    band = read_band(folder, spec, observed, stokes).of_many(len(settings.bands))
+    band = read_band(folder, spec, observed, stokes).of_many(len(settings.bands_of(stokes)))
     return band, None if observed is None else observed.truth
 
 

@@ -80,7 +80,7 @@ def simulation_inputs(
     nside = map_nside(settings, templates)
     channels = {
         str(band.name): read_channel(settings, band, nside, stokes, "noise" in included)
-        for band in settings.bands
+        for band in settings.bands_of(stokes)
         if names is None or band.name in names
     }
     if not channels:

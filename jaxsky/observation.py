@@ -182,8 +182,8 @@ class Instrument(Printed, dict[str, ObservedBand]):
     ----------
     title : name of the instrument
     channels : by name, in order
-    noise_I : uniform level of the noise of I [uK_RJ arcmin] of the channels where it is known; that
-        of a channel, `ObservedBand.noise`, is of Q and U
+    noise_I : uniform level of the noise of I [uK_RJ arcmin] of the channels where it is known and
+        not that of the channel itself, `ObservedBand.noise`, which is of Q and U by default
     sky_fraction : of the survey, or None
     """
 
@@ -210,6 +210,7 @@ class Instrument(Printed, dict[str, ObservedBand]):
         table: Any,
         title: str | None = None,
         *,
+        stokes: str = "QU",
         target: Array | float | None = None,
         samples: int = 51,
     ) -> "Instrument":
@@ -220,7 +221,7 @@ class Instrument(Printed, dict[str, ObservedBand]):
         table : columns by name, rows, or the name of a file; `jaxsky.io.instruments` says which
             columns, among them those of FGBuster and of litebird_sim
         title : by default that of the table, or the name of its file
-        target, samples : see `load_instrument`
+        stokes, target, samples : see `load_instrument`
 
         Raises
         ------
@@ -236,11 +237,12 @@ class Instrument(Printed, dict[str, ObservedBand]):
         """
         from jaxsky.io.instruments import read_instrument  # astropy, which takes its time
 
+        check_choice("stokes", stokes, STOKES.values())
         found = read_instrument(table)
         for band in found["bands"]:
             _check_simple(band)
         about = found | {"title": title or found["title"] or "from a table"}
-        return _built(about, found["bands"], target, samples)
+        return _built(about, found["bands"], stokes, target, samples)
 
     def bands(self) -> OrderedDict[str, Bandpass]:
         """Return the bandpasses by name; JAX keeps the order of this kind of dictionary."""
@@ -263,13 +265,14 @@ def load_instrument(
     name: str,
     channels: Sequence[str] | None = None,
     *,
+    stokes: str = "QU",
     target: Array | float | None = None,
     samples: int = 51,
 ) -> Instrument:
     """Return the channels of an instrument by name, as `Observation` takes them.
 
-    Each has a top-hat band, a Gaussian beam and white noise of Q and U [uK_RJ arcmin]. The numbers
-    are from `instruments.toml`, which gives the source of each. For an instrument of one's own see
+    Each has a top-hat band, a Gaussian beam and white noise [uK_RJ arcmin]. The numbers are from
+    `instruments.toml`, which gives the source of each. For an instrument of one's own see
     `Instrument.from_table`.
 
     Parameters
@@ -277,7 +280,9 @@ def load_instrument(
     name : "planck", "wmap", "core", "litebird", "litebird-arrays" (its 22 arrays), "so-sat",
         "so-sat-goal", "so-lat", "so-lat-goal" (Simons Observatory), "pico", "cmb-s4-sat",
         "cmb-s4-lat", "bicep-keck", "advact", "spt-3g" or "s-pass"
-    channels : names of the channels wanted, in this order; by default all
+    channels : names of the channels wanted, in this order; by default all that observe `stokes`
+    stokes : what is observed, "QU", "I" or "IQU", of which the noise is; that of I is taken to be
+        that of Q and U where it was not published. Planck's 545 and 857 GHz observe I alone.
     target : common beam of the maps [arcmin]; None keeps the beam of each
     samples : number of samples per band; see `Bandpass.top_hat`
 
@@ -286,7 +291,8 @@ def load_instrument(
     KeyError
         If a name is unknown; the message lists the known ones.
     TypeError, ValueError
-        If `channels` is a string, or the target negative or not finite.
+        If `channels` is a string or names one without polarization where that is wanted, `stokes`
+        is unknown, or the target negative or not finite.
 
     Examples
     --------
@@ -298,28 +304,54 @@ def load_instrument(
     if name not in presets:
         raise KeyError(f"Unknown instrument {name!r}; known are {', '.join(presets)}.")
     check_names("channels", channels)
+    check_choice("stokes", stokes, STOKES.values())
     preset = presets[name]
-    return _built(preset, _chosen(name, preset["bands"], channels), target, samples)
+    tables = _chosen(name, preset["bands"], channels)
+    for table in tables if channels is not None and stokes != "I" else ():
+        if _levels(table)[1] is None:
+            raise ValueError(
+                f"{name}: channel {table['name']!r} has no polarization; choose stokes 'I', or "
+                "leave it out."
+            )
+    return _built(preset, tables, stokes, target, samples)
 
 
 def _built(
     about: Mapping[str, Any],
     tables: Sequence[Mapping[str, Any]],
+    stokes: str,
     target: Array | float | None,
     samples: int,
 ) -> Instrument:
-    """Return an instrument with these bands, tables as in `instruments.toml`."""
+    """Return an instrument with those of the bands that observe some Stokes parameters.
+
+    The bands are tables as in `instruments.toml`.
+    """
     found, intensity = {}, {}
     for table in tables:
-        name, noise = str(table["name"]), table["noise"]
+        name, (of_I, of_P) = str(table["name"]), _levels(table)
+        if of_P is None and stokes != "I":
+            continue
         band = _bandpass(samples, **table["bandpass"])
-        factor = band.conversion(noise.get("unit", "uK_CMB"), "uK_RJ")
-        beam = jnp.asarray(table["fwhm"])
-        found[name] = ObservedBand(band, beam, target, noise["level"] * factor)
-        if "noise_I" in table:
-            intensity[name] = table["noise_I"] * factor
+        factor = band.conversion(table["noise"].get("unit", "uK_CMB"), "uK_RJ")
+        beam, level = jnp.asarray(table["fwhm"]), of_P
+        if stokes == "QU" and of_I is not None:
+            intensity[name] = of_I * factor
+        elif of_I is not None:
+            level = of_I if stokes == "I" else jnp.array([of_I, of_P, of_P])
+        found[name] = ObservedBand(band, beam, target, level * factor)
+    if not found:
+        raise ValueError(f"{about['title']}: no channel has polarization; choose stokes 'I'.")
     sky = about.get("sky_fraction")
     return Instrument(about["title"], found, noise_I=intensity, sky_fraction=sky)
+
+
+def _levels(table: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Return the levels of noise of I and of Q and U of a band in its unit, None if not known."""
+    level = table["noise"]["level"]
+    if isinstance(level, list | tuple):
+        return level[0], level[1] if len(level) > 1 else None
+    return table.get("noise_I"), level
 
 
 def _check_simple(band: Mapping[str, Any]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pysm3.units as pysm
 import pytest
 from astropy import units as u
+from astropy.constants import c, k_B
 from astropy.table import QTable, Table
 
 from fits.fisher import ForecastModel, fiducial, fisher_errors, noise_weights
@@ -44,8 +45,10 @@ def test_presets_load_print_and_simulate(tmp_path, name):
     file = tmp_path / "x.toml"
     file.write_text(f'[sky]\nembedded = {{ nside = 8 }}\n[[bands]]\ninstrument = "{name}"\n')
     instrument, tables = load_instrument(name, samples=3), band_tables(name)
+    assert list(load_instrument(name, stokes="I")) == [table["name"] for table in tables]
+    tables = [table for table in tables if not isinstance(table["noise"]["level"], list)]
     assert list(instrument) == [table["name"] for table in tables]
-    assert [band.name for band in load(file).bands] == list(instrument)
+    assert [band.name for band in load(file).bands_of("QU")] == list(instrument)
     lines = str(instrument).splitlines()
     assert lines[0].startswith(f"Instrument {instrument.title}")
     assert len(lines) == 2 + len(instrument)
@@ -114,6 +117,46 @@ def test_published_figures(name):
             assert channel not in instrument.noise_I
         else:
             assert float(instrument.noise_I[channel]) * factor == pytest.approx(intensity)
+
+
+def test_bands_of_planck_without_polarization():
+    """Noise as published, 0.78 and 0.72 kJy/sr deg, in HFI's calibration."""
+    instrument = load_instrument("planck", stokes="I")
+    assert list(instrument) == [*load_instrument("planck"), "545", "857"]
+    assert [float(instrument[name].beam) for name in ("545", "857")] == [4.83, 4.64]
+    for name, published in (("545", 0.78e3), ("857", 0.72e3)):
+        # Jy/sr at nu_0 of nu I_nu = const per K_RJ, over a band in units of power.
+        band = instrument[name].band
+        nu, nu_0 = np.asarray(band.nu) * 1e9, float(name) * 1e9
+        brightness = 2 * nu**2 * k_B.value / c.value**2
+        # Weights of antenna temperature hold nu^2 of those of power.
+        power = np.asarray(band.weights) / nu**2
+        per_K = np.trapezoid(power * brightness, nu) / np.trapezoid(power * nu_0 / nu, nu)
+        level = published / (per_K * 1e26) * 60 * 1e6
+        assert float(instrument[name].noise) == pytest.approx(level, rel=0.05)  # a top-hat
+    for row in instrument.values():
+        assert float(row.noise) < 200
+    whole = load_instrument("planck", ["353"], stokes="IQU")
+    assert whole["353"].noise.shape == (3,)
+    np.testing.assert_allclose(whole["353"].noise[0], instrument["353"].noise)
+    np.testing.assert_allclose(whole["353"].noise[1:], load_instrument("planck")["353"].noise)
+    with pytest.raises(ValueError, match="planck: channel '545' has no polarization; choose"):
+        load_instrument("planck", ["353", "545"])
+
+
+def test_infinite_noise_is_of_bands_without_polarization():
+    table = COLUMNS | {"depth_i": [7.0, 2.0, 3.0], "depth": [10.0, 3.0, np.inf]}
+    whole = Instrument.from_table(table, stokes="I")
+    assert list(Instrument.from_table(table)) == ["30", "95"]
+    factors = [float(one.band.conversion("uK_CMB", "uK_RJ")) for one in whole.values()]
+    np.testing.assert_allclose(
+        [float(c.noise) for c in whole.values()], np.multiply(table["depth_i"], factors)
+    )
+    with refused("column depth, row 3: is inf, no finite number"):
+        Instrument.from_table({k: v for k, v in table.items() if k != "depth_i"})
+    alone = {k: v[2:] for k, v in table.items()}
+    with pytest.raises(ValueError, match="no channel has polarization; choose stokes 'I'"):
+        Instrument.from_table(alone)
 
 
 def combined(name):

@@ -24,7 +24,7 @@ from jaxsky.harmonics import Preparation, expand, synthesis
 from jaxsky.io import read_maps, write_maps
 from jaxsky.noise import cholesky, stokes_noise
 from jaxsky.observation import load_instrument
-from jaxsky.settings import load
+from jaxsky.settings import BandTable, SettingsError, load
 from settings_fuzz import written
 from systems import random_maps, small_experiment
 
@@ -240,6 +240,45 @@ def test_fits_find_laws_whose_references_differ(stokes, varying):
     like = likelihood(sky, bands, data, 0.01, start, stokes=stokes)
     assert isinstance(like, PixelLikelihood) == varying
     assert best_fit(like).best_fit == pytest.approx(TRUTH, abs=1e-9)
+
+
+def test_bands_without_polarization(tmp_path, monkeypatch, capsys):
+    """All bands of Planck are simulated and fitted in I, and those with polarization in Q and U."""
+    settings = experiment("I", bands=[{"instrument": "planck"}]) | {
+        "fit": {"methods": ["gradient"]}
+    }
+    path = written(tmp_path / "x.toml", settings)
+    left = "Left out, as they have no polarization: 545, 857."
+    assert len(load(path).bands_of("I")) == 9
+    assert [b.name for b in load(path).bands_of("QU")] == ["30", "44", "70", "100", "143", "217",
+        "353"]  # fmt: skip
+    errors = {}
+    for stokes in ("I", "QU"):
+        option = "--set", f"common.stokes={stokes}"
+        found = found_by(monkeypatch, "fit", path, tmp_path / stokes, *option)
+        assert (left in found["warnings"]) == (stokes == "QU")
+        one = found["results"]["full"][stokes]["gradient"]
+        sigmas = np.sqrt(np.diag(one["covariance"]))
+        errors[stokes] = dict(zip(one["free"], sigmas, strict=True))
+        for name, sigma in errors[stokes].items():
+            assert abs(one["best_fit"][name] - TRUTH[name]) < 4 * sigma
+    inputs = inputs_of(load(path))
+    noise = inputs.bands["545"].noise
+    assert inputs.bands["545"].correlated is not None or noise == pytest.approx(4.79)
+
+
+@pytest.mark.parametrize("stokes", ["QU", "IQU"])
+def test_a_named_band_without_polarization_is_refused(stokes, tmp_path):
+    settings = load(written(tmp_path / "x.toml", experiment(stokes, ("353", "545"))))
+    with pytest.raises(SettingsError, match=r"^bands.545: has no polarization .* Q.* leave it out"):
+        inputs_of(settings)
+    with pytest.raises(SettingsError, match=r"^bands.545: has no polarization"):
+        simulation_inputs(settings)  # of I, Q, U
+    own = {"name": "x", "bandpass": {"center": 545.0}, "fwhm": 5.0}
+    for noise, polarized in (([3.0], False), (3.0, True), ([3.0, 4.0], True)):
+        band = BandTable.model_validate(own | {"noise": {"level": noise}})
+        assert band.polarized == polarized
+        assert band.noise.level_of("I") == 3.0
 
 
 @pytest.mark.parametrize(

@@ -130,7 +130,7 @@ def test_names_and_maps():
 
 @pytest.mark.parametrize("name", ["planck", "wmap", "core", "litebird", "pico", "so-lat", "spt-3g"])
 def test_presets_are_sound(name):
-    tables, instrument = band_tables(name), load_instrument(name, samples=7)
+    tables, instrument = band_tables(name), load_instrument(name, stokes="I", samples=7)
     assert list(instrument) == [table["name"] for table in tables]
     beams = [float(channel.beam) for channel in instrument.values()]
     assert beams == sorted(beams, reverse=True)
@@ -146,7 +146,8 @@ def test_presets_are_sound(name):
 
 def levels(name):
     """Noise of an instrument as it was published, by channel."""
-    return {table["name"]: table["noise"]["level"] for table in band_tables(name)}
+    found = {table["name"]: table["noise"]["level"] for table in band_tables(name)}
+    return {band: level for band, level in found.items() if not isinstance(level, list)}
 
 
 def test_published_figures():

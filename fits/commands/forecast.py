@@ -72,18 +72,18 @@ class Forecast(NamedTuple):
 
 def forecast_inputs(settings: Experiment) -> ForecastInputs:
     """Read templates, bands and mask, bring the templates to one resolution, and check them."""
-    spec = settings.forecast
+    spec, observed = settings.forecast, settings.bands_of("QU")
     for wrong, sentence in (
         (not settings.cmb.include, "cmb.include: is false, but a forecast has a CMB."),
         (settings.cmb.file, "cmb.file: a forecast changes r, which takes spectra of CAMB."),
         (not settings.modelled(), "sky: has no components; a forecast takes some."),
-        (not settings.bands, "bands: there are none."),
+        (not observed, "bands: there are none."),
     ):
         if wrong:
             raise SettingsError(sentence)
     templates, description = read_sky(settings, names=settings.modelled())
     pixels = map_nside(settings, templates)
-    bands = {str(one.name): read_channel(settings, one, pixels) for one in settings.bands}
+    bands = {str(one.name): read_channel(settings, one, pixels) for one in observed}
     if silent := [name for name, band in bands.items() if band.noise is None]:
         raise SettingsError(f"bands.{silent[0]}.noise: is missing.")
     shown = spec.bands or plots.spread(tuple(bands), SHOWN)

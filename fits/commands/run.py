@@ -177,7 +177,9 @@ def run_command(
             settings, out, bool(resume), overwrite, command.results, folder, steps, part, executor
         )
         report = command.work(settings, running)
-        report = report._replace(warnings=[*report.warnings, *other_sky(settings)])
+        table = settings.simulate if command.name == "simulate" else settings.common
+        said = [*settings.unpolarized(table.stokes), *other_sky(settings)]
+        report = report._replace(warnings=[*report.warnings, *said])
         written = job.of_first(lambda: _write(settings, report, running))
         if_stopped("; all results are written")
     if job.index():

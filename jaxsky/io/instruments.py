@@ -52,8 +52,9 @@ def read_instrument(table: Any) -> dict[str, Any]:
 
     The columns are, with the names in `COLUMNS`: center [GHz], width [GHz], FWHM of the beam
     [arcmin] and white noise of Q and of U [uK_CMB arcmin]; where they are there, that of I in the
-    same unit, and the fraction of the sky. Without a width (or with 0) a band is monochromatic,
-    without a name it is called by its frequency in GHz. Other units are converted: those of
+    same unit, and the fraction of the sky. A band has no polarization if its noise of Q and of U is
+    infinite, next to that of I. Without a width (or with 0) a band is monochromatic, without
+    a name it is called by its frequency in GHz. Other units are converted: those of
     quantities, of a table's columns, and in brackets after a column's name; a noise in K is taken
     to be thermodynamic. As in FGBuster's tables, `bandwidth` next to `depth_p` is a fraction.
 
@@ -68,7 +69,8 @@ def read_instrument(table: Any) -> dict[str, Any]:
     -------
     dict
         "bands", a list of tables as in an experiment file with "name", "bandpass" (center and
-        width), "fwhm", "noise" (level and unit) and "noise_I"; "title" and "sky_fraction", which
+        width), "fwhm", "noise" (level and unit; a list of that of I alone without polarization) and
+        "noise_I"; "title" and "sky_fraction", which
         are None where they are not given
 
     Raises
@@ -231,7 +233,8 @@ def _numbers_of(columns: Mapping[str, _Column]) -> dict[str, list[Any]]:
         if kind == "name":
             found[kind] = [_text(label, i, value) for i, value in rows]
         elif kind.startswith("noise"):
-            found[kind] = [_depth(label, i, value, unit) for i, value in rows]
+            of_I = kind == "noise" and "noise_I" in columns
+            found[kind] = [_depth(label, i, value, unit, of_I) for i, value in rows]
         else:
             found[kind] = [_number(kind, label, i, value, unit) for i, value in rows]
     width = columns.get("width")
@@ -283,21 +286,24 @@ def _number(kind: str, label: str, row: int, value: Any, unit: str | None) -> fl
     return number
 
 
-def _bare(label: str, row: int, value: Any) -> float:
+def _bare(label: str, row: int, value: Any, infinite: bool = False) -> float:
+    """Return a finite number, or one that is `infinite` if it may be."""
     try:
         number = math.nan if np.ma.is_masked(value) else float(getattr(value, "value", value))
     except (TypeError, ValueError):
         raise UnfitError(f"column {label}, row {row}: {value!r} is no number.") from None
-    if not math.isfinite(number):
+    if not math.isfinite(number) and not (infinite and number == math.inf):
         raise UnfitError(f"column {label}, row {row}: is {number:g}, no finite number.")
     return number
 
 
-def _depth(label: str, row: int, value: Any, unit: str | None) -> tuple[float, str]:
-    """Return a depth and its unit, "uK_CMB" or "uK_RJ", times arcmin."""
+def _depth(
+    label: str, row: int, value: Any, unit: str | None, infinite: bool = False
+) -> tuple[float, str]:
+    """Return a depth and its unit, "uK_CMB" or "uK_RJ", times arcmin; it may be `infinite`."""
     own = getattr(value, "unit", None)
     unit = unit if own is None else str(own)
-    level = _bare(label, row, value)
+    level = _bare(label, row, value, infinite)
     if level <= 0:
         raise UnfitError(f"column {label}, row {row}: must be positive, but is {level:g}.")
     if unit is None:
@@ -341,5 +347,7 @@ def _bands(found: Mapping[str, list[Any]]) -> list[dict[str, Any]]:
             band["noise_I"], other = found["noise_I"][i]
             if other != unit:
                 raise UnfitError(f"band {name!r} has noise in {unit}, but noise of I in {other}.")
+            if level == math.inf:
+                band["noise"]["level"] = [band.pop("noise_I")]
         bands.append(band)
     return bands

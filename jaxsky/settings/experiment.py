@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo, model_validator
 
+from jaxsky.checks import listed
 from jaxsky.settings.files import BeamedMap, MapFile
 from jaxsky.settings.tables import BandTable, CMBTable, FreeParameter, SkyTable, SmallScalesTable
 from jaxsky.settings.types import (
@@ -226,6 +227,7 @@ class Experiment(SettingsTable):
         self.bands = bands
         self.regions = REGIONS | self.regions
         names = [str(band.name) for band in bands]
+        polarized = [str(band.name) for band in bands if band.polarized]
         check_names("bands", names)
         check_names("regions", self.regions)
         if both := set(self.free) & set(self.fixed):
@@ -247,13 +249,13 @@ class Experiment(SettingsTable):
         known: list[tuple[str, Iterable[str] | None, Collection[str]]] = [
             ("common.components", self.common.components, components),
             ("simulate.include", self.simulate.include, [*components, "cmb", "noise"]),
-            ("compare.patches", self.compare.patches, names),
+            ("compare.patches", self.compare.patches, polarized),
             ("fit.stokes", self.fit.stokes, choices),
             ("fit.regions", self.fit.regions, self.regions),
             ("compare.regions", self.compare.regions, self.regions),
             ("separate.region", self.separate.region, self.regions),
             ("forecast.region", self.forecast.region, self.regions),
-            ("forecast.bands", self.forecast.bands, names),
+            ("forecast.bands", self.forecast.bands, polarized),
         ]
         for name, one in components.items():
             if one.noise is not None:
@@ -264,6 +266,27 @@ class Experiment(SettingsTable):
                     there = ", ".join(allowed) or "none is there"
                     raise MistakeAt(key, f"{value!r} is none of {there}")
         return self
+
+    def bands_of(self, stokes: str) -> list[BandTable]:
+        """Return the bands that observe some Stokes parameters, "I", "QU" or "IQU".
+
+        One without polarization is left out of Q and U if it is there as one of all bands of an
+        instrument, and refused with SettingsError if it was named.
+        """
+        for band in self.bands if stokes != "I" else []:
+            if not band.polarized and not band._of_all:
+                raise SettingsError(
+                    f"bands.{band.name}: has no polarization (its noise is of I alone), but "
+                    f"{listed(stokes)} are wanted; leave it out, or choose I as common.stokes, or "
+                    "simulate.stokes for simulations."
+                )
+        return [band for band in self.bands if stokes == "I" or band.polarized]
+
+    def unpolarized(self, stokes: str) -> list[str]:
+        """Return a warning about the bands that `bands_of` leaves out, if there are any."""
+        seen = {band.name for band in self.bands_of(stokes)}
+        left = [str(band.name) for band in self.bands if band.name not in seen]
+        return [f"Left out, as they have no polarization: {', '.join(left)}."] if left else []
 
     def modelled(self) -> list[str]:
         """Return the names of the components in the model."""

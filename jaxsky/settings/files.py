@@ -4,13 +4,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, Strict, model_validator
 
 from jaxsky.bandpass import UNITS
 from jaxsky.checks import listed
 from jaxsky.io.columns import parse_stokes
 from jaxsky.noise import COVARIANCE_COLUMNS
-from jaxsky.settings.types import FileName, MistakeAt, Pair, Positive, SettingsTable, Several, valid
+from jaxsky.settings.types import FileName, MistakeAt, Positive, SettingsTable, Several, valid
 
 Files = FileName | Annotated[list[FileName], Field(min_length=1)]
 _Hdu = Annotated[int, Field(ge=1)]
@@ -122,12 +122,14 @@ class NoiseColumns(ColumnKeys):
 
 
 _Level = Annotated[float, Field(ge=0)]
+_Levels = Annotated[tuple[_Level, ...], Field(min_length=1, max_length=2), Strict(False)]
 
 
 class NoiseTable(SettingsTable):
     """Noise of a band or of a template, as exactly one of its kinds: a level, or of each pixel.
 
-    Two levels are those of I and of polarization. `unit` is that of level, rms, covariance
+    Two levels are those of I and of polarization; one in a list is that of I, in a band without
+    polarization. `unit` is that of level, rms, covariance
     (squared) and sigma0, by default that of the map, or uK_CMB where there is no map. `weights` are
     the inverse covariance in units of sigma0.
     """
@@ -142,7 +144,7 @@ class NoiseTable(SettingsTable):
         "weights": {3: COVARIANCE_COLUMNS[3]},
     }
 
-    level: _Level | Pair[_Level] | None = None
+    level: _Level | _Levels | None = None
     rms: _Level | NoiseColumns | None = None
     covariance: NoiseColumns | None = None
     hits: NoiseColumns | None = None
@@ -165,7 +167,14 @@ class NoiseTable(SettingsTable):
 
     def level_of(self, stokes: str) -> float | None:
         """Return the level of a Stokes parameter, if levels are given."""
-        return self.level[stokes != "I"] if isinstance(self.level, tuple) else self.level
+        if not isinstance(self.level, tuple):
+            return self.level
+        return dict(zip("IP", self.level, strict=False)).get("I" if stokes == "I" else "P")
+
+    @property
+    def of_I_alone(self) -> bool:
+        """Whether there is a level of I, but none of Q and U."""
+        return self.level_of("I") is not None and self.level_of("Q") is None
 
     def _check_columns(self, kind: str, spec: NoiseColumns) -> None:
         numbered = kind in ("hits", "weights")

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
 from jaxsky.components import AME, component_class, declared
 from jaxsky.galaxy import GalaxyModel
@@ -107,6 +107,8 @@ class ComponentTable(SeenKeys):
     def _plausible(self) -> "ComponentTable":
         if self.noise is not None and self.noise.estimate_above is not None:
             raise MistakeAt("noise.estimate_above", "is of bands")
+        if self.noise is not None and self.noise.of_I_alone:
+            raise MistakeAt("noise.level", "a list is of I and of polarization; leave out its [ ]")
         if self.law == "cmb":
             raise MistakeAt("law", "the CMB is described in the table cmb")
         check_signs(self.parameters, "parameters")
@@ -229,6 +231,9 @@ class CMBTable(TableKeys):
 class BandTable(SeenKeys):
     """A band: how it observes the sky, and its map; a band without a map is simulated."""
 
+    #: Whether it was not named itself, but is one of all bands of an instrument.
+    _of_all: bool = PrivateAttr(False)
+
     name: Annotated[str, valid(lambda value: check_name(value, "."))] | None = None
     instrument: str | None = None
     channels: Several[str] | None = None
@@ -266,6 +271,11 @@ class BandTable(SeenKeys):
         elif isinstance(self.leakage, BeamedMap):
             self._check_release(self.leakage)
         return self
+
+    @property
+    def polarized(self) -> bool:
+        """Whether it observes Q and U; if not, its noise is of I alone."""
+        return self.noise is None or not self.noise.of_I_alone
 
     def _check_release(self, leakage: BeamedMap) -> None:
         """Refuse leakage from another release than the map, or that has been subtracted already."""
@@ -307,7 +317,9 @@ class BandTable(SeenKeys):
             try:
                 if "instrument" in channel:
                     raise MistakeAt("instrument", "a band of an instrument has none")
-                bands.append(BandTable.model_validate(raw))
+                band = BandTable.model_validate(raw)
+                band._of_all = channels is None
+                bands.append(band)
             except ValueError as error:
                 what = mistakes(raw, error) if isinstance(error, ValidationError) else str(error)
                 raise ValueError(f"{self.instrument}, band {channel['name']}: {what}") from None

@@ -197,18 +197,32 @@ class Layout(NamedTuple):
     """Stokes parameters, by position, that share a mixing matrix.
 
     If `joint`, Q and U form one system, with the rows of Q before those of U; else one each.
+    `columns` are the components that they have, by position; None for all.
     """
 
     joint: bool
     stokes: tuple[int, ...]
+    columns: tuple[int, ...] | None = None
 
     @classmethod
-    def of(cls, stokes: int, joint: bool) -> tuple["Layout", ...]:
-        """Return those of all Stokes parameters; `joint` if Q and U depend on each other."""
-        if not joint:
+    def of(cls, stokes: int, joint: bool, polarized: Sequence[bool] = ()) -> tuple["Layout", ...]:
+        """Return those of all Stokes parameters; `joint` if Q and U depend on each other.
+
+        `polarized` says whether each component is, by default all; those that are not are absent
+        from Q and U next to I.
+        """
+        some = stokes == 3 and not all(polarized)
+        if not (joint or some):
             return (cls(False, tuple(range(stokes))),)
-        polarized = cls(True, (stokes - 2, stokes - 1))
-        return (polarized,) if stokes == 2 else (cls(False, (0,)), polarized)
+        columns = tuple(i for i, own in enumerate(polarized) if own) if some else None
+        of_QU = cls(joint, (stokes - 2, stokes - 1), columns)
+        return (of_QU,) if stokes == 2 else (cls(False, (0,)), of_QU)
+
+    def own(self, values: Any, axis: int = 0) -> Any:
+        """Return the entries of the components that these Stokes parameters have."""
+        if self.columns is None:
+            return values
+        return module_of(values).take(values, np.array(self.columns), axis=axis)
 
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:

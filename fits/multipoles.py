@@ -259,7 +259,7 @@ def harmonic_likelihood(
     multipoles = multipoles_of(alm, noise, beams, components, lmin, lmax)
     pixels = tuple(_compressed(multipoles, layout) for layout in like.layout)
     bands_used = (multipoles.weights > 0).sum(axis=0)[..., multipoles.ell]
-    values = bands_used - components * (multipoles.ell >= lmin)
+    values = bands_used - like.unknowns()[:, None] * (multipoles.ell >= lmin)
     cells, number = jnp.zeros(len(pixels[0].data), int), int(values.sum())
     return dataclasses.replace(like, pixels=pixels, block_cell=cells, values=number)
 

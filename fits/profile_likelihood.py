@@ -110,9 +110,18 @@ class SpectralLikelihood(Likelihood):
             rows = self.prior.rows(tuple(self.mixing.sky))
             rows = jnp.broadcast_to(rows, (len(matrix), *rows.shape))
             matrix = jnp.concatenate([matrix, rows], axis=1)
+        every = [each.own(matrix, axis=-1) for each in self.layout]
         return tuple(
-            self.mixing.rotated(matrix, values) if each.joint else matrix for each in self.layout
+            self.mixing.rotated(own, values) if each.joint else own
+            for each, own in zip(self.layout, every, strict=True)
         )
+
+    def unknowns(self) -> Int[np.ndarray, " stokes"]:
+        """Return the number of components that each Stokes parameter has."""
+        number = np.zeros(len(self.stokes), int)
+        for each in self.layout:
+            number[list(each.stokes)] = len(each.own(np.arange(len(self.mixing.sky.components))))
+        return number
 
     def pieces(self):
         own = [(self.pixels, self.block_cell)] if self.source is None else self.source()
@@ -288,7 +297,7 @@ def spectral_likelihood(
         )
     mixing = Mixing.of(unit_sky(sky), bands, unit)
     noise = along(data, as_noise(noise, data.shape))
-    shrunk = amplitude_prior(prior or {}, tuple(mixing.sky), data.shape[1:])
+    shrunk = amplitude_prior(prior or {}, mixing.sky, data.shape[1:])
     rows_of_data = tuple(bands)
     if shrunk is not None:
         data, noise = shrunk.joined(data, noise)
@@ -317,6 +326,9 @@ def spectral_likelihood(
         column[:] = position + (cells.labels[name] if value.ndim else 0)
         position += value.size
     angles = any(name.startswith("angle.") for name in start)
+    polarized = [component.polarized for component in sky.components.values()]
+    if data.shape[1] == 3 and not any(polarized):
+        raise ValueError("None of the components is polarized; take data of I alone.")
     like = SpectralLikelihood(
         start=values,
         values=0,
@@ -326,7 +338,7 @@ def spectral_likelihood(
         pixels=(),
         block_cell=None,
         of_pixel=None if cells.of_pixel is None else jnp.asarray(cells.of_pixel),
-        layout=Layout.of(data.shape[1], angles or noise.covariance is not None),
+        layout=Layout.of(data.shape[1], angles or noise.covariance is not None, polarized),
         stokes=STOKES[data.shape[1]],
         weightless=(),
         prior=shrunk,
@@ -355,7 +367,7 @@ def spectral_likelihood(
         pixels=tuple(parts),
         block_cell=block_cell,
         source=source,
-        values=int(looked.counts[heavy].sum()) - components * data.shape[1] * looked.number,
+        values=int(looked.counts[heavy].sum()) - int(like.unknowns().sum()) * looked.number,
         weightless=tuple(n for n, some in zip(rows_of_data, heavy, strict=True) if not some),
     )
 

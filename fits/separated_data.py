@@ -199,14 +199,16 @@ def modelled_laws(settings: Experiment) -> tuple[Sky, Bool[np.ndarray, " pix"]]:
     known = np.ones(12 * nside**2, bool)
     for name, spec in laws.items():
         # One reference frequency for all amplitudes: that of polarization, if there is any.
-        given = folder, name, spec, nside, "common.nside", stokes[-1]
+        row = stokes[-1] if spec.polarized else "I"
+        given = folder, name, spec, nside, "common.nside", row
         numbers, has = reading.read_parameters(*given)
         known &= has
         with at_key(f"sky.{name}"):
             assert spec.law is not None  # the settings ensure this
+            rows = amplitude
             if stokes == "IQU" and not spec.polarized:
-                raise ValueError("is not polarized; to separate it, choose I as common.stokes")
-            components[name] = component_class(spec.law)(amplitude, **numbers)
+                rows = amplitude.at[1:].set(0.0)
+            components[name] = component_class(spec.law)(rows, **numbers)
     others = set(settings.sky.components) - set(laws)
     fixed = {name: v for name, v in settings.fixed.items() if name.split(".")[0] not in others}
     with at_key("fixed"):

@@ -32,11 +32,12 @@ class ComponentMaps(NamedTuple):
     """Maps of the components; NaN in masked pixels. Those of distributed data are distributed.
 
     `amplitude` are generalised least-squares estimates, uK at the reference frequency of each law,
-    CMB in uK_CMB. `covariance` is that of the components in each pixel for each Stokes parameter,
-    and `alone` the variance of each without the others; both have a single pixel if they are the
-    same in all, and are None if not requested. `chi2` is the weighted sum of squared residuals over
-    bands and Stokes parameters, `dof` their number minus that of amplitudes, and `probability` that
-    of exceeding chi2, with the spectral parameters taken as known.
+    CMB in uK_CMB; of components without polarization exactly 0 in Q and U, without error.
+    `covariance` is that of the components in each pixel for each Stokes parameter, `alone` the
+    variance of each without the others; both have one pixel if they are the same in all, and are
+    None if not requested. `chi2` is the weighted sum of squared residuals over bands and Stokes
+    parameters, `dof` their number minus that of amplitudes, and `probability` that of exceeding
+    chi2, with the spectral parameters taken as known.
     """
 
     components: tuple[str, ...]
@@ -74,7 +75,8 @@ class ComponentMaps(NamedTuple):
         assert self.alone is not None  # made with the covariance
         i, total = self.components.index(name), np.zeros(2)
         for part in ranges(self.alone.shape[-1]):
-            ratio = self.sigmas(part)[i] / np.sqrt(self.alone[..., part][i])
+            alone = self.alone[..., part][i]
+            ratio = self.sigmas(part)[i] / np.sqrt(np.where(alone > 0, alone, np.nan))
             total += np.nansum(ratio), np.isfinite(ratio).sum()
         return float(total[0] / total[1])
 
@@ -113,21 +115,23 @@ def _separated(of_pixel, known, data, noise, used, layouts, errors):
     `known` are the matrices of all cells, for each of `layouts`; `used` is None for all pixels.
     """
     stokes, npix = data.shape[1:]
-    size = known[0].shape[-1] // (1 + layouts[0].joint)
-    amplitude, alone = jnp.zeros((2, size, stokes, npix))
-    blocks, square = jnp.zeros((size, *alone.shape)), jnp.zeros(npix)
-    for layout, matrix in zip(layouts, known, strict=True):
+    both = list(zip(layouts, known, strict=True))
+    most = max(m.shape[-1] // (1 + each.joint) for each, m in both)
+    amplitude, alone = jnp.zeros((2, most, stokes, npix))
+    blocks, square = jnp.zeros((most, *alone.shape)), jnp.zeros(npix)
+    for layout, matrix in both:
+        at = layout.own(np.arange(most))  # other components are exactly zero
         pixels = pixel_rows(data, noise, layout, ALL, used)
         solved, squares, *variances = _solved(_own(of_pixel, matrix), pixels, errors)
-        amplitude = amplitude.at[:, np.array(layout.stokes)].set(layout.maps(solved))
+        amplitude = amplitude.at[at[:, None], np.array(layout.stokes)].set(layout.maps(solved))
         square = square + squares
         for k, s in enumerate(layout.stokes if errors else ()):
-            group, first = (0, k * size) if layout.joint else (k, 0)
-            cut = slice(first, first + size)
-            blocks = blocks.at[:, :, s].set(variances[0][group, cut, cut])
-            alone = alone.at[:, s].set(variances[1][group, cut])
+            group, first = (0, k * len(at)) if layout.joint else (k, 0)
+            cut = slice(first, first + len(at))
+            blocks = blocks.at[at[:, None], at, s].set(variances[0][group, cut, cut])
+            alone = alone.at[at, s].set(variances[1][group, cut])
     seen = jnp.broadcast_to(noise.weights(ALL) > 0, data.shape)
-    count = seen.sum(axis=(0, 1)) - 1.0 * size * stokes
+    count = seen.sum(axis=(0, 1)) - 1.0 * sum(m.shape[-1] * len(each.groups) for each, m in both)
     found = amplitude, *((blocks, alone) if errors else (None, None)), square, count
     return found if used is None else jax.tree.map(lambda x: jnp.where(used, x, jnp.nan), found)
 
@@ -222,7 +226,7 @@ def emission_maps(like: SpectralLikelihood, params: Mapping[str, Numeric], ampli
         maps = amplitude[..., part]
         result = np.empty((*shape[:2], maps.shape[-1]))
         for layout, matrix in zip(like.layout, known, strict=True):
-            rows = layout.rows(maps)
+            rows = layout.rows(layout.own(maps))
             own = np.asarray(_own(None if of_pixel is None else of_pixel[part], matrix))
             one, sums = len(own) == 1, "ru,kup->krp"
             model = np.einsum(*(sums, own[0]) if one else ("p" + sums, own), rows, optimize=one)
@@ -282,11 +286,9 @@ def harmonic_component_maps(
 
     Parameters
     ----------
-    like : from `harmonic_likelihood`, or `spectral_likelihood` without regions, for its laws and
-        bands
+    like : from `harmonic_likelihood`, or `spectral_likelihood` without regions
     params : spectral parameters, such as `FitResult.best_fit`
-    alm, noise, beams, lmin, lmax : as for `harmonic_likelihood`; the multipoles need not be those
-        that were fitted
+    alm, noise, beams, lmin, lmax : as for `harmonic_likelihood`, for any multipoles
     covariance : whether to compute the covariance of the amplitudes
     """
     if len(like.index) != 1:
@@ -386,12 +388,13 @@ def sky_of(components: Sequence[str] | Mapping[str, Component], stokes: int) -> 
     return Sky(components)
 
 
-def white_noise(instrument: object, data: np.ndarray, unit: str) -> Float[np.ndarray, " band"]:
-    """Return the standard deviation of the noise of an instrument in the pixels of data."""
+def white_noise(instrument: object, data: np.ndarray, unit: str) -> np.ndarray:
+    """Return the standard deviations (band, stokes) of an instrument in the pixels of data."""
     if not isinstance(instrument, Instrument):
         raise ValueError("Argument `noise` is missing: the bands do not say what they have.")
     good = data.ndim == 3 and healpy.isnpixok(data.shape[-1])
     check_shape("data", data, good, "have shape (band, stokes, pix) with 12 nside^2 pixels")
     pixel = healpy.nside2resol(healpy.npix2nside(data.shape[-1]), arcmin=True)
-    factors = [band.conversion("uK_RJ", unit) for band in instrument.bands().values()]
-    return np.array([c.noise for c in instrument.values()]) * np.array(factors) / pixel
+    factors = [[band.conversion("uK_RJ", unit)] for band in instrument.bands().values()]
+    levels = [jnp.broadcast_to(jnp.asarray(c.noise), data.shape[1]) for c in instrument.values()]
+    return np.array(levels) * np.array(factors) / pixel

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits.compress import Noise, as_noise, bare
+from jaxsky import Sky
 from jaxsky.checks import Numeric
 from jaxsky.io.stacks import Stack
 from jaxsky.mesh import spread
@@ -75,7 +76,7 @@ def _covariance(noise: Noise, bands: int, npix: int) -> np.ndarray:
 
 
 def amplitude_prior(
-    prior: Mapping[str, Numeric], components: Sequence[str], shape: tuple[int, int]
+    prior: Mapping[str, Numeric], components: Sky, shape: tuple[int, int]
 ) -> AmplitudePrior | None:
     """Return the priors of components by name, after checking them; None if there are none.
 
@@ -84,13 +85,14 @@ def amplitude_prior(
     prior : by name of the component, the standard deviation of its amplitude: a number, or a value
         for each Stokes parameter (stokes,), or maps (stokes, pix); or its covariance of Q and U
         (2, 2, pix). All in the unit of the amplitude, with mean 0.
-    components : names of all components
+    components : all components
     shape : (stokes, pix) of the data
 
     Raises
     ------
     KeyError : for a component that there is not
-    TypeError, ValueError : for shapes that do not match, and values that are not positive
+    TypeError, ValueError : for shapes that do not match, values that are not positive, and priors
+        of I, Q, U next to a component that is not polarized
     """
     found: list[Any] = []
     for name, value in prior.items():
@@ -105,6 +107,12 @@ def amplitude_prior(
             raise ValueError(f"The prior of {name!r} cannot be used: {error}") from None
     if not found:
         return None
+    alone = [name for name in components if not components[name].polarized]
+    if alone and shape[0] == 3:
+        raise ValueError(
+            f"Argument `prior` is of amplitudes of I, Q, U, but {alone[0]!r} is not polarized; "
+            "leave one of them out, or separate I and Q, U one after the other."
+        )
     joined = found[0]
     for count, more in enumerate(found[1:], start=2):
         joined = _joined(joined, more, (count, *shape))

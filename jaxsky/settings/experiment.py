@@ -270,22 +270,19 @@ class Experiment(SettingsTable):
     def bands_of(self, stokes: str) -> list[BandTable]:
         """Return the bands that observe some Stokes parameters, "I", "QU" or "IQU".
 
-        One without polarization is left out of Q and U if it is there as one of all bands of an
-        instrument, and refused with SettingsError if it was named.
+        Bands without polarization are left out of Q and U, SettingsError if no other is there.
         """
-        for band in self.bands if stokes != "I" else []:
-            if not band.polarized and not band._of_all:
-                raise SettingsError(
-                    f"bands.{band.name}: has no polarization (its noise is of I alone), but "
-                    f"{listed(stokes)} are wanted; leave it out, or choose I as common.stokes, or "
-                    "simulate.stokes for simulations."
-                )
-        return [band for band in self.bands if stokes == "I" or band.polarized]
+        found = [band for band in self.bands if stokes == "I" or band.polarized]
+        if self.bands and not found:
+            raise SettingsError(
+                f"bands: {listed([str(band.name) for band in self.bands])} have no polarization "
+                "(noise of I alone); choose I as common.stokes, or simulate.stokes for simulations."
+            )
+        return found
 
     def unpolarized(self, stokes: str) -> list[str]:
         """Return a warning about the bands that `bands_of` leaves out, if there are any."""
-        seen = {band.name for band in self.bands_of(stokes)}
-        left = [str(band.name) for band in self.bands if band.name not in seen]
+        left = [str(b.name) for b in self.bands if stokes != "I" and not b.polarized]
         return [f"Left out, as they have no polarization: {', '.join(left)}."] if left else []
 
     def modelled(self) -> list[str]:

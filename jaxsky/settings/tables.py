@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, PrivateAttr, ValidationError, model_validator
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from jaxsky.components import AME, component_class, declared
 from jaxsky.galaxy import GalaxyModel
@@ -231,9 +231,6 @@ class CMBTable(TableKeys):
 class BandTable(SeenKeys):
     """A band: how it observes the sky, and its map; a band without a map is simulated."""
 
-    #: Whether it was not named itself, but is one of all bands of an instrument.
-    _of_all: bool = PrivateAttr(False)
-
     name: Annotated[str, valid(lambda value: check_name(value, "."))] | None = None
     instrument: str | None = None
     channels: Several[str] | None = None
@@ -317,9 +314,7 @@ class BandTable(SeenKeys):
             try:
                 if "instrument" in channel:
                     raise MistakeAt("instrument", "a band of an instrument has none")
-                band = BandTable.model_validate(raw)
-                band._of_all = channels is None
-                bands.append(band)
+                bands.append(BandTable.model_validate(raw))
             except ValueError as error:
                 what = mistakes(raw, error) if isinstance(error, ValidationError) else str(error)
                 raise ValueError(f"{self.instrument}, band {channel['name']}: {what}") from None

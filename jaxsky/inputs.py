@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import inspect
 from collections.abc import Collection, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -258,9 +259,10 @@ def _read_template(
     rows = check_stokes(f"sky.{name}", found, own_stokes)
     parameters, known = read_parameters(folder, name, spec, found.nside, stokes=own_stokes)
     with at_key(f"sky.{name}.unit"):
-        factors = [float(unit_factor(found.unit, law.unit, spec.reference(s))) for s in own_stokes]
+        at = [spec.reference(s) for s in own_stokes]
+        factors = amplitude_factors(law, found.unit, at, parameters)
     own = found.maps[rows]  # as large as everything else
-    maps = jnp.asarray(np.multiply(own, np.array(factors)[:, None], out=own), dtype)
+    maps = jnp.asarray(np.multiply(own, factors, out=own), dtype)
     used = np.asarray(found.mask) & known
     with at_key(f"sky.{name}"):
         if spec.angles and stokes != "I":
@@ -274,6 +276,29 @@ def _read_template(
         if ":" in component.law:  # a class of the user's
             check_law(component)
     return Template(component, spec.fwhm or 0.0, used, found.unit)
+
+
+def amplitude_factors(
+    law: type[Component],
+    unit: str,
+    nu_ref: Sequence[float | None],
+    parameters: Mapping[str, Any],
+) -> Float[np.ndarray, "stokes _"]:
+    """Return what turns maps in a unit into amplitudes of a law; a map if a parameter is one.
+
+    `nu_ref` are the reference frequencies of the maps [GHz]; what is not among `parameters` of the
+    law has its default. Raises ValueError for a unit that the law does not take.
+    """
+    given = {f.name: parameters.get(f.name, f.default) for f in dataclasses.fields(law)}
+    for own, make in law.amplitude_from.items():
+        try:
+            one = unit_factor(unit, own)
+        except ValueError:
+            continue  # another unit
+        wanted = {name: given[name] for name in [*inspect.signature(make).parameters][1:]}
+        rows = [make(one, **wanted | {"nu_ref": nu}) for nu in nu_ref]
+        return np.stack([np.atleast_1d(np.asarray(row)) for row in rows])
+    return np.array([[float(unit_factor(unit, law.unit, nu))] for nu in nu_ref])
 
 
 def set_parameters_of(

@@ -4,7 +4,7 @@ import dataclasses
 import importlib
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -112,6 +112,9 @@ class Component(Printed, eqx.Module):
     smooth : whether the law is smooth in its parameters, so that band averages may be interpolated
         in maps of them (`jaxsky.interpolation`); not so for tables with kinks
     unit : unit of the amplitude
+    amplitude_from : functions that make an amplitude of a map in another unit, by that unit as
+        `jaxsky.io.unit_name` spells it: proportional to the map, their first argument; others
+        are parameters of the law by name
     nu_ref_I : reference frequency [GHz] of the amplitude of I, if it is not `nu_ref`
 
     Raises
@@ -139,6 +142,7 @@ class Component(Printed, eqx.Module):
     polarized: ClassVar[bool] = True
     smooth: ClassVar[bool] = True
     unit: ClassVar[str] = "uK_RJ"
+    amplitude_from: ClassVar[Mapping[str, Callable[..., Array]]] = {}
 
     amplitude: eqx.AbstractVar[StokesMaps]
     nu_ref_I: Parameter | None = parameter(

@@ -203,6 +203,7 @@ class FreeFree(Component, law="free_free"):
     """
 
     polarized: ClassVar[bool] = False
+    amplitude_from: ClassVar = {"pc / cm6": amplitude_from_emission_measure}
 
     amplitude: StokesMaps = template()
     T_e: Parameter = parameter(7000.0, positive=True, symbol=r"T_{\rm e}", unit="K", zero=False)
@@ -255,6 +256,7 @@ class ThermalSZ(Component, law="sz"):
     """
 
     polarized: ClassVar[bool] = False
+    amplitude_from: ClassVar = {"": amplitude_from_compton}
 
     amplitude: StokesMaps = template()
     T_cmb: Parameter = parameter(T_CMB, positive=True, symbol=r"T_{\rm CMB}", unit="K", zero=False)
@@ -324,6 +326,7 @@ class LineEmission(Component, law="line"):
     """
 
     smooth: ClassVar[bool] = False
+    amplitude_from: ClassVar = {"K km / s": amplitude_from_line_intensity}
 
     amplitude: StokesMaps = template()
     nu_ref: Parameter = reference(115.271, within=(0.01, 2e4))

@@ -24,12 +24,16 @@ _JANSKY = re.compile(
 )
 
 
+#: Antenna temperature times velocity, for which astropy has a plain kelvin.
+_OF_A_LINE = re.compile(r"(?<=K)_?RJ(?=[\s.*]*km)")
+
+
 def unit_name(text: str) -> str:
     """Return the package's name for a unit spelt as in FITS headers, e.g. "mK,thermodynamic".
 
     This is a name in `jaxsky.bandpass.UNITS`, with "^2" for a square; "" for a pure number; "K",
     "mK", "uK" or "nK" if the text does not say whether the temperature is antenna or thermodynamic;
-    otherwise astropy's name.
+    otherwise astropy's name, "K km / s" for that of lines, whose temperature is antenna.
     """
     if text.strip().lower() in _DIMENSIONLESS:
         return ""
@@ -43,7 +47,7 @@ def unit_name(text: str) -> str:
         square = "^2" if match["square"] else ""
         return f"{prefix}K{_KINDS[match['kind'].lower()]}{square}"
     try:
-        return u.Unit(text).to_string()
+        return u.Unit(_OF_A_LINE.sub("", text)).to_string()
     except ValueError:
         raise ValueError(f"Unknown unit {text!r}; known units are {', '.join(UNITS)}.") from None
 

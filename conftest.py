@@ -8,6 +8,7 @@ import jax
 import pytest
 
 from jaxsky.programs import forget_programs, keep_programs
+from jaxsky.workers import processors
 
 jax.config.update("jax_enable_x64", True)
 # What can be had again, of the tests and of the commands that they start.
@@ -24,7 +25,15 @@ DATA = Path(os.environ.get("JAXSKY_DATA", Path(__file__).parents[1] / "shared" /
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile without much optimisation, here and in commands that are started."""
+    """Share out the processors, and compile tests without much optimisation, here and in commands.
+
+    The processes of pytest-xdist start after this. With as many threads as processors in each, the
+    threads of healpy take turns, and wait for each other in loops: twice the time of one thread.
+    XLA keeps its threads, as one alone waits forever for a callback.
+    """
+    if getattr(config.option, "numprocesses", None):
+        threads = max(1, processors() // len(config.option.tx))
+        os.environ.setdefault("OMP_NUM_THREADS", str(threads))
     if config.option.markexpr == "not slow":
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {COMPILED_SOON}"
 

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import healpy
 import matplotlib as mpl
@@ -22,6 +22,7 @@ from jaxsky.components import parameter_declaration
 from jaxsky.io import whole
 from jaxsky.io.stacks import Maps, ranges
 
+T = TypeVar("T")
 #: A map of the full sky.
 Map: TypeAlias = Float[np.ndarray, " pix"]
 STYLE: Any = {
@@ -35,7 +36,11 @@ STYLE: Any = {
 }
 #: Okabe & Ito's colours, which the colour-blind can tell apart.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222")
-TRUTH = {"color": COLORS[3], "linewidth": 1.2}
+TRUTH = {"color": COLORS[3], "linewidth": 0.9}
+#: What pictures are written as, besides PNG, if matplotlib's `savefig.format` says so.
+VECTOR_FORMATS = ("pdf", "svg")
+#: Said below maps whose colours are not linear.
+SCALE = "colour scales with unequal ticks: linear between the inner ticks, logarithmic beyond"
 #: Width of a column of a paper [inch].
 COLUMN = 3.5
 #: Largest nside of a map that is drawn.
@@ -58,6 +63,17 @@ def plain(text: str) -> str:
     A thin space goes before an underscore, since legends omit labels that begin with one.
     """
     return ("\N{THIN SPACE}" if text.startswith("_") else "") + text.replace("$", r"\$")
+
+
+def band_title(name: str) -> str:
+    """Return a band's name as it is drawn, with GHz if it is a number."""
+    return plain(f"{name} GHz" if name.replace(".", "", 1).isdigit() else name)
+
+
+def pages(stem: str, bands: Sequence[T], most: int) -> dict[str, Sequence[T]]:
+    """Return file names of pictures, `stem.png`, `stem_2.png`, ..., and what each shows."""
+    parts = [bands[i : i + most] for i in range(0, len(bands), most)]
+    return {f"{stem}_{n}.png" if n > 1 else f"{stem}.png": p for n, p in enumerate(parts, 1)}
 
 
 def in_formula(text: str) -> str:
@@ -87,20 +103,27 @@ def draw_title(figure: plt.Figure, title: str, fontsize: float = 9, **options: A
     """Write a title literally above a figure; each of its lines is wrapped to at most three."""
     # A letter is some 0.55 times as wide as high, in points of 1/72 inch.
     letters = int(figure.get_figwidth() * 72 / (0.55 * fontsize))
-    lines = [textwrap.fill(line, letters, max_lines=3) for line in title.splitlines()]
+    lines = [textwrap.fill(line, letters, max_lines=3) for line in title.strip().splitlines()]
     figure.suptitle(plain("\n".join(lines)), fontsize=fontsize, **options)
 
 
 def save(figure: plt.Figure, path: Path) -> None:
-    """Write a figure as PNG, atomically, and close it."""
+    """Write a figure as PNG, atomically, and close it.
+
+    Where matplotlib's own settings say `savefig.format: pdf` (in a file `matplotlibrc` of the
+    working folder, for example), or svg, that is written next to it.
+    """
+    wanted = str(mpl.rcParams["savefig.format"])
+    forms = ["png", *(form for form in VECTOR_FORMATS if form == wanted)]
     # A constrained layout fits already; cropping would draw it once more.
     box = None if figure.get_layout_engine() is not None else "tight"
-    with (
-        whole(path) as beside,
-        plt.rc_context({"savefig.bbox": box}),
-        warnings.catch_warnings(action="ignore", category=UserWarning),  # glyphs a font lacks
-    ):
-        figure.savefig(beside, format="png")
+    for form in forms:
+        with (
+            whole(path.with_suffix(f".{form}")) as beside,
+            plt.rc_context({"savefig.bbox": box}),
+            warnings.catch_warnings(action="ignore", category=UserWarning),  # glyphs a font lacks
+        ):
+            figure.savefig(beside, format=form)
     plt.close(figure)
 
 
@@ -195,9 +218,9 @@ class MapPanel(NamedTuple):
 def stokes_panels(
     name: str, maps: Sequence[Map], limit: float, unit: str, middle: float | None = None
 ) -> list[MapPanel]:
-    """Return panels of the Stokes parameters."""
+    """Return panels of the Stokes parameters; the name may hold formulas, see `plain`."""
     return [
-        MapPanel(plain(f"{name}: {stokes}"), values, f"{stokes} [{UNITS[unit]}]", middle, limit)
+        MapPanel(f"{name}: {stokes}", values, f"{stokes} [{UNITS[unit]}]", middle, limit)
         for values, stokes in zip(maps, STOKES[len(maps)], strict=True)
     ]
 
@@ -219,12 +242,14 @@ def thinned(maps: Maps, rows: Sequence[int]) -> np.ndarray:
 def plot_maps(path: Path, rows: Sequence[Sequence[MapPanel]], title: str = "") -> None:
     """Draw maps of the sky in rows and columns."""
     columns = len(rows[0])
-    size = columns * COLUMN, len(rows) * MAP_HEIGHT + (0.4 if title else 0.0)
+    size = columns * COLUMN, len(rows) * MAP_HEIGHT + (0.6 if title else 0.2)
     with draw_panels(path, title, size, len(rows), columns) as panels:
         for axes, panel in zip(panels.flat, (one for row in rows for one in row), strict=True):
             limit = panel.limit or color_limit(panel.values - (panel.middle or 0.0))
             draw_map(axes, panel.values, limit, panel.label, panel.middle)
             axes.set_title(panel.title)
+        if any(panel.middle is None for row in rows for panel in row):
+            panels[0, 0].figure.supxlabel(SCALE, fontsize=7)
 
 
 def draw_patch(

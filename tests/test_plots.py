@@ -9,7 +9,18 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 
 from fits.commands.fit import _drawable, plot_marginals, plot_posterior
-from fits.plots import color_limit, draw_title, in_formula, label, plain, plot_chains, save
+from fits.commands.run import with_vectors
+from fits.plots import (
+    band_title,
+    color_limit,
+    draw_title,
+    in_formula,
+    label,
+    pages,
+    plain,
+    plot_chains,
+    save,
+)
 from fits.results import FitResult, with_errors
 from fits.spectral_index import RegionFit
 from refusals import cases
@@ -95,3 +106,33 @@ def test_chains_of_any_name_are_drawn(tmp_path):
     )
     plot_chains(tmp_path / "chains.png", {"$x_$ [/]": result, "b": result}, None, "$x_$")
     assert (tmp_path / "chains.png").exists()
+
+
+def test_many_bands_are_spread_over_pictures():
+    bands = [f"{nu}" for nu in range(7)]
+    assert pages("maps", bands, 3) == {
+        "maps.png": bands[:3],
+        "maps_2.png": bands[3:6],
+        "maps_3.png": bands[6:],
+    }
+    assert pages("maps", [], 3) == {}
+
+
+@pytest.mark.parametrize(("name", "drawn"), [("44", "44 GHz"), ("44.5", "44.5 GHz"), ("W", "W")])
+def test_bands_are_named_with_their_unit(name, drawn):
+    assert band_title(name) == drawn
+
+
+@pytest.mark.parametrize(("form", "head"), [("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_matplotlib_settings_ask_for_vector_pictures(tmp_path, form, head):
+    with mpl.rc_context({"savefig.format": form}):
+        save(plt.figure(), tmp_path / "maps_1.png")
+    assert (tmp_path / f"maps_1.{form}").read_bytes().startswith(head)
+    assert (tmp_path / "maps_1.png").read_bytes().startswith(b"\x89PNG")
+    save(plt.figure(), tmp_path / "other.png")
+    assert [path.name for path in tmp_path.glob("other.*")] == ["other.png"]
+
+
+def test_vector_pictures_are_results_too():
+    found = with_vectors(("result.json", "maps_*.png"))
+    assert found == ("result.json", "maps_*.png", "maps_*.pdf", "maps_*.svg")

@@ -1,5 +1,6 @@
 """Draw what all pictures share: style, panels, titles, symbols, maps and spectra."""
 
+import itertools
 import re
 import textwrap
 import warnings
@@ -18,9 +19,12 @@ from matplotlib.axis import Axis
 
 from fits.results import FitResult
 from jaxsky.arrays import STOKES
+from jaxsky.bandpass import Bandpass
 from jaxsky.components import parameter_declaration
 from jaxsky.io import whole
 from jaxsky.io.stacks import Maps, ranges
+from jaxsky.sed import cmb_derivative
+from jaxsky.sky import Sky, observe_components
 
 T = TypeVar("T")
 #: A map of the full sky.
@@ -309,6 +313,53 @@ def draw_spectra(
     round_numbers(axes.xaxis, (1, 3))
     axes.set_xlabel(r"multipole $\ell$")
     axes.set_ylabel(rf"$\ell(\ell+1)C_\ell/2\pi$ [{UNITS[unit]}$^2$]")
+
+
+def plot_sed(
+    sky: Sky,
+    bands: Mapping[str, Bandpass],
+    cmb_rms: float | None = None,
+    axes: Axes | None = None,
+    samples: int = 60,
+) -> Axes:
+    """Draw the rms of each component against frequency, with the bands shaded; return the axes.
+
+    The rms over the pixels is that of sqrt(Q^2 + U^2) where the sky has Q and U, else that of I,
+    in uK_RJ, at `samples` frequencies from 2/3 of the lowest to 3/2 of the highest band's centre.
+    A band is shaded where its weight is half the largest at least. `cmb_rms` [uK_CMB] adds the CMB.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If `sky` is no Sky, or `bands` is not at least one Bandpass by name.
+    """
+    if not isinstance(bands, Mapping) or not bands:
+        raise ValueError("Argument `bands` must be at least one Bandpass by name.")
+    centers = [float(band.center) for band in bands.values()]
+    nu = np.geomspace(min(centers) / 1.5, max(centers) * 1.5, samples)
+    rms: dict[str, list[float]] = {}
+    for at in nu:
+        for name, maps in observe_components(sky, [Bandpass.delta(at)]).items():
+            rms.setdefault(name, []).append(_rms(np.asarray(maps[0])))
+    if axes is None:
+        axes = plt.subplots(figsize=(COLUMN, 3.0), layout="constrained")[1]
+    for (name, values), color in zip(rms.items(), itertools.cycle(COLORS[:6])):
+        axes.plot(nu, values, color=color, label=plain(name))
+    if cmb_rms is not None:
+        axes.plot(nu, cmb_rms * np.asarray(cmb_derivative(nu)), "--", color=COLORS[6], label="CMB")
+    for band in bands.values():
+        inside = np.asarray(band.nu)[np.asarray(band.weights) >= band.weights.max() / 2]
+        axes.axvspan(inside[0], inside[-1], color="0.5", alpha=0.2, zorder=0)
+    axes.set(xscale="log", yscale="log", xlim=(nu[0], nu[-1]), xlabel="frequency [GHz]")
+    axes.set_ylabel(f"rms [{UNITS['uK_RJ']}]")
+    round_numbers(axes.xaxis)
+    axes.legend(frameon=False)
+    return axes
+
+
+def _rms(maps: np.ndarray) -> float:
+    """Return the rms of P, or of I where maps (stokes, pix) have nothing else."""
+    return float(np.sqrt((maps[-2:] ** 2).sum(axis=0).mean()))
 
 
 def plot_chains(

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from fits.grid import grid_fit
     from fits.multipoles import harmonic_coefficients, harmonic_likelihood
     from fits.optimize import Newton, best_fit
+    from fits.plots import plot_sed
     from fits.posterior import Gaussian, Uniform, chi2
     from fits.profile_likelihood import spectral_likelihood
     from fits.pseudo_cl import band_powers, bin_edges, masked_spectra

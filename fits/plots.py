@@ -1,12 +1,13 @@
 """Draw what all pictures share: style, panels, titles, symbols, maps and spectra."""
 
+import itertools
 import re
 import textwrap
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import healpy
 import matplotlib as mpl
@@ -18,10 +19,14 @@ from matplotlib.axis import Axis
 
 from fits.results import FitResult
 from jaxsky.arrays import STOKES
+from jaxsky.bandpass import Bandpass
 from jaxsky.components import parameter_declaration
 from jaxsky.io import whole
 from jaxsky.io.stacks import Maps, ranges
+from jaxsky.sed import cmb_derivative
+from jaxsky.sky import Sky, observe_components
 
+T = TypeVar("T")
 #: A map of the full sky.
 Map: TypeAlias = Float[np.ndarray, " pix"]
 STYLE: Any = {
@@ -35,7 +40,11 @@ STYLE: Any = {
 }
 #: Okabe & Ito's colours, which the colour-blind can tell apart.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222")
-TRUTH = {"color": COLORS[3], "linewidth": 1.2}
+TRUTH = {"color": COLORS[3], "linewidth": 0.9}
+#: What pictures are written as, besides PNG, if matplotlib's `savefig.format` says so.
+VECTOR_FORMATS = ("pdf", "svg")
+#: Said below maps whose colours are not linear.
+SCALE = "colour scales with unequal ticks: linear between the inner ticks, logarithmic beyond"
 #: Width of a column of a paper [inch].
 COLUMN = 3.5
 #: Largest nside of a map that is drawn.
@@ -58,6 +67,17 @@ def plain(text: str) -> str:
     A thin space goes before an underscore, since legends omit labels that begin with one.
     """
     return ("\N{THIN SPACE}" if text.startswith("_") else "") + text.replace("$", r"\$")
+
+
+def band_title(name: str) -> str:
+    """Return a band's name as it is drawn, with GHz if it is a number."""
+    return plain(f"{name} GHz" if name.replace(".", "", 1).isdigit() else name)
+
+
+def pages(stem: str, bands: Sequence[T], most: int) -> dict[str, Sequence[T]]:
+    """Return file names of pictures, `stem.png`, `stem_2.png`, ..., and what each shows."""
+    parts = [bands[i : i + most] for i in range(0, len(bands), most)]
+    return {f"{stem}_{n}.png" if n > 1 else f"{stem}.png": p for n, p in enumerate(parts, 1)}
 
 
 def in_formula(text: str) -> str:
@@ -87,20 +107,27 @@ def draw_title(figure: plt.Figure, title: str, fontsize: float = 9, **options: A
     """Write a title literally above a figure; each of its lines is wrapped to at most three."""
     # A letter is some 0.55 times as wide as high, in points of 1/72 inch.
     letters = int(figure.get_figwidth() * 72 / (0.55 * fontsize))
-    lines = [textwrap.fill(line, letters, max_lines=3) for line in title.splitlines()]
+    lines = [textwrap.fill(line, letters, max_lines=3) for line in title.strip().splitlines()]
     figure.suptitle(plain("\n".join(lines)), fontsize=fontsize, **options)
 
 
 def save(figure: plt.Figure, path: Path) -> None:
-    """Write a figure as PNG, atomically, and close it."""
+    """Write a figure as PNG, atomically, and close it.
+
+    Where matplotlib's own settings say `savefig.format: pdf` (in a file `matplotlibrc` of the
+    working folder, for example), or svg, that is written next to it.
+    """
+    wanted = str(mpl.rcParams["savefig.format"])
+    forms = ["png", *(form for form in VECTOR_FORMATS if form == wanted)]
     # A constrained layout fits already; cropping would draw it once more.
     box = None if figure.get_layout_engine() is not None else "tight"
-    with (
-        whole(path) as beside,
-        plt.rc_context({"savefig.bbox": box}),
-        warnings.catch_warnings(action="ignore", category=UserWarning),  # glyphs a font lacks
-    ):
-        figure.savefig(beside, format="png")
+    for form in forms:
+        with (
+            whole(path.with_suffix(f".{form}")) as beside,
+            plt.rc_context({"savefig.bbox": box}),
+            warnings.catch_warnings(action="ignore", category=UserWarning),  # glyphs a font lacks
+        ):
+            figure.savefig(beside, format=form)
     plt.close(figure)
 
 
@@ -195,9 +222,9 @@ class MapPanel(NamedTuple):
 def stokes_panels(
     name: str, maps: Sequence[Map], limit: float, unit: str, middle: float | None = None
 ) -> list[MapPanel]:
-    """Return panels of the Stokes parameters."""
+    """Return panels of the Stokes parameters; the name may hold formulas, see `plain`."""
     return [
-        MapPanel(plain(f"{name}: {stokes}"), values, f"{stokes} [{UNITS[unit]}]", middle, limit)
+        MapPanel(f"{name}: {stokes}", values, f"{stokes} [{UNITS[unit]}]", middle, limit)
         for values, stokes in zip(maps, STOKES[len(maps)], strict=True)
     ]
 
@@ -219,12 +246,14 @@ def thinned(maps: Maps, rows: Sequence[int]) -> np.ndarray:
 def plot_maps(path: Path, rows: Sequence[Sequence[MapPanel]], title: str = "") -> None:
     """Draw maps of the sky in rows and columns."""
     columns = len(rows[0])
-    size = columns * COLUMN, len(rows) * MAP_HEIGHT + (0.4 if title else 0.0)
+    size = columns * COLUMN, len(rows) * MAP_HEIGHT + (0.6 if title else 0.2)
     with draw_panels(path, title, size, len(rows), columns) as panels:
         for axes, panel in zip(panels.flat, (one for row in rows for one in row), strict=True):
             limit = panel.limit or color_limit(panel.values - (panel.middle or 0.0))
             draw_map(axes, panel.values, limit, panel.label, panel.middle)
             axes.set_title(panel.title)
+        if any(panel.middle is None for row in rows for panel in row):
+            panels[0, 0].figure.supxlabel(SCALE, fontsize=7)
 
 
 def draw_patch(
@@ -284,6 +313,53 @@ def draw_spectra(
     round_numbers(axes.xaxis, (1, 3))
     axes.set_xlabel(r"multipole $\ell$")
     axes.set_ylabel(rf"$\ell(\ell+1)C_\ell/2\pi$ [{UNITS[unit]}$^2$]")
+
+
+def plot_sed(
+    sky: Sky,
+    bands: Mapping[str, Bandpass],
+    cmb_rms: float | None = None,
+    axes: Axes | None = None,
+    samples: int = 60,
+) -> Axes:
+    """Draw the rms of each component against frequency, with the bands shaded; return the axes.
+
+    The rms over the pixels is that of sqrt(Q^2 + U^2) where the sky has Q and U, else that of I,
+    in uK_RJ, at `samples` frequencies from 2/3 of the lowest to 3/2 of the highest band's centre.
+    A band is shaded where its weight is half the largest at least. `cmb_rms` [uK_CMB] adds the CMB.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If `sky` is no Sky, or `bands` is not at least one Bandpass by name.
+    """
+    if not isinstance(bands, Mapping) or not bands:
+        raise ValueError("Argument `bands` must be at least one Bandpass by name.")
+    centers = [float(band.center) for band in bands.values()]
+    nu = np.geomspace(min(centers) / 1.5, max(centers) * 1.5, samples)
+    rms: dict[str, list[float]] = {}
+    for at in nu:
+        for name, maps in observe_components(sky, [Bandpass.delta(at)]).items():
+            rms.setdefault(name, []).append(_rms(np.asarray(maps[0])))
+    if axes is None:
+        axes = plt.subplots(figsize=(COLUMN, 3.0), layout="constrained")[1]
+    for (name, values), color in zip(rms.items(), itertools.cycle(COLORS[:6])):
+        axes.plot(nu, values, color=color, label=plain(name))
+    if cmb_rms is not None:
+        axes.plot(nu, cmb_rms * np.asarray(cmb_derivative(nu)), "--", color=COLORS[6], label="CMB")
+    for band in bands.values():
+        inside = np.asarray(band.nu)[np.asarray(band.weights) >= band.weights.max() / 2]
+        axes.axvspan(inside[0], inside[-1], color="0.5", alpha=0.2, zorder=0)
+    axes.set(xscale="log", yscale="log", xlim=(nu[0], nu[-1]), xlabel="frequency [GHz]")
+    axes.set_ylabel(f"rms [{UNITS['uK_RJ']}]")
+    round_numbers(axes.xaxis)
+    axes.legend(frameon=False)
+    return axes
+
+
+def _rms(maps: np.ndarray) -> float:
+    """Return the rms of P, or of I where maps (stokes, pix) have nothing else."""
+    return float(np.sqrt((maps[-2:] ** 2).sum(axis=0).mean()))
 
 
 def plot_chains(

@@ -82,6 +82,13 @@ def common_holes(maps: Sequence[Bool[np.ndarray, " pix"]]) -> dict[int, np.ndarr
     return {n: kept(n) for n in {healpy.npix2nside(used.size) for used in maps} if holed}
 
 
+def region_title(settings: Experiment, name: str) -> str:
+    """Return a region's name, and the latitudes it is made of if it says them: for titles."""
+    region = settings.regions[name]
+    said = None if isinstance(region, MapFile) else parse_region(region)
+    return f"{name}: {region} deg" if said else name
+
+
 def region_words(settings: Experiment, name: str) -> str:
     """Return words for a region, to follow "in" in a sentence."""
     region = settings.regions[name]

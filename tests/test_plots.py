@@ -8,8 +8,21 @@ mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 
+import fits
+import jaxsky
 from fits.commands.fit import _drawable, plot_marginals, plot_posterior
-from fits.plots import color_limit, draw_title, in_formula, label, plain, plot_chains, save
+from fits.commands.run import with_vectors
+from fits.plots import (
+    band_title,
+    color_limit,
+    draw_title,
+    in_formula,
+    label,
+    pages,
+    plain,
+    plot_chains,
+    save,
+)
 from fits.results import FitResult, with_errors
 from fits.spectral_index import RegionFit
 from refusals import cases
@@ -95,3 +108,59 @@ def test_chains_of_any_name_are_drawn(tmp_path):
     )
     plot_chains(tmp_path / "chains.png", {"$x_$ [/]": result, "b": result}, None, "$x_$")
     assert (tmp_path / "chains.png").exists()
+
+
+def test_many_bands_are_spread_over_pictures():
+    bands = [f"{nu}" for nu in range(7)]
+    assert pages("maps", bands, 3) == {
+        "maps.png": bands[:3],
+        "maps_2.png": bands[3:6],
+        "maps_3.png": bands[6:],
+    }
+    assert pages("maps", [], 3) == {}
+
+
+@pytest.mark.parametrize(("name", "drawn"), [("44", "44 GHz"), ("44.5", "44.5 GHz"), ("W", "W")])
+def test_bands_are_named_with_their_unit(name, drawn):
+    assert band_title(name) == drawn
+
+
+@pytest.mark.parametrize(("form", "head"), [("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_matplotlib_settings_ask_for_vector_pictures(tmp_path, form, head):
+    with mpl.rc_context({"savefig.format": form}):
+        save(plt.figure(), tmp_path / "maps_1.png")
+    assert (tmp_path / f"maps_1.{form}").read_bytes().startswith(head)
+    assert (tmp_path / "maps_1.png").read_bytes().startswith(b"\x89PNG")
+    save(plt.figure(), tmp_path / "other.png")
+    assert [path.name for path in tmp_path.glob("other.*")] == ["other.png"]
+
+
+def test_vector_pictures_are_results_too():
+    found = with_vectors(("result.json", "maps_*.png"))
+    assert found == ("result.json", "maps_*.png", "maps_*.pdf", "maps_*.svg")
+
+
+def test_the_picture_of_seds_has_the_rms_of_each_component():
+    """P of a template with Q = 3 and U = 4 has an rms of 5 at the reference frequency."""
+    maps = np.ones((2, 12)) * np.array([[3.0], [4.0]])
+    sky = jaxsky.Sky({"synchrotron": jaxsky.Synchrotron(maps, beta_syn=3.0, nu_ref=40.0)})
+    bands = {"40": jaxsky.Bandpass.top_hat(40.0, 8.0), "90": jaxsky.Bandpass.delta(90.0)}
+    axes = plt.figure().subplots()
+    assert fits.plot_sed(sky, bands, cmb_rms=2.0, axes=axes, samples=5) is axes
+    synchrotron, cmb = axes.lines
+    nu = synchrotron.get_xdata()
+    np.testing.assert_allclose(nu[[0, -1]], [40 / 1.5, 90 * 1.5])
+    np.testing.assert_allclose(synchrotron.get_ydata(), 5 * (nu / 40) ** -3, rtol=1e-6)
+    x = 6.62607015e-34 * nu * 1e9 / (1.380649e-23 * 2.72548)
+    expected = 2 * x**2 * np.exp(x) / np.expm1(x) ** 2
+    np.testing.assert_allclose(cmb.get_ydata(), expected, rtol=1e-6)
+    assert len(axes.patches) == 2
+    shaded = axes.patches[0].get_extents().transformed(axes.transData.inverted())
+    np.testing.assert_allclose([shaded.x0, shaded.x1], [36, 44], rtol=1e-6)
+    plt.close(axes.figure)
+
+
+def test_the_picture_of_seds_needs_bands():
+    sky = jaxsky.Sky({"synchrotron": jaxsky.Synchrotron(np.ones((2, 12)))})
+    with pytest.raises(ValueError, match="`bands` must be at least one Bandpass by name"):
+        fits.plot_sed(sky, {})

@@ -19,7 +19,7 @@ from fits.discs import PatchComparison, compare_patches
 from fits.inputs import inputs_of
 from fits.patches import PatchFits
 from fits.pseudo_cl import FIELDS, SPECTRA
-from fits.regions import region_masks
+from fits.regions import region_masks, region_title
 from fits.results import probability, with_error
 from jaxsky.arrays import STOKES
 from jaxsky.checks import listed
@@ -34,8 +34,8 @@ POWER = rf"$D_\ell$ [{UNIT}$^2$]"
 MULTIPOLE = r"multipole $\ell$"
 #: Largest nside of the maps that are drawn.
 NSIDE = 32
-#: Panels per row.
-COLUMNS = 3
+#: Panels per row, and bands in one picture.
+COLUMNS, MOST_BANDS = 3, 6
 #: Label, C_l of all spectra, and style.
 Curve = tuple[str, np.ndarray, dict[str, Any]]
 #: Patches in a picture: name, which are shown, and x and y, each a fit and EE (0) or BB (1).
@@ -134,7 +134,7 @@ def plot_scatter(
                 axes = grid[many * (i // COLUMNS) + s, i % COLUMNS]
                 both = (comparison.model, comparison.prepared.data)
                 x, y = (np.asarray(maps[names.index(band), s])[pixels] for maps in both)
-                axes.set_title(plots.plain(f"{band}: {stokes}"))
+                axes.set_title(f"{plots.band_title(band)}: {stokes}")
                 _draw_scatter(axes, comparison.scatters[band, region, stokes], x, y)
         for axes in grid[-many:, (len(bands) - 1) % COLUMNS + 1 :].flat:
             axes.set_visible(False)
@@ -145,7 +145,7 @@ def plot_scatter(
 
 def _draw_scatter(axes: Axes, scatter: Scatter, x: np.ndarray, y: np.ndarray) -> None:
     ends = np.array([f(np.quantile(v, q) for v in (x, y)) for f, q in ((min, 0.001), (max, 0.999))])
-    line = ends + 0.15 * (ends[1] - ends[0]) * np.array([-1, 1])
+    line = ends + 0.05 * (ends[1] - ends[0]) * np.array([-1, 1])
     axes.hexbin(x, y, gridsize=45, extent=(*line, *line), bins="log", cmap="Greys", lw=0)
     axes.plot(line, line, color="k", lw=1.0, label="one to one")
     axes.plot(line, scatter.slope * line, "--", color=plots.COLORS[1], lw=1.4, label="slope")
@@ -160,9 +160,10 @@ def _draw_scatter(axes: Axes, scatter: Scatter, x: np.ndarray, y: np.ndarray) ->
 def plot_model_maps(
     path: Path, comparison: Comparison, stokes: str, bands: Sequence[str], title: str
 ) -> None:
-    """Draw observed maps next to the model, on the same colour scale (the paper's fig. 6).
+    """Draw observed maps, the model on the same colour scale, and their difference (fig. 6).
 
-    One row per band, two columns per letter of `stokes`, such as "QU"; in pixels of nside 32.
+    One row per band, three columns per letter of `stokes`, such as "QU"; in pixels of nside 32.
+    Colours of the difference are linear to three times its standard deviation.
     """
     nside = min(NSIDE, healpy.npix2nside(comparison.prepared.used.size))
     names, rows = list(comparison.prepared.bands), []
@@ -182,9 +183,15 @@ def plot_model_maps(
             limit, slope = plots.color_limit(model[s]), with_error(scatter.slope, scatter.error)
             head = f"model; slope {slope}, r = {scatter.correlation:.2f} ({region})"
             row += [
-                plots.MapPanel(plots.plain(words), values[s], UNIT, limit=limit)
-                for words, values in ((f"{band}: {kind} observed", observed), (head, model))
+                plots.MapPanel(words, values[s], UNIT, limit=limit)
+                for words, values in (
+                    (f"{plots.band_title(band)}: {kind} observed", observed),
+                    (plots.plain(head), model),
+                )
             ]
+            left = observed[s] - model[s]
+            spread = 3 * float(np.nanstd(left)) or None
+            row.append(plots.MapPanel("observed - model", left, UNIT, 0.0, spread))
         rows.append(row)
     plots.plot_maps(path, rows, title)
 
@@ -229,12 +236,12 @@ def _draw_spectrum(axes: Axes, spectra: BandSpectra, index: int) -> None:
     chi2, pte = f"{spectra.chi2[index]:.1f}", probability(spectra.pte[index])
     tested = rf"$\chi^2$ = {chi2} / {spectra.binned.shape[-1]} bins, PTE {pte}"
     name = SPECTRA[STOKES[len(spectra.pte)]][index]
-    axes.set_title(f"{plots.plain(spectra.band)}: {name}, {tested}")
+    axes.set_title(f"{plots.band_title(spectra.band)}: {name}, {tested}")
 
 
 def plot_leakage(path: Path, spectra: Sequence[BandSpectra], title: str) -> None:
     """Draw BB before and after leakage is subtracted, and noise (the paper's fig. 9)."""
-    with plots.draw_panels(path, title, (3.6 * len(spectra), 3.2), 1, len(spectra)) as grid:
+    with plots.draw_panels(path, title, (3.6 * len(spectra), 3.9), 1, len(spectra)) as grid:
         for axes, one in zip(grid[0], spectra, strict=True):
             assert one.uncorrected is not None  # as chosen by the caller
             assert one.pte_uncorrected is not None
@@ -246,8 +253,9 @@ def plot_leakage(path: Path, spectra: Sequence[BandSpectra], title: str) -> None
                 ("noise", one.noise, {"color": plots.COLORS[2], "ls": ":"}),
             ]
             _draw_curves(axes, curves, -1, 1.2)
-            axes.set(xlabel=MULTIPOLE, title=plots.plain(f"{one.band}: BB"))
-            axes.legend(frameon=False)
+            axes.set(xlabel=MULTIPOLE, title=f"{plots.band_title(one.band)}: BB")
+            handles = axes.get_legend_handles_labels()
+            axes.legend(*handles, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.2))
         grid[0, 0].set_ylabel(POWER)
 
 
@@ -324,15 +332,19 @@ def _work(settings: Experiment, command: Run) -> Report:
     found = compare(settings, prepared, regions, simulations, report, command.executor)
     numbers, warnings = _numbers(found), comparison_warnings(found, settings)
     bands, title = list(prepared.bands), settings.title
-    pictures: dict[str, tuple[Any, ...]] = {
-        f"scatter_{region}.png": (plot_scatter, found, region, bands, f"{title}\n{region}")
-        for region in regions
-    }
-    pictures |= {f"maps_{s}.png": (plot_model_maps, found, s, bands, title) for s in found.stokes}
-    if found.spectra:
-        pictures["spectra.png"] = plot_full_sky, found.spectra, title
-    if leaky := [s for s in found.spectra if s.uncorrected is not None]:
-        pictures["leakage.png"] = plot_leakage, leaky, title
+    pictures: dict[str, tuple[Any, ...]] = {}
+    for region in regions:
+        head = f"{title}\n{region_title(settings, region)}"
+        for name, some in plots.pages(f"scatter_{region}", bands, MOST_BANDS).items():
+            pictures[name] = plot_scatter, found, region, some, head
+    for s in found.stokes:
+        for name, some in plots.pages(f"maps_{s}", bands, MOST_BANDS).items():
+            pictures[name] = plot_model_maps, found, s, some, title
+    for name, shown in plots.pages("spectra", found.spectra, MOST_BANDS).items():
+        pictures[name] = plot_full_sky, shown, title
+    leaky = [s for s in found.spectra if s.uncorrected is not None]
+    for name, shown in plots.pages("leakage", leaky, COLUMNS).items():
+        pictures[name] = plot_leakage, shown, title
     if settings.compare.patches is not None:
         command.steps.step("patches")
         patches = compare_patches(settings, inputs)
@@ -343,5 +355,5 @@ def _work(settings: Experiment, command: Run) -> Report:
     return Report(inputs.description, [_table(found)], warnings, numbers, pictures)
 
 
-PICTURES = ("scatter_*.png", "maps_[IQU].png", "spectra.png", "leakage.png", "patches.png")
+PICTURES = ("scatter_*.png", "maps_[IQU]*.png", "spectra*.png", "leakage*.png", "patches.png")
 COMMAND = Command("compare", _work, ("comparison.json", "simulations.npz", *PICTURES))

@@ -12,7 +12,7 @@ from fits.commands.run import Command, Report, Run
 from fits.common import prepared_maps
 from fits.inputs import Inputs, inputs_of, unknown_noise
 from fits.plots import COLORS, TRUTH, draw_panels, label, legend_below, plain, plot_chains
-from fits.regions import region_masks
+from fits.regions import region_masks, region_title
 from fits.results import FitResult, with_errors
 from fits.spectral_index import RegionFit, all_free, fit_regions, known_truth
 from jaxsky.settings import WORDS, Experiment
@@ -256,12 +256,13 @@ def _work(settings: Experiment, command: Run) -> Report:
     command.begin()
     fits = fit_regions(settings, prepared, regions, command.out, command.steps)
     truth = known_truth(inputs, fits)
+    title = f"{settings.title}\n{', '.join(region_title(settings, r) for r in regions)}"
     return Report(
         inputs.description,
         [_table(fits, truth)],
         fit_warnings(inputs, settings, fits),
         fit_numbers(settings, fits, truth),
-        {name: (plot, fits, truth, settings.title) for name, plot in PICTURES.items()},
+        {name: (plot, fits, truth, title) for name, plot in PICTURES.items()},
         sorted(command.out.glob(CHAINS)),
     )
 

@@ -269,36 +269,39 @@ def forecast_warnings(found: Forecast) -> list[str]:
 def plot_b_modes(path: Path, found: Forecast, settings: Experiment) -> None:
     """Draw BB of foregrounds and noise in some bands, against primordial BB."""
     lmax = settings.forecast.lmax
-    with plots.draw_panels(path, "", (plots.COLUMN, 3.9)) as panels:
+    shown, known = len(found.powers), len(found.inputs.bands)
+    title = f"{settings.title}\nB modes" + (f", {shown} of {known} bands" if shown < known else "")
+    with plots.draw_panels(path, title.strip(), (plots.COLUMN, 4.3), fontsize=8) as panels:
         axes = panels[0, 0]
         for (name, powers), color in zip(found.powers.items(), plots.COLORS, strict=False):
             BB = np.where(powers[1] > 0, powers[1], np.nan)
-            title = plots.plain(f"{name} GHz" if name.isdigit() else name)
+            title = plots.band_title(name)
             axes.loglog(found.spectra.centers, BB, color=color, lw=1.8, label=title)
             noise = fisher.noise_weights(found.inputs.bands[name], lmax) ** -2
-            axes.loglog(*plots.with_powers(noise), color=color, lw=0.7)
-        axes.loglog(*plots.with_powers(found.lensed[2, : lmax + 1]), color=LENSING, lw=1.2)
+            axes.loglog(*plots.with_powers(noise), color=color, lw=0.8)
+        lensing = {"color": LENSING, "lw": 3.0, "alpha": 0.5, "zorder": 1}  # noise may lie on it
+        axes.loglog(*plots.with_powers(found.lensed[2, : lmax + 1]), **lensing)
         bottom = 1.0
         for r, dashes in zip(sorted(settings.forecast.show_r, reverse=True), DASHES, strict=False):
             ell, primordial = plots.with_powers(r * found.tensors[2, : lmax + 1])
             axes.loglog(ell, primordial, color="k", ls=dashes, lw=1.1, label=f"$r = {r:g}$")
             bottom = min(bottom, primordial[: min(100, len(ell))].min())
-        axes.plot([], [], color=LENSING, lw=1.2, label="lensing")
-        axes.plot([], [], color="k", lw=0.7, label="noise (thin)")
+        axes.plot([], [], **lensing, label="lensing")
+        axes.plot([], [], color="k", lw=0.8, label="noise (thin)")
         plots.label_b_modes(axes, 2, lmax, 3)
         axes.set_ylim(bottom=bottom / 2)
         plots.round_numbers(axes.xaxis)
 
 
-def plot_errors(path: Path, found: Forecast) -> None:
+def plot_errors(path: Path, found: Forecast, settings: Experiment) -> None:
     """Draw values with errors and their correlations, without those of foreground spectra in l."""
     errors = found.errors
     names = [n for n in errors.free if not n.startswith(("EE.", "BB."))] or errors.free
     count = len(names)
     matrix = np.array([[errors.correlation(a, b) for b in names] for a in names])
     matrix[np.triu_indices(count)] = np.nan
-    height = 0.75 + (plots.COLUMN - 1.9) / max(count, 3) * count
-    with plots.draw_panels(path, "", (plots.COLUMN, height)) as panels:
+    height = 1.1 + (plots.COLUMN - 1.9) / max(count, 3) * count
+    with plots.draw_panels(path, settings.title, (plots.COLUMN, height), fontsize=8) as panels:
         axes = panels[0, 0]
         axes.imshow(matrix, cmap="RdBu_r", vmin=-1.3, vmax=1.3, aspect="auto")
         for (row, column), value in np.ndenumerate(matrix):
@@ -342,7 +345,7 @@ def _work(settings: Experiment, command: Run) -> Report:
         _tables(found),
         [*forecast_warnings(found), *settings.left_out("forecast")],
         _numbers(found, settings),
-        {"bb.png": (plot_b_modes, found, settings), "fisher.png": (plot_errors, found)},
+        {"bb.png": (plot_b_modes, found, settings), "fisher.png": (plot_errors, found, settings)},
     )
 
 

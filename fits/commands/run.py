@@ -113,6 +113,14 @@ class Run(NamedTuple):
         self.steps.keep(self.log)
 
 
+def with_vectors(results: Sequence[str]) -> tuple[str, ...]:
+    """Return file names of results, and for each picture those of its vector formats."""
+    from fits.plots import VECTOR_FORMATS  # slow to import
+
+    pictures = [name.removesuffix("png") for name in results if name.endswith(".png")]
+    return (*results, *(stem + form for stem in pictures for form in VECTOR_FORMATS))
+
+
 class Command(NamedTuple):
     """A command; its name is also that of its default experiment file.
 
@@ -169,12 +177,13 @@ def run_command(
             )
 
         mpl.use("Agg")  # pictures go to files
-        guard = results_folder(out, command.results, resume=resume, overwrite=overwrite, part=part)
+        results = with_vectors(command.results)
+        guard = results_folder(out, results, resume=resume, overwrite=overwrite, part=part)
         folder, owner = job.of_first(lambda: (stack.enter_context(guard), os.getpid()))
         if count > 1:
             files.writer = f"{owner}-{job.index()}"
         running = Run(
-            settings, out, bool(resume), overwrite, command.results, folder, steps, part, executor
+            settings, out, bool(resume), overwrite, results, folder, steps, part, executor
         )
         report = command.work(settings, running)
         table = settings.simulate if command.name == "simulate" else settings.common

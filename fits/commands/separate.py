@@ -25,7 +25,7 @@ UNLIKELY = 1e-3
 LEAKED = 0.5
 #: Number of bands whose residuals are drawn.
 SHOWN = 4
-CLEANED, NOISE, RESIDUAL, LEFT, LENSING, TRUTH = (*plots.COLORS[:4], "0.5", plots.COLORS[3])
+CLEANED, NOISE, RESIDUAL, LEFT, LENSING = (*plots.COLORS[:4], "0.5")
 
 
 def _numbers(found: Separation, settings: Experiment) -> dict[str, Any]:
@@ -256,7 +256,7 @@ def plot_components(path: Path, found: Separation, settings: Experiment) -> None
     for name, maps in zip(names, plots.thinned(found.maps, range(len(names))), strict=True):
         component = found.like.mixing.sky[name]
         nu_ref = getattr(component, "nu_ref", None)
-        title = "CMB" if name == "cmb" else name
+        title = "CMB" if name == "cmb" else plots.plain(name)
         title += "" if nu_ref is None else f", {float(nu_ref):g} GHz"
         rows.append(plots.stokes_panels(title, maps, plots.color_limit(maps), component.unit))
     plots.plot_maps(path, rows, settings.title)
@@ -268,9 +268,10 @@ def plot_residuals(path: Path, found: Separation, settings: Experiment) -> None:
     shown = plots.spread(names, SHOWN)
     drawn = plots.thinned(found.residuals, [names.index(name) for name in shown])
     for name, maps in zip(shown, drawn, strict=True):
-        limit = 3 * float(np.nanstd(maps))
-        rows.append(plots.stokes_panels(f"{name}, data less components", maps, limit, unit, 0.0))
-    plots.plot_maps(path, rows, settings.title)
+        limit, band = 3 * float(np.nanstd(maps)), plots.band_title(name)
+        rows.append(plots.stokes_panels(f"{band}, data less components", maps, limit, unit, 0.0))
+    some = f"\n{len(shown)} of {len(names)} bands" if len(shown) < len(names) else ""
+    plots.plot_maps(path, rows, settings.title + some)
 
 
 def plot_parameters(path: Path, found: Separation, settings: Experiment) -> bool:
@@ -341,7 +342,7 @@ def plot_ratio(path: Path, found: Separation, settings: Experiment) -> bool:
         marker: Any = {"fmt": "o", "color": "k", "ms": 3.5, "lw": 1.2, "capsize": 2}
         axes.errorbar(r, 1.12, xerr=sigma, label=f"estimate {with_error(r, sigma)}", **marker)
         if (known := (found.data.truth or {}).get("r")) is not None:
-            axes.axvline(known, color=TRUTH, lw=1.6, label="truth")
+            axes.axvline(known, **plots.TRUTH, label="truth")
         shown = grid[posterior > 2e-3].max()
         axes.set(
             xlim=(min(0.0, r - 1.3 * sigma), max(shown, r + 1.5 * sigma)),

@@ -10,7 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from fits.commands.run import Report, Run
-from fits.plots import UNITS, color_limit, draw_map, draw_panels, draw_spectra, plain, spread
+from fits.plots import (
+    UNITS,
+    band_title,
+    color_limit,
+    draw_map,
+    draw_panels,
+    draw_spectra,
+    spread,
+)
 from fits.pseudo_cl import SPECTRA
 from jaxsky import experiment, montecarlo
 from jaxsky.harmonics import analysis, power_spectrum
@@ -89,7 +97,7 @@ def _draw_sheet(path: Path, files: Mapping[str, Path], lmax: int, settings: Expe
             for axes, values, which in zip(row, maps, stokes, strict=True):
                 limit = color_limit(maps[:1] if which == "I" else maps[-2:])
                 draw_map(axes, values, limit, UNITS[unit])
-                axes.set_title(plain(f"{name}: {which}"))
+                axes.set_title(f"{band_title(name)}: {which}")
         for index, (axes, which) in enumerate(zip(panels[-1], SPECTRA[stokes], strict=True)):
             draw_spectra(axes, {n: s[index] for n, s in spectra.items()}, unit)
             axes.set_title(which)

@@ -21,7 +21,7 @@ RANGES = {
 }
 #: Units in the headers; PySM's settings have their own for the older files.
 UNITS = {"map_mbb_temperature": "K", "map_layers": "MJy/sr", "map_I": "uK_RJ"}
-COMPILED = ("dust", "dust_layers", "power_law", "spdust", "websky")
+COMPILED = ("interpolating", "dust", "dust_layers", "power_law", "spdust", "websky")
 CARBON_MONOXIDE = {"HFI_CompMap_CO-Type1": "_R2.00_ring", "mcmoleCO_HGL": ""}
 PRESETS = pysm3.sky.PRESET_MODELS
 
@@ -51,6 +51,14 @@ def write_others(folder: Path, nside: int = NSIDE, dtype: Any = float) -> None:
     for name, number in columns.items():
         maps = rng.uniform(0.1, 1.0, (number, npix)) * 1e-6
         save(folder / name, maps, dtype, "K_CMB")
+    for model in ("cib1", "rg1"):
+        kind = "cib" if model == "cib1" else "radio"
+        for nu in pysm3.Sky(1, preset_strings=[model]).components[0].freqs:
+            name = f"websky/0.4/{kind}/{kind}_{nu:06.1f}.fits"
+            save(folder / name, rng.uniform(0.1, 1.0, (1, npix)), dtype, "MJy/sr")
+    for nu in PRESETS["rg3"]["freqs"]:
+        name = PRESETS["rg3"]["path"].format(nside=2048)
+        save(folder / f"{name}/{nu:05.1f}.fits", rng.uniform(1, 2, (3, npix)), dtype, "uK_RJ")
     # Temperature, its error, index and its error are columns 3, 5, 6 and 8.
     middle = np.array([0, 0, 0, 20.0, 0, 0.5, 1.55, 0, 0.05])[:, None]
     commander = middle * rng.uniform(0.9, 1.1, (9, npix))

@@ -19,7 +19,7 @@ from jaxsky.io import InputError, MissingFileError
 from jaxsky.pysm import units
 from jaxsky.pysm.files import URL, find_template
 from jaxsky.pysm.presets import preset_settings, pysm_presets
-from pysm_files import NSIDE, PRESETS, uncompiled, write_others, write_templates
+from pysm_files import NSIDE, PRESETS, save, uncompiled, write_others, write_templates
 from refusals import cases, raises, refused
 
 __all__ = ["uncompiled"]
@@ -29,8 +29,9 @@ DONE = ["d0", "d1", "d2", "d3", "d4", "d9", "d10", "d12"]
 DONE += ["s0", "s1", "s2", "s3", "s4", "s5", "s7", "f1"]
 DONE += ["d5", "d7", "d8", "a1", "a2", "c2", "c3", "c4", "co1", "co2", "co3", "dip1", "dip2"]
 DONE += ["ksz1", "ksz2", "ksz3", "ksz5", "ksz6", "tsz1", "tsz2", "tsz3", "tsz4"]
+DONE += ["cib1", "rg1", "rg3"]
 #: Those that are not, which is said by name.
-REFUSED = ["d11", "s6", "c1", "cib1", "rg1", "rg2", "rg3"]
+REFUSED = ["d11", "s6", "c1", "rg2"]
 #: Frequencies and weights [GHz]; none is a reference frequency of I of dust, see below.
 BANDS = {
     "one": (217.0, None),
@@ -65,7 +66,12 @@ def agrees(ours, theirs):
 
 
 def emission(sky, name, nu, weights):
-    """PySM's; the sum of that at each frequency where it fails over bands."""
+    """PySM's; the sum of that at each frequency where it fails over bands.
+
+    With the beam that maps have, PySM needs to be told that it is wanted.
+    """
+    if name == "rg3":
+        return sky.get_emission(nu, weights, fwhm=5.1 * u.arcmin)
     if name not in ("d5", "d7", "d8") or nu.isscalar:
         return sky.get_emission(nu, weights)
     with pytest.raises(u.UnitsError):
@@ -109,7 +115,7 @@ def test_settings_of_presets_are_those_of_pysm():
             for key, value in own.items():
                 if key == "max_nside" or (key, value) == ("unit_mbb_temperature", "K"):
                     continue
-                if key.startswith("freq") and not value.endswith(".fits"):
+                if key.startswith("freq_") and not value.endswith(".fits"):
                     frequencies = [u.Quantity(x).to_value(u.GHz) for x in (found[key], value)]
                     assert frequencies[0] == pytest.approx(frequencies[1], rel=1e-15)
                 elif key == "map_layers":
@@ -206,6 +212,52 @@ def test_settings_in_pysms_format(tmp_path):
     mixed = pysm.Sky(component_objects=parts)
     agrees(mixed.get_emission(*band("uneven")), theirs)
     raises(ValueError, "PowerLaw is no component of jaxsky", mixed.sky)
+
+
+@pytest.mark.usefixtures("uncompiled", "folder")
+def test_maps_between_frequencies(folder, tmp_path):
+    """At a frequency between two maps and close to one, over many, and what is behind."""
+    ours, theirs = (module.Sky(NSIDE, preset_strings=["cib1"]) for module in (pysm, pysm3))
+    for nu in (95.0, 217.001, 17.0, 1080.0, np.linspace(17.0, 1080.0, 7)):
+        agrees(ours.get_emission(nu * u.GHz), theirs.get_emission(nu * u.GHz))
+    behind = ours.sky()
+    assert list(behind)[:3] == ["cib1_0", "cib1_1", "cib1_10"]
+    assert behind.shape == (3, 12 * NSIDE**2)
+    seen = jaxsky.observe_band(behind, jaxsky.Bandpass.delta(95.0))
+    np.testing.assert_allclose(seen, ours.get_emission(95.0 * u.GHz).value, rtol=1e-9)
+    local = pysm.WebSkyCIB(NSIDE, local_folder=folder)
+    np.testing.assert_array_equal(
+        local.get_emission(95 * u.GHz), ours.components[0].get_emission(95 * u.GHz)
+    )
+    for outside in (16.0 * u.GHz, [1000.0, 1081.0] * u.GHz):
+        with pytest.warns(UserWarning, match="has maps from 17 to 1080 GHz, so that it is zero"):
+            assert not ours.get_emission(outside).value.any()
+    # A folder of maps named by their frequencies, of I alone, with a closed form.
+    for nu in (100, 200):
+        save(tmp_path / f"{nu}.fits", np.full((1, 12 * NSIDE**2), nu / 100), float, "uK_RJ")
+    own = pysm.InterpolatingComponent(tmp_path, "uK_RJ", NSIDE)
+    found = own.get_emission(125 * u.GHz).value
+    np.testing.assert_allclose(found[0], 1.25, rtol=1e-7)
+    assert not found[1:].any()
+    raises(InputError, "no folder with maps", pysm.InterpolatingComponent, "nowhere", "uK_RJ", 4)
+    save(tmp_path / "many.fits", np.ones((1, 12)), float)
+    raises(InputError, "named by its frequency", pysm.InterpolatingComponent, tmp_path, "K_RJ", 4)
+
+
+@pytest.mark.usefixtures("uncompiled", "folder")
+def test_beams_of_maps_between_frequencies():
+    """That of the maps by default, and another one or other coordinates as PySM."""
+    ours, theirs = (pysm.Sky(16, preset_strings=["rg3"]), pysm3.Sky(16, preset_strings=["rg3"]))
+    ours, theirs = ours.components[0], theirs.components[0]
+    assert ours.beam == 5.1 * u.arcmin
+    nu = [90.0, 110.0] * u.GHz
+    plain = ours.get_emission(nu)
+    agrees(plain, theirs.get_emission(nu, fwhm=5.1 * u.arcmin))
+    np.testing.assert_array_equal(ours.get_emission(nu, fwhm=5.1 * u.arcmin), plain)
+    for options in ({"fwhm": 10 * u.deg}, {"fwhm": 10 * u.deg, "coord": ("G", "C")}):
+        options |= {"lmax": 20, "output_nside": 8}
+        agrees(ours.get_emission(nu, **options), theirs.get_emission(nu, **options))
+    raises(ValueError, "Argument `lmax` is missing", ours.get_emission, nu, fwhm=1 * u.deg)
 
 
 @pytest.mark.usefixtures("folder")

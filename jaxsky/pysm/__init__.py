@@ -6,6 +6,7 @@ templates that the user has, and `.sky()` the `jaxsky.Sky` behind it. PySM itsel
 
 from jaxsky.pysm.cmb import CMBDipole, CMBMap, SimpleSZ, WebSkyCMB
 from jaxsky.pysm.decorrelated import DecorrelatedModifiedBlackBody
+from jaxsky.pysm.interpolated import InterpolatingComponent, WebSkyCIB, WebSkyRadioGalaxies
 from jaxsky.pysm.lines import COLines
 from jaxsky.pysm.models import (
     CurvedPowerLaw,

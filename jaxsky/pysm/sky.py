@@ -10,6 +10,7 @@ import numpy as np
 from astropy import units as u
 
 import jaxsky.sky
+from jaxsky.bandpass import Bandpass
 from jaxsky.components import Component
 from jaxsky.io.files import InputError, check_file
 from jaxsky.public import takes_quantities
@@ -84,7 +85,18 @@ class Sky(Model):
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        return tuple(part for model in self.components for part in getattr(model, "parts", ()))
+        return tuple(part for model in self._models() for part in model.parts)
+
+    def parts_in(self, band: Bandpass) -> tuple[Part, ...]:
+        return tuple(part for model in self._models() for part in model.parts_in(band))
+
+    @property
+    def is_component(self) -> bool:
+        return any(True for _ in self._models())
+
+    def _models(self) -> Iterator[Model]:
+        """Yield the models that are components of jaxsky."""
+        yield from (one for one in self.components if getattr(one, "is_component", False))
 
     @takes_quantities
     def get_emission(self, freq: u.Quantity, weights: np.ndarray | None = None) -> u.Quantity:
@@ -101,9 +113,9 @@ class Sky(Model):
             For a frequency without a unit, and bands that `jaxsky.Bandpass` refuses.
         """
         factor = bandpass_unit_conversion(freq, weights, self.output_unit, unit_of("uK_RJ")).value
-        total = None
-        if parts := self.parts:
-            total = emission_of(parts, bandpass(freq, weights), factor) << self.output_unit
+        band, total = bandpass(freq, weights), None
+        if parts := self.parts_in(band):
+            total = emission_of(parts, band, factor) << self.output_unit
         for model in self._others():
             own = model.get_emission(freq, weights).value * factor << self.output_unit
             total = own if total is None else total + own
@@ -116,7 +128,7 @@ class Sky(Model):
         for model in self.components:
             if isinstance(model, Sky):
                 yield from model._others()
-            elif not getattr(model, "parts", ()):
+            elif not getattr(model, "is_component", False):
                 yield model
 
     def sky(self) -> jaxsky.sky.Sky:

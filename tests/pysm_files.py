@@ -8,6 +8,7 @@ import healpy
 import numpy as np
 import pysm3
 import pytest
+from astropy.io import fits as pyfits
 from pysm3 import models, utils
 
 NSIDE = 4
@@ -74,6 +75,45 @@ def write_others(folder: Path, nside: int = NSIDE, dtype: Any = float) -> None:
         table = 1e-25 * wavelengths ** -(5.5 + 0.1 * number) / np.expm1(x)
         rows = np.concatenate([wavelengths, x[:, :2], table, 0.1 * table ** (1.01)], axis=1)
         np.savetxt(folder / f"pysm_2/{name}.dat", rows, fmt="%.17e")
+
+
+#: Multipoles of coefficients of large scales and of maps that modulate, and of spectra.
+LARGE, SMALL = 6, 16
+#: Means of what is drawn, by the end of the name: map of index, of temperature, and of amplitudes.
+MEANS = {"mbb_index": 1.55, "mbb_temperature": 20.0, "pl_index": 0.05}
+
+
+def write_drawn(folder: Path) -> None:
+    """Write coefficients, spectra and maps of the models whose small scales are drawn."""
+    rng = np.random.default_rng(11)
+    for own in (PRESETS["d11"], PRESETS["s6"]):
+        for key, file in own.items():
+            if not str(file).endswith(".fits.gz"):
+                continue
+            path = folder / file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            rows = 3 if key in ("largescale_alm", "small_scale_cl") else 1
+            unit = "uK_RJ" if rows == 3 else "K" if key.endswith("temperature") else ""
+            if "_alm" in key:
+                alm = 0.05 * rng.normal(size=(2, rows, healpy.Alm.getsize(LARGE)))
+                alm = alm[0] + 1j * alm[1]
+                alm[:, : LARGE + 1] = alm[:, : LARGE + 1].real  # m = 0
+                alm[0, 0] = MEANS.get(key.partition("alm_")[2], 1.0) * np.sqrt(4 * np.pi)
+                healpy.write_alm(path, list(alm) if rows > 1 else alm[0], overwrite=True)
+            elif "_cl" in key:
+                unit = f"{unit}2" if unit else ""
+                cl = 1e-4 / np.arange(1, SMALL + 2) * np.array([1, 0.5, 0.4, 0.2])[:, None]
+                healpy.write_cl(path, cl if rows > 1 else cl[0], overwrite=True)
+            elif key == "galplane_fix":
+                unit = "uK_RJ"
+                plane = rng.uniform(0.1, 1.0, (4, healpy.nside2npix(NSIDE)))
+                healpy.write_map(path, plane, dtype=float, overwrite=True)
+            else:
+                maps = rng.uniform(0.9, 1.1, (2, healpy.nside2npix(NSIDE))) * [[1.5], [20.0]]
+                healpy.write_map(path, maps, dtype=float, overwrite=True)
+            pyfits.setval(path, "TUNIT1", value=unit, ext=1)
+            if key == "galplane_fix_beta_Td":
+                pyfits.setval(path, "TUNIT2", value="K", ext=1)
 
 
 def save(path: Path, maps: Any, dtype: Any, unit: str = "") -> None:

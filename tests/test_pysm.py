@@ -19,7 +19,7 @@ from jaxsky.io import InputError, MissingFileError
 from jaxsky.pysm import units
 from jaxsky.pysm.files import URL, find_template
 from jaxsky.pysm.presets import preset_settings, pysm_presets
-from pysm_files import NSIDE, PRESETS, save, uncompiled, write_others, write_templates
+from pysm_files import NSIDE, PRESETS, save, uncompiled, write_drawn, write_others, write_templates
 from refusals import cases, raises, refused
 
 __all__ = ["uncompiled"]
@@ -31,7 +31,9 @@ DONE += ["d5", "d7", "d8", "a1", "a2", "c2", "c3", "c4", "co1", "co2", "co3", "d
 DONE += ["ksz1", "ksz2", "ksz3", "ksz5", "ksz6", "tsz1", "tsz2", "tsz3", "tsz4"]
 DONE += ["cib1", "rg1", "rg3"]
 #: Those that are not, which is said by name.
-REFUSED = ["d11", "s6", "c1", "rg2"]
+REFUSED = ["c1", "rg2"]
+#: Another sky each time that they are made, or in each call.
+DRAWN = ["d6", "d11", "s6"]
 #: Frequencies and weights [GHz]; none is a reference frequency of I of dust, see below.
 BANDS = {
     "one": (217.0, None),
@@ -46,6 +48,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pysm")
     write_templates(folder, DONE)
     write_others(folder)
+    write_drawn(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYSM_LOCAL_DATA", str(folder))
         yield folder
@@ -96,8 +99,8 @@ def test_presets_agree_with_pysm(name):
 
 
 def test_all_of_pysms_presets_are_there_or_refused_by_name():
-    assert set(pysm_presets()) == {*DONE, "d6"}
-    assert {*REFUSED, *DONE, "d6"} == set(PRESETS)
+    assert set(pysm_presets()) == {*DONE, *DRAWN}
+    assert {*REFUSED, *DONE, *DRAWN} == set(PRESETS)
     assert len(PRESETS) == 46
     for name in REFUSED:
         with refused(rf"^Preset '{name}' is not in jaxsky: it ", ValueError):
@@ -108,7 +111,7 @@ def test_all_of_pysms_presets_are_there_or_refused_by_name():
 @pytest.mark.usefixtures("folder")
 def test_settings_of_presets_are_those_of_pysm():
     """But for the highest nside, which has no effect in either."""
-    for name in DONE:
+    for name in [*DONE, *DRAWN]:
         theirs, ours = PRESETS[name], preset_settings(name)
         for part in [None] if "class" in theirs else theirs:
             own, found = (x if part is None else x[part] for x in (theirs, ours))
@@ -157,6 +160,27 @@ def test_decorrelated_dust():
     logs = np.log(np.array([300.0, 400.0]) / 353.0) / 5.0
     closed = np.exp(-0.5 * (logs[0] - logs[1]) ** 2) - np.exp(-0.5 * (logs @ logs))
     assert np.cov(draws[:, [0, 2]].T)[0, 1] == pytest.approx(closed, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["d11", "s6"])
+@pytest.mark.usefixtures("uncompiled", "folder")
+def test_small_scales_that_are_drawn(name):
+    """With PySM's seeds its maps, with and without the plane; without seeds others each time."""
+    settings = PRESETS[name] | {"seeds": [3, 4, 5] if name == "d11" else [3, 4]}
+    bare = {key: value for key, value in settings.items() if not key.startswith("galplane")}
+    bare |= {"synalm_lmax": 8}
+    found = []
+    for own in (settings, bare):
+        ours, theirs = (module.Sky(NSIDE, component_config={"x": own}) for module in (pysm, pysm3))
+        for nu, weights in map(band, BANDS):
+            agrees(ours.get_emission(nu, weights), theirs.get_emission(nu, weights))
+        found.append(ours.get_emission(150 * u.GHz).value)
+    assert not np.allclose(*found, rtol=0.01)
+    again = [pysm.Sky(NSIDE, preset_strings=[name]).get_emission(150 * u.GHz) for _ in range(2)]
+    assert np.isfinite(again).all()
+    assert not np.allclose(*again, rtol=1e-4)
+    raises(ValueError, r"`seeds` must have . numbers, not \[1\]", pysm.Sky, NSIDE,
+           component_config={"x": settings | {"seeds": [1]}})  # fmt: skip
 
 
 @pytest.mark.parametrize("unit", ["K_CMB", "MJy/sr", "mK_RJ"])

@@ -15,6 +15,7 @@ from jaxsky.pysm.models import (
     ModifiedBlackBodyLayers,
     PowerLaw,
 )
+from jaxsky.pysm.realisations import ModifiedBlackBodyRealization, PowerLawRealization
 from jaxsky.pysm.sky import Sky, get_pysm_emission
 from jaxsky.pysm.smoothing import apply_smoothing_and_coord_transform
 from jaxsky.pysm.tabulated import HensleyDraine2017, SpDust, SpDustPol

@@ -69,11 +69,17 @@ class Model:
         """Whether this is made of components of jaxsky."""
         return False
 
+    @property
+    def only_I(self) -> bool:
+        """Whether maps are of I alone, (pix,), as those of the dipole in PySM."""
+        return False
+
     @takes_quantities
     def get_emission(self, freqs: u.Quantity, weights: np.ndarray | None = None) -> u.Quantity:
         """Return I, Q, U [uK_RJ] at a frequency, or over a band with weights in power units."""
         band = bandpass(freqs, weights)
-        return emission_of(self.parts_in(band), band, 1.0) << unit_of("uK_RJ")
+        maps = emission_of(self.parts_in(band), band, 1.0) << unit_of("uK_RJ")
+        return maps[0] if self.only_I else maps
 
     def read_map(
         self,

@@ -102,6 +102,8 @@ class Sky(Model):
     def get_emission(self, freq: u.Quantity, weights: np.ndarray | None = None) -> u.Quantity:
         """Return I, Q, U at a frequency, or over a band, in the output unit, shape (3, pix).
 
+        A sky of dipoles alone is of I alone, (pix,), as in PySM.
+
         Parameters
         ----------
         freq : frequency, or the frequencies of a band, in GHz or another unit
@@ -117,11 +119,17 @@ class Sky(Model):
         if parts := self.parts_in(band):
             total = emission_of(parts, band, factor) << self.output_unit
         for model in self._others():
-            own = model.get_emission(freq, weights).value * factor << self.output_unit
+            own = _as_IQU(model.get_emission(freq, weights).value) * factor << self.output_unit
             total = own if total is None else total + own
         if total is None:
             raise ValueError("The sky has no component.")
-        return total
+        return total[0] if self.only_I else total
+
+    @property
+    def only_I(self) -> bool:
+        return bool(self.components) and all(
+            getattr(model, "only_I", False) for model in self.components
+        )
 
     def _others(self) -> Iterator[Any]:
         """Yield the models that are no components of jaxsky."""
@@ -154,6 +162,11 @@ class Sky(Model):
                 if len(one.amplitude) < 3:
                     one = dataclasses.replace(one, amplitude=iqu(one.amplitude))
                 yield f"{name}_{part.name}" if part.name else name, one
+
+
+def _as_IQU(maps: np.ndarray) -> np.ndarray:
+    """Return maps as I, Q, U where they are a map of I alone."""
+    return np.stack([maps, 0 * maps, 0 * maps]) if maps.ndim == 1 else maps
 
 
 def _config(given: Mapping[str, Any] | str | Path | None) -> Mapping[str, Any]:

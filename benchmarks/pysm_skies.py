@@ -12,7 +12,7 @@ import pysm3
 from astropy import units as u
 
 from benchmarks.table import Row, time_text
-from jaxsky import Bandpass, Sky, observe, pysm
+from jaxsky import Bandpass, observe, pysm
 
 #: Samples of a band around 143 GHz, a quarter wide [GHz], and weights per power.
 NU, WEIGHTS = np.linspace(125.0, 161.0, 31), np.hanning(33)[1:-1]
@@ -81,8 +81,7 @@ def _compared(name: str, nside: int, rounds: int) -> Row:
         module.Sky(nside, component_objects=[_model(name, module, nside)], output_unit="uK_CMB")
         for module in (pysm, pysm3)
     )
-    # The engine alone has I at the frequency of Q and U; else it would bring it there each time.
-    engine = Sky({str(i): part.ready for i, part in enumerate(ours.parts)})
+    engine = ours.sky()
     band = Bandpass(NU, WEIGHTS, "power")
     calls: dict[str, Callable[[], Any]] = {
         "ours": lambda: ours.get_emission(NU * u.GHz, WEIGHTS).value,

@@ -45,6 +45,11 @@ def _joined(intensity: StokesMaps, amplitude: StokesMaps) -> StokesMaps:
     return jnp.concatenate([intensity, amplitude[1:]])
 
 
+def template(component: Component) -> StokesMaps:
+    """Return `Component.template`, (stokes, pix), of a component with `nu_ref_I`, anew."""
+    return _joined(_intensity(component), component.amplitude)
+
+
 def kept_template(component: Component) -> StokesMaps | None:
     """Return `Component.template` of a component with the I that is kept for the same arrays.
 

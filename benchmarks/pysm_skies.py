@@ -116,3 +116,45 @@ def skies(quick: bool) -> Iterator[Row]:
     """Dust, synchrotron and layers of dust."""
     for name in TARGETS:
         yield _compared(name, 32 if quick else 512, 1 if quick or name == "d12" else 3)
+
+
+def detectors(quick: bool) -> Iterator[Row]:
+    """Dust and synchrotron in many bands of their own."""
+    nside, number, measured = (32, 50, 2) if quick else (128, 1000, 20)
+    rng = np.random.default_rng(4)
+    nu = [x * np.linspace(0.87, 1.13, 31) * u.GHz for x in rng.normal(143.0, 3.0, number)]
+    weights = [rng.uniform(0.5, 1.0, 31) * WEIGHTS for _ in nu]
+    ours, theirs = (
+        module.Sky(
+            nside,
+            component_objects=[_model(name, module, nside) for name in ("d1", "s1")],
+            output_unit="uK_CMB",
+        )
+        for module in (pysm, pysm3)
+    )
+
+    def each(maps: Iterator[Any]) -> np.ndarray:
+        return np.array([own.value.std() for own in maps])
+
+    def single(few: int) -> Iterator[Any]:
+        return (theirs.get_emission(*own) for own in list(zip(nu, weights, strict=True))[:few])
+
+    calls: dict[str, Callable[[], Any]] = {
+        "ours": lambda: each(ours.get_emissions(nu, weights)),
+        "PySM": lambda: each(single(measured)),
+    }
+    first = _spent(calls["ours"])[0]
+    _spent(lambda: each(single(1)))
+    (spent, found), (other, expected) = (_spent(call) for call in calls.values())
+    other = Spent(*(number / measured * x for x in other))
+    wall, cpu = (a / b for a, b in zip(other, spent, strict=True))
+    error = np.abs(found[:measured] / expected - 1).max()
+    yield Row(
+        f"`jaxsky.pysm.Sky.get_emissions` of d1 and s1 in {number} bands, 31 samples each, nside "
+        f"{nside}: PySM 3 (measured in {measured} bands, scaled) / jaxsky",
+        f"{wall:.0f}x, CPU {cpu:.0f}x",
+        "",
+        None,
+        f"{time_text(other.wall)} / {time_text(spent.wall)}; CPU {time_text(other.cpu)} / "
+        f"{time_text(spent.cpu)}; first call {time_text(first.wall)}; rms {error:.0e} apart",
+    )

@@ -85,6 +85,12 @@ def pysm_models(emission) -> Calls:
     yield partial(emission._summed, plan=(None,)), (own.ready,), BANDS[0], 1.0
 
 
+@of("jaxsky.pysm.detectors")
+def many_bands(detectors) -> Calls:
+    yield detectors._map, DUST, np.ones(COUNTS)
+    yield detectors._combined, np.ones((4, 2)), np.ones((2, 3, NPIX))
+
+
 @of("jaxsky.references")
 def references_of_I(references) -> Calls:
     dust = jaxsky.Dust(random_maps(1, 3, NPIX), 1.53, 20.0, nu_ref_I=545.0)

@@ -305,6 +305,25 @@ def test_the_sky_behind_it_has_gradients():
     assert float(jax.grad(power)(1.54)) == pytest.approx(float(slope), rel=1e-6)
 
 
+@pytest.mark.parametrize("names", [["d1", "s1"], ["s3", "d0", "dip2"], ["a1", "co1", "cib1"]])
+@pytest.mark.usefixtures("folder")
+def test_many_bands_at_once(names):
+    """As one by one: with maps of parameters, numbers, tables, lines, and few samples or many."""
+    rng = np.random.default_rng(2)
+    sky = pysm.Sky(NSIDE, preset_strings=names, output_unit="uK_CMB")
+    centers = rng.uniform(100.0, 160.0, 9)
+    nu = [center * np.linspace(0.85, 1.15, 5 + i % 2) * u.GHz for i, center in enumerate(centers)]
+    nu += [100 * u.GHz]
+    weights = [rng.uniform(0, 1, own.size) for own in nu]
+    found = list(sky.get_emissions(nu, weights, at_once=4))
+    assert len(found) == len(nu)
+    for own, *one in zip(found, nu, weights, strict=True):
+        agrees(own, sky.get_emission(*one))
+    agrees(next(sky.get_emissions(nu[:1])), sky.get_emission(nu[0]))
+    raises(ValueError, "an entry for each of the 10 bands, but has 1",
+           lambda: next(sky.get_emissions(nu, [None])))  # fmt: skip
+
+
 @pytest.mark.usefixtures("folder")
 def test_the_dipole_with_others():
     """In I alone, in any order, and as an object of PySM; alone it has the shape of PySM's."""

@@ -118,6 +118,10 @@ class InterpolatingComponent(LawModel):
     def parts(self) -> tuple[Part, ...]:
         return tuple(self._part(float(nu)) for nu in self.freqs)
 
+    @property
+    def same_parts(self) -> bool:
+        return False
+
     def parts_in(self, band: Bandpass) -> tuple[Part, ...]:
         nu = np.asarray(band.nu)
         near = self.freqs[np.isclose(self.freqs, nu[0])]

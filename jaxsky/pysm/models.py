@@ -70,6 +70,11 @@ class Model:
         return False
 
     @property
+    def same_parts(self) -> bool:
+        """Whether this is made of components of jaxsky, the same in all bands."""
+        return self.is_component
+
+    @property
     def only_I(self) -> bool:
         """Whether maps are of I alone, (pix,), as those of the dipole in PySM."""
         return False

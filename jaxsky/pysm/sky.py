@@ -2,7 +2,7 @@
 
 import dataclasses
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from jaxsky.bandpass import Bandpass
 from jaxsky.components import Component
 from jaxsky.io.files import InputError, check_file
 from jaxsky.public import takes_quantities
+from jaxsky.pysm.detectors import emission_in_bands
 from jaxsky.pysm.emission import Part, emission_of, iqu
 from jaxsky.pysm.models import MODELS, Model
 from jaxsky.pysm.presets import preset_settings
@@ -124,6 +125,57 @@ class Sky(Model):
         if total is None:
             raise ValueError("The sky has no component.")
         return total[0] if self.only_I else total
+
+    @takes_quantities
+    def get_emissions(
+        self,
+        freqs: Sequence[u.Quantity],
+        weights: Sequence[np.ndarray | None] | None = None,
+        at_once: int = 16,
+    ) -> Iterator[u.Quantity]:
+        """Yield what `get_emission` returns in each of many bands, such as those of all detectors.
+
+        Each costs a few multiplications per pixel, however many samples it has. PySM has no such
+        function.
+
+        Parameters
+        ----------
+        freqs : frequencies of each band
+        weights : response of each at these, see `get_emission`
+        at_once : number of bands whose maps are computed at once; memory grows with it
+
+        Raises
+        ------
+        TypeError, ValueError
+            As for `get_emission`, and where the numbers of frequencies and of weights differ.
+        """
+        given = [None] * len(freqs) if weights is None else weights
+        if len(given) != len(freqs):
+            raise ValueError(
+                f"Argument `weights` must have an entry for each of the {len(freqs)} bands, but "
+                f"has {len(given)}."
+            )
+        if not self.components:
+            raise ValueError("The sky has no component.")
+        pairs = list(zip(freqs, given, strict=True))
+        to, unit = self.output_unit, unit_of("uK_RJ")
+        factors = np.array([bandpass_unit_conversion(*own, to, unit).value for own in pairs])
+        models = [*self._flat()]
+        many = [one for one in models if isinstance(one, Model) and one.same_parts]
+        parts = [part for model in many for part in model.parts]
+        bands = [bandpass(*own) for own in pairs]
+        others = [one for one in models if one not in many]
+        found = emission_in_bands(parts, bands, factors, at_once)
+        for own, factor, maps in zip(pairs, factors, found, strict=True):
+            total = maps
+            for model in others:
+                total = total + _as_IQU(model.get_emission(*own).value) * factor
+            yield (total[0] if self.only_I else total) << to
+
+    def _flat(self) -> Iterator[Any]:
+        """Yield the models, those of skies among them one by one."""
+        for model in self.components:
+            yield from model._flat() if isinstance(model, Sky) else (model,)
 
     @property
     def only_I(self) -> bool:

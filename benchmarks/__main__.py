@@ -32,6 +32,7 @@ BENCHMARKS = {
     "nside": band_averages.growth,
     "compile": band_averages.compilation,
     "pysm": pysm_skies.skies,
+    "pysm-detectors": pysm_skies.detectors,
     "grid": likelihoods.grid,
     "chain": likelihoods.chain,
     "simulate-beta-maps": simulations.beta_maps,
@@ -62,6 +63,7 @@ BENCHMARKS = {
 LONG = (
     "planck",
     "pysm",
+    "pysm-detectors",
     "simulate-large",
     "separation-pixels",
     "commands",

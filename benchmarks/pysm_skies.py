@@ -12,7 +12,7 @@ import pysm3
 from astropy import units as u
 
 from benchmarks.table import Row, time_text
-from jaxsky import Bandpass, Sky, observe, pysm
+from jaxsky import Bandpass, observe, pysm
 
 #: Samples of a band around 143 GHz, a quarter wide [GHz], and weights per power.
 NU, WEIGHTS = np.linspace(125.0, 161.0, 31), np.hanning(33)[1:-1]
@@ -81,8 +81,7 @@ def _compared(name: str, nside: int, rounds: int) -> Row:
         module.Sky(nside, component_objects=[_model(name, module, nside)], output_unit="uK_CMB")
         for module in (pysm, pysm3)
     )
-    # The engine alone has I at the frequency of Q and U; else it would bring it there each time.
-    engine = Sky({str(i): part.ready for i, part in enumerate(ours.parts)})
+    engine = ours.sky()
     band = Bandpass(NU, WEIGHTS, "power")
     calls: dict[str, Callable[[], Any]] = {
         "ours": lambda: ours.get_emission(NU * u.GHz, WEIGHTS).value,
@@ -117,3 +116,45 @@ def skies(quick: bool) -> Iterator[Row]:
     """Dust, synchrotron and layers of dust."""
     for name in TARGETS:
         yield _compared(name, 32 if quick else 512, 1 if quick or name == "d12" else 3)
+
+
+def detectors(quick: bool) -> Iterator[Row]:
+    """Dust and synchrotron in many bands of their own."""
+    nside, number, measured = (32, 50, 2) if quick else (128, 1000, 20)
+    rng = np.random.default_rng(4)
+    nu = [x * np.linspace(0.87, 1.13, 31) * u.GHz for x in rng.normal(143.0, 3.0, number)]
+    weights = [rng.uniform(0.5, 1.0, 31) * WEIGHTS for _ in nu]
+    ours, theirs = (
+        module.Sky(
+            nside,
+            component_objects=[_model(name, module, nside) for name in ("d1", "s1")],
+            output_unit="uK_CMB",
+        )
+        for module in (pysm, pysm3)
+    )
+
+    def each(maps: Iterator[Any]) -> np.ndarray:
+        return np.array([own.value.std() for own in maps])
+
+    def single(few: int) -> Iterator[Any]:
+        return (theirs.get_emission(*own) for own in list(zip(nu, weights, strict=True))[:few])
+
+    calls: dict[str, Callable[[], Any]] = {
+        "ours": lambda: each(ours.get_emissions(nu, weights)),
+        "PySM": lambda: each(single(measured)),
+    }
+    first = _spent(calls["ours"])[0]
+    _spent(lambda: each(single(1)))
+    (spent, found), (other, expected) = (_spent(call) for call in calls.values())
+    other = Spent(*(number / measured * x for x in other))
+    wall, cpu = (a / b for a, b in zip(other, spent, strict=True))
+    error = np.abs(found[:measured] / expected - 1).max()
+    yield Row(
+        f"`jaxsky.pysm.Sky.get_emissions` of d1 and s1 in {number} bands, 31 samples each, nside "
+        f"{nside}: PySM 3 (measured in {measured} bands, scaled) / jaxsky",
+        f"{wall:.0f}x, CPU {cpu:.0f}x",
+        "",
+        None,
+        f"{time_text(other.wall)} / {time_text(spent.wall)}; CPU {time_text(other.cpu)} / "
+        f"{time_text(spent.cpu)}; first call {time_text(first.wall)}; rms {error:.0e} apart",
+    )

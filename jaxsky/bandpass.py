@@ -197,9 +197,12 @@ def stack_bands(bands: Sequence[Bandpass]) -> Samples:
     """Return bands as tables with one row each, for `jax.vmap`, padded by samples of weight 0."""
     longest = max(band.nu.size for band in bands)
     missing = [(0, longest - band.nu.size) for band in bands]
-    nu = [jnp.pad(band.nu, n, mode="edge") for band, n in zip(bands, missing, strict=True)]
-    weights = [jnp.pad(band.quadrature, n) for band, n in zip(bands, missing, strict=True)]
-    return Samples(jnp.stack(nu), jnp.stack(weights))
+    arrays = [(band.nu, band.quadrature) for band in bands]
+    # Of many bands, thousands of small programs would be run.
+    array = np if all(is_concrete(leaf) for leaf in jax.tree.leaves(arrays)) else jnp
+    nu = [array.pad(own, n, mode="edge") for (own, _), n in zip(arrays, missing, strict=True)]
+    weights = [array.pad(own, n) for (_, own), n in zip(arrays, missing, strict=True)]
+    return Samples(jnp.asarray(array.stack(nu)), jnp.asarray(array.stack(weights)))
 
 
 def average(sed: Callable[[Array], Array], band: Bandpass | Samples) -> Float[Array, "..."]:

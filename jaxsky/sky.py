@@ -16,6 +16,7 @@ from jaxsky.checks import Printed, as_array, check_names, check_type
 from jaxsky.components import Component, Moment, check_parameter_of, check_value, declared
 from jaxsky.interpolation import Nodes, Plan, band_sed, choose_nodes
 from jaxsky.mesh import maps_of, over_pixels, typed
+from jaxsky.references import kept_template
 
 #: Bands in order: a list, or what `Instrument.bands` gives.
 Bands: TypeAlias = Sequence[Bandpass] | OrderedDict[str, Bandpass]
@@ -120,27 +121,38 @@ def _check_bands(sky: object, bands: Any) -> tuple[Bandpass, ...]:
     return tuple(bands)
 
 
-def emission(component: Component, bands: tuple[Bandpass, ...], nodes: Nodes) -> list[StokesMaps]:
-    """Return the emission of a component in each band."""
+def emission(
+    component: Component,
+    bands: tuple[Bandpass, ...],
+    nodes: Nodes,
+    known: StokesMaps | None = None,
+) -> list[StokesMaps]:
+    """Return the emission of a component in each band; `known` is its template if computed."""
+    rows = component.template if known is None else known
     laws = (band_sed(component, band, nodes) for band in bands)
     # Costly laws are evaluated once for all Stokes parameters, ...
     if nodes and len(nodes.counts) > 1:
-        return [component.template * law for law in laws]
+        return [rows * law for law in laws]
     # ... cheap ones once per row: XLA fuses each row into one pass over memory.
-    return [jnp.stack([row * law for row in component.template]) for law in laws]
+    return [jnp.stack([row * law for row in rows]) for law in laws]
 
 
 @partial(jax.jit, static_argnames=("plan", "apart"))
 @over_pixels(maps_of(3))
-def _observe(sky, bands, *, plan, apart):
+def _observe(sky, bands, kept, *, plan, apart):
     """Return the maps of all components together, or of each separately."""
     emissions = {
-        name: emission(component, bands, nodes)
+        name: emission(component, bands, nodes, kept[name])
         for (name, component), nodes in zip(sky.components.items(), plan, strict=True)
     }
     if apart:
         return {name: jnp.stack(maps) for name, maps in emissions.items()}
     return jnp.stack([sum(maps) for maps in zip(*emissions.values(), strict=True)])
+
+
+def _kept(sky: Sky) -> dict[str, StokesMaps | None]:
+    """Return the templates that need not be computed in each call, by component."""
+    return {name: kept_template(component) for name, component in sky.given.items()}
 
 
 def observe(
@@ -164,7 +176,7 @@ def observe(
     """
     sky, bands = typed(sky), _check_bands(sky, bands)
     plan = nodes or interpolation_nodes(sky, bands, tolerance)
-    return _observe(sky, bands, plan=plan, apart=False)
+    return _observe(sky, bands, _kept(sky), plan=plan, apart=False)
 
 
 def observe_band(sky: Sky, band: Bandpass, *, tolerance: float = 1e-10) -> StokesMaps:
@@ -178,7 +190,7 @@ def observe_components(
     """Observe each component separately [uK_RJ]; see `observe`."""
     sky, bands = typed(sky), _check_bands(sky, bands)
     plan = nodes or interpolation_nodes(sky, bands, tolerance)
-    return _observe(sky, bands, plan=plan, apart=True)
+    return _observe(sky, bands, _kept(sky), plan=plan, apart=True)
 
 
 # Parameters by name. A sky is a tree of arrays, and names follow from the tree: the component,

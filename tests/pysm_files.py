@@ -8,6 +8,7 @@ import healpy
 import numpy as np
 import pysm3
 import pytest
+from astropy.io import fits as pyfits
 from pysm3 import models, utils
 
 NSIDE = 4
@@ -21,7 +22,7 @@ RANGES = {
 }
 #: Units in the headers; PySM's settings have their own for the older files.
 UNITS = {"map_mbb_temperature": "K", "map_layers": "MJy/sr", "map_I": "uK_RJ"}
-COMPILED = ("dust", "dust_layers", "power_law", "spdust", "websky")
+COMPILED = ("interpolating", "dust", "dust_layers", "power_law", "spdust", "websky")
 CARBON_MONOXIDE = {"HFI_CompMap_CO-Type1": "_R2.00_ring", "mcmoleCO_HGL": ""}
 PRESETS = pysm3.sky.PRESET_MODELS
 
@@ -51,6 +52,14 @@ def write_others(folder: Path, nside: int = NSIDE, dtype: Any = float) -> None:
     for name, number in columns.items():
         maps = rng.uniform(0.1, 1.0, (number, npix)) * 1e-6
         save(folder / name, maps, dtype, "K_CMB")
+    for model in ("cib1", "rg1"):
+        kind = "cib" if model == "cib1" else "radio"
+        for nu in pysm3.Sky(1, preset_strings=[model]).components[0].freqs:
+            name = f"websky/0.4/{kind}/{kind}_{nu:06.1f}.fits"
+            save(folder / name, rng.uniform(0.1, 1.0, (1, npix)), dtype, "MJy/sr")
+    for nu in PRESETS["rg3"]["freqs"]:
+        name = PRESETS["rg3"]["path"].format(nside=2048)
+        save(folder / f"{name}/{nu:05.1f}.fits", rng.uniform(1, 2, (3, npix)), dtype, "uK_RJ")
     # Temperature, its error, index and its error are columns 3, 5, 6 and 8.
     middle = np.array([0, 0, 0, 20.0, 0, 0.5, 1.55, 0, 0.05])[:, None]
     commander = middle * rng.uniform(0.9, 1.1, (9, npix))
@@ -66,6 +75,45 @@ def write_others(folder: Path, nside: int = NSIDE, dtype: Any = float) -> None:
         table = 1e-25 * wavelengths ** -(5.5 + 0.1 * number) / np.expm1(x)
         rows = np.concatenate([wavelengths, x[:, :2], table, 0.1 * table ** (1.01)], axis=1)
         np.savetxt(folder / f"pysm_2/{name}.dat", rows, fmt="%.17e")
+
+
+#: Multipoles of coefficients of large scales and of maps that modulate, and of spectra.
+LARGE, SMALL = 6, 16
+#: Means of what is drawn, by the end of the name: map of index, of temperature, and of amplitudes.
+MEANS = {"mbb_index": 1.55, "mbb_temperature": 20.0, "pl_index": 0.05}
+
+
+def write_drawn(folder: Path) -> None:
+    """Write coefficients, spectra and maps of the models whose small scales are drawn."""
+    rng = np.random.default_rng(11)
+    for own in (PRESETS["d11"], PRESETS["s6"]):
+        for key, file in own.items():
+            if not str(file).endswith(".fits.gz"):
+                continue
+            path = folder / file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            rows = 3 if key in ("largescale_alm", "small_scale_cl") else 1
+            unit = "uK_RJ" if rows == 3 else "K" if key.endswith("temperature") else ""
+            if "_alm" in key:
+                alm = 0.05 * rng.normal(size=(2, rows, healpy.Alm.getsize(LARGE)))
+                alm = alm[0] + 1j * alm[1]
+                alm[:, : LARGE + 1] = alm[:, : LARGE + 1].real  # m = 0
+                alm[0, 0] = MEANS.get(key.partition("alm_")[2], 1.0) * np.sqrt(4 * np.pi)
+                healpy.write_alm(path, list(alm) if rows > 1 else alm[0], overwrite=True)
+            elif "_cl" in key:
+                unit = f"{unit}2" if unit else ""
+                cl = 1e-4 / np.arange(1, SMALL + 2) * np.array([1, 0.5, 0.4, 0.2])[:, None]
+                healpy.write_cl(path, cl if rows > 1 else cl[0], overwrite=True)
+            elif key == "galplane_fix":
+                unit = "uK_RJ"
+                plane = rng.uniform(0.1, 1.0, (4, healpy.nside2npix(NSIDE)))
+                healpy.write_map(path, plane, dtype=float, overwrite=True)
+            else:
+                maps = rng.uniform(0.9, 1.1, (2, healpy.nside2npix(NSIDE))) * [[1.5], [20.0]]
+                healpy.write_map(path, maps, dtype=float, overwrite=True)
+            pyfits.setval(path, "TUNIT1", value=unit, ext=1)
+            if key == "galplane_fix_beta_Td":
+                pyfits.setval(path, "TUNIT2", value="K", ext=1)
 
 
 def save(path: Path, maps: Any, dtype: Any, unit: str = "") -> None:

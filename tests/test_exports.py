@@ -82,8 +82,20 @@ def emission(laws) -> Calls:
 @of("jaxsky.pysm.emission")
 def pysm_models(emission) -> Calls:
     own = emission.Part(jaxsky.Dust(random_maps(1, 3, NPIX), 1.53, 20.0, nu_ref_I=545.0))
-    yield emission._at_one_frequency, own.component
     yield partial(emission._summed, plan=(None,)), (own.ready,), BANDS[0], 1.0
+
+
+@of("jaxsky.pysm.detectors")
+def many_bands(detectors) -> Calls:
+    yield detectors._map, DUST, np.ones(COUNTS)
+    yield detectors._combined, np.ones((4, 2)), np.ones((2, 3, NPIX))
+
+
+@of("jaxsky.references")
+def references_of_I(references) -> Calls:
+    dust = jaxsky.Dust(random_maps(1, 3, NPIX), 1.53, 20.0, nu_ref_I=545.0)
+    yield references._intensity, dust
+    yield references._joined, dust.amplitude[:1], dust.amplitude
 
 
 @of("jaxsky.bandpass")

@@ -14,10 +14,6 @@ FILES = ["test_inmemory_maps.py", "test_smoothing.py", "test_dipole.py"]
 #: What fails, and why.
 DIFFERENT = {
     "test_car_nosmoothing": "maps are HEALPix maps",
-    "test_dipole_fit": "the dipole has rows of I, Q, U",
-    "test_dipole_fit_with_sky": "the dipole has rows of I, Q, U",
-    "test_dipole_quadrupole_correction": "the dipole has rows of I, Q, U",
-    "test_dipole_preset_dip2_quadrupole": "the dipole has rows of I, Q, U",
 }
 
 
@@ -40,4 +36,4 @@ def test_pysms_own_tests(tmp_path):
         for word in ("PASSED", "FAILED")
     )
     assert failed == set(DIFFERENT), done.stdout
-    assert len(passed) >= 7
+    assert len(passed) >= 11

@@ -1,5 +1,7 @@
 """Skies, parameters by name, and what is refused."""
 
+import gc
+
 import jax
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from jaxsky import (
     observe,
     observe_band,
     parameter_names,
+    references,
     set_parameters,
 )
 from refusals import raises
@@ -146,3 +149,46 @@ def test_objects_print_while_jax_traces():
     seen = []
     jax.jit(lambda sky: seen.append(str(sky)) or 0)(Sky({"dust": Dust(np.ones((2, 12)))}))
     assert "unknown while JAX traces" in seen[0]
+
+
+def test_the_reference_of_intensity_is_taken_once(monkeypatch):
+    """For the same arrays, as long as they live; other ones, and derivatives, as without it."""
+    npix = 48
+    beta, T = np.linspace(1.4, 1.6, npix), np.linspace(18.0, 22.0, npix)
+    maps = 1 + np.arange(3.0 * npix).reshape(3, npix)
+    sky = Sky({"dust": Dust(maps, beta, T, nu_ref=353.0, nu_ref_I=545.0)})
+    bands = [Bandpass.top_hat(143.0, 40.0)]
+
+    def closed(beta):  # with the law at one frequency, apart
+        alone = [Dust(maps, beta, T, nu_ref=nu) for nu in (545.0, 353.0)]
+        found = [np.asarray(observe(Sky({"dust": one}), bands)) for one in alone]
+        return np.concatenate([found[0][:, :1], found[1][:, 1:]], axis=1)
+
+    made = []
+    own = references._intensity
+    monkeypatch.setattr(references, "_intensity", lambda one: made.append(1) or own(one))
+    seen = [observe(sky, bands) for _ in range(3)]
+    np.testing.assert_array_equal(seen[0], seen[2])
+    np.testing.assert_allclose(seen[0], closed(beta), rtol=1e-10)
+    np.testing.assert_allclose(jax.jit(lambda b: observe(sky, b))(bands), seen[0], rtol=1e-10)
+    assert len(made) == 1
+    moved = set_parameters(sky, {"dust.beta_dust": beta + 0.1})
+    np.testing.assert_allclose(observe(moved, bands), closed(beta + 0.1), rtol=1e-10)
+    np.testing.assert_allclose(observe(sky, bands), seen[0], rtol=1e-15)
+    assert len(made) == 3
+
+    def total(step):
+        return observe(set_parameters(sky, {"dust.beta_dust.offset": step}), bands)[0, 0].sum()
+
+    slope = (total(1e-5) - total(-1e-5)) / 2e-5
+    assert float(jax.grad(total)(0.0)) == pytest.approx(float(slope), rel=1e-8)
+
+
+def test_what_is_kept_goes_with_its_map():
+    kept = len(references._KEPT)
+    dust = Dust(np.ones((3, 48)), np.linspace(1.4, 1.6, 48), nu_ref=353.0, nu_ref_I=545.0)
+    observe(Sky({"dust": dust}), [Bandpass.delta(143.0)])
+    assert len(references._KEPT) == kept + 1
+    del dust
+    gc.collect()
+    assert len(references._KEPT) == kept

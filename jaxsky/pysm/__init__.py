@@ -6,6 +6,7 @@ templates that the user has, and `.sky()` the `jaxsky.Sky` behind it. PySM itsel
 
 from jaxsky.pysm.cmb import CMBDipole, CMBMap, SimpleSZ, WebSkyCMB
 from jaxsky.pysm.decorrelated import DecorrelatedModifiedBlackBody
+from jaxsky.pysm.interpolated import InterpolatingComponent, WebSkyCIB, WebSkyRadioGalaxies
 from jaxsky.pysm.lines import COLines
 from jaxsky.pysm.models import (
     CurvedPowerLaw,
@@ -14,6 +15,7 @@ from jaxsky.pysm.models import (
     ModifiedBlackBodyLayers,
     PowerLaw,
 )
+from jaxsky.pysm.realisations import ModifiedBlackBodyRealization, PowerLawRealization
 from jaxsky.pysm.sky import Sky, get_pysm_emission
 from jaxsky.pysm.smoothing import apply_smoothing_and_coord_transform
 from jaxsky.pysm.tabulated import HensleyDraine2017, SpDust, SpDustPol

@@ -113,7 +113,10 @@ class SimpleSZ(LawModel):
 
 
 class CMBDipole(LawModel):
-    """The dipole of our motion: zero in Q and U, to which PySM's `Sky` adds it as well.
+    """The dipole of our motion: a map of I alone, shape (pix,), as in PySM.
+
+    A `Sky` of nothing else has this shape, too. With others it is added to I; PySM's `Sky` adds it
+    to Q and U as well.
 
     Arguments: `amp` and `T_cmb` (temperatures, such as "3366.6 uK_CMB"), `dip_lon` and `dip_lat`
     (Galactic, such as "264 deg"), and `quadrupole_correction`: to second order in the velocity,
@@ -135,6 +138,10 @@ class CMBDipole(LawModel):
         if quadrupole:
             maps = found["quadrupole"].amplitude[:1] / 2
             yield "quadrupole", SecondOrder(maps, 0.0, T, T_CMB)
+
+    @property
+    def only_I(self) -> bool:
+        return True
 
 
 def _temperature(value: Any) -> float:

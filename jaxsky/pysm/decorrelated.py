@@ -35,6 +35,10 @@ class DecorrelatedModifiedBlackBody(ModifiedBlackBody):
     def parts(self) -> tuple[Part, ...]:
         return ()
 
+    @property
+    def is_component(self) -> bool:
+        return False
+
     @takes_quantities
     def get_emission(self, freqs: u.Quantity, weights: np.ndarray | None = None) -> u.Quantity:
         """Return I, Q, U [uK_RJ], with factors of this call."""

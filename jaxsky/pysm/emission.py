@@ -13,6 +13,7 @@ import numpy as np
 from jaxsky.bandpass import Bandpass
 from jaxsky.components import Component
 from jaxsky.interpolation import Plan, choose_nodes
+from jaxsky.references import template
 from jaxsky.sky import emission
 
 #: Relative error of band averages where parameters are maps.
@@ -34,7 +35,7 @@ class Part:
     def ready(self) -> Component:
         if self.component.nu_ref_I is None:
             return self.component
-        amplitude = _at_one_frequency(self.component)
+        amplitude = template(self.component)
         return dataclasses.replace(self.component, amplitude=amplitude, nu_ref_I=None)
 
     @cached_property
@@ -47,12 +48,6 @@ class Part:
         return eqx.tree_at(
             lambda one: one.amplitude, jax.tree.map(ends, self.ready), np.zeros((stokes, 2))
         )
-
-
-@jax.jit
-def _at_one_frequency(component):
-    """Return the amplitude with I brought to the reference frequency of the law."""
-    return component.template
 
 
 @partial(jax.jit, static_argnames="plan")

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from astropy import units as u
 
+from jaxsky.bandpass import Bandpass
 from jaxsky.checks import check_double
 from jaxsky.components import Component, component_class, declared
 from jaxsky.io.quantities import unit_factor
@@ -59,10 +60,31 @@ class Model:
         """The components of jaxsky that this is made of; none for models of users."""
         return ()
 
+    def parts_in(self, band: Bandpass) -> tuple[Part, ...]:
+        """Return those of `parts` that a band may see."""
+        return self.parts
+
+    @property
+    def is_component(self) -> bool:
+        """Whether this is made of components of jaxsky."""
+        return False
+
+    @property
+    def same_parts(self) -> bool:
+        """Whether this is made of components of jaxsky, the same in all bands."""
+        return self.is_component
+
+    @property
+    def only_I(self) -> bool:
+        """Whether maps are of I alone, (pix,), as those of the dipole in PySM."""
+        return False
+
     @takes_quantities
     def get_emission(self, freqs: u.Quantity, weights: np.ndarray | None = None) -> u.Quantity:
         """Return I, Q, U [uK_RJ] at a frequency, or over a band with weights in power units."""
-        return emission_of(self.parts, bandpass(freqs, weights), 1.0) << unit_of("uK_RJ")
+        band = bandpass(freqs, weights)
+        maps = emission_of(self.parts_in(band), band, 1.0) << unit_of("uK_RJ")
+        return maps[0] if self.only_I else maps
 
     def read_map(
         self,
@@ -128,6 +150,10 @@ class LawModel(Model):
     @property
     def parts(self) -> tuple[Part, ...]:
         return self._parts
+
+    @property
+    def is_component(self) -> bool:
+        return True
 
     def _components(self, arguments: dict[str, Any]) -> Iterable[tuple[str, Component]]:
         """Yield the components by name, "" for a single one; all arguments have to be used."""

@@ -2,7 +2,7 @@
 
 import dataclasses
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +10,11 @@ import numpy as np
 from astropy import units as u
 
 import jaxsky.sky
+from jaxsky.bandpass import Bandpass
 from jaxsky.components import Component
 from jaxsky.io.files import InputError, check_file
 from jaxsky.public import takes_quantities
+from jaxsky.pysm.detectors import emission_in_bands
 from jaxsky.pysm.emission import Part, emission_of, iqu
 from jaxsky.pysm.models import MODELS, Model
 from jaxsky.pysm.presets import preset_settings
@@ -84,11 +86,24 @@ class Sky(Model):
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        return tuple(part for model in self.components for part in getattr(model, "parts", ()))
+        return tuple(part for model in self._models() for part in model.parts)
+
+    def parts_in(self, band: Bandpass) -> tuple[Part, ...]:
+        return tuple(part for model in self._models() for part in model.parts_in(band))
+
+    @property
+    def is_component(self) -> bool:
+        return any(True for _ in self._models())
+
+    def _models(self) -> Iterator[Model]:
+        """Yield the models that are components of jaxsky."""
+        yield from (one for one in self.components if getattr(one, "is_component", False))
 
     @takes_quantities
     def get_emission(self, freq: u.Quantity, weights: np.ndarray | None = None) -> u.Quantity:
         """Return I, Q, U at a frequency, or over a band, in the output unit, shape (3, pix).
+
+        A sky of dipoles alone is of I alone, (pix,), as in PySM.
 
         Parameters
         ----------
@@ -101,22 +116,79 @@ class Sky(Model):
             For a frequency without a unit, and bands that `jaxsky.Bandpass` refuses.
         """
         factor = bandpass_unit_conversion(freq, weights, self.output_unit, unit_of("uK_RJ")).value
-        total = None
-        if parts := self.parts:
-            total = emission_of(parts, bandpass(freq, weights), factor) << self.output_unit
+        band, total = bandpass(freq, weights), None
+        if parts := self.parts_in(band):
+            total = emission_of(parts, band, factor) << self.output_unit
         for model in self._others():
-            own = model.get_emission(freq, weights).value * factor << self.output_unit
+            own = _as_IQU(model.get_emission(freq, weights).value) * factor << self.output_unit
             total = own if total is None else total + own
         if total is None:
             raise ValueError("The sky has no component.")
-        return total
+        return total[0] if self.only_I else total
+
+    @takes_quantities
+    def get_emissions(
+        self,
+        freqs: Sequence[u.Quantity],
+        weights: Sequence[np.ndarray | None] | None = None,
+        at_once: int = 16,
+    ) -> Iterator[u.Quantity]:
+        """Yield what `get_emission` returns in each of many bands, such as those of all detectors.
+
+        Each costs a few multiplications per pixel, however many samples it has. PySM has no such
+        function.
+
+        Parameters
+        ----------
+        freqs : frequencies of each band
+        weights : response of each at these, see `get_emission`
+        at_once : number of bands whose maps are computed at once; memory grows with it
+
+        Raises
+        ------
+        TypeError, ValueError
+            As for `get_emission`, and where the numbers of frequencies and of weights differ.
+        """
+        given = [None] * len(freqs) if weights is None else weights
+        if len(given) != len(freqs):
+            raise ValueError(
+                f"Argument `weights` must have an entry for each of the {len(freqs)} bands, but "
+                f"has {len(given)}."
+            )
+        if not self.components:
+            raise ValueError("The sky has no component.")
+        pairs = list(zip(freqs, given, strict=True))
+        to, unit = self.output_unit, unit_of("uK_RJ")
+        factors = np.array([bandpass_unit_conversion(*own, to, unit).value for own in pairs])
+        models = [*self._flat()]
+        many = [one for one in models if isinstance(one, Model) and one.same_parts]
+        parts = [part for model in many for part in model.parts]
+        bands = [bandpass(*own) for own in pairs]
+        others = [one for one in models if one not in many]
+        found = emission_in_bands(parts, bands, factors, at_once)
+        for own, factor, maps in zip(pairs, factors, found, strict=True):
+            total = maps
+            for model in others:
+                total = total + _as_IQU(model.get_emission(*own).value) * factor
+            yield (total[0] if self.only_I else total) << to
+
+    def _flat(self) -> Iterator[Any]:
+        """Yield the models, those of skies among them one by one."""
+        for model in self.components:
+            yield from model._flat() if isinstance(model, Sky) else (model,)
+
+    @property
+    def only_I(self) -> bool:
+        return bool(self.components) and all(
+            getattr(model, "only_I", False) for model in self.components
+        )
 
     def _others(self) -> Iterator[Any]:
         """Yield the models that are no components of jaxsky."""
         for model in self.components:
             if isinstance(model, Sky):
                 yield from model._others()
-            elif not getattr(model, "parts", ()):
+            elif not getattr(model, "is_component", False):
                 yield model
 
     def sky(self) -> jaxsky.sky.Sky:
@@ -142,6 +214,11 @@ class Sky(Model):
                 if len(one.amplitude) < 3:
                     one = dataclasses.replace(one, amplitude=iqu(one.amplitude))
                 yield f"{name}_{part.name}" if part.name else name, one
+
+
+def _as_IQU(maps: np.ndarray) -> np.ndarray:
+    """Return maps as I, Q, U where they are a map of I alone."""
+    return np.stack([maps, 0 * maps, 0 * maps]) if maps.ndim == 1 else maps
 
 
 def _config(given: Mapping[str, Any] | str | Path | None) -> Mapping[str, Any]:

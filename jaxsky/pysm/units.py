@@ -32,10 +32,9 @@ def unit_of(unit: str | u.UnitBase) -> u.UnitBase:
         raise ValueError(f"Unit {str(unit)!r} is no brightness; known are {', '.join(UNITS)}.")
     if isinstance(unit, u.UnitBase):
         return unit
-    try:
-        return u.Unit(name)
-    except ValueError:
-        return _OWN[name]
+    if name in _OWN:  # astropy takes milliseconds to find out that it has no such unit
+        return u.get_current_unit_registry().registry.get(name, _OWN[name])
+    return u.Unit(name)
 
 
 def __getattr__(name: str) -> Any:

@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: fit test lint validate bench pin clean
+.PHONY: fit test lint validate bench docs pin clean
 
 fit: .venv/.run
 	$(BIN)/jaxsky fit --out results/fit --overwrite
@@ -24,6 +24,10 @@ validate: .venv/.dev
 bench: .venv/.bench
 	GLIBC_TUNABLES=glibc.malloc.hugetlb=1 $(BIN)/python -m benchmarks --write
 
+# Pages in docs/_build/html; nothing is loaded from elsewhere, here or in the browser.
+docs: .venv/.docs
+	$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build/html
+
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
@@ -41,6 +45,10 @@ bench: .venv/.bench
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-bench.txt
 	touch $@
 
+.venv/.docs: .venv/.dev requirements-docs.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-docs.txt
+	touch $@
+
 # The newest versions of everything, in a fresh environment; run the tests before committing.
 pin:
 	rm -rf .venv
@@ -53,10 +61,15 @@ pin:
 	$(BIN)/python -m pip install --quiet -c .venv/all.txt '.[bench]'
 	( sed -n 1p requirements-bench.txt; $(BIN)/python -m pip freeze | grep -v '^jaxsky' \
 		| grep -vxF -f .venv/all.txt ) > .venv/bench.txt
+	$(BIN)/python -m pip freeze | grep -v '^jaxsky' > .venv/before_docs.txt
+	$(BIN)/python -m pip install --quiet -c .venv/all.txt '.[docs]'
+	( sed -n 1p requirements-docs.txt; $(BIN)/python -m pip freeze | grep -v '^jaxsky' \
+		| grep -vxF -f .venv/before_docs.txt ) > .venv/docs.txt
 	mv .venv/run.txt requirements.txt
 	mv .venv/dev.txt requirements-dev.txt
 	mv .venv/bench.txt requirements-bench.txt
+	mv .venv/docs.txt requirements-docs.txt
 	rm -rf .venv
 
 clean:
-	rm -rf .venv results
+	rm -rf .venv results docs/_build docs/generated

@@ -104,6 +104,9 @@ def as_noise(
 ) -> Noise:
     """Return the noise of data from standard deviations or covariances.
 
+    Standard deviations whose ratios between bands and Stokes parameters are the same in all pixels
+    are recognised: then the likelihood does not depend on the number of pixels.
+
     Parameters
     ----------
     noise : standard deviations in the unit of the data, of shape (band,), (band, stokes) or
@@ -111,9 +114,6 @@ def as_noise(
         with an infinite diagonal where masked
     shape : (band, stokes, pix) of the data
     pixel_sigma : factor on the standard deviations in each pixel, (pix,)
-
-    Standard deviations whose ratios between bands and Stokes parameters are the same in all pixels
-    are recognised: then the likelihood does not depend on the number of pixels.
     """
     if isinstance(noise, Noise):
         return noise

@@ -14,7 +14,7 @@ DOCS = Path(__file__).parent.parent / "docs"
 #: Pages whose Python is not run, and why.
 NOT_RUN = {"cluster.md": "starts processes, and needs several devices or a scheduler"}
 #: Pages that need more than a few seconds.
-SLOW = {"samplers.md", "start.md"}
+SLOW = {"python.md", "samplers.md", "start.md"}
 
 
 def python_of(path):

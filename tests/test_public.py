@@ -230,6 +230,4 @@ def test_the_code_of_the_readme_runs(capsys):
     names = {}
     exec(readme_code(), names)
     assert "dust.beta_dust" in capsys.readouterr().out
-    for name in ("fit", "found"):
-        assert names[name].best_fit["dust.beta_dust"] == pytest.approx(1.53, abs=0.01)
-    assert np.isfinite(names["sky_maps"]).all()
+    assert names["fit"].best_fit["dust.beta_dust"] == pytest.approx(1.53, abs=0.01)

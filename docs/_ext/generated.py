@@ -1,6 +1,7 @@
 """Pages that are made from the code: settings, commands, names, and tables of what is packaged."""
 
 import inspect
+import json
 import re
 import types
 import typing
@@ -56,7 +57,7 @@ def _type(annotation: Any) -> str:
     if origin is dict:
         return f"table of {_type(inner[1])}"
     if inspect.isclass(annotation) and issubclass(annotation, BaseModel):
-        return f"[{annotation.__name__}]"
+        return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
     words = {str: "text", float: "number", int: "whole number", bool: "true or false"}
     return words.get(annotation, getattr(annotation, "__name__", str(annotation)))
 
@@ -68,7 +69,7 @@ def _default(field: FieldInfo) -> str:
         return "(required)" if field.is_required() else ""
     if value is None or isinstance(value, BaseModel):
         return ""
-    return _cell(repr(value))
+    return _cell(json.dumps(value, ensure_ascii=False))  # as in TOML
 
 
 def _limits(field: FieldInfo) -> str:
@@ -236,8 +237,21 @@ def _plain(app, what, name, obj, options, lines: list[str]) -> None:
             lines[i] = "".join(pieces)
 
 
+def _described(app, what, name, obj, options, lines: list[str]) -> None:
+    """Give what follows `name :` a line of its own: it describes the argument, and is no type."""
+    named, found = False, list[str]()
+    for i, line in enumerate(lines):
+        if lines[i + 1 : i + 2] and set(lines[i + 1]) == {"-"}:
+            named = line in ("Parameters", "Attributes", "Raises")
+        key, colon, text = line.partition(" : ")
+        split = named and colon and not line.startswith(" ")
+        found += [key, f"    {text}"] if split else [line]
+    lines[:] = found
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Write the parts before pages are read."""
     app.connect("builder-inited", write)
     app.connect("autodoc-process-docstring", _plain, priority=100)
+    app.connect("autodoc-process-docstring", _described, priority=200)  # napoleon's is 500
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -209,9 +209,21 @@ def term_weights(
     return _weights(component, stack_bands(bands), terms.vectors, terms.counts)
 
 
+def weight_matrix(
+    component: Component, bands: tuple[Bandpass, ...], terms: Terms
+) -> Float[Array, "band term"]:
+    """Return `term_weights` as one array: a tuple of thousands takes a minute to compile."""
+    return _weight_matrix(component, stack_bands(bands), terms.vectors, terms.counts)
+
+
 @partial(jax.jit, static_argnames="counts")
 def _weights(component, samples, vectors, counts):
-    return tuple(jnp.dot(_all_series(component, samples, counts), vectors.T, precision=EXACT))
+    return tuple(_weight_matrix(component, samples, vectors, counts))
+
+
+@partial(jax.jit, static_argnames="counts")
+def _weight_matrix(component, samples, vectors, counts):
+    return jnp.dot(_all_series(component, samples, counts), vectors.T, precision=EXACT)
 
 
 @jax.jit

@@ -116,6 +116,7 @@ def interpolated(interpolation) -> Calls:
     yield partial(interpolation._series, counts=COUNTS), DUST, BANDS[0]
     yield partial(interpolation._all_series, counts=COUNTS), DUST, SAMPLES
     yield partial(interpolation._weights, counts=COUNTS), DUST, SAMPLES, np.ones((2, 25))
+    yield partial(interpolation._weight_matrix, counts=COUNTS), DUST, SAMPLES, np.ones((2, 25))
     yield interpolation.term, DUST, np.ones(COUNTS)
     yield (
         lambda dust: interpolation.band_seds(dust, SAMPLES, interpolation.NodeCounts(COUNTS)),

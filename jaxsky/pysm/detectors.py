@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxsky.bandpass import Bandpass, stack_bands
 from jaxsky.checks import EXACT
-from jaxsky.interpolation import Terms, band_seds, choose_terms, term, term_weights
+from jaxsky.interpolation import Terms, band_seds, choose_terms, term, weight_matrix
 from jaxsky.pysm.emission import TOLERANCE, Part, above_cut, emission_of, iqu
 
 
@@ -51,7 +51,7 @@ def emission_in_bands(
             continue
         coefs = [terms.coefs(index) for index in range(len(terms.sizes))]
         maps += [_map(part.ready, jnp.asarray(one)) for one in coefs]
-        weights.append(np.asarray(term_weights(part.ends, own, terms)))
+        weights.append(np.asarray(weight_matrix(part.ends, own, terms)))
     if maps:
         together, shared = jnp.stack(maps), np.concatenate(weights, axis=1) * factors[:, None]
     for start in range(0, len(bands), at_once):

@@ -389,6 +389,6 @@ def plot_chains(
             interval = result.of_row(result.interval_68, name)
             plotter.subplots[i, i].axvspan(*interval, color=color, alpha=0.15, linewidth=0)
     said = "68 % shaded; contours of 68 and 95 %" + ("; lines: truth" if truth else "")
-    draw_title(plotter.fig, f"{title}\n{said}", fontsize=8, y=1.03)
+    draw_title(plotter.fig, f"{title}\n{said}", fontsize=8, y=0.99, va="bottom")
     with mpl.rc_context(STYLE | {"savefig.dpi": 200}):
         save(plotter.fig, path)

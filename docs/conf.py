@@ -13,6 +13,7 @@ import jaxsky  # noqa: E402
 jax.config.update("jax_enable_x64", True)
 
 project = "jaxsky"
+author = copyright = "the jaxsky developers"
 release = version = jaxsky.__version__
 html_title = f"jaxsky {version}"
 extensions = [

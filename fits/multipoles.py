@@ -12,6 +12,7 @@ E + iB in the same way.
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -116,7 +117,7 @@ def check_alm(alm: Numeric, bands: int) -> np.ndarray:
     """Return packed coefficients (band, stokes, alm) unchanged, after checking their shape."""
     array = bare("alm", alm)
     good = array.ndim == 3 and len(array) == bands and array.shape[1] in STOKES
-    good = good and (lmax_of(array) + 1) ** 2 == array.shape[2]
+    good = good and math.isqrt(array.shape[2]) ** 2 == array.shape[2]
     form = f"shape (band, stokes, (lmax + 1)^2) with {bands} bands and rows I, or E, B, or I, E, B"
     check_shape("alm", array, good, f"have {form}, as from `harmonic_coefficients`")
     return array

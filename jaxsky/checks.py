@@ -38,7 +38,10 @@ def as_array(name: str, value: object) -> Array:
             f"Argument `{name}` must be a number or a numeric array, but is {type(value).__name__}."
         ) from None
     if jnp.iscomplexobj(array):
-        raise TypeError(f"Argument `{name}` must be real, but is complex.")
+        raise TypeError(
+            f"Argument `{name}` must be real, but is complex. (Coefficients of healpy are no maps: "
+            "healpy.alm2map makes maps of them.)"
+        )
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
 
 

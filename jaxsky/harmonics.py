@@ -61,8 +61,21 @@ def degrees(lmax: int) -> tuple[Array, Array, Array]:
 
 
 def lmax_of(alm: Array | np.ndarray) -> int:
-    """Return the largest multipole of packed coefficients."""
-    return math.isqrt(alm.shape[-1]) - 1
+    """Return the largest multipole of packed coefficients, (..., (lmax + 1)^2).
+
+    TypeError if they are complex, ValueError if their number is no square.
+    """
+    if jnp.iscomplexobj(alm):
+        raise TypeError(
+            "Argument `alm` must be packed real coefficients, but is complex; those of healpy are "
+            "converted by jaxsky.harmonics.alm_from_healpy."
+        )
+    root = math.isqrt(many := alm.shape[-1])
+    if root**2 != many:
+        raise ValueError(
+            f"Argument `alm` must have (lmax + 1)^2 coefficients, a square number, not {many}."
+        )
+    return root - 1
 
 
 @jax.jit
@@ -99,16 +112,31 @@ def map_variance(spectrum: Float[Array | np.ndarray, " ell"]) -> float:
 
 
 def alm_from_healpy(alm: np.ndarray, lmax: int) -> Float[np.ndarray, "... alm"]:
-    """Convert healpy's complex coefficients to packed real ones, along the last axis."""
-    alm = np.asarray(alm, dtype=complex)
+    """Convert healpy's complex coefficients to packed real ones, along the last axis.
+
+    TypeError if they are real, ValueError unless there are (lmax + 1) (lmax + 2) / 2 of them.
+    """
+    alm, many = np.asarray(alm), (lmax + 1) * (lmax + 2) // 2
+    if not np.iscomplexobj(alm):
+        raise TypeError(
+            "Argument `alm` must be the complex coefficients of healpy, but is real: maps, or "
+            "coefficients that are packed already."
+        )
+    check_shape("alm", alm, alm.shape[-1:] == (many,), f"have {many} coefficients at lmax = {lmax}")
     high = np.sqrt(2) * alm[..., lmax + 1 :]
     pairs = np.stack([high.real, high.imag], axis=-1).reshape(*alm.shape[:-1], -1)
     return np.concatenate([alm[..., : lmax + 1].real, pairs], axis=-1)
 
 
 def alm_to_healpy(alm: ArrayLike, lmax: int) -> np.ndarray:
-    """Convert packed real coefficients to healpy's complex ones, along the last axis."""
-    alm = np.asarray(alm, dtype=float)
+    """Convert packed real coefficients to healpy's complex ones, along the last axis.
+
+    TypeError if they are complex, ValueError unless there are (lmax + 1)^2 of them.
+    """
+    alm = np.asarray(alm)
+    form = f"have {(lmax + 1) ** 2} coefficients at lmax = {lmax}"
+    check_shape("alm", alm, lmax_of(alm) == lmax, form)
+    alm = alm.astype(float)
     pairs = alm[..., lmax + 1 :] / np.sqrt(2)
     return np.concatenate([alm[..., : lmax + 1], pairs[..., ::2] + 1j * pairs[..., 1::2]], axis=-1)
 

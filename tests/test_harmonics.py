@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxsky import ducc
+from jaxsky import Dust, ducc
 from jaxsky import harmonics as h
 
 NSIDE, LMAX = 32, 64
@@ -80,6 +80,26 @@ def test_packing_is_inverse_and_keeps_the_norm(alm):
     ell = h.alm_ell(LMAX)
     power = [np.sum(packed[0][ell == degree] ** 2) / (2 * degree + 1) for degree in range(LMAX + 1)]
     np.testing.assert_allclose(power, healpy.alm2cl(alm[0]), rtol=1e-12, atol=1e-18)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (
+            lambda alm, packed: h.alm_from_healpy(packed, LMAX),
+            "complex .* but is real",
+        ),
+        (lambda alm, packed: h.alm_from_healpy(alm, LMAX + 1), "coefficients at lmax"),
+        (lambda alm, packed: h.alm_to_healpy(alm, LMAX), "is complex; .*alm_from_healpy"),
+        (lambda alm, packed: h.alm_to_healpy(packed, LMAX - 1), "coefficients at lmax"),
+        (lambda alm, packed: h.synthesis(alm, NSIDE), "is complex; .*alm_from_healpy"),
+        (lambda alm, packed: h.synthesis(packed[:, 1:], NSIDE), "a square number, not"),
+        (lambda alm, packed: Dust(alm), "must be real, but is complex. .*alm2map"),
+    ],
+)
+def test_coefficients_of_another_packing_are_refused(alm, call, words):
+    with pytest.raises((TypeError, ValueError), match=words):
+        call(alm[1:], jnp.asarray(h.alm_from_healpy(alm[1:], LMAX)))
 
 
 @pytest.mark.parametrize("lmax", [0, 1, 5, 301, 1535])

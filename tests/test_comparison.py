@@ -333,6 +333,13 @@ def test_a_model_that_is_wrong_is_pointed_out(settings, prepared, regions):
     assert found.scatters["K", "strip", "QU"].pte_text == "<0.03"
 
 
+def test_maps_that_are_too_near_the_model_are_pointed_out(settings, prepared, model, regions):
+    found = compare(settings, prepared._replace(data=model), regions)
+    assert found.scatters["K", "strip", "QU"].pte == 1.0
+    sentences = " ".join(comparison_warnings(found, settings))
+    assert "K, strip: the maps differ from the model by less than in any of 30" in sentences
+
+
 @pytest.mark.slow
 def test_wmap_on_the_real_sky(data_dir, monkeypatch):
     """V and W against the real templates: slopes of 1 within errors, at low latitude and above."""

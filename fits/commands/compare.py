@@ -109,6 +109,11 @@ def comparison_warnings(comparison: Comparison, settings: Experiment) -> list[st
                 f"{band}, {region}: the maps differ from the model by {s.rms:.3g} uK_RJ, more "
                 f"than in any of {round(1 / s.floor) - 1} realisations of noise and CMB."
             )
+        if stokes in ("I", "QU") and s.pte + s.floor / 2 > 1:
+            sentences.append(
+                f"{band}, {region}: the maps differ from the model by less than in any of "
+                f"{round(1 / s.floor) - 1} realisations of noise and CMB; is the noise too large?"
+            )
     for one in comparison.spectra:
         if unlikely := [
             n for n, p in zip(SPECTRA[comparison.stokes], one.pte, strict=True) if p < UNLIKELY
@@ -116,6 +121,13 @@ def comparison_warnings(comparison: Comparison, settings: Experiment) -> list[st
             sentences.append(
                 f"{one.band}: {' and '.join(unlikely)} differ from the model by more than noise "
                 f"and CMB do (PTE below {UNLIKELY:g})."
+            )
+        if near := [
+            n for n, p in zip(SPECTRA[comparison.stokes], one.pte, strict=True) if p > 1 - UNLIKELY
+        ]:
+            sentences.append(
+                f"{one.band}: {' and '.join(near)} agree with the model better than noise and CMB "
+                f"allow (PTE above {1 - UNLIKELY:g}); is the noise too large?"
             )
     return sentences
 

@@ -114,12 +114,15 @@ def fit_warnings(inputs: Inputs, settings: Experiment, fits: Sequence[RegionFit]
         # The first method that converged, if any did.
         method, result = min(fit.results.items(), key=lambda pair: not pair[1].converged)
         probability = fit.probability_to_exceed(method)
-        if probability is not None and probability < UNLIKELY:
-            sentences.append(
-                f"{where}: the model does not fit the amplitudes of the templates (chi2 "
-                f"{result.chi2:.1f} for {fit.dof_amplitudes} degrees of freedom, probability "
-                f"{probability:.1g}); by chance, or its errors are too small."
-            )
+        if probability is None or UNLIKELY <= probability <= 1 - UNLIKELY:
+            continue
+        small = probability < UNLIKELY
+        how, what = ("badly", "small") if small else ("too well", "large")
+        sentences.append(
+            f"{where}: the model fits the amplitudes of the templates {how} (chi2 "
+            f"{result.chi2:.1f} for {fit.dof_amplitudes} degrees of freedom, probability "
+            f"{probability:.{1 if small else 3}g}); by chance, or its errors are too {what}."
+        )
     return sentences
 
 

@@ -143,6 +143,8 @@ def _warnings_of_BB(ratio: TensorFit, simulated: SimulatedNoise) -> list[str]:
             f"BB of the cleaned CMB is not that of tensors, lensing, noise and errors of laws "
             f"(probability {probability(ratio.probability)}); foregrounds may be left in it."
         )
+    if ratio.probability > 1 - UNLIKELY:
+        sentences.append("BB of the cleaned CMB scatters less than its noise; is that too large?")
     share = simulated.leaked.mean(axis=0) / simulated.total.std(axis=0, ddof=1)
     if (share > LEAKED).any():
         sentences.append(

@@ -19,13 +19,17 @@ html_title = f"jaxsky {version}"
 extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "myst_parser",
+    "myst_nb",
     "sphinx_copybutton",
     "mathtext",
     "generated",
 ]
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
+nb_execution_mode = "cache"  # notebooks run once, and again when they change
+nb_execution_timeout = 600
+nb_execution_raise_on_error = True
+nb_output_stderr = "remove"
 exclude_patterns = ["_build", "generated/cache", ".gitignore"]
 html_theme = "furo"
 html_static_path = ["_static"]

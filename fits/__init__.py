@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from fits.commands.forecast import forecast
     from fits.comparison import compare
     from fits.compress import as_noise
-    from fits.fisher import fisher_errors
     from fits.grid import grid_fit
     from fits.multipoles import harmonic_coefficients, harmonic_likelihood
     from fits.optimize import Newton, best_fit
@@ -19,8 +18,8 @@ if TYPE_CHECKING:
     from fits.posterior import Gaussian, Uniform, chi2
     from fits.profile_likelihood import spectral_likelihood
     from fits.pseudo_cl import band_powers, bin_edges, masked_spectra
-    from fits.regions import apodize, clusters, superpixels
-    from fits.results import Convergence, FitError, FitResult
+    from fits.regions import apodize, superpixels
+    from fits.results import FitError, FitResult
     from fits.sampling import sample
     from fits.separated_maps import component_maps, harmonic_component_maps, separate
     from fits.separated_moments import separate_moments

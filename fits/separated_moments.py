@@ -34,8 +34,9 @@ from fits.separated_maps import (
     white_noise,
 )
 from fits.systems import Pixels
-from jaxsky import Bandpass, Component, Moment, Sky, get_parameters
+from jaxsky import Bandpass, Component, Sky, get_parameters
 from jaxsky.checks import Numeric, check_shape
+from jaxsky.components import Moment
 from jaxsky.io.stacks import ranges
 from jaxsky.observation import Instrument
 

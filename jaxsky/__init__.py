@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from jaxsky.public import exported  # before all else
 
 if TYPE_CHECKING:
-    from jaxsky.archive import fetch
     from jaxsky.bandpass import Bandpass
     from jaxsky.cmb import camb_spectra
     from jaxsky.components import (
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
         Component,
         Dust,
         FreeFree,
-        Moment,
         Synchrotron,
         moments,
     )

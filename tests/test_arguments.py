@@ -7,22 +7,21 @@ import pytest
 
 import systems
 from fits import (
-    Convergence,
     FitResult,
     apodize,
     as_noise,
     best_fit,
     bin_edges,
-    clusters,
     separate,
 )
+from fits.regions import clusters
+from fits.results import Convergence
 from jaxsky import (
     Bandpass,
     Observation,
     ObservedBand,
     Sky,
     Source,
-    fetch,
     get_parameters,
     load_instrument,
     observe,
@@ -30,6 +29,7 @@ from jaxsky import (
     simulate,
     smooth,
 )
+from jaxsky.archive import fetch
 from refusals import refused
 
 BAND = Bandpass.delta(100.0)

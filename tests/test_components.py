@@ -13,7 +13,6 @@ from jaxsky import (
     Bandpass,
     Component,
     Dust,
-    Moment,
     Sky,
     Synchrotron,
     get_parameters,
@@ -22,6 +21,7 @@ from jaxsky import (
     parameter_names,
     set_parameters,
 )
+from jaxsky.components import Moment
 from refusals import cases, raises
 
 NAMES = list(systems.components())

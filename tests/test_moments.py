@@ -21,7 +21,6 @@ from jaxsky import (
     CMB,
     Bandpass,
     Dust,
-    Moment,
     Sky,
     Synchrotron,
     moments,
@@ -30,7 +29,7 @@ from jaxsky import (
     parameter_names,
     set_parameters,
 )
-from jaxsky.components import declared
+from jaxsky.components import Moment, declared
 from jaxsky.components.laws import LineEmission
 from refusals import cases, raises
 

@@ -355,10 +355,10 @@ def test_templates_without_a_word_on_their_noise_are_warned_of():
     made = inputs_of(sky, bands, exact)
     fit = fitted(made, settings, inside)
     assert fit_warnings(made, settings, [fit]) == []
-    for chi2, how in ((0.01, "too well"), (100.0, "badly")):
-        results = {name: one._replace(chi2=chi2) for name, one in fit.results.items()}
+    for value, how in ((0.01, "too well"), (100.0, "badly")):
+        results = {name: one._replace(chi2=value) for name, one in fit.results.items()}
         (said,) = fit_warnings(made, settings, [fit._replace(results=results)])
-        assert f"fits the amplitudes of the templates {how} (chi2 {chi2:.1f}" in said
+        assert f"fits the amplitudes of the templates {how} (chi2 {value:.1f}" in said
     noisy = dict.fromkeys(("dust", "synchrotron"), TemplateNoise(TEMPLATE_NOISE / 1e4))
     drawn = [draw(jax.random.key(i), TEMPLATE_NOISE / 1e4) for i in range(2)]
     maps = {

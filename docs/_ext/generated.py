@@ -213,11 +213,15 @@ PAGES = {
 
 
 def write(app: Sphinx) -> None:
-    """Write all parts that pages include, where they have changed."""
+    """Write all parts that pages include, and the notebooks, where they have changed."""
     folder = Path(app.srcdir) / "generated"
     folder.mkdir(exist_ok=True)
     for name, make in PAGES.items():
         path, text = folder / f"{name}.txt", make()
+        if not path.exists() or path.read_text() != text:
+            path.write_text(text)
+    for notebook in (Path(app.srcdir).parent / "notebooks").glob("*.ipynb"):
+        path, text = folder / notebook.name, notebook.read_text()
         if not path.exists() or path.read_text() != text:
             path.write_text(text)
 

@@ -21,7 +21,7 @@ from fits.profile_likelihood import spectral_likelihood
 from fits.separated_maps import _over_devices
 from jaxsky import Bandpass, Dust, Sky, Synchrotron
 from jaxsky.mesh import distribute
-from jaxsky.sky import _observe, interpolation_nodes
+from jaxsky.sky import _kept, _observe, interpolation_nodes
 
 BANDS = {f"{nu:g}": Bandpass.top_hat(nu, nu / 5, samples=9) for nu in (30, 44, 70, 143, 217)}
 START = {"dust.beta_dust": 1.6, "synchrotron.beta_syn": 3.0}
@@ -66,7 +66,7 @@ def programs(nside: int) -> dict[str, jax.stages.Lowered]:
     plan = interpolation_nodes(sky, bands, 1e-10)
     (layout,), theta, matrix = like.layout, like.flat({}), np.ones((1, len(BANDS), 2))
     return {
-        "observe": _observe.lower(sky, bands, plan=plan, apart=False),
+        "observe": _observe.lower(sky, bands, _kept(sky), plan=plan, apart=False),
         "inner products": jax.jit(gram).lower(data, templates, jnp.abs(data)),
         "used pixels": distributed._look.lower(data, noise, components=2),
         "band covariances": jax.jit(

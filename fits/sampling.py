@@ -56,17 +56,6 @@ def _log_probs(positions, leaves, structure):
     return jax.vmap(one)(positions)
 
 
-class _Ensemble(emcee.EnsembleSampler):
-    """emcee's ensemble for a function of all walkers whose values are never NaN.
-
-    To look at the values one by one for NaN and for what else a function may return takes emcee as
-    long as the rest of a step.
-    """
-
-    def compute_log_prob(self, coords):
-        return self.log_prob_fn(coords), None
-
-
 @jax.jit
 def _values(unbounded, z):
     return jax.vmap(unbounded.values)(z)[0]
@@ -89,7 +78,7 @@ def _ensemble(unbounded, labels, seed, report, nsteps=5000, nwalkers=None, backe
         parts = np.split(theta, 2) if len(theta) == nwalkers and nwalkers % 2 == 0 else [theta]
         return np.concatenate([_log_probs(part, leaves, structure) for part in parts])
 
-    sampler = _Ensemble(nwalkers, size, log_probs, vectorize=True, backend=backend)
+    sampler = emcee.EnsembleSampler(nwalkers, size, log_probs, vectorize=True, backend=backend)
     # emcee's own wrapper prints a traceback when it is interrupted.
     sampler.log_prob_fn = sampler.log_prob_fn.f
     if done := sampler.iteration:

@@ -175,7 +175,11 @@ def test_small_scales_that_are_drawn(name):
             agrees(ours.get_emission(nu, weights), theirs.get_emission(nu, weights))
         found.append(ours.get_emission(150 * u.GHz).value)
     assert not np.allclose(*found, rtol=0.01)
+    before = np.random.get_state()[1:3]  # noqa: NPY002
     again = [pysm.Sky(NSIDE, preset_strings=[name]).get_emission(150 * u.GHz) for _ in range(2)]
+    after = np.random.get_state()[1:3]  # noqa: NPY002
+    for own, left in zip(before, after, strict=True):  # the user's numbers go on as before
+        np.testing.assert_array_equal(own, left)
     assert np.isfinite(again).all()
     assert not np.allclose(*again, rtol=1e-4)
     raises(ValueError, r"`seeds` must have . numbers, not \[1\]", pysm.Sky, NSIDE,

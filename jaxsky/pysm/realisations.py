@@ -54,8 +54,12 @@ class _Drawn:
             raise InputError(f"{path}: no power spectra ({error}).") from None
         if cl.ndim > 1 and _unit(path) not in SQUARED:
             raise InputError(f"{path}: spectra must be in uK_RJ^2, not {_unit(path)!r}.")
-        np.random.seed(seed)  # noqa: NPY002 - seeded as PySM's
-        alm = healpy.synalm(list(cl) if cl.ndim > 1 else cl, lmax=self.lmax, new=True)
+        before = np.random.get_state()  # noqa: NPY002 - healpy draws from it, seeded as PySM's
+        try:
+            np.random.seed(seed)  # noqa: NPY002
+            alm = healpy.synalm(list(cl) if cl.ndim > 1 else cl, lmax=self.lmax, new=True)
+        finally:
+            np.random.set_state(before)  # noqa: NPY002 - the user's numbers go on as before
         rows = [healpy.almxfl(row, np.ones(cut)) for row in np.atleast_2d(alm)]
         return np.asarray(healpy.alm2map(rows if cl.ndim > 1 else rows[0], self.nside))
 
